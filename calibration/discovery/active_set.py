@@ -82,10 +82,10 @@ class ActiveSet(eqx.Module):
 def _parts(space: ActiveSet, z: Array) -> tuple[Array, tuple[Array, ...], tuple[Array, ...]]:
     """Coordinates of the base, and amplitude and shape of every effect."""
     base, amplitude, shape = space.parts(z)
-    held, effects = space.held(), range(len(space.names))
+    held = space.held()
     amplitudes = space.sd * (amplitude @ held)
     shapes = shaped(space.scales, shape @ held)
-    return base, tuple(amplitudes[k] for k in effects), tuple(shapes[k] for k in effects)
+    return base, params.one_by_one(amplitudes), params.one_by_one(shapes)
 
 
 @dataclasses.dataclass(frozen=True)

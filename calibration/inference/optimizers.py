@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from calibration.inference.normal_equations import backward, cholesky, forward
+from calibration.inference.normal_equations import half_solved, solved
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax.compiling import SELDOM, SMALL, compiled
 from mmrjax.robot import Robot
@@ -158,8 +158,7 @@ def stride_of(r: Array, jacobian: Array, held: slice, damping: Array | float) ->
     def again(carry: tuple) -> tuple:
         turns, active, _, best, lowest = carry
         counts = edge * active[:, None]
-        lower = cholesky(normal + counts.T @ counts)
-        d = -backward(lower, forward(lower, gradient + counts.T @ height))
+        d = -solved(normal + counts.T @ counts, gradient + counts.T @ height)
         beyond, here = height + edge @ d > 0, value(d)
         better = here < lowest
         return turns + 1, beyond, active, jnp.where(better, d, best), jnp.where(better, here, lowest)
@@ -189,8 +188,7 @@ def _evaluated(problem: Problem, data: Data, pin: Pin) -> Callable[[Z], tuple[Ar
 def _optimum(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array) -> Optimum:
     held_rows = penalties(data)
     informed = jacobian[informing(data)]
-    lower = cholesky(informed.T @ informed)
-    half = forward(lower, jnp.eye(z.shape[0]))
+    half = half_solved(informed.T @ informed, jnp.eye(z.shape[0]))
     sd = jnp.linalg.norm(half, axis=0)
     ahead = r + jacobian @ stride_of(r, jacobian, held_rows, 0.0)
     decrement = _cost(r, held_rows) - _cost(ahead, held_rows)

@@ -149,8 +149,8 @@ class Coordinates(eqx.Module):
 def _numbers(coordinates: Coordinates, z: Float[Array, " parameters"]) -> tuple[Array, ...]:
     """Parameters at coordinates z and those tied to them, one by one [SI]."""
     theta = coordinates.value(z)
-    tied = (coordinates.ratios[n] * theta[k] for n, (_, k) in enumerate(coordinates.followers))
-    return (*(theta[k] for k in range(len(coordinates))), *tied)
+    tied = coordinates.ratios * theta[np.array([k for _, k in coordinates.followers], int)]
+    return (*params.one_by_one(theta), *params.one_by_one(tied))
 
 
 def known(robot: Robot) -> dict[str, Parameter]:

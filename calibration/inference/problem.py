@@ -140,7 +140,7 @@ class Problem(eqx.Module):
             jacobian, (r, seen) = jax.jacfwd(explicit, has_aux=True)(x)
             return r, jacobian, seen, None
 
-        unknowns, found = jax.lax.stop_gradient(solved)
+        unknowns, found = solved
         size, (rows, count) = x.size, data.measured.shape
 
         def shown(x: Array) -> tuple[tuple[Array, Array], tuple[Array, Observation, Signals]]:

@@ -129,12 +129,12 @@ def _nothing_to_say(robot: Robot, conditions: Conditions) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class Implicit:
-    """Settled travel in two halves, so that one evaluation serves all derivatives of a fit.
+    """Settled travel of one run in two halves, so that one evaluation serves all derivatives of a fit.
 
     Attributes:
-        solve: a batch of conditions to unknowns, shape (rows, unknowns), and whether they were found, (rows,).
-        shown: results and signals of every row at some unknowns (differentiable in them and in the robot), and what
-            the equations leave there, shape (rows, unknowns).
+        solve: the unknowns, shape (unknowns,), and whether they were found; no derivatives.
+        shown: result and signals at some unknowns (differentiable in them and in the robot), and what the equations
+            leave there, shape (unknowns,).
     """
 
     solve: Callable[[Robot, Conditions], tuple[Array, Array]]

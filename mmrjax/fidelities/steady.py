@@ -297,22 +297,20 @@ def _settled(robot: Robot, conditions: Conditions) -> Result:
     return jax.vmap(lambda c: operating_point(robot, c)[0])(conditions)
 
 
-def _solve(robot: Robot, conditions: Conditions) -> tuple[Float[Array, "rows unknowns"], Bool[Array, " rows"]]:
-    """Unknowns at which the balances of every run close, and whether they were found."""
-    unknowns, solved = jax.vmap(lambda c: _root(robot, c, linear=False))(conditions)
-    return jnp.stack(unknowns, -1), solved
+def _solve(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " unknowns"], Bool[Array, ""]]:
+    unknowns, found = _root(robot, conditions, linear=False)
+    return jax.lax.stop_gradient((jnp.stack(unknowns), found))
 
 
 def _shown(
-    robot: Robot, conditions: Conditions, unknowns: Float[Array, "rows unknowns"], solved: Bool[Array, " rows"]
-) -> tuple[Result, Signals, Float[Array, "rows unknowns"]]:
-    """Results and signals at some unknowns, as `operating_point`, and what the balances leave there."""
+    robot: Robot, conditions: Conditions, unknowns: Float[Array, " unknowns"], found: Bool[Array, ""]
+) -> tuple[Result, Signals, Float[Array, " unknowns"]]:
+    signals, status, _, left = _operating_at(robot, conditions, tuple(unknowns), found)
+    return result(robot.within(conditions.configuration), signals, status), signals, jnp.stack(left)
 
-    def one(conditions: Conditions, unknowns: Array, solved: Array) -> tuple[Result, Signals, Array]:
-        signals, status, _, left = _operating_at(robot, conditions, tuple(unknowns), solved)
-        return result(robot.within(conditions.configuration), signals, status), signals, jnp.stack(left)
 
-    return jax.vmap(one)(conditions, unknowns, solved)
+#: `operating_point` in two halves.
+IMPLICIT = Implicit(_solve, _shown)
 
 
 def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None) -> Run:
@@ -336,6 +334,4 @@ def _check(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -
             )
 
 
-FIDELITY = Fidelity(
-    "steady", settled=_settled, implicit=Implicit(_solve, _shown), run=_run, outputs=steady_outputs, check=_check
-)
+FIDELITY = Fidelity("steady", settled=_settled, implicit=IMPLICIT, run=_run, outputs=steady_outputs, check=_check)

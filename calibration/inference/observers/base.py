@@ -181,7 +181,7 @@ class Observer(eqx.Module):
         """What a robot shows in every row."""
 
     def solve(self, robot: Robot) -> tuple[Array, Array] | None:
-        """Where what rows show is a root: the unknowns of each, shape (rows, unknowns), and whether they are found."""
+        """Where what rows show is a root: the unknowns of each, shape (rows, unknowns), and which were found."""
         return None
 
     def shown(self, robot: Robot, unknowns: Array, found: Array) -> tuple[Observation, Signals, Array]:

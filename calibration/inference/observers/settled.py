@@ -191,11 +191,13 @@ class SettledRuns(Observer):
         return None if self.conditions.turns else fidelities.get(self.fidelity).implicit
 
     def solve(self, robot: Robot) -> tuple[Array, Array] | None:
-        return None if self._implicit is None else self._implicit.solve(robot, self.conditions)
+        implicit = self._implicit
+        return None if implicit is None else jax.vmap(lambda c: implicit.solve(robot, c))(self.conditions)
 
     def shown(self, robot: Robot, unknowns: Array, found: Array) -> tuple[Observation, Signals, Array]:
         assert self._implicit is not None
-        result, signals, left = self._implicit.shown(robot, self.conditions, unknowns, found)
+        one = functools.partial(self._implicit.shown, robot)
+        result, signals, left = jax.vmap(one)(self.conditions, unknowns, found)
         return self._observed(robot, result), signals, left
 
     @property
