@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 from collections.abc import Iterable, Sequence
@@ -16,7 +17,7 @@ from jaxtyping import Array, Float
 from calibration.data.errors import BadConfiguration, choices, number
 from calibration.data.surfaces import GROUND
 from mmrjax import params
-from mmrjax.compiling import compiled
+from mmrjax.compiling import SELDOM, compiled
 from mmrjax.params import Parameter
 from mmrjax.robot import Robot
 
@@ -145,7 +146,7 @@ class Coordinates(eqx.Module):
         return np.where(u <= own.low, -1, np.where(u >= own.high, 1, 0))
 
 
-@compiled
+@functools.partial(compiled, options=SELDOM)
 def _numbers(coordinates: Coordinates, z: Float[Array, " parameters"]) -> tuple[Array, ...]:
     """Parameters at coordinates z and those tied to them, one by one [SI]."""
     theta = coordinates.value(z)

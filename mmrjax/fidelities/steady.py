@@ -194,9 +194,13 @@ def operating(robot: Robot, conditions: Conditions) -> tuple[Signals, Array, Arr
 
 
 def _operating_at(
-    robot: Robot, conditions: Conditions, unknowns: Vector, solved: Array
+    robot: Robot, conditions: Conditions, unknowns: Vector, solved: Array, stands: bool = True
 ) -> tuple[Signals, Array, Array, Vector]:
-    """`operating` at some unknowns, and what the balances leave there."""
+    """`operating` at some unknowns, and what the balances leave there.
+
+    Args:
+        stands: whether it is found out if a run beyond the limit of adhesion slides or stands; else it `slides`.
+    """
     given = jax.lax.stop_gradient((robot, conditions))  # as they came: nothing is stored for a loop that seldom turns
     robot = robot.within(conditions.configuration)
     sound, conditions = _sound(robot, conditions)
@@ -211,7 +215,7 @@ def _operating_at(
     status = jnp.where(still, STALLED, travels(signals.speed, voltage))
     if robot.has_ground:
         beyond = jnp.abs(signals.demand) > signals.adhesion_limit
-        slides = rarely(beyond, _slides_in_place, given, jnp.zeros_like(beyond))
+        slides = rarely(beyond, _slides_in_place, given, jnp.zeros_like(beyond)) if stands else beyond
         status = jnp.where(beyond, jnp.where(slides, SLIDES, STALLED), status)
     status = jnp.where(solved, status, FAILED)
     empty = (conditions.battery > 0.5) & robot.battery.empty(conditions.discharge)
@@ -305,7 +309,7 @@ def _solve(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " unknown
 def _shown(
     robot: Robot, conditions: Conditions, unknowns: Float[Array, " unknowns"], found: Bool[Array, ""]
 ) -> tuple[Result, Signals, Float[Array, " unknowns"]]:
-    signals, status, _, left = _operating_at(robot, conditions, tuple(unknowns), found)
+    signals, status, _, left = _operating_at(robot, conditions, tuple(unknowns), found, stands=False)
     return result(robot.within(conditions.configuration), signals, status), signals, jnp.stack(left)
 
 
