@@ -134,8 +134,8 @@ class Implicit:
     Attributes:
         solve: the unknowns, shape (unknowns,), and whether they were found; no derivatives.
         shown: result and signals at some unknowns (differentiable in them and in the robot), and what the equations
-            leave there, shape (unknowns,). What asks more of the ground than it holds is said to slide: in a fit it is
-            out of reach, slide or stand.
+            leave there, shape (unknowns,). What asks more of the ground than it holds is said to slide: in a fit
+            it is out of reach, slide or stand.
     """
 
     solve: Callable[[Robot, Conditions], tuple[Array, Array]]
