@@ -12,7 +12,7 @@ import pytest
 from mmrjax import footing, terrain
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import climb
-from mmrjax.fidelities.climb import LOSSES, SOURCES, climb_batch, still, system
+from mmrjax.fidelities.climb import LOSSES, SOURCES, Sequence, climb_batch, still, system
 from mmrjax.robots import nominal
 from mmrjax.signals import GRAVITY
 
@@ -21,9 +21,11 @@ SIZE = 4  # points of every terrain here, so that one program serves them
 
 
 def batch(runs, robot=ROBOT, **options):
-    """Runs of (terrain, front, rear in degrees, volts, further conditions)."""
+    """Runs of (terrain, front, rear in degrees, volts, further conditions); pairs of angles are at 0.1 and 0.6 s."""
     grounds = jax.tree.map(lambda *x: jnp.stack(x), *[r[0] for r in runs])
-    sequences = jax.tree.map(lambda *x: jnp.stack(x), *[still(np.radians(r[1]), np.radians(r[2])) for r in runs])
+    angles = [[jnp.asarray(np.radians(np.broadcast_to(a, 2))) for a in r[1:3]] for r in runs]
+    sequences = [Sequence(jnp.array([0.1, 0.6]), *pair, over_time=True) for pair in angles]
+    sequences = jax.tree.map(lambda *x: jnp.stack(x), *sequences)
     more = [r[4] if len(r) > 4 else {} for r in runs]
     of = {
         k: np.array([m.get(k, d) for m in more]) for k, d in (("adhesion", 1.0), ("payload", 0.0), ("slope_deg", 0.0))
@@ -37,11 +39,11 @@ def batch(runs, robot=ROBOT, **options):
 def first_second():
     """Onto a step, and against a wall; a member without numbers beside them."""
     runs = [
-        (terrain.step(0.05, size=SIZE), 45, -8.4, 24),
-        (terrain.step(0.25, size=SIZE), 45, 180, 24),
+        (terrain.step(0.05, size=SIZE), (45, 20), (-8.4, -60), 24),
+        (terrain.step(0.25, size=SIZE), (45, 80), (-8.4, -60), 24),
         (terrain.step(np.nan, size=SIZE), 45, 180, 24),
     ]
-    return batch(runs, duration=0.8, part=0.8)
+    return batch(runs, duration=0.64, part=0.64)
 
 
 def energy_left(record, k):
@@ -62,6 +64,35 @@ def test_energy_in_is_stored_and_lost_at_every_instant_and_a_failed_member_harms
         assert np.abs(left[running] / come[running]).max() < 1e-3
         assert all(since[name][-1] > 2e-3 * come[-1] for name in LOSSES), since  # or it would not be missed
     assert np.ptp(np.asarray(record.motion.q)[0, :, 1]) > 0.01  # it has climbed
+
+
+def test_tracks_of_levers_lose_what_table_3_says_at_their_own_speed():
+    """(350 - 70) / 2 mN·m and (16 - 3) / 2 mN·m·s each; all three as one where the levers stand."""
+    wheeled, tracked = (
+        system(ROBOT, Conditions(k, voltage=6.0).resolved(ROBOT), terrain.flat(), still(0.5, 0.3)) for k in (1, 0)
+    )
+    loss = np.asarray(climb._lever_loss(tracked, jnp.array([10.0, -4.0])))
+    assert loss == pytest.approx([0.140 + 0.0065 * 10, -0.140 - 0.0065 * 4])
+    assert 2 * loss[0] + tracked.chassis.track.torque_loss(10.0, 1.0) == pytest.approx(0.350 + 0.016 * 10)
+    assert np.asarray(climb._lever_loss(wheeled, jnp.array([10.0, -4.0]))) == pytest.approx(0.0)
+    assert wheeled.chassis.track.torque_loss(10.0, 1.0) == pytest.approx(0.070 + 0.003 * 10)
+
+
+def test_motors_of_levers_load_the_battery():
+    """I_b = I_s + I_p (10), with I_s of all four motors: the voltage falls by 8 x 49 mΩ an ampere."""
+    run = system(ROBOT, Conditions(0, battery=True).resolved(ROBOT), terrain.flat(), still(0.5, 0.3))
+    motion = climb.stand(run)
+    pulls = dataclasses.replace(motion, drawn=jnp.asarray(10.0))
+    none = dict.fromkeys((*SOURCES, *LOSSES), jnp.zeros(()))
+    after = jax.jit(lambda m: climb.advance(run, m, 1.0, none)[::2])
+    volts = [8 * 4.17 - 8 * 0.049 * (1.5 + drawn) for drawn in (0.0, 10.0)]
+    (end, passed), (end_pulls, passed_pulls) = after(motion), after(pulls)
+    assert [float(p.voltage) for p in (passed, passed_pulls)] == pytest.approx(volts)
+    assert float(end_pulls.discharge - end.discharge) == pytest.approx(10 * float(run.step))
+    # asked to swing they take their current by the duty of their bridge
+    end, passed = after(dataclasses.replace(motion, q=motion.q.at[4].add(-0.5)))
+    share = float(passed.lever_voltage[0]) / volts[0]
+    assert 0.01 < share < 1 and float(end.drawn) == pytest.approx(share * float(passed.lever_current[0]))
 
 
 @pytest.mark.slow
