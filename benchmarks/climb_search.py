@@ -4,7 +4,8 @@
 
 Members have angles of front and rear levers at knots of time, and a height of their own; of each generation the
 highest that were got over beget the next, angles and height changed at random. `--adhesion 4` is a ground that holds
-whatever is asked, which shows what geometry and torque leave.
+whatever is asked, which shows what geometry and torque leave. `--begin` begets the first generation of a sequence,
+which `--stretch` makes slower.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mmrjax import robots, terrain
+from mmrjax import params, robots, terrain
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.climb import NAMES, OVER, Sequence, climb_batch
 from mmrjax.tables import SURFACES, adhesion_ratio
@@ -30,17 +31,34 @@ FLUSH = -8.4
 
 
 def run(
-    robot: object, angles: np.ndarray, heights: np.ndarray, volts: float, adhesion: float, payload: float, step: float
+    robot: object,
+    angles: np.ndarray,
+    heights: np.ndarray,
+    volts: float,
+    adhesion: float,
+    payload: float,
+    step: float,
+    levers: float | None = None,
 ) -> object:
     """Climbs of members with angles (members, 2, knots) [deg] over steps of their heights [m]."""
     n = len(heights)
     conditions = Conditions(0, voltage=np.full(n, volts), adhesion=adhesion, payload=payload).resolved(robot)
     grounds = jax.vmap(lambda h: terrain.step(h))(jnp.asarray(heights))
     front, rear = (jnp.asarray(np.radians(angles[:, k])) for k in range(2))
-    sequence = Sequence(jnp.broadcast_to(jnp.asarray(KNOTS), front.shape), front, rear, True)
+    supply = None if levers is None else jnp.full(n, levers)
+    knots = jnp.broadcast_to(jnp.asarray(KNOTS), front.shape)
+    sequence = Sequence(knots, front, rear, over_time=True, supply=supply)
     return climb_batch(
         robot, conditions, grounds, sequence, duration=LENGTH, step=step, sample=0.05, part=1.0, record=False
     )
+
+
+def begotten(random: np.random.Generator, path: str, stretch: float, n: int) -> np.ndarray:
+    """Angles of a first generation: those of a file of time and angles, made slower, and moved in all but one."""
+    time, *angles = np.loadtxt(path, delimiter=",", skiprows=1).T
+    own = np.stack([np.interp(KNOTS, stretch * time, a) for a in angles])
+    spread = np.linspace(0, 30, n)[:, None, None]
+    return bounded(own + spread * random.normal(size=(n, *own.shape)))
 
 
 def mutated(random: np.random.Generator, parents: np.ndarray, n: int, spread: float) -> np.ndarray:
@@ -69,9 +87,18 @@ def main() -> None:
     parser.add_argument("--step", type=float, default=2e-4)
     parser.add_argument("--seconds", type=float, default=1e9, help="after which no generation is begun")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--begin", help="CSV of time_s, front_deg, rear_deg, of which the first generation is begotten"
+    )
+    parser.add_argument("--stretch", type=float, default=1.0)
+    parser.add_argument("--heights", type=float, nargs=2, default=(100.0, 300.0), help="of the first generation [mm]")
+    parser.add_argument("--levers-voltage", type=float, help="highest of the levers' motors; else the supply's")
+    parser.add_argument("--levers-current", type=float, help="at which the levers' driver limits their motors")
     parser.add_argument("--out")
     told = parser.parse_args()
     robot, random = robots.nominal(), np.random.default_rng(told.seed)
+    if told.levers_current is not None:
+        robot = params.replace(robot, {"running_gear.levers.current_limit": told.levers_current})
     adhesion = adhesion_ratio(told.surface, True) if told.adhesion is None else told.adhesion
     n, begun, parents = told.members, time.time(), []
     best: list[tuple[float, np.ndarray, float]] = []
@@ -79,17 +106,20 @@ def main() -> None:
         if time.time() - begun > told.seconds:
             break
         if not best:
+            low, high = (h / 1000 for h in told.heights)
             held = random.uniform([[-60], [-90]], [[120], [180]], (n, 2, len(KNOTS)))
             # half of them stay for a while where they are
             angles = bounded(np.where(random.random(held.shape) < 0.5, np.roll(held, 1, axis=2), held))
-            heights = random.uniform(0.1, 0.3, n)
+            if told.begin:
+                angles = begotten(random, told.begin, told.stretch, n)
+            heights = random.uniform(low, high, n)
         else:
             parents = np.array([angles for _, angles, _ in best])
             tops = np.array([h for h, *_ in best])
             angles = mutated(random, parents, n, 25.0 * 0.7**generation)
             heights = random.choice(tops, n) + random.uniform(-0.01, 0.04, n)
         start = time.time()
-        found = run(robot, angles, heights, told.volts, adhesion, told.payload, told.step)
+        found = run(robot, angles, heights, told.volts, adhesion, told.payload, told.step, told.levers_voltage)
         took = time.time() - start
         over = np.flatnonzero(found.verdict == OVER)
         best += [(float(heights[k]), angles[k], float(found.ended[k])) for k in over]

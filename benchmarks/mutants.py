@@ -143,12 +143,19 @@ def tested(mutant: Mutant, tree: Path, stamp: int) -> tuple[str, float, str]:
     return outcome, time.perf_counter() - begin, failed[0] if failed and outcome == "killed" else said[-1500:]
 
 
-def unmutated(chosen: list[Mutant], tree: Path) -> str | None:
-    """Why the killing tests can't serve, None where all pass and are quick."""
+def unmutated(chosen: list[Mutant], trees: list[Path]) -> str | None:
+    """Why the killing tests can't serve, None where all pass and are quick; files side by side, one tree each."""
     tests = list(dict.fromkeys(test for mutant in chosen for test in mutant.killed_by))
-    code, passed = run(tree, tests, tree / "mutant.log")
-    if code != 0:
-        return "the tests don't pass without a mutant:\n" + (tree / "mutant.log").read_text(errors="replace")[-3000:]
+    files = list(dict.fromkeys(test.split("::")[0] for test in tests))
+    shares = [[t for t in tests if files.index(t.split("::")[0]) % len(trees) == k] for k in range(len(trees))]
+    parts = [(tree, share) for tree, share in zip(trees, shares, strict=True) if share]
+    with ThreadPoolExecutor(len(parts)) as pool:
+        ends = list(pool.map(lambda part: run(*part, part[0] / "mutant.log"), parts))
+    for (tree, _), (code, _) in zip(parts, ends, strict=True):
+        if code != 0:
+            said = (tree / "mutant.log").read_text(errors="replace")
+            return f"the tests don't pass without a mutant:\n{said[-3000:]}"
+    passed = [name for _, names in ends for name in names]
     none = [t for t in tests if not any(p == t or p.startswith((f"{t}[", f"{t}::")) for p in passed)]
     return f"no test of `make test`: {', '.join(none)}" if none else None
 
@@ -169,15 +176,15 @@ def main() -> int:
     context.set_forkserver_preload([name for name in PRELOADED if importlib.util.find_spec(name.split(".")[0])])
 
     with tempfile.TemporaryDirectory(prefix="mmrjax-mutants-") as folder:
-        trees: queue.SimpleQueue[Path] = queue.SimpleQueue()
-        for k in range(options.jobs):
-            shutil.copytree(ROOT, Path(folder) / str(k), ignore=LEFT_OUT)
-            trees.put(Path(folder).resolve() / str(k))
-        tree = trees.get()
-        if wrong := unmutated(chosen, tree):
+        copies = [Path(folder).resolve() / str(k) for k in range(options.jobs)]
+        for copy in copies:
+            shutil.copytree(ROOT, copy, ignore=LEFT_OUT)
+        if wrong := unmutated(chosen, copies):
             print(wrong)
             return 1
-        trees.put(tree)
+        trees: queue.SimpleQueue[Path] = queue.SimpleQueue()
+        for copy in copies:
+            trees.put(copy)
         print(f"{len(chosen)} mutants; their tests pass without them and belong to `make test`", flush=True)
 
         def one(k: int) -> tuple[str, float]:

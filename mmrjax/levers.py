@@ -1,12 +1,14 @@
-"""Levers: what they have beyond their masses and length, and the drive that swings one pair of them, Fig. 5b."""
+"""Levers: what they have beyond their masses and length, their tracks' losses, the gears of their drives, Fig. 5b."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import equinox as eqx
 
 from mmrjax.params import Scalar, parameter
+from mmrjax.track import Track
 
 _UNSTATED = "the paper prints none"
 
@@ -82,3 +84,38 @@ class Levers(eqx.Module):
         sd=0.5,
         source=f"transport posture, Table 6; {_UNSTATED}",
     )
+    current_limit: Scalar = parameter(
+        1000.0,
+        unit="A",
+        meaning="largest current of a motor of the levers that its driver lets flow",
+        bounds=(0.01, 1e4),
+        relative_sd=0.1,
+        source="none on the bench: above any current",
+    )
+    share_coulomb: Scalar = parameter(
+        0.4,
+        unit="-",
+        meaning="share of a side's static loss torque of the tracks that each of its two levers' tracks has",
+        bounds=(0.0, 0.5),
+        sd=0.05,
+        source="Table 3: (350 - 70) / 2 of 350 mN·m",
+    )
+    share_viscous: Scalar = parameter(
+        13 / 32,
+        unit="-",
+        meaning="share of a side's pseudo-viscous loss of the tracks that each of its two levers' tracks has",
+        bounds=(0.0, 0.5),
+        sd=0.05,
+        source="Table 3: (16 - 3) / 2 of 16 mN·m·s",
+    )
+
+    def tracks(self, side: Track) -> tuple[Track, Track]:
+        """Of the tracks of a side, the main one and that of one lever."""
+
+        def share(coulomb: Scalar, viscous: Scalar) -> Track:
+            return dataclasses.replace(
+                side, loss_coulomb=coulomb * side.loss_coulomb, loss_viscous=viscous * side.loss_viscous
+            )
+
+        own = share(self.share_coulomb, self.share_viscous)
+        return share(1 - 2 * self.share_coulomb, 1 - 2 * self.share_viscous), own

@@ -79,7 +79,9 @@ def turned(forward: Scalar, up: Scalar, pitch: Scalar) -> tuple[Array, Array]:
     return jnp.asarray(forward * cosine - up * sine), jnp.asarray(forward * sine + up * cosine)
 
 
-def _parts(robot: Robot, conditions: Conditions, mass: Scalar | None) -> masses.Masses:
+def parts(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> masses.Masses:
+    """Masses of half a robot of this mass with its payload [kg], None: as stated; its levers as the conditions state
+    them."""
     if mass is None:
         stated = robot.chassis(conditions.configuration).mass + conditions.payload
         mass = stated if conditions.total_mass is None else conditions.total_mass
@@ -94,7 +96,7 @@ def outline(robot: Robot, conditions: Conditions, mass: Scalar | None = None) ->
     """
     chassis, gear = robot.chassis(conditions.configuration), robot.running_gear
     tracked = jnp.asarray(chassis.on_tracks)
-    ahead, high = _parts(robot, conditions, mass).centre
+    ahead, high = parts(robot, conditions, mass).centre
     front, rear = masses.lever_angles(gear, conditions)
     half, reach = gear.wheelbase / 2, gear.lever_length * tracked
     axle, roller = chassis.radius + tracked * gear.grouser_height, gear.levers.roller * tracked
@@ -160,7 +162,7 @@ def posture(robot: Robot, conditions: Conditions, mass: Scalar | None = None) ->
     Args:
         mass: with payload [kg]; None: as stated.
     """
-    inertia = robot.sides * _parts(robot, conditions, mass).inertia_pitch(robot.running_gear.wheelbase)
+    inertia = robot.sides * parts(robot, conditions, mass).inertia_pitch(robot.running_gear.wheelbase)
     return rest(outline(robot, conditions, mass), conditions.slope, inertia)
 
 

@@ -7,6 +7,7 @@ that climbs slowly with its levers held.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -20,10 +21,8 @@ from mmrjax.params import Scalar
 from mmrjax.posture import BELTS, FRONT_ROLLER, REAR_ROLLER, Outline, Posture
 from mmrjax.robot import Robot
 
-#: Pitches that are looked at at once, and how often the best one's neighbourhood is looked at again.
-PITCHES, CLOSER = 181, 4
-#: Of the best posture: front, rear and pitch looked at in each round, and by how much the next one looks closer.
-_ROUNDS = (((7, 19, 10), 3.0), *(((5, 5, 5), 2.0),) * 10)
+#: Pitches that are looked at at once, then in the best one's neighbourhood, and how often; of a posture, of any.
+_PITCHES, _POSTURES = (181, 33, 4), (13, 9, 1)
 #: How far beside the highest step its two sides are looked at [rad].
 _BESIDE = 1e-5
 
@@ -107,20 +106,28 @@ def step_at(side: Outline, pitch: Scalar) -> Scalar:
     return ahead - behind
 
 
-def step(side: Outline) -> Step:
+def _highest(height: Callable[[Scalar], Scalar], count: int, near: int, rounds: int) -> tuple[Scalar, Scalar]:
+    """The pitch of the highest step among `count`, then among `near` ever closer ones, and their distance [rad]."""
+    apart = jnp.pi / 2 / (count - 1)
+    grid = jnp.linspace(0.0, jnp.pi / 2, count)
+    best = grid[jnp.argmax(jax.vmap(height)(grid))]
+    for _ in range(rounds):
+        grid = jnp.clip(best + apart * jnp.linspace(-1.0, 1.0, near), 0.0, jnp.pi / 2)
+        best, apart = grid[jnp.argmax(jax.vmap(height)(grid))], apart * 2 / (near - 1)
+    return best, apart
+
+
+def step(side: Outline, pitch: Scalar | None = None) -> Step:
     """The highest of `step_at`, nose up, for one outline.
 
     Where two parts of the outline meet at the highest step, its derivatives are those of both, weighted by their
     rises s with pitch on the other side: dH = (s_1 dH_2 - s_2 dH_1) / (s_1 - s_2).
+
+    Args:
+        pitch: of the highest step [rad]; None: it is looked for.
     """
     still = jax.lax.stop_gradient(side)
-    heights = jax.vmap(lambda pitch: step_at(still, pitch))
-    wide = jnp.pi / 2 / (PITCHES - 1)
-    grid = jnp.linspace(0.0, jnp.pi / 2, PITCHES)
-    best = grid[jnp.argmax(heights(grid))]
-    for _ in range(CLOSER):
-        near = jnp.clip(best + wide * jnp.linspace(-1.0, 1.0, 33), 0.0, jnp.pi / 2)
-        best, wide = near[jnp.argmax(heights(near))], wide / 16
+    best = _highest(lambda pitch: step_at(still, pitch), *_PITCHES)[0] if pitch is None else pitch
     beside = best + jnp.array([-_BESIDE, _BESIDE])
     rises = jax.vmap(lambda pitch: jax.jvp(lambda x: step_at(still, x), (pitch,), (jnp.ones_like(pitch),))[1])(beside)
     share = jnp.clip(-rises[1] / jnp.maximum(rises[0] - rises[1], 1e-12), 0.0, 1.0)
@@ -142,31 +149,48 @@ def flush(robot: Robot) -> Scalar:
     return -jnp.arcsin((robot.radius_pulley + gear.grouser_height - gear.levers.roller) / gear.lever_length)
 
 
+def best_levers(robot: Robot, conditions: Conditions, pitch: Scalar) -> tuple[Scalar, Scalar]:
+    """The angles of front and rear levers [rad] in which one run's robot stands on its highest step at a pitch θ.
+
+    The belt is over the edge, and the tail stands on the rollers of the rear levers. Front levers reach out level,
+    which brings their mass furthest over the step: φ_1 = -θ. Rear levers of length L stand
+
+        θ - φ_2 = π/2 + atan2(μ c sin θ, L cos θ),
+
+    upright but for what their mass, a share μ of all, c from their axle, is worth further ahead; both within the
+    levers' range.
+    """
+    gear, half = robot.running_gear, posture.parts(robot, conditions)
+    moved = gear.lever_mass * gear.lever_centre / (half.chassis + 2 * half.pulley)
+    rear = pitch - jnp.pi / 2 - jnp.arctan2(moved * jnp.sin(pitch), gear.lever_length * jnp.cos(pitch))
+    least, most = gear.levers.angle_least, gear.levers.angle_most
+    return jnp.clip(-pitch, least, most), jnp.clip(rear, least, most)
+
+
 def best_step(robot: Robot, conditions: Conditions) -> tuple[Step, Scalar, Scalar]:
     """The highest step of one run in any posture within the levers' range, and the angles of front and rear levers
     [rad]; its derivatives are those at these angles.
 
     What a robot that climbs slowly can get over in whatever sequence of postures, where the wall of the step carries
     nothing: as its tail leaves the lower ground, the centre of mass has to be over the step, and what is under it is
-    no higher than in the best posture.
+    no higher than in the best posture. The pitch alone is searched for, the levers' angles follow (`best_levers`).
     """
     still, there = jax.lax.stop_gradient((robot, conditions))
-    levers = still.running_gear.levers
-    least, most = levers.angle_least, levers.angle_most
 
-    def height(at: Array) -> Scalar:
-        return step_at(posture.outline(still, with_levers(there, at[0], at[1])), at[2])
+    def height(pitch: Scalar) -> Scalar:
+        return step_at(posture.outline(still, with_levers(there, *best_levers(still, there, pitch))), pitch)
 
-    low = jnp.stack(jnp.broadcast_arrays(least, least, 0.0))
-    high = jnp.stack(jnp.broadcast_arrays(most, most, jnp.pi / 2))
-    best, wide = (low + high) / 2, (high - low) / 2
-    for count, closer in _ROUNDS:
-        axes = [jnp.linspace(-1.0, 1.0, n) for n in count]
-        grid = jnp.stack(jnp.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-        near = jnp.clip(best + wide * grid, low, high)
-        best, wide = near[jnp.argmax(jax.vmap(height)(near))], wide / closer
-    front, rear = best[0], best[1]
-    return step(posture.outline(robot, with_levers(conditions, front, rear))), front, rear
+    best, apart = _highest(height, *_POSTURES)
+    for _ in range(2):  # smooth there: the tops of parabolas
+        low, middle, high = jnp.asarray(jax.vmap(height)(best + apart * jnp.array([-1.0, 0.0, 1.0])))
+        bend = 2 * middle - low - high
+        best = (
+            best
+            + jnp.where(bend > 0, jnp.clip((high - low) / (2 * jnp.where(bend > 0, bend, 1.0)), -1, 1), 0.0) * apart
+        )
+        apart = apart / 16
+    front, rear = best_levers(still, there, best)
+    return step(posture.outline(robot, with_levers(conditions, front, rear)), best), front, rear
 
 
 def stairs_rise(robot: Robot, conditions: Conditions, tread: Scalar, friction: Scalar) -> Scalar:

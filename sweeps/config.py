@@ -440,9 +440,13 @@ class Climb(RobotPart, SupplyPart, OutputPart):
     )
     levers_rear_deg: Angle | None = about(None, "Rear levers, the same", usual="as the robot states them")
     sequence: Path | None = about(
-        None, "CSV of lever angles: x_mm (middle of the robot from the obstacle) or time_s, front_deg, rear_deg",
+        None, "CSV of lever angles: x_mm (middle of the robot from the obstacle) or time_s, front_deg, rear_deg; or "
+        "voltages of their motors, front_V, rear_V, beginning at the stated angles",
         format="path",
     )  # fmt: skip
+    levers_voltage_V: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)] | None = about(
+        None, "Highest voltage of the levers' motors (V)", usual="that of the supply", flag="--levers-voltage"
+    )
     supply_voltage_V: Voltage | None = about(None, "Supply voltage (V)", usual="12", flag="--voltage")
     payload_kg: Payload = about(0.0, "Additional load mass")
     surface: Literal[tuple(SURFACES)] = about(  # type: ignore[valid-type]  # names of a table
@@ -470,8 +474,6 @@ class Climb(RobotPart, SupplyPart, OutputPart):
             raise PydanticCustomError("idle", "find stairs needs stairs, whose tread and count stay")
         if self.find is not None and given and not given[0].startswith(self.find):
             raise PydanticCustomError("idle", f"find {self.find} acts without {given[0]}")
-        if self.sequence is not None and (self.levers_front_deg, self.levers_rear_deg) != (None, None):
-            raise PydanticCustomError("idle", "levers_front_deg and levers_rear_deg act without sequence only")
         if self.battery and self.supply_voltage_V is not None:
             raise PydanticCustomError("idle", "supply_voltage_V acts without battery only")
         if self.film and self.find is not None:

@@ -16,13 +16,31 @@ from mmrjax.tables import COULOMB_PER_MAH
 from sweeps.config import BatchPart, OutputPart, Part, ProfilePart, RobotPart, Sweep, about, read_toml, resolve
 
 #: Keys that only a sweep into a store has.
-KEYS = ("axes", "samples", "conditions", "outputs", "storage", "compression", "profile")
+KEYS = ("axes", "samples", "conditions", "outputs", "storage", "compression", "profile", "obstacle")
 #: Options of a grid, which a file with axes of its own has no use for.
 GRID = (
     "configurations", "voltages_V", "motor_speeds_rpm", "payloads_kg", "slopes_deg", "surface", "battery",
     "discharge_mAh",
 )  # fmt: skip
 EXPORTS = ("csv", "parquet")
+
+
+#: Axis of the size of what is climbed.
+SIZE = "obstacle_mm"
+
+
+class Obstacle(Part):
+    """What every point of a sweep climbs (`sweeps.points.climbs`); its size is the axis `obstacle_mm`, or found."""
+
+    kind: Literal["step", "stairs", "gap"]
+    find: bool = False
+    tread_mm: float = Field(default=290.0, ge=10, le=5000)
+    count: int = Field(default=3, ge=1, le=50)
+    nose_mm: float = Field(default=0.0, ge=0, le=500)
+    sequence: Path | None = None
+    levers_voltage_V: float | None = Field(default=None, gt=0, le=1e6)
+    duration_s: float = Field(default=20.0, gt=0, le=600)
+    time_step_s: float = Field(default=1e-4, gt=0, le=1e-3)
 
 
 class Campaign(RobotPart, ProfilePart, BatchPart, OutputPart):
@@ -36,6 +54,7 @@ class Campaign(RobotPart, ProfilePart, BatchPart, OutputPart):
             profile columns of `mmrjax.missions.OUTPUTS`, or flags; empty: `missions.USUAL`.
         storage: type in which outputs are stored.
         compression: of the store's chunks.
+        obstacle: that every point climbs, in place of a run of the fidelity.
     """
 
     conditions: dict[str, Any] = Field(default_factory=dict)
@@ -44,6 +63,7 @@ class Campaign(RobotPart, ProfilePart, BatchPart, OutputPart):
     outputs: tuple[str, ...] = ()
     storage: Literal["float64", "float32"] = "float64"
     compression: Literal["none", "zstd"] = "none"
+    obstacle: Obstacle | None = None
 
 
 class SharePart(Part):

@@ -12,6 +12,7 @@ import pytest
 
 from calibration.data import terrains
 from calibration.data.errors import BadConfiguration, BadData
+from mmrjax.fidelities.climb import LOSSES
 from mmrjax.robots import nominal
 from sweeps.commands import climb as room
 
@@ -29,6 +30,8 @@ REFUSED = {
     "a nose larger than its stair": (["--stairs", "100x290x2", "--nose", "60"], r"--nose: got 60 mm; expected less than"),
     "two obstacles": (["--step", "50", "--gap", "90"], r"step_mm and gap_mm are stated both"),
     "none": ([], r"no obstacle is stated"),
+    "angles beside a sequence of them": (["--step", "50", "--sequence", "s.csv", "--levers-front", "30"],
+                                         r"s\.csv states all angles"),
     "a search of another kind": (["--find", "gap", "--step", "50"], r"find gap acts without step_mm"),
     "no such terrain": (["--terrain", "none.csv"], r"--terrain: none\.csv cannot be read"),
     "a bench": (["--step", "50", "--robot", "bench.toml"], r"climb: the robot's load is a shaft"),
@@ -41,6 +44,7 @@ def test_what_cannot_be_climbed_is_refused_in_one_sentence(mmrjax, tmp_path, cas
     if case == "a bench":
         assert mmrjax("rig", "new", "bench.toml", "--kind", "bench")[0] == 0
         message = r"climb: |bench\.toml"
+    (tmp_path / "s.csv").write_text("time_s,front_deg,rear_deg\n0,45,180\n")
     code, _, err = mmrjax("climb", *arguments, "--out", "c")
     assert code == 2 and err.count("\n") == 1, err
     assert re.search(message, err), err
@@ -51,11 +55,15 @@ def test_files_of_terrain_and_sequence_are_read_with_their_units(tmp_path):
     (tmp_path / "t.csv").write_text("# a kerb\nx_mm;z_mm\n100;0\n100;80\n300,5;80\n")
     ground = terrains.read_terrain(tmp_path / "t.csv")
     assert float(ground.finish) == pytest.approx(0.2005)
-    assert float(ground.distance(jnp.array([[0.1, 0.1]]))[0][0]) == pytest.approx(0.02)
+    assert np.asarray(ground.distance(jnp.array([[0.1, 0.1], [0.1, 0.05]]))[0]) == pytest.approx([0.02, -0.03])
     (tmp_path / "s.csv").write_text("x_mm,front_deg,rear_deg\n-300,45,180\n0,0,-8\n")
-    sequence = terrains.read_sequence(tmp_path / "s.csv", nominal())
+    sequence = terrains.read_sequence(tmp_path / "s.csv", nominal(), (0.0, 0.0))
     assert np.degrees(np.asarray(sequence.angles(-0.15, 0.0))) == pytest.approx([22.5, 180 - 86])
     assert not sequence.over_time
+    (tmp_path / "v.csv").write_text("time_s,front_V,rear_V\n0,0,0\n1,6,-12\n")
+    sequence = terrains.read_sequence(tmp_path / "v.csv", nominal(), (0.5, 0.1))
+    assert np.asarray(sequence.first) == pytest.approx([0.5, np.pi - 0.1]) and sequence.over_time
+    assert np.asarray(sequence.voltages(0.0, 0.5)) == pytest.approx([3.0, 6.0])  # up of a rear lever is where ψ falls
 
 
 FILES = {
@@ -80,13 +88,14 @@ def test_terrains_that_are_none_are_refused_in_one_sentence(tmp_path, case):
     [
         ("time_s,front_deg,rear_deg\n1,0,0\n1,0,0\n", r"row 3, time_s: got 1 after 1; expected values that rise"),
         ("time_s,front_deg,rear_deg\n1,0,270\n", r"row 2, rear_deg: got 270 deg; expected -180 to 180"),
+        ("time_s,front_V,rear_V\n1,0,2400\n", r"row 2, rear_V: got 2400 V; expected -1000 to 1000 V"),
         ("front_deg,rear_deg\n1,0\n", r"expected x_mm and front_deg and rear_deg, or time_s"),
     ],
 )
 def test_sequences_that_are_none_are_refused_in_one_sentence(tmp_path, text, message):
     (tmp_path / "s.csv").write_text(text)
     with pytest.raises(BadData, match=message):
-        terrains.read_sequence(tmp_path / "s.csv", nominal())
+        terrains.read_sequence(tmp_path / "s.csv", nominal(), (0.0, 0.0))
 
 
 def test_stairs_are_read_and_refused_as_they_are_written():
@@ -130,9 +139,7 @@ def test_one_climb_leaves_a_folder_whose_energy_adds_up(mmrjax, tmp_path):
         rows = list(csv.DictReader(stream))
     last = {name: float(value) for name, value in rows[-1].items()}
     assert last["x_mm"] > 60 and last["front_deg"] == pytest.approx(45, abs=0.1)
-    lost = sum(
-        last[f"{name}_J"] for name in ("winding", "motor", "gearbox", "track", "sliding", "contact", "rolling")
-    )
+    lost = sum(last[f"{name}_J"] for name in LOSSES)
     assert last["supply_J"] + last["levers_J"] == pytest.approx(lost + last["stored_J"], rel=5e-3)
     page = (folder / "report.html").read_text("utf-8")
     assert "The robot gets over: a gap of 60 mm." in page and page.count("<svg") == 2

@@ -1175,7 +1175,8 @@ def test_instant_of_half_robot_with_all_effects_has_finite_derivatives_by_every_
     def outputs(robot, run):
         system = half_robot.system(robot, run, 1e-4)
         signals, _, pulled = half_robot.instant(system, half_robot.stand(system))
-        return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves((signals, pulled)) if x.dtype == THETA.dtype])
+        leaves = [jnp.asarray(x) for x in jax.tree.leaves((signals, pulled))]
+        return jnp.concatenate([x.ravel() for x in leaves if x.dtype == THETA.dtype])
 
     slopes = _slopes(outputs)
     assert np.isfinite(slopes).all() and np.abs(slopes[0]).max() > 0

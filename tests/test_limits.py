@@ -45,6 +45,8 @@ def rated(robot):
         ({"discharge": 12_900.0, "battery": 0.0}, set()),
         ({"total_current": -0.1, "battery": 0.0}, {"current_returned"}),
         ({"total_current": 0.1, "battery": 0.0}, set()),
+        ({"voltage_source": -24.0, "total_current": -0.1, "battery": 0.0}, set()),  # driven backward, it draws
+        ({"voltage_source": -24.0, "total_current": 0.1, "battery": 0.0}, {"current_returned"}),
     ],
 )
 def test_limits_that_an_instant_exceeds(rated, changed, flags):

@@ -122,7 +122,9 @@ def test_class_lists_family_and_stated_value(shown, capsys):
     row = got.page.tables["effects"][1]
     assert said in row[-1] and "voltage drop that changes with current" in row
     assert said.split(" (")[0] in got.printed and "voltage drop that changes with current, one of" in got.printed
-    assert 'id="standing"' not in got.text and 'id="ruled_out"' not in got.text
+    why = words.standing(got.found)
+    assert why.startswith("Each by itself") and "series_resistance" in why
+    assert why in got.printed and why in got.page.text and 'id="ruled_out"' not in got.text
 
 
 def test_class_with_a_stated_value_is_listed_and_said(shown, capsys, tmp_path):
@@ -176,7 +178,7 @@ def test_what_is_too_large_is_said_beside_the_verdict(shown, capsys):
     assert said in got.printed and said in got.page.text
     assert got.text.index('id="ruled_out"') < got.text.index('id="effects"')
     why = f"Why no name: {got.found.standing}."
-    assert why in got.printed and why in got.page.text and "winding_heating" in why
+    assert why in got.printed and why in got.page.text and "one smooth curve in the electrical balance" in why
     assert got.page.tables["implausible"][1][-1] == ruled_out["why"]
 
 

@@ -83,16 +83,21 @@ MORE = {
     # missions
     "energy_by_where_Wh": "energy that goes to each sink",
     # climbs
+    "largest_mm": "largest obstacle that a search got over",
     "z_mm": "middle of the robot above the ground before the obstacle",
     "nose_mm": "radius of rounded noses", "time_step_s": "step of a climb",
     "front_deg": "front levers", "rear_deg": "rear levers", "belt_mm_s": "of the main belt",
+    "motors_current_A": "of all motors, from the supply", "front_voltage_V": "at the motor of the front levers",
+    "rear_voltage_V": "at that of the rear ones", "front_holds": "1 where its worm alone holds a pair", "rear_holds": "the same",
     "traction_current_A": "of each traction motor", "front_current_A": "of the motor of the front levers",
     "rear_current_A": "of that of the rear ones", "front_torque_Nm": "of the pair", "rear_torque_Nm": "of the pair",
     "reaction_N": "of the ground, both sides", "stored_J": "in motion, height, contacts and windings",
     **{f"{name}_J": "since the run began" for name in (*SOURCES, *LOSSES)},
     "furthest_mm": "largest x", "pitch_most_deg": "nose up", "pitch_least_deg": "nose up",
     "margin_least_mm": "of the run", "traction_current_most_A": "of the run", "front_current_most_A": "of the run",
-    "rear_current_most_A": "of the run", "front_torque_most_Nm": "of the run", "rear_torque_most_Nm": "of the run",
+    "rear_current_most_A": "of the run", "front_voltage_most_V": "of the run", "rear_voltage_most_V": "of the run",
+    "energy_levers_J": "from the supply, of their motors", "levers_voltage_V": "highest of the levers' motors",
+    "front_torque_most_Nm": "of the run", "rear_torque_most_Nm": "of the run",
     "energy_J": "from the supply",
     # robots that are found
     "radius_m": "of the driving wheel",

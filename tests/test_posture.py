@@ -168,6 +168,35 @@ def test_derivative_where_two_parts_decide_the_step(robot, angles):
         assert float(exact[k]) == pytest.approx(apart, rel=2e-3), k
 
 
+@pytest.mark.parametrize("least", [-180.0, -30.0])
+def test_no_posture_stands_on_a_higher_step_than_the_best(robot, least):
+    """Of all within the range, near the best and far from it; and near it some stand about as high."""
+    of = params.replace(
+        robot,
+        {
+            "running_gear.levers.angle_least": np.radians(least),
+            "running_gear.centre_offset": 0.02,
+            f"{robot.configurations.names[0]}.mass": 16.0,
+        },
+    )
+    conditions = run(payload=3.0)
+    best, front, rear = jax.jit(static_limits.best_step)(of, conditions)
+    front, rear = (float(np.degrees(x)) for x in (front, rear))
+
+    def angles(at):
+        return np.unique(np.clip([*np.arange(-180.0, 181.0, 30.0), *(at + np.linspace(-3, 3, 7))], least, 180.0))
+
+    heights = np.asarray(static_limits.steps_over_levers(of, conditions, angles(front), angles(rear)).height)
+    assert heights.max() <= float(best.height) + 1e-8
+    assert heights.max() == pytest.approx(float(best.height), abs=1e-6)
+    assert np.median(heights) < float(best.height) - 0.02
+    if least == -30.0:
+        assert front == rear == pytest.approx(-30.0)
+    else:  # front levers level, rear ones upright but for a few degrees
+        pitch = float(np.degrees(best.pitch))
+        assert front == pytest.approx(-pitch, abs=1e-3) and 0 < pitch - rear - 90 < 5
+
+
 def test_map_over_levers_is_that_of_single_postures(robot):
     found = static_limits.steps_over_levers(
         robot, run(payload=2.0), np.array([-54.0, 180.0]), np.array([-39.0, 0.0, 180.0])

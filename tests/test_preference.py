@@ -152,7 +152,7 @@ def test_what_follows_is_of_the_leader_that_was_chosen(traced, monkeypatch):
 
 
 @pytest.mark.slow
-def test_page_and_terminal_begin_with_what_gets_worse(traced, tmp_path, capsys):
+def test_what_gets_worse_stands_before_effects_on_page_and_terminal(traced, tmp_path, capsys):
     found = finished(traced)
     rise = Worse("slope", "motor_speed", found.errors_held_out["slope"][1]["motor_speed"]["rows"], 4.3, 4.7)
     found = dataclasses.replace(found, held_out_worse=(rise,))
@@ -174,8 +174,8 @@ def test_page_and_terminal_begin_with_what_gets_worse(traced, tmp_path, capsys):
     text = loop_page.write(tmp_path, found, robot_name="nominal").read_text("utf-8")
     page = Tables(text)
     assert said in page.text
-    assert text.index('id="worse"') < text.index('id="errors"') < text.index('id="effects"')
-    assert page.tables["errors"][1][0].startswith("as stated, nothing fitted")
+    assert text.index('id="errors"') < text.index('id="worse"') < text.index('id="effects"')
+    assert [row[0] for row in page.tables["summary"][1:3]] == ["as stated", "fitted again"]
     assert len(page.tables["alternatives_held_out"]) == 1 + len(traced.held_out)
 
     found = dataclasses.replace(found, held_out_worse=())

@@ -228,6 +228,16 @@ def test_what_no_parts_meet_is_left_out_and_said(robot):
     assert set(found.motors) == {MOTOR} and len(drives((MOTOR,))) == 3
 
 
+@pytest.mark.slow
+def test_step_that_is_asked_for_decides_the_design(robot):
+    """Smaller pulleys stand on higher steps: 290 mm without payload takes 3/4 of the robot's, with which it does 270."""
+    text = "speed_m_s = 0.5\nstep_mm = { least = 290, payload_kg = 0 }\n[envelope]\nstate_of_charge = [0.1, 1]"
+    asked = requirements.read(text, "r.toml")
+    best = search.size(robot, asked, ("mass",), starts=32, motors=(MOTOR,)).best
+    meets(best, asked)
+    assert 0.6 <= best.radius / float(robot.radius_pulley) < 0.75
+
+
 REFUSED = {
     ("--objective", "price"): r"^mmrjax: --objective: got price; allowed: mass, energy, cost",
     ("--pareto", "mass"): r"^mmrjax: --pareto: got mass; expected two different objectives",

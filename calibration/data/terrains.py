@@ -18,6 +18,10 @@ from mmrjax.terrain import Terrain
 
 #: A polyline longer or higher than this is taken for one in other units [m].
 LARGEST = 50.0
+#: Voltage of a motor that nothing here has [V].
+HIGHEST = 1000.0
+#: The part of a lever's angle that lies within this of the ground at the start is on it [rad].
+ON_GROUND = 2e-3
 #: Metres of one.
 _LENGTHS = {"m": 1.0, "mm": 1e-3}
 
@@ -94,27 +98,61 @@ def read_terrain(path: Path) -> Terrain:
         raise BadData(f"{path.name}: {error}") from error
 
 
-def read_sequence(path: Path, robot: Robot) -> Sequence:
-    """Lever angles over distance or time from a file.
+def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Sequence:
+    """Lever angles over distance or time from a file, or voltages of their motors.
+
+    Args:
+        begins: angles of front and rear levers at which those that have voltages begin [rad].
 
     Raises:
         BadConfiguration: no such file.
-        BadData: other columns, cells without numbers, knots that do not rise, an angle beyond the robot's range.
+        BadData: other columns, cells without numbers, knots that do not rise, an angle beyond the robot's range, a
+            voltage beyond `HIGHEST`.
     """
-    angles = ("front_deg", "rear_deg")
-    columns, names = _read(path, "--sequence", [("x_mm", *angles), ("time_s", *angles)])
+    angles, volts = ("front_deg", "rear_deg"), ("front_V", "rear_V")
+    wanted = [(at, *both) for both in (angles, volts) for at in ("x_mm", "time_s")]
+    columns, names = _read(path, "--sequence", wanted)
     at = columns[names[0]] * (1e-3 if names[0] == "x_mm" else 1.0)
     if (falls := np.flatnonzero(np.diff(at) <= 0)).size:
         raise BadData(
             f"{path.name} row {falls[0] + 3}, {names[0]}: got {columns[names[0]][falls[0] + 1]:g} after "
             f"{columns[names[0]][falls[0]]:g}; expected values that rise"
         )
+    over_time = names[0] == "time_s"
+    if names[1:] == volts:
+        for name in volts:
+            for k, value in enumerate(columns[name]):
+                if abs(value) > HIGHEST:
+                    raise BadData(
+                        f"{path.name} row {k + 2}, {name}: got {value:g} V; expected -{HIGHEST:g} to {HIGHEST:g} V"
+                    )
+        front, rear = (jnp.asarray(columns[name]) for name in volts)
+        return Sequence(jnp.asarray(at), front, rear, jnp.asarray(begins), over_time)
     for name in angles:
         for k, value in enumerate(columns[name]):
             if why := beyond(robot, value):
                 raise BadData(f"{path.name} row {k + 2}, {name}: {why}")
     front, rear = (jnp.asarray(np.radians(columns[name])) for name in angles)
-    return Sequence(jnp.asarray(at), front, rear, names[0] == "time_s")
+    return Sequence(jnp.asarray(at), front, rear, over_time=over_time)
+
+
+def below(robot: Robot, angle: float) -> str:
+    """Why levers cannot begin at an angle [deg] on level ground; empty where they can."""
+    gear = robot.running_gear
+    axle, reach, roller = (
+        float(np.asarray(x))
+        for x in (robot.radius_pulley + gear.grouser_height, gear.lever_length, gear.levers.roller)
+    )
+    under = axle + reach * np.sin(np.radians(angle)) - roller
+    least = -float(np.degrees(np.arcsin((axle - roller) / reach)))
+    return (
+        ""
+        if under >= -ON_GROUND * reach
+        else (
+            f"at {angle:.4g} deg they begin {-1000 * under:.0f} mm below the ground; expected at least {least:.1f} "
+            "deg there, where they lie on it (a sequence may press them down later)"
+        )
+    )
 
 
 def beyond(robot: Robot, angle: float) -> str:

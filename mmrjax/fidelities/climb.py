@@ -1,8 +1,8 @@
 """Half a robot with levers over a terrain in its plane of travel: its state, one step, and how a run ends.
 
-The bodies are the chassis with payload, two pulleys and two levers; the belts run rigidly with the pulleys, and the
-levers swing as a sequence asks, at most at their rate, with whatever torque that takes. Contacts are of `footing`,
-the drive of `balances`.
+The bodies are the chassis with payload, two pulleys and two levers; the belts run rigidly with the pulleys. The
+levers' drives follow a sequence of angles at most at the levers' rate, or have its voltages. Contacts are of
+`footing`, the drive of the tracks of `balances`, those of the levers of `lever_drives`.
 """
 
 from __future__ import annotations
@@ -24,12 +24,13 @@ from mmrjax.conditions import Conditions
 from mmrjax.fidelities.half_robot import current_after
 from mmrjax.fidelities.linear import factorise, substitute
 from mmrjax.footing import COORDINATES, FRONT, PITCH, REAR, SHAFT, Footing, Shape
-from mmrjax.gearbox import Gearbox
+from mmrjax.lever_drives import LeverDrive, Swing, lever_drive, swing
 from mmrjax.masses import Masses, without_levers
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import GRAVITY, Signals, State
 from mmrjax.terrain import Terrain
+from mmrjax.track import Track
 
 #: How a climb ends; the last two: its time was over while it still went on, numbers that mean nothing.
 VERDICTS = OVER, TIPS, STALLS, SLIDES, HANGS, UNFINISHED, FAILED = range(7)
@@ -44,29 +45,51 @@ TURNED_OVER = np.radians(100.0)
 GAIN, PATIENCE = 5e-3, 2.0
 #: A belt slower than this [m/s] stands; a body that bears more than this share of the weight hangs.
 STANDS, BEARS = 5e-3, 0.1
-#: Time in which levers come to their rate and near their angle [s].
-_SWINGS = 0.03
-FREE, LED = np.array([0, 1, 2, 3]), np.array([4, 5])
+#: Time in which levers come to their rate and near their angle [s], and rate below which they are let stand [rad/s].
+_SWINGS, _STILL = 0.03, 5e-3
+LED = np.array([FRONT, REAR])
+#: What the pulleys of both levers' tracks turn by on their levers, per velocity of `COORDINATES`.
+_ON_BELTS = np.eye(COORDINATES)[LED] + np.eye(COORDINATES)[SHAFT]
 
 
 class Sequence(eqx.Module):
-    """Angles of the levers over distance or time, straight between knots and constant beyond them.
+    """Angles of the levers, or voltages of their motors, over distance or time, straight between knots and constant
+    beyond them.
 
     Attributes:
         at: knots, of the middle of the wheelbase from where the obstacle begins [m], or times [s].
-        front, rear: angles at them, 0 along the wheelbase outward, positive up [rad].
+        front, rear: angles at them, 0 along the wheelbase outward, positive up [rad]; or voltages, positive up [V].
+        begins: angles of front and rear at which levers that have voltages begin [rad]; None: angles are asked for.
         over_time: whether knots are times.
+        supply: highest voltage of the levers' motors [V]; None: that of the supply.
     """
 
     at: Float[Array, " knots"]
     front: Float[Array, " knots"]
     rear: Float[Array, " knots"]
+    begins: Float[Array, " 2"] | None = None
     over_time: bool = eqx.field(default=False, static=True)
+    supply: Scalar | None = None
+
+    def _both(self, place: Scalar, time: Scalar) -> tuple[Array, Array]:
+        at = time if self.over_time else place
+        return jnp.interp(at, self.at, self.front), jnp.interp(at, self.at, self.rear)
+
+    @property
+    def first(self) -> Float[Array, " 2"]:
+        """ψ of both levers in the beginning, see `footing` [rad]."""
+        front, rear = self._both(-jnp.inf, 0.0) if self.begins is None else self.begins
+        return jnp.stack([front, jnp.pi - rear])
 
     def angles(self, place: Scalar, time: Scalar) -> Float[Array, " 2"]:
         """ψ of both levers that are asked for, see `footing` [rad]."""
-        at = time if self.over_time else place
-        return jnp.stack([jnp.interp(at, self.at, self.front), jnp.pi - jnp.interp(at, self.at, self.rear)])
+        front, rear = self._both(place, time)
+        return jnp.stack([front, jnp.pi - rear])
+
+    def voltages(self, place: Scalar, time: Scalar) -> Float[Array, " 2"]:
+        """Voltages of both motors, by ψ [V]."""
+        front, rear = self._both(place, time)
+        return jnp.stack([front, -rear])
 
 
 def still(front: Scalar, rear: Scalar) -> Sequence:
@@ -77,17 +100,18 @@ def still(front: Scalar, rear: Scalar) -> Sequence:
 
 class Motion(eqx.Module):
     """State of half a robot: coordinates and velocities (see `footing`), current of one motor [A], charge taken from
-    the battery [C]."""
+    the battery [C], current that the levers' motors take from the supply [A]."""
 
     q: Float[Array, " 6"]
     v: Float[Array, " 6"]
     current: Scalar
     discharge: Scalar
+    drawn: Scalar
 
 
-#: Where energy goes, per side: what comes in, then what is lost.
+#: Where energy goes: what the motors of tracks and of levers take, then what is lost.
 SOURCES = ("supply", "levers")
-LOSSES = ("winding", "motor", "gearbox", "track", "sliding", "contact", "rolling")
+LOSSES = ("winding", "motor", "gearbox", "track", "sliding", "contact", "rolling", "lever_winding", "lever_gears")
 
 
 Energy = dict[str, Any]
@@ -97,7 +121,9 @@ class Passed(eqx.Module):
     """What an instant or a sample has: means over it, and energy since the start of the run.
 
     Attributes:
-        current: of one motor [A]; torque: of each pair of levers on the chassis' side, up [N·m].
+        current: of one motor [A]; total_current: of all motors, from the supply, I_s of (10) [A].
+        torque: of each drive on its pair of levers [N·m], lever_current [A] and lever_voltage [V] of its motor, up.
+        holds: 1 where a pair stands by its worm alone, without current [-].
         energy: in and lost, by the names of `SOURCES` and `LOSSES`, of the whole robot [J].
         stored: in motion, height, contacts and windings, of the whole robot [J].
         body: share of all normal force that the body bears [-].
@@ -107,9 +133,12 @@ class Passed(eqx.Module):
     time: Scalar
     motion: Motion
     current: Scalar
+    total_current: Scalar
     voltage: Scalar
     torque: Float[Array, " 2"]
     lever_current: Float[Array, " 2"]
+    lever_voltage: Float[Array, " 2"]
+    holds: Float[Array, " 2"]
     energy: Energy
     stored: Scalar
     normal: Scalar
@@ -118,7 +147,7 @@ class Passed(eqx.Module):
 
 
 class System(eqx.Module):
-    """One run's constants."""
+    """One run's constants; robot and chassis have the main tracks' losses alone, the levers' tracks their own."""
 
     robot: Robot
     conditions: Conditions
@@ -128,6 +157,8 @@ class System(eqx.Module):
     half: Masses
     lever: Float[Array, " 3"]
     chassis: Chassis
+    lever_track: Track
+    drive: LeverDrive
     step: Scalar
 
 
@@ -135,14 +166,27 @@ def system(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Seq
     """Constants of one run (scalar conditions); the robot may hold tracers."""
     zero = jnp.zeros_like(conditions.voltage)
     mass = balances.begin(robot, conditions, State(zero, zero, zero, zero)).mass
-    chassis, gear = robot.chassis(conditions.configuration), robot.running_gear
+    robot, gear = robot.within(conditions.configuration), robot.running_gear
+    chassis = robot.chassis(conditions.configuration)
+    half, shape = without_levers(robot, conditions, mass), footing.shape_of(chassis, gear, robot.radius_pulley)
+    none = jnp.zeros_like(chassis.on_tracks)
     lever = jnp.stack([gear.lever_mass, gear.lever_centre, gear.lever_inertia]) * jnp.stack(
         [chassis.on_tracks, jnp.ones(()), chassis.on_tracks]
     )
+    main, own = (
+        jax.tree.map(lambda part, whole: jnp.where(chassis.on_tracks > 0.5, part, whole), track, without)
+        for track, without in zip(
+            gear.levers.tracks(chassis.track),
+            (chassis.track, dataclasses.replace(chassis.track, loss_coulomb=none, loss_viscous=none)),
+            strict=True,
+        )
+    )
+    chassis = dataclasses.replace(chassis, track=main)
+    robot = eqx.tree_at(lambda r: r.configurations.chosen, robot, chassis)
+    drive = lever_drive(robot)
     return System(
-        robot, conditions, terrain, sequence, footing.shape_of(chassis, gear, robot.radius_pulley),
-        without_levers(robot, conditions, mass), lever, chassis, jnp.asarray(step, float),
-    )  # fmt: skip
+        robot, conditions, terrain, sequence, shape, half, lever, chassis, own, drive, jnp.asarray(step, float)
+    )
 
 
 def inertia(run: System, q: Array, v: Array) -> tuple[Float[Array, "6 6"], Float[Array, " 6"], Scalar]:
@@ -201,6 +245,7 @@ class _Mover(eqx.Module):
     at: Footing
     v: Array
     radius: Scalar
+    levers: Scalar  # what the levers' tracks lose, on the shaft [N·m]
 
     @property
     def normal(self) -> Scalar:
@@ -212,7 +257,7 @@ class _Mover(eqx.Module):
         at = self.at
         force = jnp.asarray(chassis.ground.traction(_sliding(at, self.v, signals), at.force, signals.adhesion))
         guide = jnp.sum(chassis.track.guide_friction * at.guided * at.force * signals.direction)
-        load = guide * self.radius - jnp.sum(force * at.along[:, SHAFT] + at.force * at.off[:, SHAFT])
+        load = guide * self.radius + self.levers - jnp.sum(force * at.along[:, SHAFT] + at.force * at.off[:, SHAFT])
         return _Pull(jnp.sum(force), guide, load, force)
 
 
@@ -236,7 +281,7 @@ def instant(run: System, motion: Motion, on: Scalar) -> tuple[Signals, Footing, 
 
     ratio = run.robot.gearbox.ratio
     state = State(motion.current, ratio * motion.v[SHAFT], speed, motion.discharge)
-    mover = _Mover(at, motion.v, run.shape.main.first)
+    mover = _Mover(at, motion.v, run.shape.main.first, jnp.sum(_lever_loss(run, motion.v[SHAFT] + motion.v[LED])))
     signals, pulled = balances.resolved(run.robot, conditions, state, mover, 2 * run.half.inertia_pulley)
     return signals, at, pulled, share
 
@@ -245,43 +290,57 @@ def _driven(run: System, on: Scalar) -> Conditions:
     return dataclasses.replace(run.conditions, duty=run.conditions.duty * on)
 
 
+def _lever_loss(run: System, speed: Array) -> Array:
+    """Loss torques of the levers' tracks (24) [N·m] at the speeds of their pulleys on their levers [rad/s]."""
+    rolls = contact.direction(run.shape.main.first * speed, run.chassis.speed_still)
+    return jnp.asarray(run.lever_track.torque_loss(speed, rolls))
+
+
+def _loaded(run: System, motion: Motion) -> System:
+    """The run with what the levers' motors take from the battery beside the others, I_s of eq. (10)."""
+    battery = run.robot.battery
+    battery = dataclasses.replace(battery, current_other=battery.current_other + motion.drawn)
+    return dataclasses.replace(run, robot=dataclasses.replace(run.robot, battery=battery))
+
+
 def asked(run: System, motion: Motion, time: Scalar) -> Float[Array, " 2"]:
-    """Angular speeds of the levers after a step [rad/s]: towards the sequence's angles, at most at their rate."""
+    """Angular speeds of the levers after a step that are asked for [rad/s]: towards the sequence's angles, at most at
+    their rate; levers that have come there stand."""
     rate = run.robot.running_gear.levers.rate
     toward = (run.sequence.angles(motion.q[0], time) - motion.q[LED]) / (4 * _SWINGS)
-    return motion.v[LED] + run.step / _SWINGS * (jnp.clip(toward, -rate, rate) - motion.v[LED])
+    speed = motion.v[LED] + run.step / _SWINGS * (jnp.clip(toward, -rate, rate) - motion.v[LED])
+    return jnp.where((jnp.abs(toward) < _STILL) & (jnp.abs(motion.v[LED]) < _STILL), 0.0, speed)
 
 
-def lever_current(robot: Robot, torque: Array, rate: Array) -> Array:
-    """Current of the motor of a pair of levers [A] at its torque [N·m] and angular speed [rad/s], up both.
-
-    M_d = M / (i_p i_w) by the efficiencies of planetary gear and worm, driven (20) or overhauling, plus the motor's
-    friction (14); a worm of an efficiency up to 1/2 holds a lever that stands, without current.
-    """
-    levers = robot.running_gear.levers
-    direction = contact.direction(rate, 1e-2)
-    for ratio, efficiency in (
-        (levers.worm_ratio, levers.worm_efficiency),
-        (levers.planetary_ratio, levers.planetary_efficiency),
-    ):
-        gear = Gearbox(ratio=ratio, efficiency_load=efficiency, mesh_theory=True)
-        flows = jnp.abs(direction) * gear.efficiency_flow(torque * direction, 1.0) + (1 - jnp.abs(direction))
-        torque = torque / (ratio * flows)
-    holds = (levers.worm_efficiency <= 0.5) * (1 - jnp.abs(direction))
-    speed = rate * levers.worm_ratio * levers.planetary_ratio
-    return (torque * (1 - holds) + robot.motor.torque_loss(speed, direction)) / robot.motor.torque_constant
+def _swung(run: System, motion: Motion, time: Scalar, source: Scalar, free: Array, yields: Array) -> Swing:
+    """What the drives do to the levers in a step, which without them are at the rates `free` after it [rad/s]."""
+    levers, sequence = run.robot.running_gear.levers, run.sequence
+    most = jnp.abs(source) if sequence.supply is None else sequence.supply
+    low = high = jnp.stack([most, most])
+    low = -low
+    aims = asked(run, motion, time)
+    if sequence.begins is not None:
+        aims = jnp.zeros_like(aims)
+        low = high = jnp.clip(sequence.voltages(motion.q[0], time), low, high)
+    # beyond its range nothing drives a lever on
+    angles = jnp.stack([motion.q[FRONT], jnp.pi - motion.q[REAR]])
+    above, below = angles > levers.angle_most + 1e-3, angles < levers.angle_least - 1e-3
+    up, down = jnp.stack([above[0], below[1]]), jnp.stack([below[0], above[1]])
+    low, high = (jnp.where(up, jnp.minimum(x, 0.0), jnp.where(down, jnp.maximum(x, 0.0), x)) for x in (low, high))
+    return swing(run.drive, run.step, motion.v[LED], free, yields, aims, low, high)
 
 
 def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[Motion, Energy, Passed]:
     """One step, linearly implicit in what contacts and drive resist by as `half_robot.advance` is.
 
-    (M + Δt K) Δv = Δt (Q - c), the levers' Δv imposed, whose torque follows from their rows. Energy is that of the
-    step's impulses at the mean of its velocities, and of a current that changes evenly.
+    (M + Δt K) Δv = Δt (Q - c), with the drives' torques on the levers as those and the levers' rates answer each
+    other within the step. Energy is that of the step's impulses at the mean of its velocities, and of a current of
+    the tracks' motors that changes evenly.
 
     Returns:
         Motion and energy after it, and what was before it.
     """
-    on = jnp.clip((time - SETTLES) / RISES, 0.0, 1.0)
+    run, on = _loaded(run, motion), jnp.clip((time - SETTLES) / RISES, 0.0, 1.0)
     signals, at, pulled, share = instant(run, motion, on)
     robot, step, radius = run.robot, run.step, run.shape.main.first
     matrix, bias, height = inertia(run, motion.q, motion.v)
@@ -290,6 +349,10 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
     resisted = signals.resistance * (share @ at.carried)
     force = pulled.force @ at.along + at.force @ at.off - resisted
     force = force.at[SHAFT].set(signals.torque_net - resisted[SHAFT])
+    belts = motion.v[SHAFT] + motion.v[LED]
+    lost, stiffens = jax.jvp(lambda speed: _lever_loss(run, speed), (belts,), (jnp.ones_like(belts),))
+    stiffens = jnp.maximum(stiffens, 0.0)
+    force = force.at[LED].add(-lost)
 
     rises = jnp.maximum(
         run.chassis.ground.traction_rise(_sliding(at, motion.v, signals), at.force, signals.adhesion), 0
@@ -298,20 +361,32 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
     pushes = coefficient[:, None] * at.along + at.off
     shaft = _shaft_loss(run, motion, signals, at)
     damping = (at.along.T * rises) @ at.along + (pushes.T * at.damped) @ at.off
-    damping = damping.at[SHAFT, SHAFT].add(shaft)
+    damping = damping.at[SHAFT, SHAFT].add(shaft) + (_ON_BELTS.T * stiffens) @ _ON_BELTS
     whole = matrix.at[SHAFT, SHAFT].add(armature) + step * damping
-    led = asked(run, motion, time) - motion.v[LED]
+    # of wheels, whose levers weigh nothing
+    whole = whole.at[LED, LED].add(1 - run.chassis.on_tracks)
     pushed = step * (force - bias)
-    free = substitute(factorise(whole[:4, :4]), pushed[:4] - whole[:4, 4:] @ led)
-    gained = jnp.concatenate([free, led])
+    factors = factorise(whole[:4, :4])
+    moved, *coupled = (substitute(factors, x) for x in (pushed[:4], whole[:4, 4], whole[:4, 5]))
+    coupling = jnp.stack(coupled, axis=1)
+    left = whole[4:, 4:] - whole[4:, :4] @ coupling
+    inverse = jnp.array([[left[1, 1], -left[0, 1]], [-left[1, 0], left[0, 0]]]) / (
+        left[0, 0] * left[1, 1] - left[0, 1] * left[1, 0]
+    )
+    alone = motion.v[LED] + inverse @ (pushed[4:] - whole[4:, :4] @ moved)
+    swung = _swung(run, motion, time, signals.voltage_source, alone, step * inverse / robot.sides)
+    led = swung.rate - motion.v[LED]
+    gained = jnp.concatenate([moved - coupling @ led, led])
     v = motion.v + gained
     middle = motion.v + gained / 2
 
     charge = robot.battery.current(signals.total_current) * (run.conditions.battery > 0.5)
     current = current_after(robot, _driven(run, on), step, signals)
-    after = Motion(motion.q + step * v, v, current, motion.discharge + step * charge)
+    drawn = swung.voltage @ swung.current / jnp.maximum(jnp.abs(signals.voltage_source), 1e-9)
+    after = Motion(motion.q + step * v, v, current, motion.discharge + step * charge, drawn)
 
-    torque = (whole[4:] @ gained - pushed[4:]) / step
+    pair = run.drive
+    geared = (pair.constant * swung.current - pair.inertia * led / step - swung.torque) @ middle[LED]
     off, along = at.off @ gained, at.along @ gained
     normal = at.force - at.damped * off
     friction = pulled.force - rises * along - coefficient * at.damped * off
@@ -323,29 +398,35 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
     mean, resistance = signals.current + rise / 2, robot.motor.resistance
     added = run.step * robot.sides * jnp.stack([
         signals.voltage * mean,
-        torque @ middle[LED],
+        swung.voltage @ swung.current / robot.sides,
         (signals.voltage_drop + resistance * rise / 2) * mean + resistance * rise**2 / 12,
         signals.torque_motor_loss * motor,
         (signals.torque_idle + (1 - signals.efficiency_load) * mesh) * motor + own * middle[SHAFT],
-        (signals.torque_track_loss + shaft * gained[SHAFT]) * middle[SHAFT],
+        (signals.torque_track_loss + shaft * gained[SHAFT]) * middle[SHAFT]
+        + (lost + stiffens * (_ON_BELTS @ gained)) @ (_ON_BELTS @ middle),
         -friction @ (at.along @ middle),
         -(normal - at.elastic) @ (at.off @ middle),
         resisted @ middle,
+        pair.resistance * swung.current @ swung.current / robot.sides,
+        geared / robot.sides,
     ])  # fmt: skip
     spent = {name: energy[name] + added[k] for k, name in enumerate((*SOURCES, *LOSSES))}
     kinetic = motion.v @ matrix @ motion.v + (signals.inertia_added + rotor * ratio**2) * motion.v[SHAFT] ** 2
     stored = kinetic / 2 + signals.inductance * motion.current**2 / 2 + height + jnp.sum(at.energy)
-    torques = torque * jnp.array([1.0, -1.0]) * robot.sides  # up, of a rear lever that is where ψ falls
+    up = jnp.array([1.0, -1.0])  # of a rear lever that is where ψ falls
     total = jnp.sum(at.force)
     passed = Passed(
         time=time,
         motion=motion,
         current=signals.current,
+        total_current=signals.total_current + drawn,
         voltage=signals.voltage,
-        torque=torques,
-        lever_current=lever_current(robot, torques, middle[LED] * jnp.array([1.0, -1.0])),
+        torque=up * swung.torque,
+        lever_current=up * swung.current,
+        lever_voltage=up * swung.voltage,
+        holds=1.0 * swung.holds,
         energy=energy,
-        stored=robot.sides * stored,
+        stored=robot.sides * stored + pair.inertia * motion.v[LED] @ motion.v[LED] / 2,
         normal=total,
         body=jnp.sum(at.force * (1 - at.rolls)) / jnp.maximum(total, 1e-9),
         margin=_margin(run, motion, at, matrix),
@@ -395,7 +476,7 @@ class Progress(eqx.Module):
 def stand(run: System, clear: float = 0.1) -> Motion:
     """At rest on the ground before the obstacle, its foremost point `clear` [m] from it."""
     shape = run.shape
-    angles = run.sequence.angles(-jnp.inf, 0.0)
+    angles = run.sequence.first
     outer = shape.main.first + shape.gear.grouser_height
     axle = jnp.where(shape.on_tracks > 0.5, outer, shape.wheel)
     tip = shape.gear.lever_length * jnp.cos(angles[0]) + shape.gear.levers.roller
@@ -406,7 +487,7 @@ def stand(run: System, clear: float = 0.1) -> Motion:
     place = below + (axle - gap - 2e-5) * normal
     zero = jnp.zeros_like(x)
     q = jnp.stack([place[0], place[1], jnp.arctan2(normal[0], normal[1]), zero, angles[0], angles[1]])
-    return Motion(q, jnp.zeros(COORDINATES), zero, run.conditions.discharge + zero)
+    return Motion(q, jnp.zeros(COORDINATES), zero, run.conditions.discharge + zero, zero)
 
 
 def _judged(
@@ -443,9 +524,9 @@ def _judged(
     return motion, dataclasses.replace(progress, verdict=verdict)
 
 
-def begin(run: System) -> tuple[Motion, Energy, Progress]:
-    """What a run begins with: motion, no energy yet, and that it goes on."""
-    motion = stand(run)
+def begin(run: System, motion: Motion | None = None) -> tuple[Motion, Energy, Progress]:
+    """What a run begins with: motion (None: at rest before the obstacle), no energy yet, and that it goes on."""
+    motion = stand(run) if motion is None else motion
     zero = jnp.zeros_like(motion.q[0])
     energy = dict.fromkeys((*SOURCES, *LOSSES), zero)
     return motion, energy, Progress(jnp.asarray(_RUNNING), zero, motion.q[0], zero, zero)
@@ -485,19 +566,31 @@ class Climb(eqx.Module):
         return [NAMES[k] for k in self.verdict]
 
 
+def _alike(robot: Robot) -> int | None:
+    """Axis of the runs in a robot's parameters; None where one robot runs them all."""
+    return 0 if jnp.ndim(robot.sides) else None
+
+
 @compiled
-def _begin(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, step: float) -> Any:
-    return jax.vmap(lambda c, t, s: begin(system(robot, c, t, s, step)))(conditions, terrain, sequence)
+def _begin(
+    robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, step: float, motion: Motion | None
+) -> Any:
+    def one(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, motion: Motion | None) -> Any:
+        return begin(system(robot, conditions, terrain, sequence, step), motion)
+
+    return jax.vmap(one, in_axes=(_alike(robot), 0, 0, 0, 0))(robot, conditions, terrain, sequence, motion)
 
 
 def _part(
     robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any, first: Scalar,
     step: float, steps: int, samples: int,
 ) -> tuple[Any, Passed]:  # fmt: skip
-    def one(conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any) -> tuple[Any, Passed]:
+    def one(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any) -> Any:
         return sampled(system(robot, conditions, terrain, sequence, step), state, first, steps, samples)
 
-    return jax.vmap(one)(conditions, terrain, sequence, state)
+    each = (_alike(robot), 0, 0, 0, 0)
+    found: tuple[Any, Passed] = jax.vmap(one, in_axes=each)(robot, conditions, terrain, sequence, state)
+    return found
 
 
 _compiled = compiled(_part, options=SMALL)
@@ -514,18 +607,21 @@ def climb_batch(
     sample: float = SAMPLE,
     part: float = 1.0,
     record: bool = True,
+    start: Motion | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Climb:
     """Climb over a batch of conditions, terrains and sequences (leading axis of every field), until all have ended.
 
     Args:
+        robot: of all runs, or every parameter of it with a leading axis too.
         duration: of the longest run [s]; step, sample: intervals of integration and of the record [s].
         part: length of run between two looks at whether all have ended [s].
         record: whether samples are kept; else the record is the last sample.
+        start: motions with which the runs begin; None: at rest before the obstacle.
         progress: told the share of the time that is done.
     """
     steps, samples = round(sample / step), round(part / sample)
-    state = _begin(robot, conditions, terrain, sequence, step)
+    state = _begin(robot, conditions, terrain, sequence, step, start)
     kept: list[Passed] = []
     parts = int(np.ceil(duration / part - 1e-9))
     for k in range(parts):

@@ -69,7 +69,7 @@ def exceeded(robot: Robot, signals: Signals) -> dict[str, Scalar]:
         "current_limited": robot.driver.limits(signals.current),
         "gearbox_overload": torque > (robot.gearbox.torque_limit or jnp.inf),
         "voltage_rising": on_battery & battery.rises(signals.discharge),
-        "current_returned": ~on_battery & (signals.total_current < -CURRENT_SMALL),
+        "current_returned": ~on_battery & (signals.total_current * jnp.sign(signals.voltage_source) < -CURRENT_SMALL),
     }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from rich.table import Table
 
 from calibration.data import robot_file, terrains
 from calibration.data.errors import BadConfiguration
-from mmrjax import masses, terrain
+from mmrjax import terrain
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import climb as fidelity
 from mmrjax.fidelities.climb import Climb, Sequence, climb_batch
@@ -23,17 +24,13 @@ from sweeps import config as configuration
 from sweeps.console import progress, say
 from sweeps.inputs import check_configurations, load_robot
 from sweeps.points import imposed
+from sweeps.points.climbs import NEAR, SLOW, SOUGHT, refused
 from sweeps.results.climb import VERDICTS, ClimbResult
 from sweeps.skeleton import leave, page
 from sweeps.store import open_folder
 
-#: Voltage where none is stated [V]: slow enough that a robot climbs rather than leaps.
-SLOW = 12.0
-#: A search: sizes [mm] between which it begins, runs of a round, and how near its ends come [mm].
-SOUGHT = {"step": (10.0, 450.0), "stairs": (20.0, 400.0), "gap": (20.0, 800.0)}
-ROUND, NEAR = 12, 1.0
-#: The part of the largest run's angles that lies within this of the ground at the start is on it [rad].
-_ON_GROUND = 2e-3
+#: Runs of a round of a search.
+ROUND = 12
 
 
 def climb(config: configuration.Climb, out: Path | None, force: bool) -> int:
@@ -43,15 +40,10 @@ def climb(config: configuration.Climb, out: Path | None, force: bool) -> int:
     """
     file = load_robot(config)
     robot = file.robot
-    imposed.check_on_ground(robot, "climb")
-    if robot.rig.imposed != "voltage":
-        raise BadConfiguration("climb: the robot's file says that its motors are not driven by voltage")
+    if (why := refused(robot)) is not None:
+        raise BadConfiguration(f"climb: {why}")
     name = config.configuration or robot.configurations.names[0]
     check_configurations(robot, (name,), "--configuration")
-    try:
-        masses.check_parts(robot)
-    except ValueError as error:
-        raise BadConfiguration(f"climb: {error}") from error
     if config.battery:
         imposed.check_battery(robot)
     voltage = SLOW if config.supply_voltage_V is None else config.supply_voltage_V
@@ -183,29 +175,29 @@ def _sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
             f"--levers-front, --levers-rear, --sequence: {name} has no levers"
             + (f"; expected --configuration {' or '.join(with_levers)}" if with_levers else "")
         )
-    if config.sequence is not None:
-        found = terrains.read_sequence(config.sequence, robot)
-    else:
-        own = float(np.degrees(np.asarray(gear.lever_front))), 180 - float(np.degrees(np.asarray(gear.lever_rear)))
-        angles = []
-        for option, given, usual in zip(("--levers-front", "--levers-rear"), stated[1:], own, strict=True):
-            angle = usual if given is None else given
-            if given is not None and (why := terrains.beyond(robot, angle)):
-                raise BadConfiguration(f"{option}: {why}")
-            angles.append(float(np.radians(angle)))
+    own = float(np.degrees(np.asarray(gear.lever_front))), 180 - float(np.degrees(np.asarray(gear.lever_rear)))
+    angles = []
+    for option, given, usual in zip(("--levers-front", "--levers-rear"), stated[1:], own, strict=True):
+        angle = usual if given is None else given
+        if given is not None and (why := terrains.beyond(robot, angle)):
+            raise BadConfiguration(f"{option}: {why}")
+        angles.append(float(np.radians(angle)))
+    if config.sequence is None:
         found = fidelity.still(*angles)
+    else:
+        found = terrains.read_sequence(config.sequence, robot, (angles[0], angles[1]))
+        if found.begins is None and stated[1:] != (None, None):
+            raise BadConfiguration(
+                f"--levers-front, --levers-rear: {config.sequence.name} states all angles; expected them beside a "
+                "sequence of voltages alone (front_V, rear_V)"
+            )
+    if config.levers_voltage_V is not None:
+        found = dataclasses.replace(found, supply=jnp.asarray(config.levers_voltage_V))
     if tracked:
-        axle = float(np.asarray(robot.radius_pulley + gear.grouser_height))
-        reach, roller = (float(np.asarray(x)) for x in (gear.lever_length, gear.levers.roller))
-        least = -float(np.arcsin((axle - roller) / reach))
-        for option, angle in (("front", float(found.front[0])), ("rear", float(found.rear[0]))):
-            below = axle + reach * np.sin(angle) - roller
-            if below < -_ON_GROUND * reach:
-                raise BadConfiguration(
-                    f"levers {option}: at {np.degrees(angle):.4g} deg they begin {-1000 * below:.0f} mm below the "
-                    f"ground; expected at least {np.degrees(least):.1f} deg there, where they lie on it (a sequence "
-                    "may press them down later)"
-                )
+        first = (float(found.first[0]), float(np.pi - found.first[1]))
+        for option, angle in zip(("front", "rear"), first, strict=True):
+            if why := terrains.below(robot, float(np.degrees(angle))):
+                raise BadConfiguration(f"levers {option}: {why}")
     return found
 
 

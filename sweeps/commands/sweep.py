@@ -17,7 +17,6 @@ from rich.table import Table
 from calibration.data import profiles, robot_file
 from calibration.data.errors import BadConfiguration, InputError
 from calibration.data.robot_file import RobotFile
-from mmrjax import fidelities
 from mmrjax.signals import STATUSES
 from sweeps import config_campaign, skeleton
 from sweeps.config import Sweep
@@ -25,7 +24,7 @@ from sweeps.config_campaign import Campaign, How
 from sweeps.console import progress, say, tell
 from sweeps.inputs import beside_robot, load_robot
 from sweeps.pages import words
-from sweeps.points import axes, grid, run, scale, uncertainty
+from sweeps.points import axes, climbs, grid, run, scale, uncertainty
 from sweeps.points.design import Blocks
 from sweeps.points.identity import Identity, identity
 from sweeps.points.job import laid_out, prepare, showing_turns, usual
@@ -94,7 +93,13 @@ def _into_store(config: Campaign, file: RobotFile, where: str, out: Path | None,
     try:
         device = scale.device_kind() if pool is None else pool.device
         wanted = options.outputs or config.outputs or usual(config, robot)
-        chunk = config.chunk or scale.default_chunk(config.model, None if pool is None else device)
+        chunk = config.chunk or (
+            scale.default_chunk(config.model, None if pool is None else device)
+            if config.obstacle is None
+            else climbs.AT_ONCE
+            if device.startswith("cpu")
+            else climbs.AT_ONCE_ACCELERATED
+        )
         config = config.model_copy(update={"chunk": chunk, "outputs": wanted})
         job = prepare(config, robot, plan, where)
         layout = laid_out(config, job)
@@ -127,7 +132,7 @@ def _into_store(config: Campaign, file: RobotFile, where: str, out: Path | None,
 def dry_run(job: scale.Job, layout: Layout, path: Path) -> None:
     """Say how many points, chunks and bytes a sweep is, and how long it would take; nothing is written."""
     compiled = scale.Compiled(job)
-    blocks, slow = job.blocks, fidelities.facts(job.model).slow
+    blocks, slow = job.blocks, job.slow
     if slow and blocks.points > PROBED:
         small = Blocks.of(job.plan.design.shape, PROBED)
         compiled = scale.Compiled(dataclasses.replace(job, blocks=small))

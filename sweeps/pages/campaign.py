@@ -13,7 +13,9 @@ from mmrjax.variation import STATUS
 from sweeps.pages import campaign_figures, words
 from sweeps.pages.campaign_figures import Varied
 from sweeps.pages.page import Album, named, render
+from sweeps.points.climbs import SIZE, VERDICT
 from sweeps.points.zarr_store import STORE, Layout
+from sweeps.results.climb import VERDICTS
 
 if TYPE_CHECKING:
     from calibration.data.robot_file import RobotFile
@@ -51,6 +53,26 @@ def write(folder: Path, file: RobotFile, layout: Layout, result: dict[str, Any])
             }
             drawing = partial(campaign_figures.spread, numbers, _label(label, unit), varied)
             album.add(f"spread_{name}", drawing)
+    verdicts = []
+    if VERDICT in found:
+        codes = found[VERDICT].astype(int)
+        about = next(v.attributes for v in layout.variables if v.name == VERDICT)
+        meanings = about["flag_meanings"].split()
+        for k in np.unique(codes):
+            short, meaning = VERDICTS[meanings[k]]
+            verdicts.append(
+                {"name": meanings[k], "count": int((codes == k).sum()), "short": short, "meaning": meaning}
+            )
+        pair = [n for n in layout.design.axes if n != SIZE and len(layout.design.axes[n]) > 1][:1]
+        if pair and SIZE in layout.design.axes:
+            # of what else varies the first values
+            rest = [k for k, n in enumerate(layout.design.names) if n not in (SIZE, *pair)]
+            shown = np.all(values[:, rest] == [layout.design.axes[layout.design.names[k]][0] for k in rest], axis=1)
+            across, up = (
+                Varied(values[shown, layout.design.names.index(n)], _label(n, known[n].get("units", "")))
+                for n in (*pair, SIZE)
+            )
+            album.add("endings", partial(campaign_figures.endings, codes[shown], meanings, across, up))
     total = result["points"]
     statuses = [
         {"name": s, "count": n, "percent": 100 * n / total, "meaning": words.meaning(s)}
@@ -67,6 +89,7 @@ def write(folder: Path, file: RobotFile, layout: Layout, result: dict[str, Any])
         status=statuses,
         varied=_varied(layout, values),
         outputs=rows,
+        verdicts=verdicts,
         thinned=len(values),
         **named(file),
     )

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
-from sweeps.pages.figure_style import BLUE, figure, note, short
+from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, note, short
 
 #: Bins of a histogram, and along a name at most; at least, and points of each that more need.
 BARS, BINS = 40, 24
 LEAST, EACH = 6, 5
+#: Colours of verdicts, in the order of their codes.
+ENDINGS = (GREEN, VERMILION, ORANGE, SKY, PURPLE, FAINT, INK)
 
 
 class Varied(NamedTuple):
@@ -42,6 +45,27 @@ def spread(output: np.ndarray, label: str, varied: Mapping[str, Varied]) -> Figu
         _ticks(axes.xaxis, varied[name])
     if len(names) == 2:
         _map(fig, others[2], varied[names[0]], varied[names[1]], output, label)
+    return fig
+
+
+def endings(codes: np.ndarray, names: Sequence[str], across: Varied, up: Varied) -> Figure:
+    """How points of a grid ended, over two of its axes.
+
+    Args:
+        codes: of the points; names: of the codes.
+    """
+    fig, axes = figure(1, 1, 4.2)
+    ax = axes[0, 0]
+    x, y = np.unique(across.values), np.unique(up.values)
+    grid = np.full((len(y), len(x)), np.nan)
+    grid[np.searchsorted(y, up.values), np.searchsorted(x, across.values)] = codes
+    ax.pcolormesh(
+        x, y, grid, cmap=ListedColormap(ENDINGS[: len(names)]), vmin=-0.5, vmax=len(names) - 0.5, shading="nearest"
+    )
+    for k in np.unique(codes):
+        ax.plot([], [], "s", color=ENDINGS[k], label=names[k])
+    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
+    ax.set(xlabel=across.label, ylabel=up.label)
     return fig
 
 

@@ -19,8 +19,8 @@ from mmrjax.robot import Robot
 from mmrjax.tables import SURFACES, adhesion_ratio
 from mmrjax.variation import Axis
 from sweeps import config as configuration
-from sweeps.config_campaign import Campaign
-from sweeps.points import imposed
+from sweeps.config_campaign import SIZE, Campaign
+from sweeps.points import climbs, imposed
 from sweeps.points.design import DESIGNS, ROW, Design, Drawn, Joint, Samples, in_blocks
 
 if TYPE_CHECKING:
@@ -81,12 +81,18 @@ def plan(config: Campaign, robot: Robot, where: str) -> Plan:
             name stated twice, and the like; one sentence.
     """
     data: list[str] = []
-    axes = {name: _axis(name, stated, robot, f"{where}, axes.{name}") for name, stated in config.axes.items()}
+    extra = {} if config.obstacle is None else {SIZE: climbs.axis(config.obstacle)}
+    axes = {name: _axis(name, stated, robot, f"{where}, axes.{name}", extra) for name, stated in config.axes.items()}
     samples = _samples(config.samples, robot, f"{where}, samples", data)
     if not axes and samples is None:
         raise BadConfiguration(f"{where}: got neither [axes] nor [samples]; expected at least one name that varies")
     design = Design(axes, samples)
     fixed, surface = _fixed(config.conditions, robot, f"{where}, conditions")
+    if config.obstacle is not None:
+        stated = {**{name: np.array([value]) for name, value in fixed.items()}, **axes}
+        climbs.check(config.obstacle, stated, robot, where)
+        if "voltage" not in stated and fixed.get("battery", 0.0) <= 0.5:
+            fixed["voltage"] = climbs.SLOW
     for k, name in enumerate(design.names):
         if name in fixed or name in design.names[:k]:
             raise BadConfiguration(f"{where}, {name}: stated twice; expected it in one of conditions, axes, samples")
@@ -103,7 +109,8 @@ def plan(config: Campaign, robot: Robot, where: str) -> Plan:
         raise BadConfiguration(f"{where}, conditions.surface: got {surface} beside adhesion; expected one of the two")
     if design.points > MOST:
         raise BadConfiguration(f"{where}: got {design.points:.3g} points; expected at most {MOST:.3g}")
-    known = variation.Variation(robot, design.names).axes
+    varied = variation.Variation(robot, tuple(name for name in design.names if name not in extra)).axes
+    known = {name: extra.get(name) or varied[name] for name in design.names}
     return Plan(design, known, fixed, surface, tuple(data))
 
 
@@ -166,8 +173,8 @@ def _configuration(name: Any, robot: Robot, where: str) -> float:
 # --- grids ------------------------------------------------------------------------------------------------------
 
 
-def _axis(name: str, stated: Any, robot: Robot, where: str) -> np.ndarray:
-    axis = _known(name, robot, where)
+def _axis(name: str, stated: Any, robot: Robot, where: str, extra: Mapping[str, Axis]) -> np.ndarray:
+    axis = extra[name] if name in extra else _known(name, robot, where)
     if name == CONFIGURATION:
         names = (
             list(robot.configurations.names) if stated == "all" else stated if isinstance(stated, list) else [stated]

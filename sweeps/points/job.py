@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import profiles
-from calibration.data.errors import BadConfiguration
+from calibration.data.errors import BadConfiguration, choices
 from mmrjax import __version__, channels, fidelities, outputs
 from mmrjax.conditions import OF_TURNS
 from mmrjax.errors import UsageError
@@ -20,12 +20,14 @@ from mmrjax.profile import Profile
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
 from mmrjax.variation import STATUS, Variation, check_outputs
-from sweeps.config_campaign import Campaign
+from sweeps.config_campaign import SIZE, Campaign
 from sweeps.console import tell
-from sweeps.points import axes, scale
+from sweeps.points import axes, climbs, scale
 from sweeps.points.design import Blocks
 from sweeps.points.zarr_store import ABSENT, Layout, Variable
 
+#: Model of points that climb.
+CLIMB = "climb"
 #: Points at which a fidelity is asked, before the first is simulated, whether it could bear them.
 ASKED = 48
 
@@ -40,7 +42,10 @@ def showing_turns(robot: Robot, conditions: Collection[str]) -> Robot:
 
 
 def usual(config: Campaign, robot: Robot) -> tuple[str, ...]:
-    """Outputs of a store where none are stated: what the instruments show, over a profile what it comes to."""
+    """Outputs of a store where none are stated: what the instruments show, over a profile or an obstacle what it
+    comes to."""
+    if config.obstacle is not None:
+        return climbs.names(config.obstacle)
     if config.profile is None:
         return channels.names(robot.channels)
     from mmrjax import missions  # which imports an integrator
@@ -54,7 +59,7 @@ def prepare(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> scal
     Raises:
         BadConfiguration: an output that the fidelity does not have, or a point that it cannot bear.
     """
-    variation = Variation(robot, plan.design.names)
+    variation = Variation(robot, tuple(name for name in plan.design.names if name != SIZE))
     profile = None if config.profile is None else _profile(config.profile, robot, plan, where)
     repeated = [name for k, name in enumerate(config.outputs) if name in config.outputs[:k]]
     if repeated:
@@ -62,6 +67,15 @@ def prepare(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> scal
     taken = [name for name in config.outputs if name in plan.design.names]
     if taken:
         raise BadConfiguration(f"{where}, outputs: got {taken[0]}, which varies; expected what comes out of a run")
+    if config.obstacle is not None:
+        allowed = climbs.names(config.obstacle)
+        if unknown := [name for name in config.outputs if name not in allowed]:
+            raise BadConfiguration(f"{where}, outputs: got {unknown[0]}; {choices(unknown[0], allowed)}")
+        assert config.chunk is not None
+        blocks = Blocks.of(plan.design.shape, config.chunk)
+        return scale.Job(
+            robot, CLIMB, config.options, plan, config.outputs, config.storage, blocks, obstacle=config.obstacle
+        )
     try:
         check_outputs(variation, config.model, plan.fixed(), config.options, config.outputs, profile)
     except UsageError as error:
@@ -130,7 +144,12 @@ def laid_out(config: Campaign, job: scale.Job) -> Layout:
 
         rows |= {row.column: row for row in (*missions.OUTPUTS, *missions.OF_TURNS)}
     variables = []
+    of_climbs = climbs.rows()
     for name in job.outputs:
+        if job.obstacle is not None:
+            kind = "uint8" if name == climbs.VERDICT else config.storage
+            variables.append(Variable(name, kind, of_climbs[name]))
+            continue
         if name == "flags":
             about = {"long_name": "limits exceeded", "flag_masks": [1 << k for k in range(len(FLAGS))]}
             variables.append(Variable(name, "uint16", {**about, "flag_meanings": " ".join(FLAGS)}))

@@ -28,6 +28,8 @@ from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.profile import Profile
 from mmrjax.variation import FLAGS, STATUS, Variation, evaluate, pick
+from sweeps.config_campaign import SIZE, Obstacle
+from sweeps.points import climbs
 from sweeps.points.axes import Plan, adhesions
 from sweeps.points.design import ROW, Blocks
 
@@ -48,7 +50,7 @@ class Job:
     Attributes:
         robot: that is varied; model: fidelity, and its options.
         outputs: names; storage: type that they are stored in.
-        profile: that every point follows, if any.
+        profile: that every point follows, if any; obstacle: that every point climbs, in place of a fidelity's run.
     """
 
     robot: Robot
@@ -59,6 +61,12 @@ class Job:
     storage: str
     blocks: Blocks
     profile: Profile | None = None
+    obstacle: Obstacle | None = None
+
+    @property
+    def slow(self) -> bool:
+        """Whether a call takes long and says how far it is."""
+        return self.obstacle is not None or fidelities.facts(self.model).slow
 
 
 @dataclasses.dataclass
@@ -97,7 +105,7 @@ class Compiled:
         each = -(-job.blocks.points // len(devices))
         each = each if each < SHARED else -(-each // SHARED) * SHARED
         self.size = each * len(devices)
-        names = tuple(name for name in job.plan.design.names if name != ROW)
+        names = tuple(name for name in job.plan.design.names if name not in (ROW, SIZE))
         everywhere = NamedSharding(self.mesh, PartitionSpec())
         self._variation, self._fixed = _placed((Variation(job.robot, names), job.plan.fixed()), everywhere)
         self._split = NamedSharding(self.mesh, PartitionSpec(POINTS))
@@ -108,8 +116,9 @@ class Compiled:
             surface,
         )  # fmt: skip
         # What takes long in one call is run in parts, between which it says how far it is and can be interrupted.
-        slow = fidelities.facts(job.model).slow and job.profile is None
-        self.in_parts = slow and len(devices) == 1 and not self._variation.varies_robot
+        slow = job.slow and job.profile is None
+        whole = len(devices) > 1 or self._variation.varies_robot
+        self.in_parts = job.obstacle is not None or (slow and not whole)
         self._program = _one_device_kept if len(devices) == 1 else eqx.filter_jit(_split_among(self.mesh))
 
     def points(self, chunk: int) -> Float[np.ndarray, "points names"]:
@@ -131,6 +140,8 @@ class Compiled:
         if rows is not None:
             which, values = values[:, 0].astype(int), values[:, 1:]
             conditions = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[which], self._split), rows)
+        if self.job.obstacle is not None:
+            return self._climbed(self.job.obstacle, values, told or _not_told)
         placed = jax.device_put(values, self._split)
         if self.in_parts:
             conditions = _on_surface(self._variation, conditions, placed, self._asked.surface)
@@ -139,6 +150,15 @@ class Compiled:
             return _stored(pick(run, robot.channels, self.job.outputs), self._asked)
         found: dict[str, Array] = self._program(self._variation, conditions, placed, self._asked, self.job.profile)
         return found
+
+    def _climbed(self, of: Obstacle, values: np.ndarray, told: Callable[[float], None]) -> dict[str, Any]:
+        names = self.job.plan.design.names
+        sizes = values[:, names.index(SIZE)] if SIZE in names else None
+        others = values[:, [k for k, name in enumerate(names) if name != SIZE]]
+        placed = jax.device_put(others, self._split)
+        conditions = _wide(_on_surface(self._variation, self._fixed, placed, self._asked.surface), len(values))
+        found = climbs.computed(of, self._variation, conditions, placed, sizes, told)
+        return {name: found[name] for name in (*self.job.outputs, STATUS)}
 
 
 class _Asked(NamedTuple):

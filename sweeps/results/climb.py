@@ -79,6 +79,11 @@ class ClimbResult:
             "traction_current_A": r.current[0],
             "front_current_A": r.lever_current[0, :, 0],
             "rear_current_A": r.lever_current[0, :, 1],
+            "motors_current_A": r.total_current[0],
+            "front_voltage_V": r.lever_voltage[0, :, 0],
+            "rear_voltage_V": r.lever_voltage[0, :, 1],
+            "front_holds": r.holds[0, :, 0],
+            "rear_holds": r.holds[0, :, 1],
             "front_torque_Nm": r.torque[0, :, 0],
             "rear_torque_Nm": r.torque[0, :, 1],
             "margin_mm": 1000 * r.margin[0],
@@ -104,7 +109,7 @@ class ClimbResult:
     def numbers(self) -> dict[str, float]:
         """Largest and final numbers of the run that is shown."""
         t = self.table
-        spent = t["supply_J"][-1] - t["supply_J"][0]
+        levers, tracks = (float(t[name][-1] - t[name][0]) for name in ("levers_J", "supply_J"))
         return {
             "time_s": float(t["time_s"][-1]),
             "furthest_mm": float(1000 * self.climb.furthest[0]),
@@ -116,7 +121,10 @@ class ClimbResult:
             "rear_current_most_A": float(np.abs(t["rear_current_A"]).max()),
             "front_torque_most_Nm": float(np.abs(t["front_torque_Nm"]).max()),
             "rear_torque_most_Nm": float(np.abs(t["rear_torque_Nm"]).max()),
-            "energy_J": float(spent),
+            "front_voltage_most_V": float(np.abs(t["front_voltage_V"]).max()),
+            "rear_voltage_most_V": float(np.abs(t["rear_voltage_V"]).max()),
+            "energy_levers_J": levers,
+            "energy_J": tracks + levers,
         }
 
     def to_json(self) -> dict[str, Any]:

@@ -1,0 +1,218 @@
+"""Climbs as points of a sweep: each one run over an obstacle, or the largest obstacle that it gets over."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.data import terrains
+from calibration.data.errors import BadConfiguration
+from mmrjax import masses, terrain
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities.climb import FAILED, NAMES, OVER, UNFINISHED, Climb, Sequence, climb_batch, still
+from mmrjax.footing import PITCH
+from mmrjax.robot import Robot
+from mmrjax.signals import CONVERGED, NOT_SETTLED
+from mmrjax.signals import FAILED as FAILED_POINT
+from mmrjax.terrain import Terrain
+from mmrjax.variation import STATUS, Axis, Variation
+from sweeps.config_campaign import SIZE, Obstacle
+
+#: Sizes [mm] between which a search begins, and how near its ends come.
+SOUGHT = {"step": (10.0, 450.0), "stairs": (20.0, 400.0), "gap": (20.0, 800.0)}
+NEAR = 1.0
+#: Voltage where none is stated [V]: slow enough that a robot climbs rather than leaps.
+SLOW = 12.0
+#: Climbs in one call on processors, and on an accelerator; interval of their record [s].
+AT_ONCE, AT_ONCE_ACCELERATED, SAMPLE = 64, 1024, 0.05
+#: Outputs with units and words; a search has the first two.
+VERDICT, LARGEST = "verdict", "largest_mm"
+OUTPUTS: dict[str, tuple[str, str]] = {
+    VERDICT: ("", "how the climb ended; of a search, of the smallest obstacle that it does not get over"),
+    LARGEST: ("mm", "largest obstacle that it gets over, 0 where none is"),
+    "time_s": ("s", "time until the verdict"),
+    "furthest_mm": ("mm", "how far the middle of the robot came from where the obstacle begins"),
+    "pitch_most_deg": ("deg", "largest pitch, nose up"),
+    "energy_J": ("J", "energy from the supply, of all motors"),
+    "traction_current_most_A": ("A", "largest current of a traction motor"),
+    "front_current_most_A": ("A", "largest current of the motor of the front levers"),
+    "rear_current_most_A": ("A", "largest current of the motor of the rear levers"),
+}
+
+
+def axis(of: Obstacle) -> Axis:
+    """What is known of the obstacle's size."""
+    meaning = {"step": "height of the step", "stairs": "rise of each stair", "gap": "width of the trench"}
+    return Axis(SIZE, "mm", meaning[of.kind], (1.0, 5000.0), None)
+
+
+def names(of: Obstacle) -> tuple[str, ...]:
+    """Outputs that a point has."""
+    return (VERDICT, LARGEST) if of.find else tuple(name for name in OUTPUTS if name != LARGEST)
+
+
+def terrains_of(of: Obstacle, sizes: np.ndarray) -> Terrain:
+    """Terrains of sizes [mm]."""
+    nose, tread = of.nose_mm / 1000, of.tread_mm / 1000
+    make = {
+        "step": lambda s: terrain.step(s, nose),
+        "stairs": lambda s: terrain.stairs(s, tread, of.count, nose),
+        "gap": terrain.gap,
+    }
+    return jax.vmap(make[of.kind])(jnp.asarray(sizes) / 1000)
+
+
+def check(of: Obstacle, varied: Mapping[str, np.ndarray], robot: Robot, where: str) -> None:
+    """Refuse a sweep of climbs that cannot be.
+
+    Args:
+        varied: what varies or is stated, with its values.
+
+    Raises:
+        BadConfiguration: a robot that cannot climb, no size or one beside a search, angles beside a sequence of them,
+            beyond the levers' range or below the ground in the beginning.
+    """
+    if (why := refused(robot)) is not None:
+        raise BadConfiguration(f"{where}, obstacle: {why}")
+    if of.find == (SIZE in varied):
+        wants = "find looks for it" if of.find else f"expected an axis {SIZE}, or find = true"
+        raise BadConfiguration(f"{where}, {SIZE}: got {'it' if of.find else 'none'}; {wants}")
+    one = None if of.sequence is None else terrains.read_sequence(of.sequence, robot, (0.0, 0.0))
+    for name in ("levers_front_deg", "levers_rear_deg"):
+        if name in varied and one is not None and one.begins is None:
+            raise BadConfiguration(f"{where}, {name}: {of.sequence} states all angles; expected one of the two")
+        for angle in varied.get(name, ()):
+            if why := terrains.beyond(robot, angle) or terrains.below(robot, angle):
+                raise BadConfiguration(f"{where}, {name}: {why}")
+
+
+def refused(robot: Robot) -> str | None:
+    """Why a robot cannot climb; None: it can."""
+    if not robot.has_ground:
+        return "the robot's load is a shaft; expected one with ground under it"
+    if robot.rig.imposed != "voltage":
+        return "the robot's file says that its motors are not driven by voltage"
+    try:
+        masses.check_parts(robot)
+    except ValueError as error:
+        return str(error)
+    return None
+
+
+def computed(
+    of: Obstacle,
+    variation: Variation,
+    conditions: Conditions,
+    values: np.ndarray,
+    sizes: np.ndarray | None,
+    told: Callable[[float], None],
+) -> dict[str, np.ndarray]:
+    """Outputs and status of points, by name.
+
+    Args:
+        conditions: what does not vary, of shape (points,); values: of the variation, a row a point.
+        sizes: of the obstacles [mm]; None: they are searched for, all side by side.
+        told: what share is done.
+    """
+    robot, at = variation.at(jnp.asarray(values), conditions)
+    points = len(values)
+    if variation.varies_robot:
+        base = variation.robot
+        robot = jax.tree.map(
+            lambda new, old: (
+                new if jnp.ndim(new) > jnp.ndim(old) else jnp.broadcast_to(new, (points, *jnp.shape(new)))
+            ),
+            robot,
+            base,
+        )
+    sequence = _sequences(of, robot, at, points)
+
+    def run(sizes: np.ndarray, told: Callable[[float], None]) -> Climb:
+        return climb_batch(
+            robot, at, terrains_of(of, sizes), sequence,
+            duration=of.duration_s, step=of.time_step_s, sample=SAMPLE, record=not of.find, progress=told,
+        )  # fmt: skip
+
+    found = _numbers(run(sizes, told)) if sizes is not None else _searched(of, points, run, told)
+    verdict = found[VERDICT]
+    status = np.where(verdict == FAILED, FAILED_POINT, np.where(verdict == UNFINISHED, NOT_SETTLED, CONVERGED))
+    told(1.0)
+    return {**found, VERDICT: verdict.astype(np.uint8), STATUS: status.astype(np.uint8)}
+
+
+def _sequences(of: Obstacle, robot: Robot, conditions: Conditions, points: int) -> Sequence:
+    each = 0 if jnp.ndim(robot.sides) else None
+    angles = jax.vmap(lambda r, c: masses.lever_angles(r.running_gear, c), in_axes=(each, 0))(robot, conditions)
+    front, rear = (jnp.broadcast_to(x, (points,)) for x in angles)
+    found = jax.vmap(still)(front, rear)
+    if of.sequence is not None:
+        one = terrains.read_sequence(of.sequence, robot, (0.0, 0.0))
+        found = jax.tree.map(lambda x: jnp.broadcast_to(x, (points, *jnp.shape(x))), one)
+        if found.begins is not None:
+            found = dataclasses.replace(found, begins=jnp.stack([front, rear], axis=1))
+    if of.levers_voltage_V is None:
+        return found
+    return dataclasses.replace(found, supply=jnp.full(points, of.levers_voltage_V))
+
+
+def _numbers(found: Climb) -> dict[str, np.ndarray]:
+    """Numbers of runs until their verdicts."""
+    r = found.record
+    during = np.asarray(r.time) <= np.asarray(found.ended)[:, None] + 1e-9
+
+    def most(values: Any) -> np.ndarray:
+        return np.max(np.where(during, np.nan_to_num(np.asarray(values)), -np.inf), axis=1)
+
+    last = np.maximum(during.sum(axis=1) - 1, 0)[:, None]
+    energy = np.asarray(r.energy["supply"] + r.energy["levers"])
+    return {
+        VERDICT: found.verdict,
+        "time_s": np.take_along_axis(np.asarray(r.time), last, 1)[:, 0],
+        "furthest_mm": 1000 * np.asarray(found.furthest),
+        "pitch_most_deg": np.degrees(most(-np.asarray(r.motion.q)[..., PITCH])),
+        "energy_J": np.take_along_axis(energy, last, 1)[:, 0],
+        "traction_current_most_A": most(np.abs(r.current)),
+        "front_current_most_A": most(np.abs(r.lever_current[..., 0])),
+        "rear_current_most_A": most(np.abs(r.lever_current[..., 1])),
+    }
+
+
+def _searched(
+    of: Obstacle, points: int, run: Callable[..., Climb], told: Callable[[float], None]
+) -> dict[str, np.ndarray]:
+    """The largest sizes that are got over, by bisection of all points side by side, and how the next one ends."""
+    low, high = SOUGHT[of.kind]
+    rounds = 1 + int(np.ceil(np.log2((high - low) / NEAR)))
+    over, beyond, verdict, sizes = (
+        np.zeros(points),
+        np.full(points, high),
+        np.full(points, OVER),
+        np.full(points, low),
+    )
+    for k in range(rounds):
+        ended = run(sizes, functools.partial(_share, told, k, rounds)).verdict
+        gone = ended == OVER
+        over, beyond = np.where(gone, sizes, over), np.where(gone, beyond, sizes)
+        verdict = np.where(gone, verdict, ended)
+        sizes = (np.maximum(over, low) + beyond) / 2
+    return {VERDICT: verdict, LARGEST: over}
+
+
+def _share(told: Callable[[float], None], k: int, rounds: int, share: float) -> None:
+    told((k + share) / rounds)
+
+
+def rows() -> dict[str, dict[str, Any]]:
+    """Attributes of the outputs in a store."""
+    about = {name: {"units": unit or "1", "long_name": words} for name, (unit, words) in OUTPUTS.items()}
+    del about[VERDICT]["units"]
+    return {
+        **about,
+        VERDICT: {**about[VERDICT], "flag_values": [*range(len(NAMES))], "flag_meanings": " ".join(NAMES)},
+    }

@@ -1,0 +1,138 @@
+"""Sweeps of climbs: the search of many points side by side, points as single climbs, the store, what is refused."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import zarr
+
+from calibration.data.errors import BadConfiguration
+from mmrjax import params, terrain
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities.climb import NAMES, OVER, SLIDES, TIPS, climb_batch, still
+from mmrjax.robots import nominal
+from mmrjax.variation import STATUS, Variation
+from sweeps.config_campaign import Campaign, Obstacle
+from sweeps.points import axes, climbs
+
+ROBOT = nominal()
+
+
+def test_search_of_many_points_ends_within_a_millimetre_of_each_ones_limit():
+    limits = np.array([0.0, 10.0, 87.3, 301.0, 1000.0])
+    calls = []
+
+    class Ended:
+        def __init__(self, sizes):
+            calls.append(sizes)
+            self.verdict = np.where(sizes <= limits, OVER, np.where(sizes > 200, TIPS, SLIDES))
+
+    found = climbs._searched(
+        Obstacle(kind="step", find=True), 5, lambda sizes, told: Ended(sizes), lambda share: None
+    )
+    largest = found[climbs.LARGEST]
+    assert largest[0] == 0 and np.all(largest <= limits) and np.all(limits[1:4] - largest[1:4] <= climbs.NEAR)
+    assert largest[4] > climbs.SOUGHT["step"][1] - climbs.NEAR
+    assert [NAMES[k] for k in found[climbs.VERDICT]] == ["slides", "slides", "slides", "tips", "over"]
+    assert len(calls) == 10
+
+
+REFUSED = {
+    "no size": ({"kind": "step"}, {"levers_front_deg": [30, 45]}, r"obstacle_mm: got none; expected an axis obstacle_mm"),
+    "a size beside a search": ({"kind": "gap", "find": True}, {"obstacle_mm": [30, 45]}, r"got it; find looks for it"),
+    "a lever below the ground": ({"kind": "step"}, {"levers_front_deg": [-30, 45], "obstacle_mm": [50]},
+                                 r"levers_front_deg: at -30 deg they begin 72 mm below the ground"),
+    "beyond the range": ({"kind": "step"}, {"levers_rear_deg": [190], "obstacle_mm": [50]}, r"expected -180 to 180 deg"),
+    "no size at all": ({"kind": "step"}, {"obstacle_mm": [0]}, r"obstacle_mm: got 0; expected 1 to 5000 mm"),
+    "a name that is none": ({"kind": "step"}, {"obstacle_mm": [50], "friction": [1]}, r"neither a parameter"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_sweeps_that_cannot_be_climbed_are_refused_in_one_sentence(case):
+    of, varied, message = REFUSED[case]
+    with pytest.raises(BadConfiguration, match=message) as error:
+        axes.plan(Campaign(obstacle=Obstacle(**of), axes=varied), ROBOT, "map.toml")
+    assert "\n" not in str(error.value)
+
+
+def test_size_is_an_obstacles_alone():
+    with pytest.raises(BadConfiguration, match="obstacle_mm: neither a parameter of the robot nor a condition"):
+        axes.plan(Campaign(axes={"obstacle_mm": [50]}), ROBOT, "map.toml")
+
+
+def test_each_point_has_its_own_robot_levers_and_obstacle(monkeypatch):
+    asked = {}
+
+    def recorded(robot, conditions, ground, sequence, **options):
+        asked.update(robot=robot, conditions=conditions, ground=ground, sequence=sequence)
+        raise StopIteration
+
+    monkeypatch.setattr(climbs, "climb_batch", recorded)
+    variation = Variation(ROBOT, ("levers_front_deg", "motor.resistance"))
+    conditions = Conditions(np.zeros(2, int), voltage=np.full(2, 24.0)).resolved(ROBOT)
+    with pytest.raises(StopIteration):
+        climbs.computed(
+            Obstacle(kind="stairs", tread_mm=300, count=2, levers_voltage_V=8.0), variation, conditions,
+            np.array([[30.0, 0.6], [50.0, 1.5]]), np.array([60.0, 90.0]), lambda share: None,
+        )  # fmt: skip
+    assert np.asarray(asked["robot"].motor.resistance) == pytest.approx([0.6, 1.5])
+    assert np.asarray(asked["robot"].motor.inertia) == pytest.approx([33.5e-7] * 2)
+    assert np.degrees(np.asarray(asked["sequence"].front)) == pytest.approx(np.array([[30.0], [50.0]]))
+    assert np.degrees(np.asarray(asked["sequence"].rear)) == pytest.approx(180.0)
+    assert np.asarray(asked["sequence"].supply) == pytest.approx([8.0, 8.0])
+    assert np.asarray(asked["ground"].points)[:, 2] == pytest.approx(np.array([[0.0, 0.06], [0.0, 0.09]]))
+    assert np.asarray(asked["ground"].finish) == pytest.approx([0.3, 0.3])
+
+
+@pytest.mark.slow
+def test_points_of_which_the_robot_varies_are_single_climbs():
+    of = Obstacle(kind="step", duration_s=0.5, time_step_s=2e-4)
+    variation = Variation(ROBOT, ("levers_front_deg", "motor.resistance", "payload"))
+    values = np.array([[30.0, 0.6, 0.0], [50.0, 1.5, 4.0]])
+    conditions = Conditions(np.zeros(2, int), voltage=np.full(2, 24.0)).resolved(ROBOT)
+    found = climbs.computed(of, variation, conditions, values, np.array([60.0, 90.0]), lambda share: None)
+    robot = params.replace(ROBOT, {"motor.resistance": 1.5})
+    one = climb_batch(
+        robot, Conditions(np.zeros(1, int), voltage=24.0, payload=4.0).resolved(robot),
+        jax.tree.map(lambda x: jnp.asarray(x)[None], terrain.step(0.09)),
+        jax.tree.map(lambda x: x[None], still(np.radians(50.0), 0.0 + np.pi - robot.running_gear.lever_rear)),
+        duration=0.5, step=2e-4, sample=climbs.SAMPLE,
+    )  # fmt: skip
+    alone = climbs._numbers(one)
+    for name, value in alone.items():
+        assert float(found[name][1]) == pytest.approx(float(value[0]), rel=1e-6), name
+    assert found["furthest_mm"][0] > found["furthest_mm"][1] + 1  # with less resistance and payload
+    assert found[STATUS].tolist() == [3, 3]  # not settled: the time was over
+
+
+def test_store_of_climbs_is_filled_in_shares_and_its_page_has_the_map(mmrjax, tmp_path):
+    (tmp_path / "map.toml").write_text(
+        """
+chunk = 2
+outputs = ["verdict", "furthest_mm", "energy_J"]
+[obstacle]
+kind = "gap"
+time_step_s = 4e-4
+duration_s = 3
+[conditions]
+voltage = 24
+[axes]
+levers_front_deg = [0, 45]
+obstacle_mm = [60, 500]
+"""
+    )
+    for share in ("1/2", "2/2"):
+        code, _, err = mmrjax("sweep", "map.toml", "--shard", share, "--out", "run")
+        assert code == 0, err
+        assert (tmp_path / "run").exists() == (share == "2/2")
+    result = json.loads((tmp_path / "run" / "result.json").read_text("utf-8"))
+    assert result["model"] == "climb" and result["statuses"]["converged"] == 4
+    store = zarr.open_group(tmp_path / "run" / "results.zarr", mode="r")
+    verdicts = [[NAMES[k] for k in row] for row in store["verdict"][:]]
+    assert [row[0] for row in verdicts] == ["over", "over"] and "over" not in [row[1] for row in verdicts]
+    assert (store["furthest_mm"][:, 0] > 60).all() and np.isfinite(store["energy_J"][:]).all()
+    page = (tmp_path / "run" / "report.html").read_text("utf-8")
+    assert "Verdicts over the first name that varies" in page and "gets over" in page and page.count("<svg") == 3
