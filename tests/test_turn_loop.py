@@ -125,7 +125,10 @@ def test_what_a_channel_of_one_side_shows_is_off_by_that_side_alone(linear):
 
 #: Table → equation that the answer has to be in, and effects of which one has to be established; none: nothing is
 #: missing.
-FOUND = {"clean": (), "friction": ("side_friction",), "voltage": ("side_voltage",), "moment": ("turning_resistance",)}
+FOUND = {
+    "clean": (), "friction": ("side_friction",), "voltage": ("side_voltage",), "moment": ("turning_resistance",),
+    "grip": ("lateral_grip",),
+}  # fmt: skip
 
 
 @pytest.mark.slow
