@@ -194,6 +194,11 @@ def _replace(component: Any, values: dict[str, Any], prefix: str) -> Any:
     return dataclasses.replace(component, **changes) if changes else component
 
 
+def one_by_one(numbers: Float[Array, " n"]) -> tuple[Array, ...]:
+    """The numbers of an array, each by itself."""
+    return tuple(x.reshape(()) for x in jax.lax.split(numbers, [1] * len(numbers))) if len(numbers) else ()
+
+
 def strong(robot: M) -> M:
     """`robot` without weakly typed numbers: each of those is another program to compile of the same function."""
     return jax.tree.map(lambda x: jnp.asarray(x, x.dtype) if eqx.is_array(x) else x, robot)

@@ -23,6 +23,7 @@ from calibration.discovery.stated_values import Shift
 from mmrjax import channels, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
+from mmrjax.fidelities.steady import IMPLICIT
 
 PAIRS = {
     ("series_resistance", "supply_sag"): {"one motor, 6T2A", "one motor, 4W2T", "stall, one motor"},
@@ -45,6 +46,10 @@ SPANS, BY = predicted.spans(MENU), {e.name: e for e in MENU}
 SETTINGS = SETTLED.settings
 
 
+def foreseen(robot, batch):
+    return predicted.readings(robot, batch, *predicted.of_runs(IMPLICIT.solve, robot, batch))[1]
+
+
 # --- what the menu foresees -------------------------------------------------------------------------
 
 
@@ -52,7 +57,7 @@ SETTINGS = SETTLED.settings
 def shown():
     """Readings of the whole menu, and which exist, for constants and a term of the generator."""
     full = dataclasses.replace(CLIMBING, effects=tuple(BY_NAME[name]() for name in g.LIBRARY))
-    read, batch = eqx.filter_jit(predicted.readings), predicted.batch(MENU, channels.USUAL)
+    read, batch = eqx.filter_jit(foreseen), predicted.batch(MENU, channels.USUAL)
 
     def of(p, term=None):
         values = dict(p)
@@ -417,7 +422,7 @@ def test_only_levels_that_the_robot_manages_are_left():
 
 def test_steepest_slope_is_one_that_the_robot_climbs():
     slippery = params.replace(CLIMBING, {f"{c}.ground.friction.static": 0.40 for c in ("6T2A", "4W2T")})
-    found = eqx.filter_jit(predicted.readings)(slippery, predicted.batch(MENU, channels.USUAL))
+    found = eqx.filter_jit(foreseen)(slippery, predicted.batch(MENU, channels.USUAL))
     first = 0
     for run in runs_of(MENU):
         rows = slice(first, first := first + len(run.voltage))

@@ -14,7 +14,7 @@ from calibration.data.columns import Layout
 from calibration.inference import blocks as holdout
 from calibration.inference import identifiability, noise, observers, priors, problem
 from calibration.inference import optimizers as fit
-from calibration.inference.normal_equations import backward, cholesky, forward
+from calibration.inference.normal_equations import half_solved, solved
 from mmrjax import robots
 from mmrjax.signals import CONVERGED, SLIDES
 
@@ -67,16 +67,23 @@ def starts(size, count, seed=0):
 def test_normal_equations_solve():
     rng = np.random.default_rng(0)
     a, b = rng.standard_normal((9, 5)), rng.standard_normal(9)
-    lower = cholesky(jnp.asarray(a.T @ a))
-    np.testing.assert_allclose(lower, np.linalg.cholesky(a.T @ a), rtol=1e-10, atol=1e-12)
-    x = backward(lower, forward(lower, jnp.asarray(a.T @ b)))
+    matrix = jnp.asarray(a.T @ a)
+    lower = np.linalg.cholesky(a.T @ a)
+    np.testing.assert_allclose(
+        half_solved(matrix, jnp.asarray(a.T)), np.linalg.solve(lower, a.T), rtol=1e-9, atol=1e-12
+    )
+    x = solved(matrix, jnp.asarray(a.T @ b))
     np.testing.assert_allclose(x, np.linalg.lstsq(a, b)[0], rtol=1e-9)
+    assert np.isnan(half_solved(-matrix, jnp.asarray(a.T))).any()
 
 
 class Bent(eqx.Module):
     """An observer of rows with residuals a function of four numbers: curved, and with a penalty beyond a line."""
 
     long: bool = eqx.field(static=True, default=False)
+
+    def solve(self, robot):
+        return None
 
     def __call__(self, robot):
         x = jnp.linspace(0.0, 1.0, 6)

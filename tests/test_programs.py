@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from calibration.inference.normal_equations import cholesky, forward
 from mmrjax import effects, programs, robots
 from mmrjax.compiling import for_equations
 from mmrjax.effects import UNNAMED
+from mmrjax.trigonometry import cosine, sine
 
 MATRIX = np.array([[4.0, 1.0], [1.0, 3.0]])
 
@@ -47,18 +47,18 @@ def named(function, *args):
 
 
 def test_a_second_process_finds_a_program_without_tracing(folder, compilations):
-    first = programs.Programs(cholesky).of(((MATRIX,), {}))
+    first = programs.Programs(sine).of(((MATRIX,), {}))
     answer = first(((MATRIX,), {}))
-    np.testing.assert_allclose(answer, np.linalg.cholesky(MATRIX), rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(answer, np.sin(MATRIX), rtol=1e-12, atol=1e-15)
     made = len(compilations)
-    again = programs.Programs(untraceable(cholesky)).of(((2 * MATRIX,), {}))  # as a new process, with other numbers
-    np.testing.assert_allclose(again(((2 * MATRIX,), {})), np.linalg.cholesky(2 * MATRIX), rtol=1e-12, atol=1e-15)
+    again = programs.Programs(untraceable(sine)).of(((2 * MATRIX,), {}))  # as a new process, with other numbers
+    np.testing.assert_allclose(again(((2 * MATRIX,), {})), np.sin(2 * MATRIX), rtol=1e-12, atol=1e-15)
     np.testing.assert_array_equal(again(((MATRIX,), {})), answer)
     assert len(compilations) == made
 
 
 def test_a_program_of_this_process_is_not_read_again(folder):
-    kept = programs.Programs(cholesky)
+    kept = programs.Programs(sine)
     first = kept.of(((MATRIX,), {}))
     for path in folder.iterdir():
         path.unlink()
@@ -89,11 +89,11 @@ def test_results_come_back_with_what_is_no_array(folder):
     ],
 )
 def test_other_arguments_have_another_program(other):
-    assert named(cholesky, *other) == named(cholesky, *other) != named(cholesky, np.eye(2))
+    assert named(sine, *other) == named(sine, *other) != named(sine, np.eye(2))
 
 
 def test_whole_numbers_floats_and_truths_are_told_apart(folder):
-    assert len({named(cholesky, x) for x in (1, 1.0, True)}) == 3
+    assert len({named(sine, x) for x in (1, 1.0, True)}) == 3
     kept = programs.Programs(for_equations)
     found = [kept.of((((x, MATRIX),), {})).result[0] for x in (1, 1.0, True)]
     assert [type(x) for x in found] == [int, float, bool]
@@ -101,21 +101,21 @@ def test_whole_numbers_floats_and_truths_are_told_apart(folder):
 
 def test_another_function_class_or_curve_has_another_program():
     robot, plain = robots.nominal(), np.eye(2)
-    assert named(cholesky, plain) != named(forward, plain)
+    assert named(sine, plain) != named(cosine, plain)
     some = [effects.BY_NAME["churning"](), effects.BY_NAME["windage"](), *(curve() for curve in UNNAMED.values())]
-    names = {named(cholesky, dataclasses.replace(robot, effects=(e,))) for e in some}
+    names = {named(sine, dataclasses.replace(robot, effects=(e,))) for e in some}
     assert len(names) == len(some)
 
 
 def test_settings_and_source_are_part_of_a_name(monkeypatch, tmp_path):
-    before = named(cholesky, MATRIX)
+    before = named(sine, MATRIX)
     with monkeypatch.context() as patch:
         patch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
-        assert named(cholesky, MATRIX) != before
+        assert named(sine, MATRIX) != before
     with monkeypatch.context() as patch:
         patch.setattr(programs, "_sources", lambda: "other")
-        assert named(cholesky, MATRIX) != before
-    assert named(cholesky, MATRIX) == before
+        assert named(sine, MATRIX) != before
+    assert named(sine, MATRIX) == before
     found = set()
     for package in programs.OWN:
         (tmp_path / package / "room").mkdir(parents=True)
@@ -138,7 +138,7 @@ def test_what_has_no_name_goes_the_usual_way(what, folder):
 
 
 def test_tracers_go_the_usual_way(folder):
-    kept = programs.Programs(cholesky)
+    kept = programs.Programs(sine)
     jax.eval_shape(lambda x: [x, kept.of(((x,), {}))][0], MATRIX)
     assert not list(folder.iterdir())
 
@@ -146,29 +146,29 @@ def test_tracers_go_the_usual_way(folder):
 def test_programs_that_call_back_into_python_are_used_and_not_kept(folder):
     seen = []
 
-    @functools.wraps(cholesky)
+    @functools.wraps(sine)
     def watched(matrix):
         jax.debug.callback(seen.append, matrix[0, 0])
-        return cholesky(matrix)
+        return sine(matrix)
 
     found = programs.Programs(watched).of(((MATRIX,), {}))(((MATRIX,), {}))
     jax.effects_barrier()
-    np.testing.assert_allclose(found, np.linalg.cholesky(MATRIX), rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(found, np.sin(MATRIX), rtol=1e-12, atol=1e-15)
     assert seen == [4.0] and not list(folder.iterdir())
 
 
 @pytest.mark.parametrize("ending", ["program", "executable"])
 def test_broken_files_are_made_again(folder, ending):
-    made = programs.Programs(cholesky).of(((MATRIX,), {}))(((MATRIX,), {}))
+    made = programs.Programs(sine).of(((MATRIX,), {}))(((MATRIX,), {}))
     (broken,) = folder.glob(f"*.{ending}")
     broken.write_bytes(b"nonsense")
-    again = programs.Programs(cholesky).of(((MATRIX,), {}))(((MATRIX,), {}))
+    again = programs.Programs(sine).of(((MATRIX,), {}))(((MATRIX,), {}))
     np.testing.assert_array_equal(made, again)
 
 
 def test_nothing_is_kept_unless_a_folder_is_stated(folder, monkeypatch):
     monkeypatch.setenv(programs.VARIABLE, "")
-    assert programs.Programs(cholesky).of(((MATRIX,), {})) is None
+    assert programs.Programs(sine).of(((MATRIX,), {})) is None
     monkeypatch.setenv(programs.VARIABLE, str(folder / "is not there"))
-    found = programs.Programs(cholesky).of(((MATRIX,), {}))  # cannot be written to: the program is used all the same
-    np.testing.assert_allclose(found(((MATRIX,), {})), np.linalg.cholesky(MATRIX), rtol=1e-12, atol=1e-15)
+    found = programs.Programs(sine).of(((MATRIX,), {}))  # cannot be written to: the program is used all the same
+    np.testing.assert_allclose(found(((MATRIX,), {})), np.sin(MATRIX), rtol=1e-12, atol=1e-15)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -22,7 +23,7 @@ from calibration.inference.linearization import (
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem
 from mmrjax import params
-from mmrjax.compiling import compiled
+from mmrjax.compiling import SELDOM, compiled
 from mmrjax.effects import Effect
 from mmrjax.robot import Robot
 
@@ -78,14 +79,14 @@ class ActiveSet(eqx.Module):
         return dataclasses.replace(self, active=jnp.asarray(active, int))
 
 
-@compiled
+@functools.partial(compiled, options=SELDOM)
 def _parts(space: ActiveSet, z: Array) -> tuple[Array, tuple[Array, ...], tuple[Array, ...]]:
     """Coordinates of the base, and amplitude and shape of every effect."""
     base, amplitude, shape = space.parts(z)
-    held, effects = space.held(), range(len(space.names))
+    held = space.held()
     amplitudes = space.sd * (amplitude @ held)
     shapes = shaped(space.scales, shape @ held)
-    return base, tuple(amplitudes[k] for k in effects), tuple(shapes[k] for k in effects)
+    return base, params.one_by_one(amplitudes), params.one_by_one(shapes)
 
 
 @dataclasses.dataclass(frozen=True)

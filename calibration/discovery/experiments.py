@@ -16,6 +16,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -40,11 +41,14 @@ from calibration.discovery.notes import (
 from calibration.discovery.reach import Reach, reach_of
 from calibration.discovery.settings import Settings
 from calibration.inference import bases, priors
-from calibration.inference.normal_equations import cholesky, forward
+from calibration.inference.normal_equations import half_solved
 from calibration.inference.optimizers import informing, linearised
 from calibration.inference.problem import Problem
 from mmrjax import channels
 from mmrjax.compiling import SELDOM, compiled
+from mmrjax.fidelities.newton import implicit_slopes
+from mmrjax.fidelities.steady import IMPLICIT
+from mmrjax.robot import Robot
 
 #: Alternatives are foreseen in batches of a multiple of this, so that most classes share what is compiled.
 PAD = 4
@@ -189,15 +193,21 @@ def _predicted(
     def one(w: Array, z: Float[Array, " coordinates"], informed: Array) -> tuple[predicted.Predicted, Array]:
         here = problem.coordinates.with_effects(w)
 
-        def reading(x: Array) -> tuple[Array, predicted.Predicted]:
+        def robot(x: Array) -> Robot:
             base = problem.base if other is None else other.robot(problem.base, x[z.size :])
-            found = predicted.readings(here.robot(base, x[: z.size]), batch)
-            return found.value, found
+            return here.robot(base, x[: z.size])
 
-        lower = cholesky(informed.T @ informed)
         wide = jnp.concatenate([z, jnp.zeros(0 if other is None else len(other))])
-        slopes, found = jax.jacfwd(reading, has_aux=True)(wide)
-        half = jnp.concatenate([forward(lower, slopes[:, : z.size].T).T, slopes[:, z.size :]], 1)
+        unknowns, solved = predicted.of_runs(IMPLICIT.solve, robot(wide), batch)
+
+        def readings(x: Array) -> tuple[Any, predicted.Predicted]:
+            return predicted.readings(robot(x[: wide.size]), batch, unknowns + x[wide.size :], solved)
+
+        (acts, every, left), found = jax.jacfwd(readings, has_aux=True)(
+            jnp.concatenate([wide, jnp.zeros(unknowns.shape[1])])
+        )
+        slopes = predicted.arranged(batch, [a[:, : wide.size] for a in acts], implicit_slopes(every, left))
+        half = jnp.concatenate([half_solved(informed.T @ informed, slopes[:, : z.size].T).T, slopes[:, z.size :]], 1)
         exists = found.exists & jnp.all(jnp.isfinite(half), 1) & jnp.isfinite(found.value)
         return dataclasses.replace(found, exists=exists), half
 

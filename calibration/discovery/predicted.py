@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -17,10 +18,11 @@ from calibration.discovery.menu import Act, Experiment, Run
 from calibration.discovery.setups import Setup
 from mmrjax import channels
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.steady import operating_point
+from mmrjax.fidelities.steady import IMPLICIT
 from mmrjax.robot import Robot
 from mmrjax.signals import STALLED, done
 
+T = TypeVar("T")
 #: Mass of a robot whose weight is carried by stands [kg]: none, but for the sake of ratios to its load.
 UNLOADED = 1e-9
 
@@ -93,36 +95,56 @@ def _conditions(run: Run) -> Conditions:
     return Conditions(run.configuration, run.voltage, run.slope, run.payload, total_mass=mass)
 
 
-def readings(robot: Robot, experiments: Batch) -> Predicted:
-    """What the robot shows in every experiment."""
-    shown = [(value := act(robot, at), jnp.ones(value.shape, bool)) for act, at in zip(
-        experiments.acts, experiments.at, strict=True
-    )]  # fmt: skip
-    conditions, which = experiments.conditions, np.asarray(experiments.which)
-    own = jax.vmap(lambda k: robot.chassis(k).mass)(conditions.configuration) + conditions.payload
+def of_runs(function: Callable[..., T], robot: Robot, experiments: Batch, *own: Array) -> T:
+    """`function` of the robot as it is set up for every run, under what conditions, and of what each run has of its
+    own; a leading axis of runs."""
+    conditions = experiments.conditions
+    mass = jax.vmap(lambda k: robot.chassis(k).mass)(conditions.configuration) + conditions.payload
     stated = jnp.asarray(conditions.total_mass)
-    conditions = dataclasses.replace(conditions, total_mass=jnp.where(jnp.isnan(stated), own, stated))
+    conditions = dataclasses.replace(conditions, total_mass=jnp.where(jnp.isnan(stated), mass, stated))
     braked = jnp.max(experiments.brake, initial=0.0)
-    set_up = [
+    each = [
         dataclasses.replace(setup(robot, braked), sides=robot.sides if sides is None else sides)
         for setup, sides in experiments.set_up
     ]
-    robots = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x])[which], *set_up)
-    result = jax.vmap(lambda r, c: operating_point(r, c)[0])(robots, conditions)
+    which = np.asarray(experiments.which)
+
+    def same(*x: Any) -> bool:  # whatever the setup
+        return all(v is x[0] for v in x)
+
+    robots = jax.tree.map(lambda *x: x[0] if same(*x) else jnp.stack([jnp.asarray(v) for v in x])[which], *each)
+    axes = jax.tree.map(lambda *x: None if same(*x) else 0, *each)
+    return jax.vmap(function, in_axes=(axes, 0, *[0] * len(own)))(robots, conditions, *own)
+
+
+def readings(
+    robot: Robot, experiments: Batch, unknowns: Float[Array, "runs unknowns"], found: Bool[Array, " runs"]
+) -> tuple[tuple[tuple[Array, ...], Array, Array], Predicted]:
+    """What the robot shows in every act, what in every run at some unknowns, shape (runs, channels), and what its
+    equations leave there, (runs, unknowns); and all that it shows."""
+    acts = tuple(act(robot, at) for act, at in zip(experiments.acts, experiments.at, strict=True))
+    result, _, left = of_runs(IMPLICIT.shown, robot, experiments, unknowns, found)
     every = jnp.stack([result.reading[c] for c in channels.names(robot.channels)], -1)
-    held = np.array([setup is setups.blocked for setup, _ in experiments.set_up])[which]
+    held = np.array([experiments.set_up[k][0] is setups.blocked for k in experiments.which])
     does = jnp.where(jnp.asarray(held), result.status == STALLED, done(result.status))
-    first = 0
-    for read, runs in experiments.read:
-        rows = slice(first, first := first + runs)
-        value = every[rows][:, list(read)]
-        shown.append((value.ravel(), jnp.broadcast_to(does[rows, None], value.shape).ravel()))
-    values, exists = zip(*(shown[k] for k in experiments.order), strict=True)
+    exists = arranged(
+        experiments, [jnp.ones(a.shape, bool) for a in acts], jnp.broadcast_to(does[:, None], every.shape)
+    )
     speed = jnp.where(jnp.asarray(held), 0.0, result.reading["motor_speed"])
-    return Predicted(
-        jnp.concatenate(values), jnp.concatenate(exists), does, jnp.asarray(result.adhesion_used),
+    shown = Predicted(
+        arranged(experiments, acts, every), exists, does, jnp.asarray(result.adhesion_used),
         jnp.asarray(result.winding_settled), speed,
     )  # fmt: skip
+    return (acts, every, left), shown
+
+
+def arranged(experiments: Batch, acts: Sequence[Array], every: Float[Array, "runs channels ..."]) -> Array:
+    """What is known of the readings of every act, and of every run by channel, in the order of the readings."""
+    parts, first = list(acts), 0
+    for read, runs in experiments.read:
+        of_run = every[first : (first := first + runs)][:, list(read)]
+        parts.append(of_run.reshape(-1, *every.shape[2:]))
+    return jnp.concatenate([parts[k] for k in experiments.order])
 
 
 # --- where they stand -------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from calibration.inference.bases import Bases, signature
 from calibration.inference.linearization import Linearization, ScoredEffect
-from calibration.inference.normal_equations import cholesky, forward
+from calibration.inference.normal_equations import half_solved
 from calibration.inference.optimizers import CORES
 from calibration.inference.problem import Problem
 from mmrjax.compiling import SELDOM, SMALL, compiled
@@ -33,8 +33,8 @@ ABSORBED = 1e-3
 UNSETTLED = 0.05
 #: Prior sd of a curve's columns where they are fitted with the free parameters [σ]: wide, and keeps their rank.
 WIDE = 30.0
-#: Further columns are filled up to a multiple of this.
-FILLED = 36
+#: Coordinates are filled up to a multiple of this.
+FILLED = 72
 #: By which factors an estimated sd may be off.
 UNSURE = 0.3, 4.0
 #: Replicates in one batch of the bootstrap.
@@ -51,6 +51,7 @@ class ScoreTable(eqx.Module):
             zero where the two can't be told apart; cosine: between what is left of two signatures.
         curve: of each family, as a normal deviate, shape (families,); explained: its ridge score [σ²].
         row: signed root of the score of a shift of each reading alone, shape (rows, channels).
+        fall: of the objective that a step of the fit still predicts [½σ²].
     """
 
     single: Float[Array, " instances"]
@@ -61,25 +62,41 @@ class ScoreTable(eqx.Module):
     curve: Float[Array, " families"]
     explained: Float[Array, " families"]
     row: Float[Array, "rows channels"]
+    fall: Float[Array, ""]
 
 
-def _projected(linear: Linearization, columns: Array) -> tuple[Array, Array, Array]:
-    """What is left of columns over the readings: their products with e, the part Lᵀ in the fit, and L."""
-    jacobian = linear.jacobian
-    readings = columns.shape[0]
-    lower = cholesky(jacobian.T @ jacobian)
-    inside = forward(lower, jacobian[:readings].T @ columns)
-    e = linear.residual
-    dots = columns.T @ e[:readings] - inside.T @ forward(lower, jacobian.T @ e)
-    return dots, inside, lower
+class Fit(eqx.Module):
+    """How a fit answers, L Lᵀ = JᵀJ.
+
+    Attributes:
+        half: L⁻¹ Jᵀ of the readings, shape (coordinates, readings).
+        step: L⁻¹ Jᵀ e, shape (coordinates,); left: e of the readings, once the step is taken.
+    """
+
+    half: Float[Array, "coordinates readings"]
+    step: Float[Array, " coordinates"]
+    left: Float[Array, " readings"]
+
+    @staticmethod
+    def of(linear: Linearization) -> Fit:
+        """Of a linearisation."""
+        jacobian, e, readings = linear.jacobian, linear.residual, linear.readings
+        asked = jnp.concatenate([jacobian[:readings].T, (jacobian.T @ e)[:, None]], 1)
+        solved = half_solved(jacobian.T @ jacobian, asked)
+        half, step = solved[:, :-1], solved[:, -1]
+        return Fit(half, step, e[:readings] - half.T @ step)
+
+    def projected(self, columns: Array) -> tuple[Array, Array]:
+        """What is left of columns over the readings: their products with e, and those with each other."""
+        inside = self.half @ columns
+        return columns.T @ self.left, columns.T @ columns - inside.T @ inside
 
 
 def score_tests(linear: Linearization, bases: Bases) -> ScoreTable:
     """Scores of every instance, pair, curve and reading."""
-    g = linear.signatures
-    dots, inside, lower = _projected(linear, g)
+    g, fit = linear.signatures, Fit.of(linear)
+    dots, products = fit.projected(g)
     whole = jnp.sum(g**2, 0)
-    products = g.T @ g - inside.T @ inside
     norm2 = jnp.maximum(jnp.diag(products), 0.0)
     seen = norm2 > ABSORBED**2 * jnp.maximum(whole, 1e-300)
     norm = jnp.sqrt(jnp.where(seen, norm2, 1.0))
@@ -90,37 +107,33 @@ def score_tests(linear: Linearization, bases: Bases) -> ScoreTable:
     both = (single[:, None] ** 2 + single**2 - 2 * cosine * single[:, None] * single) / jnp.maximum(apart, 1e-9)
     pair = jnp.where(apart > 1e-2, both, 0.0)
 
-    readings = g.shape[0]
-    jacobian, e = linear.jacobian[:readings], linear.residual
-    half = forward(lower, jacobian.T)
-    leverage = jnp.sum(half**2, 0)
-    fitted = e[:readings] - half.T @ forward(lower, linear.jacobian.T @ e)
-    row = jnp.where(leverage < 1 - 1e-6, fitted / jnp.sqrt(jnp.maximum(1 - leverage, 1e-12)), 0.0)
+    leverage = jnp.sum(fit.half**2, 0)
+    row = jnp.where(leverage < 1 - 1e-6, fit.left / jnp.sqrt(jnp.maximum(1 - leverage, 1e-12)), 0.0)
 
-    found = [jax.vmap(lambda c: _curve_score(linear, c))(basis.signatures(linear)) for basis in bases]
+    found = [jax.vmap(lambda c: _curve_score(fit, c))(basis.signatures(linear)) for basis in bases]
     deviate, explained = (jnp.concatenate([f[k] for f in found] or [jnp.zeros(0)]) for k in (0, 1))
     amplitude = jnp.where(seen, -dots / norm**2, 0.0)
     row = row.reshape(linear.rows, -1)
-    return ScoreTable(single, amplitude, jnp.sqrt(norm2), pair, cosine, deviate, explained, row)
+    fall = 0.5 * jnp.sum(fit.step**2)
+    return ScoreTable(single, amplitude, jnp.sqrt(norm2), pair, cosine, deviate, explained, row, fall)
 
 
-def _curve_score(linear: Linearization, columns: Array) -> tuple[Array, Array]:
+def _curve_score(fit: Fit, columns: Array) -> tuple[Array, Array]:
     """(rᵀe)ᵀ (rᵀr + I)⁻¹ (rᵀe), and the same as a normal deviate.
 
     The columns are scaled so that each by itself leaves ten sigmas: a prior that the discrepancy is of such a size.
     """
-    dots, inside, _ = _projected(linear, columns)
-    products = columns.T @ columns - inside.T @ inside
+    dots, products = fit.projected(columns)
     norm2 = jnp.diag(products)
     seen = norm2 > ABSORBED**2 * jnp.maximum(jnp.sum(columns**2, 0), 1e-300)
     scale = jnp.where(seen, 10.0 / jnp.sqrt(jnp.where(seen, norm2, 1.0)), 0.0)
     products = products * scale[:, None] * scale
     dots = dots * scale
-    lower = cholesky(products + jnp.eye(dots.size))
-    half = forward(lower, dots)
-    explained = jnp.sum(half**2)
+    asked = jnp.concatenate([dots[:, None], jnp.eye(dots.size)], 1)
+    half = half_solved(products + jnp.eye(dots.size), asked)
+    explained = jnp.sum(half[:, 0] ** 2)
     # E = tr(A (A + I)⁻¹) under the null: degrees of freedom.
-    freedom = dots.size - jnp.sum(forward(lower, jnp.eye(dots.size)) ** 2)
+    freedom = dots.size - jnp.sum(half[:, 1:] ** 2)
     deviate = normal_deviate(explained, jnp.maximum(freedom, 1e-3))
     return jnp.where(jnp.any(seen), deviate, -1.0 / ABSORBED), explained
 
@@ -155,27 +168,43 @@ class Statistics(eqx.Module):
 
 def strongest(scores: ScoreTable, linear: Linearization) -> Statistics:
     """The largest statistics of a table; what a bootstrap draws the distribution of."""
-    e, jacobian = linear.residual, linear.jacobian
-    decrement = 0.5 * jnp.sum(forward(cholesky(jacobian.T @ jacobian), jacobian.T @ e) ** 2)
     return Statistics(
         jnp.max(jnp.abs(scores.single)),
         jnp.max(scores.pair),
         jnp.max(scores.curve),
-        jnp.sum(e**2),
+        jnp.sum(linear.residual**2),
         linear.memory(),
-        decrement < UNSETTLED,
+        scores.fall < UNSETTLED,
     )
 
 
 Diagnosed = tuple[Linearization, ScoreTable, Statistics]
 
 
-@functools.partial(compiled, options=SELDOM)
 def diagnosed(problem: Problem, z: Array, effects: tuple[ScoredEffect, ...], bases: Bases) -> Diagnosed:
     """A fit linearised, what effects and curves could explain of its residual, and the strongest of that."""
-    linear = problem.observe.linearise(problem, z, problem.data, effects)
+    linear = _linearised(problem, z, effects)
+    return linear, *_looked_at(linear, bases)
+
+
+@functools.partial(compiled, options=SELDOM)
+def _linearised(problem: Problem, z: Array, effects: tuple[ScoredEffect, ...]) -> Linearization:
+    return problem.observe.linearise(problem, z, problem.data, effects)
+
+
+def _looked_at(linear: Linearization, bases: Bases) -> tuple[ScoreTable, Statistics]:
+    """Scores and the strongest of them, by a program that serves fits of any number of coordinates: to so many more
+    of them, of which readings tell nothing, that the sizes are few."""
+    filled = np.zeros((linear.readings, -linear.jacobian.shape[1] % FILLED))
+    jacobian, residual = augment_with_columns(linear, filled)
+    wide: Any = {"jacobian": jacobian, "residual": residual}
+    return _scores_and_strongest(dataclasses.replace(jax.tree.map(np.asarray, linear), **wide), bases)
+
+
+@functools.partial(compiled, options=SELDOM)
+def _scores_and_strongest(linear: Linearization, bases: Bases) -> tuple[ScoreTable, Statistics]:
     scores = score_tests(linear, bases)
-    return linear, scores, strongest(scores, linear)
+    return scores, strongest(scores, linear)
 
 
 def family_columns(linear: Linearization, bases: Bases, chosen: int) -> np.ndarray:
@@ -218,11 +247,8 @@ def beside_columns(
     Args:
         extra: columns over the readings, shape (readings, columns); of: their places.
     """
-    filled = np.pad(extra, ((0, 0), (0, -extra.shape[1] % FILLED)))  # to few sizes: each is compiled
-    wide: tuple[Any, Any] = augment_with_columns(linear, filled)
-    linear = jax.tree.map(np.asarray, linear)
-    padded = dataclasses.replace(linear, jacobian=wide[0], residual=wide[1])
-    scores = _score_tests(padded, bases)
+    wide: tuple[Any, Any] = augment_with_columns(linear, extra)
+    scores, _ = _looked_at(dataclasses.replace(linear, jacobian=wide[0], residual=wide[1]), bases)
     balances = np.array([n[0] for b in bases for n in b.names])
     deviate = np.where(np.isin(balances, list(of)), -np.inf, np.asarray(scores.curve))
     nothing = jnp.asarray(-jnp.inf)
@@ -235,9 +261,6 @@ def beside_columns(
         settled=jnp.asarray(True),
     )
     return found, deviate
-
-
-_score_tests = compiled(score_tests, options=SELDOM)
 
 
 def bootstrap(

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from calibration.inference.normal_equations import backward, cholesky, forward
+from calibration.inference.normal_equations import half_solved, solved
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax.compiling import SELDOM, SMALL, compiled
 from mmrjax.robot import Robot
@@ -127,11 +127,6 @@ def informing(data: Data) -> np.ndarray:
     return np.r_[: held.start, held.stop : held.stop + data.centre.size]
 
 
-def _signed(problem: Problem, seen: Observation, data: Data) -> Array:
-    """Residuals of readings and penalties; that of a row which leaves some of its adhesion's margin is negative."""
-    return jnp.concatenate([problem.whitened(seen, data)[: data.measured.size], problem.excess(seen, data)])
-
-
 def counted(r: Array, jacobian: Array, held: slice) -> tuple[Array, Array]:
     """Residuals and Jacobian as they count: penalties only where they are positive."""
     counts = jnp.ones(r.shape, bool).at[held].set(r[held] > 0)
@@ -163,8 +158,7 @@ def stride_of(r: Array, jacobian: Array, held: slice, damping: Array | float) ->
     def again(carry: tuple) -> tuple:
         turns, active, _, best, lowest = carry
         counts = edge * active[:, None]
-        lower = cholesky(normal + counts.T @ counts)
-        d = -backward(lower, forward(lower, gradient + counts.T @ height))
+        d = -solved(normal + counts.T @ counts, gradient + counts.T @ height)
         beyond, here = height + edge @ d > 0, value(d)
         better = here < lowest
         return turns + 1, beyond, active, jnp.where(better, d, best), jnp.where(better, here, lowest)
@@ -183,15 +177,10 @@ def _evaluated(problem: Problem, data: Data, pin: Pin) -> Callable[[Z], tuple[Ar
     """Residuals (readings, penalties with their signs, then prior), their Jacobian, and what the model says of every
     row, as a function of z: one evaluation serves all three."""
 
-    def function(x: Z) -> tuple[Array, tuple[Array, Observation]]:
-        seen = problem.observation(pin.apply(x))
-        prior = jnp.where(pin.held, x - pin.at, x - data.centre)
-        r = jnp.concatenate([_signed(problem, seen, data), prior])
-        return r, (r, seen)
-
     def at(z: Z) -> tuple[Array, Array, Observation]:
-        jacobian, (r, seen) = jax.jacfwd(function, has_aux=True)(z)
-        return r, jacobian, seen
+        r, jacobian, seen, _ = problem.linearised(lambda x: problem.robot(pin.apply(x)), z, data)
+        prior = jnp.where(pin.held, z - pin.at, z - data.centre)
+        return jnp.concatenate([r, prior]), jnp.concatenate([jacobian, jnp.eye(z.size)]), seen
 
     return at
 
@@ -199,8 +188,7 @@ def _evaluated(problem: Problem, data: Data, pin: Pin) -> Callable[[Z], tuple[Ar
 def _optimum(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array) -> Optimum:
     held_rows = penalties(data)
     informed = jacobian[informing(data)]
-    lower = cholesky(informed.T @ informed)
-    half = forward(lower, jnp.eye(z.shape[0]))
+    half = half_solved(informed.T @ informed, jnp.eye(z.shape[0]))
     sd = jnp.linalg.norm(half, axis=0)
     ahead = r + jacobian @ stride_of(r, jacobian, held_rows, 0.0)
     decrement = _cost(r, held_rows) - _cost(ahead, held_rows)
@@ -516,12 +504,7 @@ def linearised_signed(problem: Problem, z: Z, data: Data) -> tuple[Array, Array,
     derivative grows without limit; such a reading, if it counts, counts as one that could not be computed.
     """
 
-    def function(z: Z) -> tuple[Array, tuple[Array, Observation]]:
-        seen = problem.observation(z)
-        r = jnp.concatenate([_signed(problem, seen, data), z - data.centre])
-        return r, (r, seen)
-
-    jacobian, (r, seen) = jax.jacfwd(function, has_aux=True)(z)
+    r, jacobian, seen = _evaluated(problem, data, no_pin(z.size))(z)
     return *_known(r, jacobian, data), seen
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 from collections.abc import Iterable, Sequence
@@ -16,7 +17,7 @@ from jaxtyping import Array, Float
 from calibration.data.errors import BadConfiguration, choices, number
 from calibration.data.surfaces import GROUND
 from mmrjax import params
-from mmrjax.compiling import compiled
+from mmrjax.compiling import SELDOM, compiled
 from mmrjax.params import Parameter
 from mmrjax.robot import Robot
 
@@ -145,12 +146,12 @@ class Coordinates(eqx.Module):
         return np.where(u <= own.low, -1, np.where(u >= own.high, 1, 0))
 
 
-@compiled
+@functools.partial(compiled, options=SELDOM)
 def _numbers(coordinates: Coordinates, z: Float[Array, " parameters"]) -> tuple[Array, ...]:
     """Parameters at coordinates z and those tied to them, one by one [SI]."""
     theta = coordinates.value(z)
-    tied = (coordinates.ratios[n] * theta[k] for n, (_, k) in enumerate(coordinates.followers))
-    return (*(theta[k] for k in range(len(coordinates))), *tied)
+    tied = coordinates.ratios * theta[np.array([k for _, k in coordinates.followers], int)]
+    return (*params.one_by_one(theta), *params.one_by_one(tied))
 
 
 def known(robot: Robot) -> dict[str, Parameter]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -11,7 +12,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mmrjax.channels import Channel
+from mmrjax.fidelities.newton import implicit_slopes
 from mmrjax.robot import Robot
+from mmrjax.signals import Signals
 
 if TYPE_CHECKING:
     from calibration.inference.observers import Observer
@@ -112,6 +115,44 @@ class Problem(eqx.Module):
         error = (seen.reading - data.measured) / data.sd
         error = data.weight * jnp.where(jnp.isfinite(error), error, MISSING)
         return jnp.concatenate([error.ravel(), jax.nn.relu(self.excess(seen, data))])
+
+    def signed(self, seen: Observation, data: Data) -> Float[Array, " residuals"]:
+        """The same, that of adhesion negative where a row leaves some of its margin."""
+        return jnp.concatenate([self.whitened(seen, data)[: data.measured.size], self.excess(seen, data)])
+
+    def linearised(
+        self, robot: Callable[[Array], Robot], x: Float[Array, " x"], data: Data
+    ) -> tuple[Array, Array, Observation, Signals | None]:
+        """What a robot that depends on x shows, all of it by one evaluation.
+
+        Returns:
+            Residuals of readings, then of adhesion with their signs; their Jacobian by x; the observation; and the
+            signals of every row, where the observer solves its equations (`Observer.solve`).
+        """
+        solved = self.observe.solve(robot(x))
+        if solved is None:
+
+            def explicit(x: Array) -> tuple[Array, tuple[Array, Observation]]:
+                seen = self.observe(robot(x))
+                r = self.signed(seen, data)
+                return r, (r, seen)
+
+            jacobian, (r, seen) = jax.jacfwd(explicit, has_aux=True)(x)
+            return r, jacobian, seen, None
+
+        unknowns, found = solved
+        size, (rows, count) = x.size, data.measured.shape
+
+        def shown(x: Array) -> tuple[tuple[Array, Array], tuple[Array, Observation, Signals]]:
+            seen, signals, left = self.observe.shown(robot(x[:size]), unknowns + x[size:], found)
+            r = self.signed(seen, data)
+            return (r, left), (r, seen, signals)
+
+        wide = jnp.concatenate([x, jnp.zeros(unknowns.shape[1])])
+        (slope, left), (r, seen, signals) = jax.jacfwd(shown, has_aux=True)(wide)
+        by_row = slope[: rows * count].reshape(rows, count, -1)
+        by_row = implicit_slopes(jnp.concatenate([by_row, slope[rows * count :, None]], 1), left)
+        return r, jnp.concatenate([by_row[:, :count].reshape(-1, size), by_row[:, count]]), seen, signals
 
     def excess(self, seen: Observation, data: Data) -> Float[Array, " rows"]:
         """Demand on adhesion over its margin, as the penalty counts it; negative where a row leaves some."""

@@ -128,6 +128,21 @@ def _nothing_to_say(robot: Robot, conditions: Conditions) -> list[str]:
 
 
 @dataclasses.dataclass(frozen=True)
+class Implicit:
+    """Settled travel of one run in two halves, so that one evaluation serves all derivatives of a fit.
+
+    Attributes:
+        solve: the unknowns, shape (unknowns,), and whether they were found; no derivatives.
+        shown: result and signals at some unknowns (differentiable in them and in the robot), and what the equations
+            leave there, shape (unknowns,). What asks more of the ground than it holds is said to slide: in a fit
+            it is out of reach, slide or stand.
+    """
+
+    solve: Callable[[Robot, Conditions], tuple[Array, Array]]
+    shown: Callable[[Robot, Conditions, Array, Array], tuple[Result, Signals, Array]]
+
+
+@dataclasses.dataclass(frozen=True)
 class Fidelity:
     """One way to simulate a robot. Each module of a fidelity ends with its own.
 
@@ -135,6 +150,7 @@ class Fidelity:
         name: its line in `fidelities.TABLE`.
         settled: a batch of conditions to results, pure and traceable, with numbers wherever it can give some,
             whatever the status: what calibrations differentiate (forward).
+        implicit: the same of straight travel in two halves; None where it is not the root of equations.
         run: results of a batch, as sweeps make them.
         outputs: those of a batch that are named alone [SI], of `outputs.table`, and `status`, which is quicker than
             `run`; None where it would not be. A fidelity that has it has no options.
@@ -148,6 +164,7 @@ class Fidelity:
     settled: Callable[[Robot, Conditions], Result]
     run: Simulate
     outputs: Callable[[Robot, Conditions, tuple[str, ...]], dict[str, Array]] | None = None
+    implicit: Implicit | None = None
     histories: Simulate | None = None
     check: Callable[[Robot, Conditions, Mapping[str, float]], None] = _nothing_to_refuse
     cautions: Callable[[Robot, Conditions], list[str]] = _nothing_to_say

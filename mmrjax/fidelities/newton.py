@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from mmrjax.fidelities.elimination import Entry, Matrix, Vector, factorise, regular, substitute
 
@@ -21,8 +21,17 @@ Residual = Callable[[Vector, Any, Any], Vector]
 MAX_STEPS = 40
 
 
-def _linearised(residual: Residual, y: Vector, shared: Any, own: Any) -> tuple[Matrix, Vector]:
-    """∂f/∂y by its rows, and f; by one unknown after another, so that what does not depend on it costs nothing."""
+def _linearised(residual: Residual, y: Vector, shared: Any, own: Any, apart: bool) -> tuple[Matrix, Vector]:
+    """∂f/∂y by its rows, and f. `apart` by one unknown after another, so that what does not depend on it costs
+    nothing; else by all together, which is a third of the program."""
+    if not apart:
+
+        def together(y: Array) -> tuple[Vector, Vector]:
+            values = residual(tuple(y), shared, own)
+            return values, values
+
+        slopes, value = jax.jacfwd(together, has_aux=True)(jnp.stack(y))
+        return [tuple(row) for row in slopes], value
     columns: list[list[Entry]] = []
     value = y
     for k in range(len(y)):
@@ -57,9 +66,9 @@ def _small(value: Vector, tolerance: float) -> Bool[Array, ""]:
     return functools.reduce(jnp.logical_and, [jnp.abs(x) < tolerance for x in value])
 
 
-def _step(residual: Residual, y: Vector, shared: Any, own: Any) -> tuple[Vector, Vector]:
+def _step(residual: Residual, y: Vector, shared: Any, own: Any, apart: bool) -> tuple[Vector, Vector]:
     """y - J⁻¹ f, each unknown as it was where that is no number; and J⁻¹ f."""
-    jacobian, value = _linearised(residual, y, shared, own)
+    jacobian, value = _linearised(residual, y, shared, own, apart)
     step = tuple(jnp.zeros(()) if x is None else x for x in substitute(factorise(jacobian), value))
     return tuple(jnp.where(jnp.isfinite(b), a - b, a) for a, b in zip(y, step, strict=True)), step
 
@@ -81,7 +90,7 @@ def root(
         shared, own: what f depends on beside y: data of all members of a batch and of each. Derivatives by both
             are implicit, dy = -(∂f/∂y)⁻¹ (∂f/∂shared dshared + ∂f/∂own down), forward and reverse, zero where ∂f/∂y
             is singular. The program holds no host callback.
-        linear: whether f is linear in y but for branches; right for any f, fast for such.
+        linear: whether f is linear in y but for branches, and the batch large; right for any f, fast for such.
 
     Returns:
         y, and whether it was there within `MAX_STEPS` turns; one whose residual is not finite is not.
@@ -99,12 +108,12 @@ def root(
             # what the turns have in common before the first of them, also where there is none.
             here = jax.tree.map(lambda x: jnp.where(solved, jnp.ones_like(x), x), own)
         # A step so small leaves an error of its square.
-        y, step = _step(residual, y, shared, here)
+        y, step = _step(residual, y, shared, here, linear)
         return count + 1, y, _small(step, tolerance**0.7)
 
     y, solved = start, jnp.asarray(False)
     if linear:
-        y, _ = _step(residual, start, shared, own)
+        y, _ = _step(residual, start, shared, own, linear)
         solved = _small(residual(y, shared, own), tolerance)
     _, y, solved = jax.lax.while_loop(going, turn, (jnp.asarray(0, jnp.int8), y, solved))
     return y, solved
@@ -117,9 +126,29 @@ def _implicit(primals: tuple, tangents: tuple) -> tuple[tuple[Vector, Array], tu
     moved = eqx.filter_jvp(lambda *given: residual(y, *given), (shared, own), tangents[2:4])[1]
     if moved is None or all(m is None for m in moved):
         return (y, solved), (tuple(jnp.zeros_like(x) for x in y), None)
-    factors, own_factors = regular(factorise(_linearised(residual, y, shared, own)[0]))
+    factors, own_factors = regular(factorise(_linearised(residual, y, shared, own, linear)[0]))
     step = substitute(factors, moved)
     change = tuple(
         jnp.zeros_like(a) if b is None else jnp.where(own_factors, -b, 0.0) for a, b in zip(y, step, strict=True)
     )
     return (y, solved), (change, None)
+
+
+def implicit_slopes(slope: Float[Array, "rows outputs x_and_y"], left: Float[Array, "rows n x_and_y"]) -> Array:
+    """Slopes of what rows show by x, where the unknowns y of each row follow from f(x, y) = 0.
+
+    Args:
+        slope: ∂/∂x of the outputs, then ∂/∂y; left: the same of f, one equation for each of the n unknowns, in the
+            order of `root`.
+
+    Returns:
+        Shape (rows, outputs, x): ∂/∂x - ∂/∂y (∂f/∂y)⁻¹ ∂f/∂x, without the second where ∂f/∂y is singular.
+    """
+    n = left.shape[1]
+    size = left.shape[2] - n
+    factors, own = regular(factorise([[left[:, i, size + j, None] for j in range(n)] for i in range(n)]))
+    by_x = slope[:, :, :size]
+    for k, moved in enumerate(substitute(factors, [left[:, i, :size] for i in range(n)])):
+        assert moved is not None
+        by_x = by_x - slope[:, :, size + k, None] * jnp.where(own, moved, 0.0)[:, None, :]
+    return by_x

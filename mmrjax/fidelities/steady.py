@@ -10,17 +10,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mmrjax import balances, channels, outputs
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import turning
-from mmrjax.fidelities.base import Fidelity, Progress, Run
+from mmrjax.fidelities.base import Fidelity, Implicit, Progress, Run
 from mmrjax.fidelities.elimination import Vector
 from mmrjax.fidelities.newton import root
 from mmrjax.fidelities.rest import creeps, direction, slides_in_place, voltage_at_rest
 from mmrjax.fidelities.result import result, travels, turned, withhold
+from mmrjax.params import Scalar
 from mmrjax.rarely import rarely
 from mmrjax.robot import Robot
 from mmrjax.signals import (
@@ -55,6 +56,11 @@ def _residual(unknowns: Vector, robot: Robot, own: tuple[Conditions, Array]) -> 
     robot = robot.within(conditions.configuration)
     _, conditions = _sound(robot, conditions)
     signals, creep = _balanced(robot, conditions, _state(unknowns, conditions.discharge), sense)
+    return _left(unknowns, conditions, sense, signals, creep)
+
+
+def _left(unknowns: Vector, conditions: Conditions, sense: Array, signals: Signals, creep: Scalar) -> Vector:
+    """What the balances leave at some unknowns, all 0 at the operating point."""
     # Moving with balanced torques, or at rest with too little torque: speed >= 0, torque <= 0 in the direction of
     # travel, one of them 0.
     lacking, moving = -sense * signals.torque_net / _TORQUE, sense * unknowns[2]
@@ -93,14 +99,14 @@ def _start(robot: Robot, conditions: Conditions) -> Vector:
     )
 
 
-def _root(robot: Robot, conditions: Conditions) -> tuple[State, Array]:
-    """The state at which the balances close, and whether the search got there; derivatives are implicit."""
+def _root(robot: Robot, conditions: Conditions, linear: bool) -> tuple[Vector, Array]:
+    """The unknowns at which the balances close, and whether the search got there; derivatives are implicit. `linear`
+    as of `root`."""
     tolerance = float(jnp.finfo(jnp.result_type(conditions.voltage)).eps) ** 0.85
     sound = _sound(robot, conditions)[1]
     start = jax.lax.stop_gradient(_start(robot, sound))
     own = conditions, direction(robot, sound)
-    unknowns, solved = root(_residual, start, robot, own, tolerance, not robot.effects)
-    return _state(unknowns, sound.discharge), solved
+    return root(_residual, start, robot, own, tolerance, linear)
 
 
 @compiled
@@ -113,9 +119,9 @@ def operating_signals(robot: Robot, conditions: Conditions) -> Signals:
     robot that turns those of each side, along an axis of 2."""
     if conditions.turns:
         return _circled(robot, conditions)
-    state, _ = _root(robot, conditions)
+    unknowns, _ = _root(robot, conditions, not robot.effects)
     _, sound = _sound(robot, conditions)
-    return _balanced(robot, sound, state, direction(robot, sound))[0]
+    return _balanced(robot, sound, _state(unknowns, sound.discharge), direction(robot, sound))[0]
 
 
 def steady(robot: Robot, conditions: Conditions) -> Result:
@@ -183,12 +189,24 @@ def _slides_in_place(robot: Robot, conditions: Conditions) -> Array:
 
 def operating(robot: Robot, conditions: Conditions) -> tuple[Signals, Array, Array]:
     """Every signal of `operating_point`, its status, and whether robot and conditions are sound."""
-    state, solved = _root(robot, conditions)
+    unknowns, solved = _root(robot, conditions, not robot.effects)
+    return _operating_at(robot, conditions, unknowns, solved)[:3]
+
+
+def _operating_at(
+    robot: Robot, conditions: Conditions, unknowns: Vector, solved: Array, stands: bool = True
+) -> tuple[Signals, Array, Array, Vector]:
+    """`operating` at some unknowns, and what the balances leave there.
+
+    Args:
+        stands: whether it is found out if a run beyond the limit of adhesion slides or stands; else it `slides`.
+    """
     given = jax.lax.stop_gradient((robot, conditions))  # as they came: nothing is stored for a loop that seldom turns
     robot = robot.within(conditions.configuration)
     sound, conditions = _sound(robot, conditions)
     sense = direction(robot, conditions)
-    signals, _ = _balanced(robot, conditions, state, sense)
+    signals, creep = _balanced(robot, conditions, _state(unknowns, conditions.discharge), sense)
+    left = _left(unknowns, conditions, sense, signals, creep)
     rest = robot.chassis(conditions.configuration).speed_still
     voltage = voltage_at_rest(robot, conditions)
     still = creeps(sense, voltage, signals.speed_theoretical, signals.speed, rest)
@@ -197,13 +215,13 @@ def operating(robot: Robot, conditions: Conditions) -> tuple[Signals, Array, Arr
     status = jnp.where(still, STALLED, travels(signals.speed, voltage))
     if robot.has_ground:
         beyond = jnp.abs(signals.demand) > signals.adhesion_limit
-        slides = rarely(beyond, _slides_in_place, given, jnp.zeros_like(beyond))
+        slides = rarely(beyond, _slides_in_place, given, jnp.zeros_like(beyond)) if stands else beyond
         status = jnp.where(beyond, jnp.where(slides, SLIDES, STALLED), status)
     status = jnp.where(solved, status, FAILED)
     empty = (conditions.battery > 0.5) & robot.battery.empty(conditions.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
     status = jnp.where(sound, status, FAILED)
-    return signals, status, sound
+    return signals, status, sound, left
 
 
 def _axes(tree: Any) -> Any:
@@ -283,6 +301,22 @@ def _settled(robot: Robot, conditions: Conditions) -> Result:
     return jax.vmap(lambda c: operating_point(robot, c)[0])(conditions)
 
 
+def _solve(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " unknowns"], Bool[Array, ""]]:
+    unknowns, found = _root(robot, conditions, linear=False)
+    return jax.lax.stop_gradient((jnp.stack(unknowns), found))
+
+
+def _shown(
+    robot: Robot, conditions: Conditions, unknowns: Float[Array, " unknowns"], found: Bool[Array, ""]
+) -> tuple[Result, Signals, Float[Array, " unknowns"]]:
+    signals, status, _, left = _operating_at(robot, conditions, tuple(unknowns), found, stands=False)
+    return result(robot.within(conditions.configuration), signals, status), signals, jnp.stack(left)
+
+
+#: `operating_point` in two halves.
+IMPLICIT = Implicit(_solve, _shown)
+
+
 def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None) -> Run:
     return Run(steady_batch(robot, conditions))
 
@@ -304,4 +338,4 @@ def _check(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -
             )
 
 
-FIDELITY = Fidelity("steady", settled=_settled, run=_run, outputs=steady_outputs, check=_check)
+FIDELITY = Fidelity("steady", settled=_settled, implicit=IMPLICIT, run=_run, outputs=steady_outputs, check=_check)

@@ -23,6 +23,7 @@ from calibration.inference.problem import Data, Observation, Problem
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.robot import Robot
+from mmrjax.signals import Signals
 
 if TYPE_CHECKING:
     from calibration.discovery.adequacy import Diagnosis
@@ -178,6 +179,15 @@ class Observer(eqx.Module):
     @abc.abstractmethod
     def __call__(self, robot: Robot) -> Observation:
         """What a robot shows in every row."""
+
+    def solve(self, robot: Robot) -> tuple[Array, Array] | None:
+        """Where what rows show is a root: the unknowns of each, shape (rows, unknowns), and which were found."""
+        return None
+
+    def shown(self, robot: Robot, unknowns: Array, found: Array) -> tuple[Observation, Signals, Array]:
+        """What a robot shows in every row at such unknowns, its signals, and what its equations leave there, shape
+        (rows, unknowns)."""
+        raise NotImplementedError
 
     @property
     @abc.abstractmethod

@@ -31,7 +31,7 @@ from calibration.inference.bases import Bases
 from calibration.inference.details import Memory, Strongest, TimeSide, TimeStatistics
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
-from calibration.inference.normal_equations import backward, cholesky, forward
+from calibration.inference.normal_equations import solved
 from calibration.inference.notes import CoarseSteps, ManyChanges, Note, StopsOnSlope
 from calibration.inference.observers import settled_ends
 from calibration.inference.observers.base import Observer, SearchPolicy
@@ -524,10 +524,9 @@ class Histories(Observer):
         self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Array
     ) -> Linearization:
         jacobian = linear.jacobian
-        lower = cholesky(jacobian.T @ jacobian)
         counts = jnp.concatenate([data.weight.ravel(), jnp.zeros(linear.rows), jnp.ones(jacobian.shape[1])])
         noise = counts * jax.random.normal(jax.random.wrap_key_data(drawn), counts.shape)
-        return linear.with_residual(noise - jacobian @ backward(lower, forward(lower, jacobian.T @ noise)))
+        return linear.with_residual(noise - jacobian @ solved(jacobian.T @ jacobian, jacobian.T @ noise))
 
     def starts(self, problem: Problem, random: np.random.Generator, count: int) -> Float[np.ndarray, "starts z"]:
         """As the protocol says; see `settled_ends`."""
@@ -881,8 +880,7 @@ def _over_delays(problem: Problem, z: Array, data: Data, scanned: Array, values:
 def _moved(residual: Array, jacobian: Array, z: Array, held: Array) -> tuple[Array, Array]:
     """Objective at the minimum of a linearisation in which one coordinate is held, and the coordinates there."""
     free = jnp.where(held, 0.0, jacobian)
-    lower = cholesky(free.T @ free + jnp.diag(held.astype(float)))
-    step = -backward(lower, forward(lower, free.T @ residual))
+    step = -solved(free.T @ free + jnp.diag(held.astype(float)), free.T @ residual)
     return 0.5 * jnp.sum((residual + free @ step) ** 2), z + step
 
 

@@ -23,16 +23,17 @@ from calibration.inference.linearization import Linearization, ScoredEffect, fin
 from calibration.inference.noise import Noise
 from calibration.inference.notes import Note
 from calibration.inference.observers.base import Observer, SearchPolicy
-from calibration.inference.optimizers import Member, Numbers, Optimum, searches_refilled
+from calibration.inference.optimizers import Member, Numbers, Optimum, counted, penalties, searches_refilled
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax import balances, channels, fidelities
 from mmrjax.compiling import SELDOM, compiled
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
+from mmrjax.fidelities.base import Implicit
 from mmrjax.fidelities.steady import operating_signals
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-from mmrjax.signals import FAILED, SLIDES, TIPS, Signals
+from mmrjax.signals import FAILED, SLIDES, TIPS, Result, Signals
 
 if TYPE_CHECKING:
     from calibration.discovery.adequacy import Diagnosis
@@ -179,9 +180,25 @@ class SettledRuns(Observer):
         return self.of_size
 
     def __call__(self, robot: Robot) -> Observation:
-        result = fidelities.get(self.fidelity).settled(robot, self.conditions)
+        return self._observed(robot, fidelities.get(self.fidelity).settled(robot, self.conditions))
+
+    def _observed(self, robot: Robot, result: Result) -> Observation:
         reading = jnp.stack([result.reading[name] for name in channels.names(robot.channels)], -1)
         return Observation(reading, jnp.asarray(result.adhesion_used), result.status, jnp.asarray(result.flags))
+
+    @property
+    def _implicit(self) -> Implicit | None:
+        return None if self.conditions.turns else fidelities.get(self.fidelity).implicit
+
+    def solve(self, robot: Robot) -> tuple[Array, Array] | None:
+        implicit = self._implicit
+        return None if implicit is None else jax.vmap(lambda c: implicit.solve(robot, c))(self.conditions)
+
+    def shown(self, robot: Robot, unknowns: Array, found: Array) -> tuple[Observation, Signals, Array]:
+        assert self._implicit is not None
+        one = functools.partial(self._implicit.shown, robot)
+        result, signals, left = jax.vmap(one)(self.conditions, unknowns, found)
+        return self._observed(robot, result), signals, left
 
     @property
     def long(self) -> bool:
@@ -209,19 +226,21 @@ class SettledRuns(Observer):
         probes = tuple(probe(b) for b in kind.probed)
         robot, size, shown = problem.robot(z), z.size, channels.names(problem.channels)
 
-        def whitened(x: Array) -> Array:
-            z, delta = x[:size], x[size:].reshape(len(probes), *self.shape_sides)
-            there = problem.robot(z)
+        def probed(x: Array) -> Robot:
+            delta = x[size:].reshape(len(probes), *self.shape_sides)
+            there = problem.robot(x[:size])
             put = tuple(eqx.tree_at(lambda e: e.amplitude, p, d) for p, d in zip(probes, delta, strict=True))
-            there = dataclasses.replace(there, effects=(*there.effects, *put))
-            return jnp.concatenate([problem.whitened(self(there), data), z - data.centre])
+            return dataclasses.replace(there, effects=(*there.effects, *put))
 
-        jacobian, residual = jax.jacfwd(lambda x: (whitened(x),) * 2, has_aux=True)(
-            jnp.concatenate([z, jnp.zeros(len(probes) * math.prod(self.shape_sides))])
-        )
+        wide = jnp.concatenate([z, jnp.zeros(len(probes) * math.prod(self.shape_sides))])
+        r, slopes, _, signals = problem.linearised(probed, wide, data)
+        r, slopes = counted(r, slopes, penalties(data))
+        jacobian = jnp.concatenate([slopes, jnp.eye(size, wide.size)])
+        residual = jnp.concatenate([r, z - data.centre])
         rows, count = data.measured.shape
         defects = jacobian[: rows * count, size:].reshape(rows, count, len(probes), -1).transpose(2, 3, 0, 1)
-        signals = jax.vmap(lambda c: operating_signals(robot, c))(self.conditions)
+        if signals is None:
+            signals = jax.vmap(lambda c: operating_signals(robot, c))(self.conditions)
         each = jax.tree.map(lambda x: x.reshape(-1), signals)
         scale = data.weight / data.sd
 
