@@ -60,8 +60,8 @@ def keep_programs() -> Path | None:
     """Keep every compiled program, however small, and read those that earlier processes kept, as the commands do.
 
     To be called before anything compiles. A cache that JAX has been given by its own settings
-    (`JAX_COMPILATION_CACHE_DIR`) stays. An entry that cannot be read is compiled again. `MMRJAX_CACHE` is the folder to
-    hold caches, or `off`; without it `~/.cache/mmrjax`.
+    (`JAX_COMPILATION_CACHE_DIR`) stays. An entry that cannot be read is compiled again. `MMRJAX_CACHE` is the folder
+    to hold caches, or `off`; without it `~/.cache/mmrjax`.
 
     Returns:
         The folder; None where the cache is switched off or its place cannot be written to, which is no error.
