@@ -54,7 +54,7 @@ def ready() -> None:
 
     from sweeps import compilation_cache
 
-    compilation_cache.enable()
+    compilation_cache.keep_programs()
     jax.config.update("jax_enable_x64", True)
 
 

@@ -227,7 +227,7 @@ def main() -> None:
     arguments = options.parse_args()
     from sweeps import compilation_cache
 
-    compilation_cache.enable()
+    compilation_cache.keep_programs()
     set_precision(False)
     record: dict[str, Any] = {"benchmark": "sweep_scale", "machine": machine()}
     if arguments.designs:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from mmrjax.signals import STATUSES as STATUSES
     from mmrjax.simulation import simulate as simulate
     from sweeps import sweep as sweep
+    from sweeps.compilation_cache import keep_programs as keep_programs
 
 #: Where each public name lives.
 _HOME = {
@@ -51,6 +52,7 @@ _HOME = {
 _ABOVE = {
     "calibrate": "calibration",
     "discover": "calibration",
+    "keep_programs": "sweeps.compilation_cache",
     "read_robot": "calibration",
     "read_runs": "calibration",
     "sweep": "sweeps",
@@ -66,6 +68,7 @@ __all__ = [
     "__version__",
     "calibrate",
     "discover",
+    "keep_programs",
     "nominal",
     "read_robot",
     "read_runs",

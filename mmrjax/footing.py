@@ -261,9 +261,5 @@ def shape_of(chassis: Chassis, gear: RunningGear, radius: Scalar) -> Shape:
         gear.grouser_length,
         GROUSERS_LEVER,
     )
-    belly = CLEARANCE - (radius + gear.grouser_height)
+    belly = gear.clearance - (radius + gear.grouser_height)
     return Shape(main, lever, gear, chassis.on_tracks, chassis.radius, belly)
-
-
-#: Ground clearance under the body on tracks, Table 6 [m].
-CLEARANCE = 10.7e-3

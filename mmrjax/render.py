@@ -19,6 +19,7 @@ from mmrjax.fidelities.track import Trajectory
 from mmrjax.robot import Robot
 from mmrjax.running_gear import GROUSERS, TEETH_BELT
 from mmrjax.signals import GRAVITY
+from mmrjax.tables import BODY_HEIGHT
 from mmrjax.undercarriage import lever_tips
 
 FORMATS = (".png", ".gif", ".mp4")
@@ -132,8 +133,10 @@ def draw(axes: Any, view: Scene, k: int) -> None:
     marks = np.arange(first, axle_x + 0.6, 0.05) - axle_x  # fixed to the ground: they show the travel
     axes.add_collection(LineCollection([ground([(m, 0), (m - 0.008, -0.012)]) for m in marks], colors=_INK, lw=0.8))
 
-    top = 0.043
-    body = [(-view.axle, top - 0.076), (view.axle, top - 0.076), (view.axle + 0.01, top), (-view.axle - 0.01, top)]
+    gear = view.path.gear
+    under = float(gear.clearance - view.path.radius - gear.grouser_height)
+    top = under + BODY_HEIGHT
+    body = [(-view.axle, under), (view.axle, under), (view.axle + 0.01, top), (-view.axle - 0.01, top)]
     body = [(x, max(z, -radius + 0.008)) for x, z in body]
     axes.add_patch(Polygon(world(body), facecolor=_BODY, edgecolor=_INK, lw=1, alpha=0.85))
     for (x, z), start in zip(view.levers, (view.axle, -view.axle), strict=False):

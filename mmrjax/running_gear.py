@@ -134,7 +134,15 @@ class RunningGear(eqx.Module):
         meaning="centre of mass above the axles, payload and levers apart",
         bounds=(-0.1, 0.3),
         sd=0.01,
-        source="middle of the body: ground clearance 10.7 mm + 76/2 mm less 43.7 mm (Table 6)",
+        source="middle of the body (Table 6), half of its height of 76 mm over its underside (`clearance`)",
+    )
+    clearance: Scalar = parameter(
+        10.7e-3,
+        unit="m",
+        meaning="ground clearance under the body on tracks",
+        bounds=(0.0, 0.3),
+        sd=1e-3,
+        source="Table 6",
     )
     centre_offset: Scalar = parameter(
         0.0,

@@ -14,6 +14,8 @@ TEETH_BELT, TEETH_PULLEY, GROUSERS = 168, 48, 24
 TEETH_LEVER, GROUSERS_LEVER = 112, 16
 PITCH_TOOTH, PITCH_GROUSER = 5e-3, 35e-3
 RADIUS_PULLEY = TEETH_PULLEY * PITCH_TOOTH / (2 * math.pi)  # 38.2 mm
+#: Height of the body [m], Table 6.
+BODY_HEIGHT = 76e-3
 
 #: Charge that a battery's maker states in mAh, in coulombs.
 COULOMB_PER_MAH = 3.6

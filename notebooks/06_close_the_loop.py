@@ -23,6 +23,7 @@ import numpy as np
 
 import mmrjax as mm
 
+mm.keep_programs()  # compiled once, for later sessions too
 robot, runs = mm.nominal(), mm.read_runs("measured")
 found = mm.discover(runs, robot)
 print(found.statement)

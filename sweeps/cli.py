@@ -503,7 +503,7 @@ def _start_jax(no_cache: bool) -> None:
     from sweeps import compilation_cache
 
     if not no_cache:
-        compilation_cache.enable()
+        compilation_cache.keep_programs()
     import jax
 
     if no_cache:

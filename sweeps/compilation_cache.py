@@ -56,19 +56,17 @@ def _processor() -> str:
     return f"{platform.machine()}-{hashlib.sha256(kind.encode()).hexdigest()[:8]}"
 
 
-def enable(path: Path | None = None) -> Path | None:
-    """Keep every compiled program, however small, and read those that earlier processes kept.
+def keep_programs() -> Path | None:
+    """Keep every compiled program, however small, and read those that earlier processes kept, as the commands do.
 
     To be called before anything compiles. A cache that JAX has been given by its own settings
-    (`JAX_COMPILATION_CACHE_DIR`) stays. An entry that cannot be read is compiled again.
-
-    Args:
-        path: folder to hold caches; None: see `location`.
+    (`JAX_COMPILATION_CACHE_DIR`) stays. An entry that cannot be read is compiled again. `MMRJAX_CACHE` is the folder
+    to hold caches, or `off`; without it `~/.cache/mmrjax`.
 
     Returns:
         The folder; None where the cache is switched off or its place cannot be written to, which is no error.
     """
-    folder = location(path)
+    folder = location()
     if folder is None:
         return None
     # On some processors XLA logs an error for each program that it reads: tuning flags of its own compiler that it

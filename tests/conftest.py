@@ -14,7 +14,7 @@ from pathlib import Path
 os.environ["MMRJAX_PROGRAMS"] = ""  # what tests put in the place of a function is traced, not read
 from sweeps import compilation_cache
 
-compilation_cache.enable()  # one for all workers, and for the next time
+compilation_cache.keep_programs()  # one for all workers, and for the next time
 
 import jax
 

@@ -41,6 +41,8 @@ PAGES = {
     "store": f"sweep {Path(__file__).parent / 'record' / 'commands' / 'plan.toml'}",
     "track": "simulate --model track --slope 5",
     "turn": "simulate --left 33 --right 15",
+    "climb": "climb --gap 60 --levers-front 45 --voltage 24 --duration 2 --time-step 4e-4",
+    "found": "climb --find gap --levers-front 45 --voltage 24 --duration 2 --time-step 4e-4",
     "path": "simulate --left 24 --right -12 --slope 10 --heading 30 --model drive --duration 2",
 }
 FAULTY = """<html><body style="margin:0"><p style="white-space:nowrap">{long}</p>

@@ -9,12 +9,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from mmrjax import footing, terrain
+from mmrjax import footing, params, posture, static_limits, terrain
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import climb
 from mmrjax.fidelities.climb import LOSSES, SOURCES, Sequence, climb_batch, still, system
+from mmrjax.fidelities.steady import steady
 from mmrjax.robots import nominal
 from mmrjax.signals import GRAVITY
+from mmrjax.tables import PITCH_TOOTH
 
 ROBOT = nominal()
 SIZE = 4  # points of every terrain here, so that one program serves them
@@ -146,9 +148,63 @@ def test_dynamics_are_those_of_mujoco():
     """Mass matrix and bias of chassis, pulleys and levers as hinged bodies, at random states."""
     conditions = Conditions(0, voltage=6.0, slope_deg=12.0, payload=5.0).resolved(ROBOT)
     run = system(ROBOT, conditions, terrain.flat(), still(0.5, 0.3))
+    model = mujoco.MjModel.from_xml_string(_bodies(run, 12.0))
+    data = mujoco.MjData(model)
+    random = np.random.default_rng(5)
+    for _ in range(5):
+        q, v = random.normal(size=6), 3 * random.normal(size=6)
+        data.qpos[:], data.qvel[:] = TIES @ q, TIES @ v
+        mujoco.mj_forward(model, data)
+        whole = np.zeros((7, 7))
+        mujoco.mj_fullM(model, data, whole)
+        matrix, bias, _ = climb.inertia(run, jnp.asarray(q), jnp.asarray(v))
+        assert np.asarray(matrix) == pytest.approx(TIES.T @ whole @ TIES, abs=1e-11)
+        assert np.asarray(bias) == pytest.approx(TIES.T @ data.qfrc_bias, abs=1e-10)
+
+
+@pytest.mark.parametrize("slope", [0.0, 10.0])
+def test_ten_thousand_steps_are_those_of_mujoco_under_the_same_forces(slope):
+    """Of a second of driving off and swinging the levers; with forces that each step had, impulses over its time."""
+    conditions = Conditions(0, voltage=12.0, slope_deg=slope, payload=5.0).resolved(ROBOT)
+    angles = (jnp.radians(jnp.array(pair)) for pair in ((45.0, 20.0), (-8.4, 30.0)))
+    run = system(ROBOT, conditions, terrain.flat(), Sequence(jnp.array([0.1, 0.8]), *angles, over_time=True))
+    steps = 10_000
+
+    @jax.jit
+    def driven(run, motion, none):
+        def one(motion, k):
+            after = climb.advance(run, motion, k * run.step, none)[0]
+            matrix, bias, _ = climb.inertia(run, motion.q, motion.v)
+            return after, (matrix @ (after.v - motion.v) / run.step + bias, after.q)
+
+        return jax.lax.scan(one, motion, jnp.arange(steps))
+
+    start = climb.stand(run)
+    _, (force, ours) = jax.device_get(driven(run, start, dict.fromkeys((*SOURCES, *LOSSES), jnp.zeros(()))))
+    model = mujoco.MjModel.from_xml_string(_bodies(run, slope))
+    model.opt.timestep = float(run.step)
+    data = mujoco.MjData(model)
+    data.qpos[:] = TIES @ np.asarray(start.q)
+    shared = TIES / TIES.sum(axis=0)  # both pulleys have half of the shaft's
+    theirs = np.empty_like(ours)
+    for k in range(steps):
+        data.qfrc_applied[:] = shared @ force[k]
+        mujoco.mj_step(model, data)
+        theirs[k] = data.qpos[[0, 1, 2, 3, 5, 6]]
+    assert np.abs(ours - theirs).max() < 1e-6
+    assert ours[-1, 0] - ours[0, 0] > 0.05 and np.ptp(ours[:, 4]) > 0.3 and np.ptp(ours[:, 5]) > 0.3
+
+
+#: Both pulleys turn as one.
+TIES = np.zeros((7, 6))
+TIES[[0, 1, 2, 3, 4, 5, 6], [0, 1, 2, 3, 3, 4, 5]] = 1
+
+
+def _bodies(run, slope):
+    """Chassis, pulleys and levers as hinged bodies under gravity tilted by a slope [deg]."""
     half, (mass, along, about) = run.half, (float(x) for x in run.lever)
     base = float(ROBOT.running_gear.wheelbase) / 2
-    down = -GRAVITY * np.array([np.sin(np.radians(12)), 0, np.cos(np.radians(12))])
+    down = -GRAVITY * np.array([np.sin(np.radians(slope)), 0, np.cos(np.radians(slope))])
 
     def hinged(name, x, m, at, j, axis):
         return (
@@ -157,28 +213,13 @@ def test_dynamics_are_those_of_mujoco():
         )
 
     pulley = float(half.pulley), 0, float(half.inertia_pulley)
-    text = f"""<mujoco><compiler inertiafromgeom="false"/><option gravity="{down[0]} 0 {down[2]}"/><worldbody><body>
+    return f"""<mujoco><compiler inertiafromgeom="false"/><option gravity="{down[0]} 0 {down[2]}"/><worldbody><body>
       <inertial pos="{float(half.forward)} 0 {float(half.up)}" mass="{float(half.chassis)}"
         diaginertia="{" ".join([str(float(half.inertia))] * 3)}"/>
       <joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint type="hinge" axis="0 1 0"/>
       {hinged("p1", base, *pulley, 1)}{hinged("p2", -base, *pulley, 1)}
       {hinged("l1", base, mass, along, about, -1)}{hinged("l2", -base, mass, along, about, -1)}
     </body></worldbody></mujoco>"""
-    model = mujoco.MjModel.from_xml_string(text)
-    data = mujoco.MjData(model)
-    # both pulleys turn as one
-    ties = np.zeros((7, 6))
-    ties[[0, 1, 2, 3, 4, 5, 6], [0, 1, 2, 3, 3, 4, 5]] = 1
-    random = np.random.default_rng(5)
-    for _ in range(5):
-        q, v = random.normal(size=6), 3 * random.normal(size=6)
-        data.qpos[:], data.qvel[:] = ties @ q, ties @ v
-        mujoco.mj_forward(model, data)
-        whole = np.zeros((7, 7))
-        mujoco.mj_fullM(model, data, whole)
-        matrix, bias, _ = climb.inertia(run, jnp.asarray(q), jnp.asarray(v))
-        assert np.asarray(matrix) == pytest.approx(ties.T @ whole @ ties, abs=1e-11)
-        assert np.asarray(bias) == pytest.approx(ties.T @ data.qfrc_bias, abs=1e-10)
 
 
 def test_rates_of_all_gaps_are_the_derivatives_of_the_gaps():
@@ -242,3 +283,112 @@ def test_largest_step_of_a_nose_up_robot_is_that_of_statics():
     # a grouser more or less under the edge, and the way that the robot is at
     runs = [(terrain.step(limit + d, size=SIZE), 60, 180, 4, {"adhesion": 4.0}) for d in (-0.006, 0.008)]
     assert batch(runs, duration=14.0, step=2e-4).names == ["over", "tips"]
+
+
+def test_level_ground_is_travelled_as_settled_balances_have_it():
+    """With the share of its load on the guide that its belt has: the same laws, but for the ripple of its grousers.
+
+    `track`, whose belt yields, has another share and another ripple, and so other means (docs/climb.md).
+    """
+    conditions = Conditions(0, voltage=15.0, slope_deg=5.0).resolved(ROBOT)
+    run = system(ROBOT, conditions, terrain.flat(), still(np.pi, np.pi))
+    none = dict.fromkeys((*SOURCES, *LOSSES), jnp.zeros(()))
+
+    @jax.jit
+    def driven(motion, first):
+        def one(motion, k):
+            after, _, passed = climb.advance(run, motion, first + k * run.step, none)
+            at = footing.footing(run.shape, run.terrain, motion.q, motion.v)
+            load = jnp.stack([jnp.sum(at.guided * at.force), jnp.sum(at.force)])
+            return after, (motion.q[3], passed.current, motion.v[0], load)
+
+        return jax.lax.scan(one, motion, jnp.arange(9000))
+
+    motion, _ = driven(climb.stand(run), 0.0)
+    _, (turned, *found) = jax.device_get(driven(motion, 0.9))
+    pitch = float(run.shape.main.pitch / run.shape.main.first)
+    whole = np.searchsorted(turned, turned[0] + pitch * np.floor((turned[-1] - turned[0]) / pitch))
+    current, speed, load = (x[:whole].mean(axis=0) for x in found)
+    assert 0.85 < load[0] / load[1] < 0.95
+    settled = steady(params.replace(ROBOT, {"6T2A.track.guide_share": load[0] / load[1]}), conditions)
+    assert current == pytest.approx(float(settled.total_current) / 2, rel=3e-3)
+    assert speed == pytest.approx(float(settled.speed), rel=1e-3)
+
+
+def test_pairs_of_the_paper_s_full_model_are_counted_on_the_belts_of_its_geometry():
+    """1680 (Section 3.4.5): grousers on the ground and teeth on two guides, of two main and four levers' belts. The climb
+    resolves the grousers alone, each beside corners of the ground; its teeth run rigidly."""
+    run = system(ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.flat(), still(0.5, 0.3))
+    pairs = {}
+    for name, belt, count in (("main", run.shape.main, 2), ("lever", run.shape.lever, 4)):
+        teeth = round(float(belt.length) / PITCH_TOOTH)
+        assert float(belt.length) == pytest.approx(teeth * PITCH_TOOTH, abs=1e-3)
+        pairs[name] = count * belt.grousers, count * 2 * teeth
+    assert sum(pairs["main"]) == 720 and sum(pairs["main"]) + sum(pairs["lever"]) == 1680
+    at = footing.footing(run.shape, run.terrain, climb.stand(run).q, jnp.zeros(6))
+    # grousers of one side, then what corners of a terrain and wheels meet
+    tips = (pairs["main"][0] + pairs["lever"][0]) // 2
+    near = np.abs(np.asarray(at.gap)) < 1.0
+    assert tips == 56 and near.sum() == tips + 2  # and the wheels, which bear where there are no tracks
+
+
+def leant(run, pitch):
+    """Coordinates at a pitch, nose up, with the tail on the lower ground and the robot against the edge of a step."""
+    q = climb.stand(run).q.at[2].set(-pitch)
+    gap = jax.jit(
+        lambda x, z: jnp.min(footing.footing(run.shape, run.terrain, q.at[0].set(x).at[1].set(z), 0 * q).gap)
+    )
+    z = 1.0 - float(gap(-1.5, 1.0))
+    far, near = -1.5, 0.5
+    for _ in range(40):
+        middle = (far + near) / 2
+        free = float(gap(middle, z + 1e-4)) > 0
+        far, near = (middle, near) if free else (far, middle)
+    return q.at[0].set(far).at[1].set(z - 2e-5)
+
+
+@pytest.mark.slow
+def test_static_limits_of_steps_and_gaps_are_those_of_the_dynamics():
+    """Slow, on a ground that holds. A robot that leans on a step with its rear levers flush gets over where the centre
+    of mass comes over the edge: under the tips of grousers at the least, between two of them at the most."""
+    flush = float(np.degrees(static_limits.flush(ROBOT)))
+    runs, starts = [], []
+    for payload in (0.0, 8.0):
+        of = {"adhesion": 4.0, "payload": payload}
+        side = posture.outline(
+            ROBOT, Conditions(0, payload=payload, levers_front_deg=180.0, levers_rear_deg=flush).resolved(ROBOT)
+        )
+        low = static_limits.step(side)
+        high = static_limits.step(dataclasses.replace(side, belt=ROBOT.radius_pulley))
+        assert 1e3 * float(low.height) == pytest.approx({0.0: 232, 8.0: 203}[payload], abs=1)
+        for height in (float(low.height) - 0.004, float(high.height) + 0.006):
+            ground = terrain.step(height, size=6)
+            run = system(
+                ROBOT, Conditions(0, voltage=4.0, **of).resolved(ROBOT), ground, still(np.pi, np.radians(flush))
+            )
+            runs.append((ground, 180, flush, 4, of))
+            starts.append(leant(run, float(low.pitch) - np.radians(4.0)))
+    # what bridges on both sides of the centre of mass does not fall in; a nose that does may still catch the far edge
+    for front, widths in ((180.0, (0.144, 0.21)), (flush, (0.346, 0.38))):
+        for width in widths:
+            ground = terrain.gap(width)
+            runs.append((ground, front, front, 4, {"adhesion": 4.0}))
+            run = system(ROBOT, Conditions(0, voltage=4.0).resolved(ROBOT), ground, still(*[np.radians(front)] * 2))
+            starts.append(climb.stand(run).q)
+    zero = np.zeros(len(runs))
+    start = climb.Motion(jnp.stack(starts), jnp.zeros((len(runs), 6)), *map(jnp.asarray, (zero, zero, zero)))
+    found = batch(runs, duration=16.0, step=2e-4, start=start)
+    over = [name == "over" for name in found.names]
+    assert over == [True, False] * 4, found.names
+
+
+@pytest.mark.slow
+def test_largest_step_is_the_same_to_a_millimetre_with_half_the_step_of_time():
+    heights = 0.090 + 1e-3 * np.arange(16)
+    runs = [(terrain.step(h, size=SIZE), 60, 180, 4, {"adhesion": 4.0}) for h in heights]
+    largest = []
+    for step in (1e-4, 5e-5):
+        over = [name == "over" for name in batch(runs, duration=14.0, step=step).names]
+        assert over == sorted(over, reverse=True), over
+        largest.append(heights[sum(over) - 1])
+    assert abs(largest[0] - largest[1]) < 1.01e-3

@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PROGRAM = """
 import json, sys
 from sweeps import compilation_cache
-folder = compilation_cache.enable()
+folder = compilation_cache.keep_programs()
 import jax
 jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
@@ -98,7 +98,7 @@ def test_broken_entries_are_compiled_again(tmp_path):
 def test_cache_switched_off_has_no_place(word, monkeypatch):
     monkeypatch.setenv("MMRJAX_CACHE", word)
     assert compilation_cache.location() is None
-    assert compilation_cache.enable() is None
+    assert compilation_cache.keep_programs() is None
     assert str(compilation_cache.describe()) == "off (MMRJAX_CACHE=off)"
 
 

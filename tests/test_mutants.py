@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 KINDS = {
     "balances", "energy", "contact", "statuses", "missions", "verdicts", "calibration", "readers", "units", "writers",
-    "sweeps", "derivatives", "effects", "inertia", "posture",
+    "sweeps", "derivatives", "effects", "inertia", "posture", "climb",
 }  # fmt: skip
 
 

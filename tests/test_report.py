@@ -162,6 +162,14 @@ def test_blocks_cover_each_cell_once():
         assert sorted(covered) == sorted(cells)
 
 
+def test_runs_that_share_a_cell_of_a_map_are_shown_by_their_median():
+    rng = np.random.default_rng(3)
+    cell, values = rng.integers(0, 7, 40) * 2, rng.normal(size=40)
+    shown, medians = sweep_figures._medians(cell, values)
+    assert shown.tolist() == sorted(set(cell.tolist())) and len(set(np.bincount(cell)[shown] % 2)) == 2
+    np.testing.assert_allclose(medians, [np.median(values[cell == k]) for k in shown], rtol=1e-15)
+
+
 def test_report_of_a_file_names_it_without_its_folder_and_lists_what_changed(tmp_path):
     robot = params.replace(ROBOTS["nominal"](), {"motor.resistance": 0.9})
     robot = dataclasses.replace(robot, effects=(BY_NAME["churning"](amplitude=1e-4),))

@@ -524,9 +524,9 @@ def _judged(
     return motion, dataclasses.replace(progress, verdict=verdict)
 
 
-def begin(run: System) -> tuple[Motion, Energy, Progress]:
-    """What a run begins with: motion, no energy yet, and that it goes on."""
-    motion = stand(run)
+def begin(run: System, motion: Motion | None = None) -> tuple[Motion, Energy, Progress]:
+    """What a run begins with: motion (None: at rest before the obstacle), no energy yet, and that it goes on."""
+    motion = stand(run) if motion is None else motion
     zero = jnp.zeros_like(motion.q[0])
     energy = dict.fromkeys((*SOURCES, *LOSSES), zero)
     return motion, energy, Progress(jnp.asarray(_RUNNING), zero, motion.q[0], zero, zero)
@@ -572,11 +572,13 @@ def _alike(robot: Robot) -> int | None:
 
 
 @compiled
-def _begin(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, step: float) -> Any:
-    def one(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence) -> Any:
-        return begin(system(robot, conditions, terrain, sequence, step))
+def _begin(
+    robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, step: float, motion: Motion | None
+) -> Any:
+    def one(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, motion: Motion | None) -> Any:
+        return begin(system(robot, conditions, terrain, sequence, step), motion)
 
-    return jax.vmap(one, in_axes=(_alike(robot), 0, 0, 0))(robot, conditions, terrain, sequence)
+    return jax.vmap(one, in_axes=(_alike(robot), 0, 0, 0, 0))(robot, conditions, terrain, sequence, motion)
 
 
 def _part(
@@ -605,6 +607,7 @@ def climb_batch(
     sample: float = SAMPLE,
     part: float = 1.0,
     record: bool = True,
+    start: Motion | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Climb:
     """Climb over a batch of conditions, terrains and sequences (leading axis of every field), until all have ended.
@@ -614,10 +617,11 @@ def climb_batch(
         duration: of the longest run [s]; step, sample: intervals of integration and of the record [s].
         part: length of run between two looks at whether all have ended [s].
         record: whether samples are kept; else the record is the last sample.
+        start: motions with which the runs begin; None: at rest before the obstacle.
         progress: told the share of the time that is done.
     """
     steps, samples = round(sample / step), round(part / sample)
-    state = _begin(robot, conditions, terrain, sequence, step)
+    state = _begin(robot, conditions, terrain, sequence, step, start)
     kept: list[Passed] = []
     parts = int(np.ceil(duration / part - 1e-9))
     for k in range(parts):

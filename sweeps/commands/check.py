@@ -15,6 +15,7 @@ from sweeps import config as configuration
 from sweeps.console import say
 from sweeps.inputs import load_robot
 from sweeps.pages import words
+from sweeps.results import posture
 from sweeps.results.check import CheckResult, changed, corner, label, limit, reached, wanted
 from sweeps.skeleton import leave, page
 from sweeps.store import RunFolder, open_folder
@@ -33,7 +34,8 @@ def check(config: configuration.Check, out: Path | None, force: bool) -> int:
     robot = file.robot
     sheet.refuse(robot, asked)
     with open_folder("check", config, robot, out, force) as folder:
-        found = CheckResult(asked, robot, sheet.check(robot, asked, changes=config.changes))
+        outcomes = sheet.check(robot, asked, changes=config.changes)
+        found = CheckResult(asked, robot, outcomes, posture.of_requirements(robot, outcomes))
         _write(folder, config, found)
         print_check(found, changes=config.changes)
         manifest = {"seed": None, **sheet.counts(found.outcomes)}

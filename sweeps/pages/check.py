@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calibration.data.errors import rounded
-from sweeps.pages import check_figures
+from sweeps.pages import check_figures, posture_figures
 from sweeps.pages.page import Album, named, render
 from sweeps.results import check as check_result
 
@@ -20,6 +20,8 @@ def write(folder: Path, found: CheckResult, file: RobotFile) -> Path:
     """Write `report.html` and `figures/` of a check; returns the path of the page."""
     album = Album(folder)
     album.add("margins", partial(check_figures.margins, found))
+    if found.drawn:
+        album.add("postures", partial(posture_figures.asked_about, found.drawn))
     return render(
         folder,
         "check.html.j2",

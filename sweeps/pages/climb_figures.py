@@ -13,6 +13,7 @@ from matplotlib.patches import Polygon
 from mmrjax import footing, loop
 from mmrjax.footing import PITCH, SHAFT
 from mmrjax.render import film_gif
+from mmrjax.tables import BODY_HEIGHT
 from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, figure, style
 from sweeps.results.climb import ClimbResult
 
@@ -54,8 +55,11 @@ def _ground(axes: Any, found: ClimbResult, begin: float, end: float) -> None:
 def _draw(axes: Any, found: ClimbResult, q: np.ndarray, colour: str = BLUE) -> None:
     outlines = _outlines(found, q)
     cos, sin = np.cos(-q[PITCH]), np.sin(-q[PITCH])
-    half = float(found.robot.running_gear.wheelbase) / 2
-    box = np.array([(-half, -0.033), (half, -0.033), (half + 0.01, 0.043), (-half - 0.01, 0.043)])
+    chassis = found.robot.configurations[found.configuration]
+    shape = footing.shape_of(chassis, found.robot.running_gear, found.robot.radius_pulley)
+    half, under = float(shape.half), float(shape.belly)
+    top = under + BODY_HEIGHT
+    box = np.array([(-half, under), (half, under), (half + 0.01, top), (-half - 0.01, top)])
     box = box @ np.array([[cos, sin], [-sin, cos]]) + q[:2]
     axes.add_patch(Polygon(box, facecolor=colour, edgecolor=INK, lw=0.8, alpha=0.55))
     for path, tips in outlines:

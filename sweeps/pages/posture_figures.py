@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -50,6 +52,21 @@ def silhouette(axes: Axes, shown: Drawn, title: str) -> None:
     every = np.concatenate([page(around(side, belt)) for belt in colours])
     (left, low), (right, high) = every.min(0) - 40, every.max(0) + 40
     axes.set(title=title, aspect="equal", xlim=(left, right), ylim=(low, high), xlabel="mm", ylabel="mm")
+
+
+#: What a robot does where requirements of its geometry ask about it.
+ASKED = {"step_mm": "On its highest step", "gap_mm": "Flush over a gap", "length_mm": "Folded"}
+
+
+def asked_about(drawn: Mapping[str, tuple[Drawn, float, float]]) -> Figure:
+    """A robot as requirements of its geometry ask about it."""
+    fig, grid = figure(1, max(len(drawn), 2), 3.6)
+    for axes, (name, (shown, front, rear)) in zip(grid[0], drawn.items(), strict=False):
+        step = f": {shown.step / MM:.0f} mm" if shown.step else ""
+        silhouette(axes, shown, f"{ASKED[name]}{step}\nfront {front:.0f}°, rear {rear:.0f}°")
+    for axes in grid[0][len(drawn) :]:
+        axes.axis("off")
+    return fig
 
 
 def rest_and_step(found: Postures) -> Figure:

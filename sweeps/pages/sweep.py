@@ -61,8 +61,9 @@ def counts(runs: Table, channels: Sequence[Channel]) -> dict[str, Any]:
     for s in status:
         s["where"] = "" if s["name"] in words.SETTLED else _where(runs, runs["status"] == s["name"])
     flags = []
+    known, which = np.unique(runs["flags"], return_inverse=True)
     for flag, meaning in words.FLAGS.items():
-        over = np.array([flag in str(f).split(";") for f in runs["flags"]])
+        over = np.array([flag in str(f).split(";") for f in known])[which]
         if over.any():
             flags.append({"name": flag, "count": int(over.sum()), "meaning": meaning, "where": _where(runs, over)})
     return {

@@ -103,18 +103,14 @@ def _map(axes: Axes, runs: dict[str, np.ndarray], index: np.ndarray, channel: Ch
     if slopes.size * payloads.size > 4 * index.size:  # scattered, no grid
         _scatter(axes, runs, index, channel, norm)
         return
-    cells: dict[tuple[int, int], list[int]] = {}
-    for run, i, j in zip(index, at_slope, at_payload, strict=True):
-        cells.setdefault((int(i), int(j)), []).append(int(run))
+    cell, has_number = at_payload * slopes.size + at_slope, settled(runs, channel)[index]
     image = np.full((payloads.size, slopes.size), np.nan)
-    missing: dict[tuple[int, int], str] = {}
-    has_number = settled(runs, channel)
-    for (i, j), members in cells.items():
-        values = runs[channel.column][[m for m in members if has_number[m]]]
-        if values.size:
-            image[j, i] = np.median(values)
-        else:
-            missing[i, j] = str(runs["status"][members[0]])
+    shown, medians = _medians(cell[has_number], runs[channel.column][index][has_number])
+    image.flat[shown] = medians
+    asked, first = np.unique(cell, return_index=True)
+    unshown = ~np.isin(asked, shown)
+    j, i = np.divmod(asked[unshown], slopes.size)
+    missing = dict(zip(zip(i.tolist(), j.tolist(), strict=True), runs["status"][index[first[unshown]]], strict=True))
     axes.imshow(image, origin="lower", aspect="auto", cmap="viridis", norm=norm, interpolation="nearest")
     labelled = slopes.size <= _CELLS and payloads.size <= _CELLS
     if labelled:
@@ -127,6 +123,14 @@ def _map(axes: Axes, runs: dict[str, np.ndarray], index: np.ndarray, channel: Ch
     _say_missing(axes, missing, labelled)
     _ticks(axes.set_xticks, slopes)
     _ticks(axes.set_yticks, payloads)
+
+
+def _medians(cell: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which cells there are, and the median of each one's values."""
+    order = np.lexsort((values, cell))
+    cells, begin, count = np.unique(cell[order], return_index=True, return_counts=True)
+    ranked = values[order]
+    return cells, 0.5 * (ranked[begin + (count - 1) // 2] + ranked[begin + count // 2])
 
 
 def _blocks(cells: set[tuple[int, int]], joined: bool) -> list[tuple[int, int, int, int]]:

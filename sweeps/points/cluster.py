@@ -265,7 +265,7 @@ def _start() -> None:
     """Double precision and compiled programs kept, as in the command itself."""
     from sweeps import compilation_cache
 
-    compilation_cache.enable()
+    compilation_cache.keep_programs()
     import jax
 
     jax.config.update("jax_enable_x64", True)

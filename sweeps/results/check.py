@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from calibration.sizing.sheet import Change, Outcome
 from mmrjax.robot import Robot
 from mmrjax.tables import COULOMB_PER_MAH
 from sweeps.pages import words
+from sweeps.results.posture import Drawn
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,11 +24,13 @@ class CheckResult:
 
     Attributes:
         asked: the requirements; robot: that was held against them; outcomes: one each, in order.
+        drawn: the robot as requirements of its geometry ask about it, see `posture.of_requirements`.
     """
 
     asked: Requirements
     robot: Robot
     outcomes: tuple[Outcome, ...]
+    drawn: Mapping[str, tuple[Drawn, float, float]] = dataclasses.field(default_factory=dict)
 
     @property
     def missed(self) -> list[Outcome]:

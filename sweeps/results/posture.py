@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import numpy as np
 
 from calibration.data.columns import LEVERS
 from calibration.data.table import Runs
-from mmrjax import static_limits
+from calibration.sizing.sheet import Outcome
+from mmrjax import posture, static_limits
 from mmrjax.channels import MM
 from mmrjax.conditions import Conditions
 from mmrjax.masses import lever_angles
@@ -103,6 +105,29 @@ def step_map(robot: Robot, conditions: Conditions) -> StepMap:
     best = _on_step(jax.tree.map(lambda x: x[front, rear], found))
     own = tuple(float(np.degrees(x)) for x in lever_angles(robot.running_gear, conditions))
     return StepMap(ANGLES, found.height / MM, best, float(ANGLES[front]), float(ANGLES[rear]), (own[0], own[1]))
+
+
+def of_requirements(robot: Robot, outcomes: Sequence[Outcome]) -> dict[str, tuple[Drawn, float, float]]:
+    """A robot as requirements of its geometry ask about it, by their names: drawn, and angles of its levers [deg].
+
+    The best posture on a step, levers flush with the belt over a gap, folded for its size.
+    """
+    found: dict[str, tuple[Drawn, float, float]] = {}
+    for outcome in outcomes:
+        name = outcome.requirement.name
+        if name not in ("step_mm", "gap_mm", "length_mm"):
+            continue
+        of = Conditions(outcome.at["configuration"], payload=outcome.at.get("payload_kg", 0.0)).resolved(robot)
+        if name == "step_mm":
+            step, front, rear = jax.device_get(static_limits.best_step(robot, of))
+            drawn = _on_step(step)
+        else:
+            front = rear = float(static_limits.flush(robot)) if name == "gap_mm" else np.pi
+            stands = static_limits.with_levers(of, front, rear)
+            rests, side = posture.level(robot, stands), posture.outline(robot, stands)
+            drawn = Drawn(jax.device_get(side.pitched(rests.pitch)), float(rests.height), 0.0)
+        found[name] = drawn, float(np.degrees(front)), float(np.degrees(rear))
+    return found
 
 
 def _on_step(found: static_limits.Step) -> Drawn:
