@@ -384,11 +384,11 @@ def test_static_limits_of_steps_and_gaps_are_those_of_the_dynamics():
 
 @pytest.mark.slow
 def test_largest_step_is_the_same_to_a_millimetre_with_half_the_step_of_time():
-    heights = 0.090 + 1e-3 * np.arange(16)
+    heights = 0.096 + 1e-3 * np.arange(9)
     runs = [(terrain.step(h, size=SIZE), 60, 180, 4, {"adhesion": 4.0}) for h in heights]
     largest = []
     for step in (1e-4, 5e-5):
-        over = [name == "over" for name in batch(runs, duration=14.0, step=step).names]
-        assert over == sorted(over, reverse=True), over
+        over = [name == "over" for name in batch(runs, duration=14.0, step=step, record=False).names]
+        assert over == sorted(over, reverse=True) and any(over) and not all(over), over
         largest.append(heights[sum(over) - 1])
     assert abs(largest[0] - largest[1]) < 1.01e-3

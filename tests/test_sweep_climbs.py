@@ -15,6 +15,7 @@ from mmrjax.fidelities.climb import NAMES, OVER, SLIDES, TIPS, climb_batch, stil
 from mmrjax.robots import nominal
 from mmrjax.variation import STATUS, Variation
 from sweeps.config_campaign import Campaign, Obstacle
+from sweeps.pages.campaign_figures import Varied, endings
 from sweeps.points import axes, climbs
 
 ROBOT = nominal()
@@ -108,6 +109,18 @@ def test_points_of_which_the_robot_varies_are_single_climbs():
     assert found[STATUS].tolist() == [3, 3]  # not settled: the time was over
 
 
+def test_map_of_verdicts_has_each_point_in_its_colour():
+    angles, sizes = np.meshgrid([0.0, 30.0, 60.0], [50.0, 100.0], indexing="ij")
+    codes = np.array([OVER, SLIDES, OVER, TIPS, OVER, OVER])
+    figure = endings(codes, NAMES, Varied(angles.ravel(), "angle [deg]"), Varied(sizes.ravel(), "obstacle_mm [mm]"))
+    (axes,) = figure.axes
+    shown = axes.collections[0].get_array().reshape(2, 3)
+    assert shown.tolist() == [[OVER, OVER, OVER], [SLIDES, TIPS, OVER]]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["over", "tips", "slides"]
+    assert axes.get_ylabel() == "obstacle_mm [mm]"
+
+
+@pytest.mark.slow
 def test_store_of_climbs_is_filled_in_shares_and_its_page_has_the_map(mmrjax, tmp_path):
     (tmp_path / "map.toml").write_text(
         """

@@ -75,7 +75,14 @@ def write(folder: Path, file: RobotFile, layout: Layout, result: dict[str, Any])
             album.add("endings", partial(campaign_figures.endings, codes[shown], meanings, across, up))
     total = result["points"]
     statuses = [
-        {"name": s, "count": n, "percent": 100 * n / total, "meaning": words.meaning(s)}
+        {
+            "name": s,
+            "count": n,
+            "percent": 100 * n / total,
+            "meaning": "came to a verdict"
+            if verdicts and s == signals.STATUSES[signals.CONVERGED]
+            else words.meaning(s),
+        }
         for s, n in result["statuses"].items()
         if n
     ]

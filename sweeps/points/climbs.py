@@ -31,18 +31,19 @@ NEAR = 1.0
 SLOW = 12.0
 #: Climbs in one call on processors, and on an accelerator; interval of their record [s].
 AT_ONCE, AT_ONCE_ACCELERATED, SAMPLE = 64, 1024, 0.05
-#: Outputs with units and words; a search has the first two.
+#: Outputs with units and words, a search has the first two: currents are the largest, places those of the robot's
+#: middle from where the obstacle begins; 0 where nothing is got over.
 VERDICT, LARGEST = "verdict", "largest_mm"
 OUTPUTS: dict[str, tuple[str, str]] = {
     VERDICT: ("", "how the climb ended; of a search, of the smallest obstacle that it does not get over"),
-    LARGEST: ("mm", "largest obstacle that it gets over, 0 where none is"),
-    "time_s": ("s", "time until the verdict"),
-    "furthest_mm": ("mm", "how far the middle of the robot came from where the obstacle begins"),
-    "pitch_most_deg": ("deg", "largest pitch, nose up"),
-    "energy_J": ("J", "energy from the supply, of all motors"),
-    "traction_current_most_A": ("A", "largest current of a traction motor"),
-    "front_current_most_A": ("A", "largest current of the motor of the front levers"),
-    "rear_current_most_A": ("A", "largest current of the motor of the rear levers"),
+    LARGEST: ("mm", "largest got over"),
+    "time_s": ("s", "time to the verdict"),
+    "furthest_mm": ("mm", "furthest place"),
+    "pitch_most_deg": ("deg", "largest pitch"),
+    "energy_J": ("J", "energy, all motors"),
+    "traction_current_most_A": ("A", "traction motor"),
+    "front_current_most_A": ("A", "front levers' motor"),
+    "rear_current_most_A": ("A", "rear levers' motor"),
 }
 
 
