@@ -1,6 +1,7 @@
 """The fit: exact Jacobians, both optimizers, many starts, recovered truth, coverage, and what holds what."""
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import jax
@@ -58,6 +59,10 @@ def clean(posed, truth):
     """The same problem with readings of the true robot, without noise, and bench values that are right."""
     reading = posed.observation(truth).reading
     return dataclasses.replace(posed, data=dataclasses.replace(posed.data, measured=reading, centre=truth))
+
+
+def residuals(problem, z):
+    return jnp.concatenate([problem.misfit(z, problem.data), z - problem.data.centre])
 
 
 def starts(size, count, seed=0):
@@ -151,7 +156,7 @@ def test_steps_are_those_of_another_implementation(bent, monkeypatch):
     solver = eqx.tree_at(lambda s: s.search, solver, shares)
     member = jax.tree.map(lambda x: jnp.asarray(x[2]), members)
     here = member.problem(posed)
-    function = fit.residuals(here, here.data, fit.no_pin(4))
+    function = functools.partial(residuals, here)
 
     def theirs(z, _):
         return function(z), None
@@ -209,15 +214,27 @@ def test_jacobian_of_steady_is_the_finite_difference(posed, truth):
     np.testing.assert_allclose(jacobian, np.stack(columns, 1), rtol=1e-5, atol=1e-5 * np.abs(jacobian).max())
 
 
+def test_one_evaluation_has_the_derivatives_of_the_root(posed, truth):
+    """Over coordinates and unknowns together, unknowns eliminated: as through the root itself, where runs slide too."""
+    one = jax.jit(lambda z: posed.linearised(posed.robot, z, posed.data)[:2])
+
+    def signed(z):
+        return (posed.signed(posed.observation(z), posed.data),) * 2
+
+    root = jax.jit(jax.jacfwd(signed, has_aux=True))
+    for z in (truth, jnp.zeros_like(truth)):
+        (r, jacobian), (through, wanted) = one(z), root(z)
+        np.testing.assert_allclose(r, wanted, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(jacobian, through, rtol=1e-7, atol=1e-9 * np.abs(through).max())
+
+
 @pytest.mark.slow
 def test_the_objective_is_finite_where_the_robot_slides_and_leads_back(posed):
     nominal_z = jnp.zeros(len(posed.coordinates))
     seen = posed.observation(nominal_z)
     assert np.sum(np.asarray(seen.status) == SLIDES) == 6  # Table 5's adhesion against 15 and 20 degrees
     assert np.all(np.isfinite(np.asarray(seen.reading)))
-    gradient = jax.grad(lambda z: 0.5 * jnp.sum(fit.residuals(posed, posed.data, fit.no_pin(z.size))(z) ** 2))(
-        nominal_z
-    )
+    gradient = jax.grad(lambda z: 0.5 * jnp.sum(residuals(posed, z) ** 2))(nominal_z)
     for name, g in zip(posed.coordinates.names, np.asarray(gradient), strict=True):
         if name.endswith("friction.static"):
             assert g < 0  # more adhesion costs less

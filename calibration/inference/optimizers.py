@@ -84,38 +84,6 @@ class Optimum(eqx.Module):
     steps: Int[Array, ""]
 
 
-def with_jacobian(function: Callable[[Z], Array]) -> Callable[[Z], Array]:
-    """`function` with its Jacobian computed once, forward, wherever it is differentiated (either mode).
-
-    Exact: implicit through the root of `steady`, through the rollout of `drive`. One evaluation of value
-    and Jacobian together then serves every product with it, which a solver would else recompute.
-    """
-
-    @jax.custom_jvp
-    def value(z: Z) -> Array:
-        return function(z)
-
-    @value.defjvp
-    def derivative(primals: tuple[Z], tangents: tuple[Z]) -> tuple[Array, Array]:
-        (z,), (dz,) = primals, tangents
-        jacobian, out = jax.jacfwd(lambda x: (function(x),) * 2, has_aux=True)(z)
-        return out, jacobian @ dz
-
-    return value
-
-
-def residuals(problem: Problem, data: Data, pin: Pin) -> Callable[[Z], Array]:
-    """Residuals as a function of z: misfit, then prior; a held coordinate has a prior residual that keeps
-    it where it is, so that the Jacobian has full rank."""
-
-    def function(z: Z) -> Array:
-        held = pin.apply(z)
-        prior = jnp.where(pin.held, z - pin.at, z - data.centre)
-        return jnp.concatenate([problem.misfit(held, data), prior])
-
-    return with_jacobian(function)
-
-
 def penalties(data: Data) -> slice:
     """Which residuals are penalties on adhesion, one a row, between readings and priors."""
     return slice(data.measured.size, data.measured.size + data.measured.shape[0])
