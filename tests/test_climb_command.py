@@ -55,7 +55,9 @@ def test_files_of_terrain_and_sequence_are_read_with_their_units(tmp_path):
     (tmp_path / "t.csv").write_text("# a kerb\nx_mm;z_mm\n100;0\n100;80\n300,5;80\n")
     ground = terrains.read_terrain(tmp_path / "t.csv")
     assert float(ground.finish) == pytest.approx(0.2005)
-    assert np.asarray(ground.distance(jnp.array([[0.1, 0.1], [0.1, 0.05]]))[0]) == pytest.approx([0.02, -0.03])
+    # above it, within it, and within it where the foot of the kerb is nearest
+    gaps = ground.distance(jnp.array([[0.1, 0.1], [0.1, 0.05], [0.01, -0.01]]))[0]
+    assert np.asarray(gaps) == pytest.approx([0.02, -0.03, -0.01 * np.sqrt(2)])
     (tmp_path / "s.csv").write_text("x_mm,front_deg,rear_deg\n-300,45,180\n0,0,-8\n")
     sequence = terrains.read_sequence(tmp_path / "s.csv", nominal(), (0.0, 0.0))
     assert np.degrees(np.asarray(sequence.angles(-0.15, 0.0))) == pytest.approx([22.5, 180 - 86])
