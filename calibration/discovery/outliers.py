@@ -5,6 +5,7 @@ from __future__ import annotations
 import concurrent.futures
 import contextlib
 import dataclasses
+import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -54,11 +55,17 @@ def ahead(
     mean = Candidate(none, nothing, nothing, np.inf, nothing, nothing, False, False, False)
     start = BaseFit(mean, np.full(np.shape(space.bare.data.measured), np.nan), space, ())
 
+    looked = threading.Event()
+
     def look() -> None:
-        bases, (linear, _, _) = _look(start, bases_at, settings)
+        try:
+            bases, (linear, _, _) = _look(start, bases_at, settings)
+        finally:
+            looked.set()
         bootstrap(space.bare, nothing[: space.free], linear, space.library.scored, bases, 1, settings.seed)
 
-    def fit() -> None:
+    def fit() -> None:  # needed last: what compiles beside the base fit shares two cores with it
+        looked.wait()
         if not space.bare.observe.long:
             search_each(space.equipped, [nothing], [space.weight], [space.library.indices(none)])
 

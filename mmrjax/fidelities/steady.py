@@ -247,7 +247,10 @@ def _over_points(function: Callable[..., Any], *arguments: Any) -> Any:
         own = [x if row is None else row for x, row in zip(leaves, rows, strict=True)]
         return batched(*jax.tree.unflatten(tree, own))
 
-    found = jax.lax.map(of_block, [jnp.reshape(x, (-1, block)) if jnp.ndim(x) else None for x in leaves])
+    # Derivatives in reverse compute a block again: what they need of all blocks would fill the memory.
+    found = jax.lax.map(
+        jax.checkpoint(of_block), [jnp.reshape(x, (-1, block)) if jnp.ndim(x) else None for x in leaves]
+    )
     return jax.tree.map(lambda x: jnp.reshape(x, points), found)
 
 
