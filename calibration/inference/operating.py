@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from mmrjax import channels, params
+from mmrjax.compiling import SELDOM, compiled
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.steady import steady_batch
+from mmrjax.fidelities.steady import steady
 from mmrjax.robot import Robot
-from mmrjax.signals import done
+from mmrjax.signals import Result, done
 
 #: Conditions are padded to a multiple of this, so that tables of about one size share what is compiled.
 PAD = 16
@@ -41,7 +43,12 @@ def operating_readings(
         gripping = conditions.adhesion
     posed = dataclasses.replace(conditions, adhesion=gripping, total_mass=own_mass)
     padded = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[index]), posed)
-    found = steady_batch(params.strong(robot), padded)
+    found = _settled(params.strong(robot), padded)
     reading = np.stack([np.asarray(found.reading[c]) for c in names or channels.names(robot.channels)], 1)[:runs]
     moving = done(np.asarray(found.status))[:runs]
     return np.where(moving[:, None], reading, np.nan)
+
+
+@functools.partial(compiled, options=SELDOM)
+def _settled(robot: Robot, conditions: Conditions) -> Result:
+    return jax.vmap(lambda c: steady(robot, c))(conditions)
