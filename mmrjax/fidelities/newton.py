@@ -75,7 +75,7 @@ def _step(residual: Residual, y: Vector, shared: Any, own: Any, apart: bool) -> 
 
 @eqx.filter_custom_jvp
 def root(
-    residual: Residual, start: Vector, shared: Any, own: Any, tolerance: float, linear: bool
+    residual: Residual, start: Vector, shared: Any, own: Any, tolerance: float, linear: bool, apart: bool
 ) -> tuple[Vector, Bool[Array, ""]]:
     """y with f(y) = 0, by y ← y - J⁻¹ f(y), until every member of a batch is there.
 
@@ -90,7 +90,9 @@ def root(
         shared, own: what f depends on beside y: data of all members of a batch and of each. Derivatives by both
             are implicit, dy = -(∂f/∂y)⁻¹ (∂f/∂shared dshared + ∂f/∂own down), forward and reverse, zero where ∂f/∂y
             is singular. The program holds no host callback.
-        linear: whether f is linear in y but for branches, and the batch large; right for any f, fast for such.
+        linear: whether f is linear in y but for branches; right for any f, fast for such.
+        apart: whether ∂f/∂y is found by one unknown after another, which is faster over large batches, or by all
+            together, a program of a third of the size.
 
     Returns:
         y, and whether it was there within `MAX_STEPS` turns; one whose residual is not finite is not.
@@ -108,12 +110,12 @@ def root(
             # what the turns have in common before the first of them, also where there is none.
             here = jax.tree.map(lambda x: jnp.where(solved, jnp.ones_like(x), x), own)
         # A step so small leaves an error of its square.
-        y, step = _step(residual, y, shared, here, linear)
+        y, step = _step(residual, y, shared, here, apart)
         return count + 1, y, _small(step, tolerance**0.7)
 
     y, solved = start, jnp.asarray(False)
     if linear:
-        y, _ = _step(residual, start, shared, own, linear)
+        y, _ = _step(residual, start, shared, own, apart)
         solved = _small(residual(y, shared, own), tolerance)
     _, y, solved = jax.lax.while_loop(going, turn, (jnp.asarray(0, jnp.int8), y, solved))
     return y, solved
@@ -121,12 +123,12 @@ def root(
 
 @root.def_jvp
 def _implicit(primals: tuple, tangents: tuple) -> tuple[tuple[Vector, Array], tuple[Any, None]]:
-    residual, start, shared, own, tolerance, linear = primals
-    y, solved = root(residual, start, shared, own, tolerance, linear)
+    residual, start, shared, own, tolerance, linear, apart = primals
+    y, solved = root(residual, start, shared, own, tolerance, linear, apart)
     moved = eqx.filter_jvp(lambda *given: residual(y, *given), (shared, own), tangents[2:4])[1]
     if moved is None or all(m is None for m in moved):
         return (y, solved), (tuple(jnp.zeros_like(x) for x in y), None)
-    factors, own_factors = regular(factorise(_linearised(residual, y, shared, own, linear)[0]))
+    factors, own_factors = regular(factorise(_linearised(residual, y, shared, own, apart)[0]))
     step = substitute(factors, moved)
     change = tuple(
         jnp.zeros_like(a) if b is None else jnp.where(own_factors, -b, 0.0) for a, b in zip(y, step, strict=True)

@@ -99,14 +99,14 @@ def _start(robot: Robot, conditions: Conditions) -> Vector:
     )
 
 
-def _root(robot: Robot, conditions: Conditions, linear: bool) -> tuple[Vector, Array]:
-    """The unknowns at which the balances close, and whether the search got there; derivatives are implicit. `linear`
-    as of `root`."""
+def _root(robot: Robot, conditions: Conditions, large: bool = True) -> tuple[Vector, Array]:
+    """The unknowns at which the balances close, and whether the search got there; derivatives are implicit. `large`:
+    the program is to be quick over large batches, else soon compiled."""
     tolerance = float(jnp.finfo(jnp.result_type(conditions.voltage)).eps) ** 0.85
     sound = _sound(robot, conditions)[1]
     start = jax.lax.stop_gradient(_start(robot, sound))
     own = conditions, direction(robot, sound)
-    return root(_residual, start, robot, own, tolerance, linear)
+    return root(_residual, start, robot, own, tolerance, large and not robot.effects, large)
 
 
 @compiled
@@ -119,7 +119,7 @@ def operating_signals(robot: Robot, conditions: Conditions) -> Signals:
     robot that turns those of each side, along an axis of 2."""
     if conditions.turns:
         return _circled(robot, conditions)
-    unknowns, _ = _root(robot, conditions, not robot.effects)
+    unknowns, _ = _root(robot, conditions)
     _, sound = _sound(robot, conditions)
     return _balanced(robot, sound, _state(unknowns, sound.discharge), direction(robot, sound))[0]
 
@@ -189,7 +189,7 @@ def _slides_in_place(robot: Robot, conditions: Conditions) -> Array:
 
 def operating(robot: Robot, conditions: Conditions) -> tuple[Signals, Array, Array]:
     """Every signal of `operating_point`, its status, and whether robot and conditions are sound."""
-    unknowns, solved = _root(robot, conditions, not robot.effects)
+    unknowns, solved = _root(robot, conditions)
     return _operating_at(robot, conditions, unknowns, solved)[:3]
 
 
@@ -305,7 +305,7 @@ def _settled(robot: Robot, conditions: Conditions) -> Result:
 
 
 def _solve(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " unknowns"], Bool[Array, ""]]:
-    unknowns, found = _root(robot, conditions, linear=False)
+    unknowns, found = _root(robot, conditions, large=False)
     return jax.lax.stop_gradient((jnp.stack(unknowns), found))
 
 
