@@ -27,6 +27,8 @@ CONDITIONS = ("voltage", "duty", "duty_left", "duty_right", "slope_deg", "payloa
 FURTHER = ("voltage_left", "voltage_right", "yaw_rate", "current_other")
 #: What drives the sides apart, stated of both or of none.
 PAIRS = (("duty_left", "duty_right"), ("voltage_left", "voltage_right"))
+#: What makes a robot free to turn where a profile states it.
+APART = (*PAIRS[0], *PAIRS[1], "yaw_rate")
 
 
 class Instant(eqx.Module):
@@ -109,7 +111,7 @@ class Profile(eqx.Module):
     @property
     def turns(self) -> bool:
         """Whether it drives the sides apart: the robot is then free to turn."""
-        return any(getattr(self, name) is not None for name in (*PAIRS[0], *PAIRS[1], "yaw_rate"))
+        return any(getattr(self, name) is not None for name in APART)
 
     @property
     def duration(self) -> Scalar:

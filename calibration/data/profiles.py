@@ -21,7 +21,7 @@ from calibration.data.errors import BadConfiguration, BadData, choices, is_numbe
 from calibration.data.units import Quantity
 from mmrjax import channels
 from mmrjax.fidelities.mission import Start
-from mmrjax.profile import MODES, MOTOR_SPEED, PAIRS, SPEED, VOLTAGE, profile
+from mmrjax.profile import APART, MODES, MOTOR_SPEED, PAIRS, SPEED, VOLTAGE, profile
 from mmrjax.tables import CONDITION_LIMITS, SURFACES, adhesion_ratio, lateral_ratio
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ QUANTITIES: dict[str, Quantity] = {
 }
 #: Columns of which a row has at most one, and the mode that each means.
 DEMANDS = {
-    **dict.fromkeys(("duty", *(name for pair in PAIRS for name in pair)), MODES[VOLTAGE]),
+    **dict.fromkeys(("duty", *PAIRS[0], *PAIRS[1]), MODES[VOLTAGE]),
     **{mode: mode for mode in CONTROLLED},
 }
 #: Demanded beside a speed.
@@ -132,7 +132,7 @@ class ProfileTable:
     @property
     def turns(self) -> bool:
         """Whether it drives the sides apart."""
-        return any(name in self.values for name in (YAW_RATE, *(name for pair in PAIRS for name in pair)))
+        return any(name in self.values for name in APART)
 
     @property
     def stated(self) -> tuple[str, ...]:
@@ -159,7 +159,7 @@ class ProfileTable:
         Raises:
             BadConfiguration: it states a supply voltage, and the battery is to feed the motors.
         """
-        if self.turns and battery and PAIRS[1][0] in self.values:
+        if battery and PAIRS[1][0] in self.values:
             raise BadConfiguration(
                 f"--battery: got it beside {self.source}, which states voltage_left_V; a battery's voltage falls, so "
                 "state duty_left and duty_right"

@@ -316,8 +316,8 @@ def _swung(run: System, motion: Motion, time: Scalar, source: Scalar, free: Arra
     """What the drives do to the levers in a step, which without them are at the rates `free` after it [rad/s]."""
     levers, sequence = run.robot.running_gear.levers, run.sequence
     most = jnp.abs(source) if sequence.supply is None else sequence.supply
-    low = high = jnp.stack([most, most])
-    low = -low
+    high = jnp.stack([most, most])
+    low = -high
     aims = asked(run, motion, time)
     if sequence.begins is not None:
         aims = jnp.zeros_like(aims)
