@@ -382,8 +382,8 @@ def _drawn(robot: Robot, chassis: Chassis, signals: Signals, pull: Any) -> Signa
 def resolved_sides(
     robot: Robot, conditions: Conditions, motion: PlaneMotion, mover: Mover, inertia: Scalar
 ) -> tuple[Signals, Any]:
-    """`resolved` of a robot free to turn, of left and right side: a leading axis of 2 in the signals, the normal loads
-    of `mover` and what it pulls."""
+    """`resolved` of a robot free to turn, of left and right side: a leading axis of 2 in the signals, in the normal
+    loads of `mover` and in what it pulls."""
     robot = robot.within(conditions.configuration)
     chassis = dataclasses.replace(robot.chassis(conditions.configuration), inertia=inertia)
     own = conditions.of_sides()

@@ -165,7 +165,8 @@ class Conditions(eqx.Module):
 
     def straight(self) -> Conditions:
         """The same of a robot whose sides are driven alike, uphill."""
-        return dataclasses.replace(self, **dict.fromkeys(OF_TURNS))
+        alike: dict[str, Any] = dict.fromkeys(OF_TURNS)
+        return dataclasses.replace(self, **alike)
 
     def of_sides(self) -> Conditions:
         """Those of left and right side, a leading axis of 2."""

@@ -45,8 +45,8 @@ class Bodies(NamedTuple):
 
     Attributes:
         names: of the bodies.
-        mass: [kg]; inertia: about its own centre by x, y, z [kg·m²]; centre: in its own frame [m]; place: of its frame
-            in that of the chassis, whose origin is the middle of the wheelbase [m].
+        mass: [kg]; inertia: about its own centre by x, y, z [kg·m²]; centre: in its own frame [m].
+        place: of its frame in that of the chassis, whose origin is the middle of the wheelbase [m].
     """
 
     names: tuple[str, ...]
@@ -118,10 +118,9 @@ def text(robot: Robot, conditions: Conditions, mass: float, step: float = 1e-4) 
                 levers += f'<geom type="capsule" size="0.012" fromto="{ends}" rgba=".35 .4 .45 1"/>\n      '
     pulleys = ""
     for k, name in enumerate(parts.names[1:], 1):
-        shown = "".join(
-            f'<geom type="cylinder" size="{outer:.9g} 0.018" euler="90 0 0" pos="0 {y} 0" rgba=".2 .2 .2 1"/>\n        '
-            for y in ((0.0,) if conditions.turns else (0.122, -0.122))
-        )
+        disc = f'<geom type="cylinder" size="{outer:.9g} 0.018" euler="90 0 0" rgba=".2 .2 .2 1"'
+        middles = (0.0,) if conditions.turns else (0.122, -0.122)
+        shown = "".join(f'{disc} pos="0 {y} 0"/>\n        ' for y in middles)
         across = 0.019 if conditions.turns else 0.141
         pulleys += f"""
       <body name="{name}" pos="{_row(parts.place[k])}">
@@ -135,7 +134,8 @@ def text(robot: Robot, conditions: Conditions, mass: float, step: float = 1e-4) 
         for y in (-0.122, 0.122)
         for z in (-radius, radius)
     )
-    return f"""<mujoco model="{"" if conditions.turns else "half "}robot {robot.configurations.names[int(conditions.configuration)]}">
+    titled = f"{'' if conditions.turns else 'half '}robot {robot.configurations.names[int(conditions.configuration)]}"
+    return f"""<mujoco model="{titled}">
   <compiler inertiafromgeom="false"/>
   <option timestep="{step:.9g}" integrator="Euler" gravity="{-GRAVITY * sin:.17g} 0 {-GRAVITY * cos:.17g}">
     <flag contact="disable" constraint="disable" eulerdamp="disable"/>

@@ -197,8 +197,10 @@ class Law(eqx.Module):
         )
 
     def rises(self, along: Scalar, across: Scalar) -> tuple[tuple[Scalar, Scalar], tuple[Scalar, Scalar]]:
-        """How fast forces over load, `per_speed` times the sliding speeds, rise with these, at speeds along and across
-        [s/m]: by rows. A force that falls as all of the sliding grows is taken as one that stays."""
+        """How fast forces over load, `per_speed` times the sliding speeds, rise with these [s/m], by rows.
+
+        A force that falls as all of the sliding grows is taken as one that stays.
+        """
         square, other, both = along**2, across**2, along * across
         held, (by_along, by_across) = self.per_speed(square, other), self.per_speed_rise(square, other)
         grows = held + 2 * (square * by_along + other * by_across)

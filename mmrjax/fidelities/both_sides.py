@@ -2,9 +2,9 @@
 
 Coordinates q: place x uphill and y to the left [m], height z of the middle of the wheelbase over the ground [m], yaw,
 pitch (nose down) and roll (left side up) [rad], then the angles of driving and driven pulley of the left and of the
-right side [rad], relative to the chassis. Velocities v alike. MJX carries chassis and pulleys (`mjcf`); each side is
+right side [rad], relative to the chassis. Velocities v alike. MJX carries chassis and pulleys (`mjcf`). Each side is
 the half robot's belt, contacts and drive (`undercarriage`, `balances.resolved_sides`) at its own height z + y_s roll
-and speed v_x - ω y_s, with `turning.Law` at each contact in the place of Fig. 7 along the travel alone. Roll is small.
+and speed v_x - ω y_s; `turning.Law` at each contact takes the place of Fig. 7 along the travel alone. Roll is small.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ def _losses(run: System, motion: PlaneMotion, sides: _Sides) -> Float[Array, "2 
 
 
 class _Levers(eqx.Module):
-    """How each contact of a side moves along the robot, to its left and off the ground with `OF_SIDE`'s velocities."""
+    """How each contact of a side moves along the robot, to its left and off the ground with velocities `OF_SIDE`."""
 
     along: Float[Array, "2 contacts 8"]
     across: Float[Array, "2 contacts 8"]
@@ -148,9 +148,9 @@ def _levers(run: System, motion: Motion, at: Touch) -> _Levers:
     none = jnp.zeros_like(one)
     front, rear = run.path.radius * (1 - at.weight), run.path.radius * at.weight
     x, z = at.lever_x, at.lever_z
-    along = [cos * one, sin * one, none, -y * one, z, none, at.rate_x * front, at.rate_x * rear]
-    across = [-sin * one, cos * one, none, x, none, -z, none, none]
-    off = [none, none, one, none, -x, y * one, at.rate_z * front, at.rate_z * rear]
+    along: list[Any] = [cos * one, sin * one, none, -y * one, z, none, at.rate_x * front, at.rate_x * rear]
+    across: list[Any] = [-sin * one, cos * one, none, x, none, -z, none, none]
+    off: list[Any] = [none, none, one, none, -x, y * one, at.rate_z * front, at.rate_z * rear]
     return _Levers(*(jnp.stack(rows, axis=-1) for rows in (along, across, off)))
 
 
@@ -192,7 +192,9 @@ def resistance(
     moves = jnp.concatenate([levers.along, levers.across, levers.off], axis=1)
     falls = at.damped[..., None] * levers.off
     pushes = [
-        rises[k, 0][..., None] * levers.along + rises[k, 1][..., None] * levers.across + (f / least)[..., None] * falls
+        rises[k, 0][..., None] * levers.along
+        + rises[k, 1][..., None] * levers.across
+        + (f / least)[..., None] * falls
         for k, f in enumerate((pulled.force, pulled.aside))
     ]
     each = jnp.einsum("sci,scj->sij", moves, jnp.concatenate([*pushes, falls], axis=1))
@@ -208,9 +210,10 @@ def resistance(
     return run.robot.sides / 2 * found, levers, rises
 
 
-def _dynamics(run: System, motion: Motion, signals: Signals) -> tuple[Float[Array, "10 10"], Float[Array, " 10"]]:
-    """Mass matrix, the rotors' armature in it, and bias of MJX."""
-    armature = run.robot.sides / 2 * half_robot.rotating(run, signals)
+def dynamics(
+    run: System, motion: Motion, armature: Float[Array, " 2"]
+) -> tuple[Float[Array, "10 10"], Float[Array, " 10"]]:
+    """Mass matrix and bias of MJX, with the rotors' `armature` at the driving shafts [kg·m²] in the first."""
     model = run.model.replace(dof_armature=jnp.zeros(COORDINATES).at[PULLEYS[:, 0]].set(armature))
     data = run.data.replace(qpos=motion.q, qvel=motion.v)
     data = mjx.com_pos(model, mjx.kinematics(model, data))
@@ -229,11 +232,11 @@ def advance(run: System, motion: Motion) -> tuple[Motion, balances.Travel, Float
     plane = plane_motion(run, motion)
     signals, pulled = _resolved(run, plane, sides)
     damping, levers, rises = resistance(run, motion, signals, sides, pulled)
-    mass, bias = _dynamics(run, motion, signals)
+    mass, bias = dynamics(run, motion, jnp.asarray(run.robot.sides / 2 * half_robot.rotating(run, signals)))
     push = generalized(run, motion, signals, sides.at, pulled) - bias
     whole = mass + run.step * damping
     factors = elimination.factorise([list(row) for row in whole])
-    gained = jnp.stack(elimination.substitute(factors, list(run.step * push)))
+    gained = jnp.stack([jnp.asarray(x) for x in elimination.substitute(factors, list(run.step * push))])
     v = motion.v + gained
 
     def later(own: Conditions, signals: Signals, memory: Mapping[str, Scalar]) -> Any:
@@ -245,28 +248,33 @@ def advance(run: System, motion: Motion) -> tuple[Motion, balances.Travel, Float
     return after, _travel(run, motion, signals, sides, pulled, levers, rises, gained), pulled.guided
 
 
+def forces_after(
+    at: Touch, pulled: Pull, levers: _Levers, rises: Array, gained: Float[Array, " 10"]
+) -> tuple[Array, Array, Array]:
+    """Forces of the contacts ahead, to the left and off the ground [N] with which a step that gains Δv is made, each
+    of shape (2, contacts)."""
+    own = gained[OF_SIDE]
+    along, across, off = (jnp.einsum("sci,si->sc", x, own) for x in (levers.along, levers.across, levers.off))
+    down, least = at.damped * off, jnp.maximum(at.force, 1e-9)
+    assert pulled.aside is not None
+    ahead, aside = (
+        force - (rises[k, 0] * along + rises[k, 1] * across + force / least * down)
+        for k, force in enumerate((pulled.force, pulled.aside))
+    )
+    return ahead, aside, at.force - down
+
+
 def _travel(
     run: System, motion: Motion, signals: Signals, sides: _Sides, pulled: Pull, levers: _Levers, rises: Array,
     gained: Array,
 ) -> balances.Travel:  # fmt: skip
     """All of a step, its forces those at its end to first order."""
     at, several = sides.at, run.robot.sides / 2
-    assert pulled.aside is not None
-    own = gained[OF_SIDE]
-    along, across, off = (jnp.einsum("sci,si->sc", x, own) for x in (levers.along, levers.across, levers.off))
-    down = at.damped * off
-    least = jnp.maximum(at.force, 1e-9)
-    normal = at.force - down
-    ahead, aside = (
-        force - (rises[k, 0] * along + rises[k, 1] * across + force / least * down)
-        for k, force in enumerate((pulled.force, pulled.aside))
-    )
+    ahead, aside, normal = forces_after(at, pulled, levers, rises, gained)
     forward = run.half.centre[0]
     arm = at.lever_x - forward
     load, moment = jnp.sum(normal, axis=-1), jnp.sum(aside * arm, axis=-1)
-    signals = dataclasses.replace(
-        signals, traction=jnp.sum(ahead, axis=-1), normal=load, moment_lateral=moment
-    )
+    signals = dataclasses.replace(signals, traction=jnp.sum(ahead, axis=-1), normal=load, moment_lateral=moment)
     # Of the centre of mass, in the frame of the robot that turns.
     speed, lateral = _ahead(run, motion.v, motion.q[YAW])
     ahead_gained, aside_gained = _ahead(run, gained / run.step, motion.q[YAW])
@@ -284,9 +292,7 @@ def _travel(
         centre=jnp.sum(normal * at.lever_x) / jnp.maximum(jnp.sum(load), 1e-9),
         lacking=jnp.zeros_like(y),
     )
-    return balances.Travel(
-        signals, grip, acceleration, aside_gained - motion.v[YAW] * speed + forward * turn, turn
-    )
+    return balances.Travel(signals, grip, acceleration, aside_gained - motion.v[YAW] * speed + forward * turn, turn)
 
 
 def stand(run: System) -> Motion:
@@ -295,8 +301,10 @@ def stand(run: System) -> Motion:
     heading = _heading(run)
     along = jnp.degrees(jnp.arcsin(sine(run.conditions.slope) * cosine(heading)))
     half = half_robot.stand(dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, slope_deg=along)))
-    q = jnp.zeros(COORDINATES, half.q.dtype).at[jnp.asarray([HEIGHT, PITCH, YAW])].set(
-        jnp.stack([half.q[1], half.q[2], heading + jnp.zeros_like(half.q[1])])
+    q = (
+        jnp.zeros(COORDINATES, half.q.dtype)
+        .at[jnp.asarray([HEIGHT, PITCH, YAW])]
+        .set(jnp.stack([half.q[1], half.q[2], heading + jnp.zeros_like(half.q[1])]))
     )
     memory = {name: jnp.stack([x, x]) for name, x in half.memory.items()}
     return Motion(q, jnp.zeros_like(q), jnp.zeros(len(SIDES), q.dtype), half.discharge, memory)
@@ -315,5 +323,5 @@ def roll(run: System) -> Motion:
     lateral = rolls.speed_lateral - run.half.centre[0] * rolls.yaw_rate
     shafts = rolls.speed_motor / run.robot.gearbox.ratio
     plane = [cos * rolls.speed - sin * lateral, sin * rolls.speed + cos * lateral, rolls.yaw_rate]
-    v = begins.v.at[jnp.asarray([X, Y, YAW])].set(jnp.stack(plane)).at[PULLEYS].set(shafts[:, None])
+    v = begins.v.at[jnp.asarray([X, Y, YAW])].set(jnp.stack(plane)).at[PULLEYS].set(jnp.asarray(shafts)[:, None])
     return dataclasses.replace(begins, v=v, current=rolls.current, memory=rolls.memory)

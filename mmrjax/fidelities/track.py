@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -52,9 +52,13 @@ OVER, HIGH = 0.5, 20.0
 SETTLED = 1e-3  # largest relative change of the speeds from one half of the window to the other
 
 
+#: Changes of some signals, and their sizes.
+Changes = Sequence[tuple[Scalar, Scalar]]
+
+
 class Steady(eqx.Module):
-    """Averages over the last whole number of grouser periods of a run; of a robot that turns a leading axis of left and
-    right side, each over periods of its own.
+    """Averages over the last whole number of grouser periods of a run; of a robot that turns a leading axis of left
+    and right side, each over periods of its own.
 
     Attributes:
         signals: means.
@@ -106,7 +110,7 @@ class Trajectory(eqx.Module):
 
 def _average(
     run: System, time: Array, travelled: Array, sums: tuple[Any, Array]
-) -> tuple[Any, Scalar, Array, list[tuple[Scalar, Scalar]]]:
+) -> tuple[Any, Scalar, Array, Changes]:
     """Means of signals (or `Travel`) and guides' load, periods averaged, and of three signals the change and size."""
     # Weights over the belt's travel that rise over one pitch and fall over another by the cubic step, which
     # adds up to one with its neighbour a pitch on: the mean of an orbit that repeats with the pitch is exact
@@ -142,7 +146,7 @@ def _steady(run: System, time: Array, travelled: Array, record: Record) -> Stead
         share = guided / jnp.maximum(signals.normal, 1e-9)
         return Steady(signals, share, periods, jnp.max(_relative(changes)))
 
-    def side(travelled: Array, of_side: tuple[Any, Array]) -> tuple[Any, Scalar, Array, list[tuple[Scalar, Scalar]]]:
+    def side(travelled: Array, of_side: tuple[Any, Array]) -> tuple[Any, Scalar, Array, Changes]:
         return _average(run, time, travelled, of_side)
 
     # What is of the whole robot is averaged over the periods of either side.
@@ -155,7 +159,7 @@ def _steady(run: System, time: Array, travelled: Array, record: Record) -> Stead
     return Steady(travel.signals, share, periods, jnp.max(_relative(larger)), travel)
 
 
-def _relative(changes: list[tuple[Scalar, Scalar]]) -> Array:
+def _relative(changes: Changes) -> Array:
     return jnp.stack([change / jnp.maximum(size, 1e-3) for change, size in changes])
 
 
@@ -299,7 +303,7 @@ def check(robot: Robot, conditions: Conditions, *, duration: float, step: float,
         raise ValueError(
             f"the motors' {what} is imposed, and this model drives them by their voltage; use steady or drive"
         )
-    if conditions.motor_speed is not None or conditions.turns and conditions.of_sides().motor_speed is not None:
+    if conditions.motor_speed is not None or (conditions.turns and conditions.of_sides().motor_speed is not None):
         raise ValueError("motor_speed: got an imposed one; this model drives the motors by their voltage")
     if sample < step or abs(sample / step - round(sample / step)) > 1e-6:
         raise ValueError(f"step: got {step:g} s; expected {sample:g} s, a sample, divided by a whole number")
