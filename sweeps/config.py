@@ -367,7 +367,6 @@ class Simulate(RobotPart, ProfilePart, SupplyPart, TurnPart, PosteriorPart, Outp
     def _certain(self) -> Self:
         if self.turns:
             beside = [name for name in ("profile", "posterior") if getattr(self, name) is not None]
-            beside += ["model track"] * (self.model == "track")
             if beside:
                 raise PydanticCustomError("idle", f"left, right and heading act without {beside[0]} only")
             if self.battery and self.left_V is not None:
