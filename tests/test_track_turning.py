@@ -10,8 +10,10 @@ from mmrjax import balances, mjcf, params, render_above
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import both_sides, half_robot
 from mmrjax.fidelities.half_robot import system
+from mmrjax.fidelities.steady import steady_batch
+from mmrjax.fidelities.track import track_batch
 from mmrjax.masses import masses
-from mmrjax.signals import GRAVITY, State
+from mmrjax.signals import CONVERGED, GRAVITY, State
 from mmrjax.turning import SIDES, Law
 
 STEP, STEPS = 1e-4, 3000
@@ -238,3 +240,17 @@ def test_a_turn_is_seen_from_above(contacts):
     moved = [np.subtract(arrow.xy, arrow.xyann) for arrow in (first, last)]
     np.testing.assert_allclose(moved[0], [0.15 * 0.15, 0.0], atol=1e-12)  # rear left: to the right alone
     np.testing.assert_allclose(moved[1], [-0.15 * 0.15, 0.15 * (0.2 + 0.1215 - 0.5)], atol=1e-12)
+
+
+@pytest.mark.slow
+def test_wheels_turn_as_the_steady_fidelity_says_and_tracks_faster(robot):
+    """On the spot; the track does not bear along all of its wheelbase (docs/turning.md)."""
+    turns = Conditions(["6T2A", "4W2T"], voltage=[15.0, 24.0], duty_left=-1.0, duty_right=1.0).resolved(robot)
+    found = track_batch(robot, turns, duration=0.6, rolling=True)
+    settled = steady_batch(robot, turns)
+    assert list(found.result.status) == [CONVERGED, CONVERGED]
+    for name in ("yaw_rate", "motor_current_right", "motor_speed_right"):
+        mine, other = (float(x.reading[name][1]) for x in (found.result, settled))
+        assert mine == pytest.approx(other, rel=1e-3), name
+    faster = found.result.reading["yaw_rate"][0] / settled.reading["yaw_rate"][0]
+    assert 1.07 < float(faster) < 1.13
