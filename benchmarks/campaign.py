@@ -166,7 +166,7 @@ class Shares:
 
 
 def _worker(work: Callable[[Task], dict], line: Connection, core: int | None) -> None:
-    """Judge what comes along a line, on one core if one is given: XLA's pool has a thread for each that it may use."""
+    """Judge what comes along a line, on one core if one is given: XLA's pool has a thread for each it may use."""
     if core is not None:
         os.sched_setaffinity(0, {core})
     while (task := line.recv()) is not None:
