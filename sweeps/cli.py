@@ -254,7 +254,7 @@ def render(
 ) -> int:
     """Draw a run of the track model from standstill: the robot on its slope, its track running, its forces.
 
-    Needs no display.
+    With --left and --right it turns, and is seen from above. Needs no display.
     """
     from sweeps.commands import render as room
 

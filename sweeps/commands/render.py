@@ -9,10 +9,12 @@ import jax
 
 from calibration.data.errors import BadConfiguration
 from mmrjax import render as pictures
+from mmrjax import render_above
 from mmrjax.fidelities.track import track_batch
 from mmrjax.signals import STATUSES
 from sweeps import capabilities
 from sweeps import config as configuration
+from sweeps.commands import turn
 from sweeps.console import progress, say, tell
 from sweeps.inputs import load_robot, one_run
 from sweeps.pages import words
@@ -39,6 +41,9 @@ def render(
         raise BadConfiguration(f"FILE: {file.parent} is no folder; choose another path")
     robot = load_robot(config).robot
     imposed.check_on_ground(robot, "render")
+    if config.turns:
+        turn.check(robot, given.get("configuration") or robot.configurations.names[0])
+        given = {**given, **turn.cells(config, given)}
     conditions = run.commanded(robot, one_run(robot, given, config.battery), config)
     run.refuse(robot, conditions, config)
     if not robot.rig.inherits and not capabilities.stated(robot, "running_gear."):
@@ -50,7 +55,7 @@ def render(
     trajectory, conditions = jax.tree.map(lambda x: x[0], (trajectory, conditions))
     aside = file.with_name(f".{file.stem}.writing{file.suffix}")
     try:
-        view = pictures.scene(robot, conditions, trajectory)
+        view = (render_above if config.turns else pictures).scene(robot, conditions, trajectory)
         with progress(1, quiet=False, doing="drawing") as advance:
             pictures.render(view, aside, begin, end, slow)
             advance(1)
