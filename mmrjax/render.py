@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable
 from pathlib import Path as File
 from typing import Any, NamedTuple
 
@@ -282,15 +282,26 @@ def render(
     Raises:
         ValueError: as `instants`.
     """
-    file = File(file)
-    times = instants(file, begin, end, slow, float(view.time[-1]), rate)
-    frames = [int(np.argmin(np.abs(view.time - t))) for t in times]
+    return draw_run(lambda k: figure(view, k), view.time, File(file), begin, end, slow, rate)
+
+
+def draw_run(
+    picture: Callable[[int], Any], time: Float[np.ndarray, " n"], file: File, begin: float, end: float | None,
+    slow: float, rate: int,
+) -> File:  # fmt: skip
+    """Write a run as a picture or a film, see `render`, of figures of its samples, which are at `time` [s]."""
+    times = instants(file, begin, end, slow, float(time[-1]), rate)
+    sheets = (picture(int(np.argmin(np.abs(time - t)))) for t in times)
     if file.suffix == ".png":
-        figure(view, frames[0]).savefig(file)
+        next(sheets).savefig(file)
         return file
     if file.suffix == ".gif":
-        return film_gif((figure(view, k) for k in frames), file, rate)
-    pictures = (_pixels(figure(view, k)) for k in frames)
+        from PIL import Image
+
+        images = [Image.fromarray(_pixels(sheet)).quantize(256) for sheet in sheets]
+        images[0].save(file, save_all=True, append_images=images[1:], duration=round(1000 / rate), loop=0)
+        return file
+    pictures = (_pixels(sheet) for sheet in sheets)
     first = next(pictures)
     import imageio_ffmpeg
 
@@ -299,16 +310,7 @@ def render(
         # jax warns of every fork; this one becomes ffmpeg at once and never touches jax's threads
         warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
         writer.send(None)
-    for picture in itertools.chain([first], pictures):
-        writer.send(picture.tobytes())
+    for pixels in itertools.chain([first], pictures):
+        writer.send(pixels.tobytes())
     writer.close()
-    return file
-
-
-def film_gif(sheets: Iterable[Any], file: File, rate: int) -> File:
-    """Write figures of one size as a film (.gif) of `rate` frames a second."""
-    from PIL import Image
-
-    images = [Image.fromarray(_pixels(sheet)).quantize(256) for sheet in sheets]
-    images[0].save(file, save_all=True, append_images=images[1:], duration=round(1000 / rate), loop=0)
     return file

@@ -122,7 +122,7 @@ def climb(config: configuration.Climb, out: Path | None, force: bool) -> int:
         if config.film:
             from sweeps.pages import climb_figures
 
-            climb_figures.film(found, folder.partial / "climb.gif")
+            climb_figures.render(found, folder.partial / "climb.gif")
         print_climb(found)
         manifest = {"seed": None, "verdict": found.verdict}
         return leave(folder, config, manifest, solved=found.verdict != "failed", page=page("climb", found, file))
