@@ -260,7 +260,8 @@ def render(
 ) -> int:
     """Draw a run of the track model from standstill: the robot on its slope, its track running, its forces.
 
-    Or, with --climb, a climb that has been computed. Needs no display.
+    With --left and --right it turns, and is seen from above. With --climb a climb that has been computed is drawn.
+    Needs no display.
     """
     from sweeps.commands import render as room
 

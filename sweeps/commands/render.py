@@ -10,10 +10,12 @@ import jax
 
 from calibration.data.errors import BadConfiguration
 from mmrjax import render as pictures
+from mmrjax import render_above
 from mmrjax.fidelities.track import track_batch
 from mmrjax.signals import STATUSES
 from sweeps import capabilities
 from sweeps import config as configuration
+from sweeps.commands import turn
 from sweeps.console import progress, say, tell
 from sweeps.inputs import load_robot, one_run
 from sweeps.pages import words
@@ -38,6 +40,9 @@ def render(
     _check_free(file, force)
     robot = load_robot(config).robot
     imposed.check_on_ground(robot, "render")
+    if config.turns:
+        turn.check(robot, given.get("configuration") or robot.configurations.names[0])
+        given = {**given, **turn.cells(config, given)}
     conditions = run.commanded(robot, one_run(robot, given, config.battery), config)
     run.refuse(robot, conditions, config)
     if not robot.rig.inherits and not capabilities.stated(robot, "running_gear."):
@@ -47,9 +52,12 @@ def render(
         trajectory = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=told)
         told(1.0)
     trajectory, conditions = jax.tree.map(lambda x: x[0], (trajectory, conditions))
-    _write(
-        file, lambda aside: pictures.render(pictures.scene(robot, conditions, trajectory), aside, begin, end, slow)
-    )
+
+    def draw(aside: Path) -> None:
+        view = (render_above if config.turns else pictures).scene(robot, conditions, trajectory)
+        pictures.render(view, aside, begin, end, slow)
+
+    _write(file, draw)
     status = STATUSES[int(trajectory.result.status)]
     say(f"{status}: {words.STATUSES[status].why}")
     say(str(file))

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from mmrjax import footing, loop
+from mmrjax import render as pictures
 from mmrjax.footing import PITCH, SHAFT
-from mmrjax.render import draw_run
 from mmrjax.tables import BODY_HEIGHT
 from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, figure, style
 from sweeps.results.climb import SHOWN as IN_TITLE
@@ -148,27 +147,37 @@ def search(found: ClimbResult) -> Figure:
     return fig
 
 
-def picture(found: Drawable, k: int) -> Figure:
-    """The robot at sample `k`, as a picture of a film."""
-    q = coordinates(found.table)
-    low, high = q[:, 1].min() - 0.3, q[:, 1].max() + 0.35
-    with style():
-        sheet = Figure(figsize=(7.2, 4.6), dpi=80, layout="constrained")
-        ax = sheet.subplots()
-        _ground(ax, found, q[k, 0] - 0.7, q[k, 0] + 0.7)
-        _draw(ax, found, q[k])
-        ax.set(xlim=(q[k, 0] - 0.6, q[k, 0] + 0.6), ylim=(low, high), aspect="equal")
-        time, current = (found.table[name][k] for name in IN_TITLE)
-        ax.set_title(f"{found.obstacle}, {time:.2f} s, motors {current:.1f} A")
-        ax.axis("off")
-    return sheet
+class Film(NamedTuple):
+    """A climb as `mmrjax.render` draws it."""
+
+    found: Drawable
+
+    @property
+    def time(self) -> np.ndarray:
+        """Of the samples [s]."""
+        return self.found.table["time_s"]
+
+    def sheet(self, k: int) -> Figure:
+        """The robot at sample `k`."""
+        found, q = self.found, coordinates(self.found.table)
+        low, high = q[:, 1].min() - 0.3, q[:, 1].max() + 0.35
+        with style():
+            sheet = Figure(figsize=(7.2, 4.6), dpi=80, layout="constrained")
+            ax = sheet.subplots()
+            _ground(ax, found, q[k, 0] - 0.7, q[k, 0] + 0.7)
+            _draw(ax, found, q[k])
+            ax.set(xlim=(q[k, 0] - 0.6, q[k, 0] + 0.6), ylim=(low, high), aspect="equal")
+            time, current = (found.table[name][k] for name in IN_TITLE)
+            ax.set_title(f"{found.obstacle}, {time:.2f} s, motors {current:.1f} A")
+            ax.axis("off")
+        return sheet
 
 
 def render(
     found: Drawable, file: Path, begin: float | None = None, end: float | None = None, slow: float | None = None
 ) -> Path:
     """The run as a film (.gif, .mp4) or a picture (.png), of the instant `begin` or else of the largest pitch."""
-    time = found.table["time_s"]
+    view = Film(found)
     if begin is None:
-        begin = float(time[np.argmax(np.abs(found.table["pitch_deg"]))]) if file.suffix == ".png" else 0.0
-    return draw_run(partial(picture, found), time, file, begin, end, SLOW if slow is None else slow, RATE)
+        begin = float(view.time[np.argmax(np.abs(found.table["pitch_deg"]))]) if file.suffix == ".png" else 0.0
+    return pictures.render(view, file, begin, end, SLOW if slow is None else slow, RATE)
