@@ -16,8 +16,9 @@ PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --
 # slower, which short tests don't feel.
 QUICK := XLA_FLAGS="--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
 
+# Bytecode is kept, whatever a machine's settings: tests start processes of their own.
 test: lint
-	$(QUICK) $(PYTEST) -m "not slow"
+	PYTHONDONTWRITEBYTECODE= $(QUICK) $(PYTEST) -m "not slow"
 
 # Everything, compiled as users compile it: the tests that compile or run for long too, less than an hour on two cores.
 test-all: lint

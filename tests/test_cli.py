@@ -470,6 +470,7 @@ def test_partial_folder_of_another_run_is_not_taken_up(mmrjax, tmp_path, monkeyp
     assert (tmp_path / "s" / "runs.csv").read_text() == (tmp_path / "t" / "runs.csv").read_text()
 
 
+@pytest.mark.slow
 def test_progress_is_on_stderr_and_stdout_ends_with_the_path(tmp_path):
     arguments = ["sweep", "--slopes", "0:4:0.5", "--chunk", "50", "--no-report", "--out", str(tmp_path / "s")]
     done = subprocess.run(

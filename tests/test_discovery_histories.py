@@ -62,7 +62,7 @@ def clean(runs):
 ONE = dataclasses.replace(ANALYST, library={"pulley_eccentricity": BY_NAME["pulley_eccentricity"]})
 
 
-@pytest.fixture(scope="module", params=["prior", pytest.param("fitted", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=[pytest.param(x, marks=pytest.mark.slow) for x in ("prior", "fitted")])
 def seen(request, runs):
     """Runs, space, coordinates and the linear model there: at the prior's mean, and where the loop's fit ends."""
     if request.param == "fitted":

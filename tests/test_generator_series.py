@@ -56,7 +56,8 @@ def test_series_generator_holds_every_effect_that_only_a_series_shows():
     assert sum(not f.cls for f in gs.FORMS.values()) >= 4
 
 
-@pytest.mark.parametrize("battery", [0.0, pytest.param(1.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("battery", [0.0, 1.0])
 def test_clean_histories_agree_with_drive(package, battery):
     _, y = gs.histories(RUNS, DURATION, EVERY, battery=np.full(6, battery))
     assert apart(package(battery), y) < CLEAN

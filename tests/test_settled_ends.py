@@ -83,6 +83,7 @@ def ends_of(runs, p):
     return ends, settled_ends._sliding(problem, ends), truth.T, sound
 
 
+@pytest.mark.slow
 def test_ends_of_runs_that_grip_are_those_of_settled_travel(gripping):
     ends, slides, truth, sound = ends_of(*gripping)
     assert sound.all() and not slides.any()

@@ -65,7 +65,14 @@ def test_loop_looks_for_effects_of_turns_beside_the_library(posed):
     assert {"6T2A.turning.width", "6T2A.turning.lateral"} < set(space.coordinates.base.names)
 
 
-@pytest.mark.parametrize("name", ["side_voltage", "side_torque", "turning_resistance", "lateral_grip", "iron_loss"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "side_voltage",
+        "lateral_grip",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("side_torque", "turning_resistance", "iron_loss")),
+    ],
+)
 def test_signature_is_what_the_effect_does(posed, linear, shown, name):
     _, space = posed
     k = space.library.names.index(name)
@@ -81,7 +88,13 @@ def test_signature_is_what_the_effect_does(posed, linear, shown, name):
     np.testing.assert_allclose(mine[:, at], wanted, rtol=1e-3, atol=1e-4 * np.abs(wanted).max())
 
 
-@pytest.mark.parametrize("name", ["curve_track_side", "curve_yaw_yaw_rate", "curve_slip_yaw_rate"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "curve_track_side",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("curve_yaw_yaw_rate", "curve_slip_yaw_rate")),
+    ],
+)
 def test_column_of_a_curve_is_what_the_curve_does(linear, shown, name):
     """A curve that the loop fits is the one whose columns it scored."""
     _, balance, variable = name.split("_", 2)
