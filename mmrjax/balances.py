@@ -369,10 +369,28 @@ def resolved(
     signals = _fill(begin(robot, conditions, state), normal=mover.normal)
     signals = _to_slip(robot, conditions, chassis, signals)
     pull = mover.pull(chassis, signals)
+    return _drawn(robot, chassis, signals, pull), pull
+
+
+def _drawn(robot: Robot, chassis: Chassis, signals: Signals, pull: Any) -> Signals:
+    """The signals of one side, known up to its sliding, that its contacts pull."""
     traction, guide = pull.traction, jnp.sum(pull.guide)
-    signals = _pulled(robot, signals, traction)
-    signals = track(robot, chassis, signals, guide)
-    return gearbox(robot, chassis, signals, pull.load - guide * chassis.radius), pull
+    signals = track(robot, chassis, _pulled(robot, signals, traction), guide)
+    return gearbox(robot, chassis, signals, pull.load - guide * chassis.radius)
+
+
+def resolved_sides(
+    robot: Robot, conditions: Conditions, motion: PlaneMotion, mover: Mover, inertia: Scalar
+) -> tuple[Signals, Any]:
+    """`resolved` of a robot free to turn, of left and right side: a leading axis of 2 in the signals, in the normal
+    loads of `mover` and in what it pulls."""
+    robot = robot.within(conditions.configuration)
+    chassis = dataclasses.replace(robot.chassis(conditions.configuration), inertia=inertia)
+    own = conditions.of_sides()
+    signals = _fill(_begin_sides(robot, conditions, own, motion), normal=mover.normal)
+    signals = jax.vmap(lambda c, s: _to_slip(robot, c, chassis, s))(own, signals)
+    pull = mover.pull(chassis, signals)
+    return jax.vmap(lambda s, p: _drawn(robot, chassis, s, p))(signals, pull), pull
 
 
 def driven(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
@@ -465,6 +483,35 @@ def lateral_friction(conditions: Conditions, chassis: Chassis) -> Scalar:
     return own if stated is None else own * stated / conditions.adhesion
 
 
+def _both(x: Scalar) -> Array:
+    """The same of left and right side."""
+    return jnp.broadcast_to(x, SIDES.shape)
+
+
+def _begin_sides(robot: Robot, conditions: Conditions, own: Conditions, motion: PlaneMotion) -> Signals:
+    """`begin` of left and right side, and what the robot does in the plane; `own` are the sides' conditions."""
+    chassis = robot.chassis(conditions.configuration)
+    signals = jax.vmap(functools.partial(begin, robot))(own, states_of_sides(robot, conditions, motion))
+    return _fill(
+        signals,
+        total_current=_both(total(jnp.asarray(signals.total_current)) / 2),
+        side=jnp.sign(SIDES),
+        direction_turn=_both(contact.direction(motion.yaw_rate * chassis.turning.width / 2, chassis.speed_still)),
+        slope=_both(jnp.arcsin(sine(conditions.slope) * cosine(motion.heading))),
+        **{name: _both(getattr(motion, name)) for name in IN_PLANE},
+    )
+
+
+def added_in_plane(robot: Robot, signals: Signals) -> tuple[Scalar, Scalar]:
+    """What effects add to the balances `lateral` [N] and `yaw` [N·m], of all sides."""
+
+    def of(balance: str) -> Scalar:
+        each = _both(jax.vmap(lambda s: added(robot, s, balance))(signals))
+        return robot.sides / 2 * total(each)
+
+    return of("lateral"), of("yaw")
+
+
 def turning(
     robot: Robot, conditions: Conditions, motion: PlaneMotion, loads: Float[Array, " 2"] | None = None
 ) -> Travel:
@@ -479,20 +526,8 @@ def turning(
     robot = robot.within(conditions.configuration)
     chassis, own = robot.chassis(conditions.configuration), conditions.of_sides()
     y = SIDES * chassis.turning.width
-
-    def both(x: Scalar) -> Array:
-        return jnp.broadcast_to(x, y.shape)
-
-    signals = jax.vmap(functools.partial(begin, robot))(own, states_of_sides(robot, conditions, motion))
+    signals = _begin_sides(robot, conditions, own, motion)
     sine_slope, mass = sine(conditions.slope), jnp.maximum(*jnp.asarray(signals.mass))
-    signals = _fill(
-        signals,
-        total_current=both(total(jnp.asarray(signals.total_current)) / 2),
-        side=jnp.sign(SIDES),
-        direction_turn=both(contact.direction(motion.yaw_rate * chassis.turning.width / 2, chassis.speed_still)),
-        slope=both(jnp.arcsin(sine_slope * cosine(motion.heading))),
-        **{name: both(getattr(motion, name)) for name in IN_PLANE},
-    )
     even = jax.vmap(lambda c, s: _to_slip(robot, c, chassis, s))(own, signals)
     rolling = chassis.ground.force_resistance(1.0, even.direction_travel)
     units = robot.sides / 2
@@ -505,10 +540,7 @@ def turning(
     own_load = jax.vmap(lambda s: travel(robot, chassis, s))(
         _fill(even, normal=held.normal / units, moment_lateral=held.moment / units)
     )
-    lateral, yaw = (
-        units * total(both(jax.vmap(lambda s, name=name: added(robot, s, name))(own_load)))
-        for name in ("lateral", "yaw")
-    )
+    lateral, yaw = added_in_plane(robot, own_load)
     pull = held.ahead - units * own_load.resistance
     along = total(pull) - mass * GRAVITY * sine_slope * cosine(motion.heading)
     across = total(held.aside) + mass * GRAVITY * sine_slope * sine(motion.heading) - lateral
@@ -520,7 +552,7 @@ def turning(
         pulled = jax.vmap(lambda s: gearbox(robot, chassis, s))(pulled)
     else:
         pulled = jax.vmap(lambda c, s: _speed_imposed(robot, c, chassis, s))(own, pulled)
-        pulled = _fill(pulled, total_current=both(total(jnp.asarray(pulled.total_current)) / 2))
+        pulled = _fill(pulled, total_current=_both(total(jnp.asarray(pulled.total_current)) / 2))
     return Travel(
         pulled,
         held,

@@ -163,6 +163,11 @@ class Conditions(eqx.Module):
         """Whether the sides are driven apart, or the robot heads elsewhere than uphill: it is then free to turn."""
         return any(getattr(self, name) is not None for name in OF_TURNS)
 
+    def straight(self) -> Conditions:
+        """The same of a robot whose sides are driven alike, uphill."""
+        alike: dict[str, Any] = dict.fromkeys(OF_TURNS)
+        return dataclasses.replace(self, **alike)
+
     def of_sides(self) -> Conditions:
         """Those of left and right side, a leading axis of 2."""
 

@@ -146,10 +146,8 @@ def _missions(robot: Robot, conditions: Conditions, profile: Profile, start: Sta
     further = missions.columns(missions.numbers(robot, flat, found))
     course = None
     if found.course is not None:
-        signals, shown = found.course.signals, None
-        if profile.turns or conditions.turns:
-            signals, shown = turning.together(signals), turning.shown(robot, signals)
-        course = History.of(robot, found.course.time, found.course.distance, signals, shown=shown)
+        of = turning.history if profile.turns or conditions.turns else History.of
+        course = of(robot, found.course.time, found.course.distance, found.course.signals)
     found, further, course = _shaped((found, further, course), conditions.shape)
     names, mass = robot.configurations.names, total_mass(robot, conditions)
     return Results(

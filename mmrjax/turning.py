@@ -196,6 +196,18 @@ class Law(eqx.Module):
             slower + share * (1 / (square + STILL) - self.ratio / (weighed + STILL)),
         )
 
+    def rises(self, along: Scalar, across: Scalar) -> tuple[tuple[Scalar, Scalar], tuple[Scalar, Scalar]]:
+        """How fast forces over load, `per_speed` times the sliding speeds, rise with these [s/m], by rows.
+
+        A force that falls as all of the sliding grows is taken as one that stays.
+        """
+        square, other, both = along**2, across**2, along * across
+        held, (by_along, by_across) = self.per_speed(square, other), self.per_speed_rise(square, other)
+        grows = held + 2 * (square * by_along + other * by_across)
+        stays = jnp.maximum(-grows, 0.0) / (square + other + STILL)
+        first, second = 2 * by_along + stays, 2 * by_across + stays
+        return (held + square * first, both * second), (both * first, held + other * second)
+
 
 @eqx.filter_custom_jvp
 def moments(law: Law, sliding: Float[Array, " 2"], middle: Scalar, end: Scalar) -> Float[Array, "2 4"]:

@@ -154,6 +154,7 @@ class Pull(eqx.Module):
         guided: load on the lower guide [N].
         load: of the belt, the ground and the guides on the driving shaft [N·m].
         generalized: forces on (x, z, θ, φ_2) [N, N, N·m, N·m]; the shaft's own torque is the gearbox's.
+        aside: lateral force of each contact, to the left on a robot free to turn [N]; None: of straight travel.
     """
 
     force: Float[Array, " contacts"]
@@ -161,6 +162,7 @@ class Pull(eqx.Module):
     guided: Float[Array, ""]
     load: Scalar
     generalized: Float[Array, " 4"]
+    aside: Float[Array, " contacts"] | None = None
 
     @property
     def traction(self) -> Scalar:
@@ -168,17 +170,19 @@ class Pull(eqx.Module):
         return jnp.sum(self.force)
 
 
-def _sliding(signals: Signals, at: Touch) -> Float[Array, " contacts"]:
+def sliding(signals: Signals, at: Touch) -> Float[Array, " contacts"]:
     """How fast each contact slides backward over the ground [m/s]; `speed_slip_terms` shifts it."""
     return -at.speed_x - signals.speed_slip_terms
 
 
 def friction_rise(chassis: Chassis, signals: Signals, at: Touch) -> Float[Array, " contacts"]:
     """How fast the traction of each contact rises with its sliding [N·s/m]."""
-    return jnp.asarray(chassis.ground.traction_rise(_sliding(signals, at), at.force, signals.adhesion))
+    return jnp.asarray(chassis.ground.traction_rise(sliding(signals, at), at.force, signals.adhesion))
 
 
-def pull(path: Path, chassis: Chassis, signals: Signals, at: Touch, height: Scalar) -> Pull:
+def pull(
+    path: Path, chassis: Chassis, signals: Signals, at: Touch, height: Scalar, force: Array | None = None
+) -> Pull:
     """Friction of the contacts (25) by Fig. 7, of the guide (26), and all generalized forces.
 
     The motion resistance (5) acts on the chassis at the ground. Friction of the upper guide is part of the
@@ -190,8 +194,10 @@ def pull(path: Path, chassis: Chassis, signals: Signals, at: Touch, height: Scal
         signals: those up to `balances.slip`; `speed_slip_terms` shifts the sliding of every contact.
         at: the contacts.
         height: of the axle line over the ground [m].
+        force: traction of each contact where contacts slide aside too [N]; None: by Fig. 7.
     """
-    force = jnp.asarray(chassis.ground.traction(_sliding(signals, at), at.force, signals.adhesion))
+    if force is None:
+        force = jnp.asarray(chassis.ground.traction(sliding(signals, at), at.force, signals.adhesion))
     guide = chassis.track.guide_friction * at.guided * at.force * signals.direction
     # Power of the contact forces per belt speed, then on the pulleys in the shares of that speed.
     along = force * at.rate_x + at.force * at.rate_z - guide

@@ -367,7 +367,6 @@ class Simulate(RobotPart, ProfilePart, SupplyPart, TurnPart, PosteriorPart, Outp
     def _certain(self) -> Self:
         if self.turns:
             beside = [name for name in ("profile", "posterior") if getattr(self, name) is not None]
-            beside += ["model track"] * (self.model == "track")
             if beside:
                 raise PydanticCustomError("idle", f"left, right and heading act without {beside[0]} only")
             if self.battery and self.left_V is not None:
@@ -455,6 +454,11 @@ class Climb(RobotPart, SupplyPart, OutputPart):
     find: Literal["step", "stairs", "gap"] | None = about(
         None, "Look for the largest that it gets over, in place of one run; of stairs the rise at --stairs' tread"
     )
+    derivatives: tuple[str, ...] = about(
+        (),
+        "Derivatives of margins, time, energy and currents by these, comma-separated: parameters, adhesion, payload, "
+        "voltage, levers_front_deg, levers_rear_deg, obstacle_mm",
+    )
     film: bool = about(False, "Write climb.gif")
     duration_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = about(20.0, "Longest run")
     time_step_s: Annotated[float, Field(gt=0, le=1e-3, allow_inf_nan=False)] = about(
@@ -476,8 +480,9 @@ class Climb(RobotPart, SupplyPart, OutputPart):
             raise PydanticCustomError("idle", f"find {self.find} acts without {given[0]}")
         if self.battery and self.supply_voltage_V is not None:
             raise PydanticCustomError("idle", "supply_voltage_V acts without battery only")
-        if self.film and self.find is not None:
-            raise PydanticCustomError("idle", "film acts without find only")
+        for name in ("film", "derivatives"):
+            if getattr(self, name) and self.find is not None:
+                raise PydanticCustomError("idle", f"{name} acts without find only")
         return self
 
 

@@ -162,12 +162,16 @@ def test_dynamics_are_those_of_mujoco():
         assert np.asarray(bias) == pytest.approx(TIES.T @ data.qfrc_bias, abs=1e-10)
 
 
-@pytest.mark.parametrize("slope", [0.0, 10.0])
-def test_ten_thousand_steps_are_those_of_mujoco_under_the_same_forces(slope):
-    """Of a second of driving off and swinging the levers; with forces that each step had, impulses over its time."""
-    conditions = Conditions(0, voltage=12.0, slope_deg=slope, payload=5.0).resolved(ROBOT)
-    angles = (jnp.radians(jnp.array(pair)) for pair in ((45.0, 20.0), (-8.4, 30.0)))
-    run = system(ROBOT, conditions, terrain.flat(), Sequence(jnp.array([0.1, 0.8]), *angles, over_time=True))
+@functools.cache
+def beside_mujoco(slope, ground, angles, volts, clear):
+    """Coordinates of 10 000 steps, ours and MuJoCo's under the forces that each of ours had, impulses over its time.
+
+    Args:
+        angles: of front and rear levers at 0.1 and 0.8 s [deg]; clear: from the obstacle in the beginning [m].
+    """
+    conditions = Conditions(0, voltage=volts, slope_deg=slope, payload=5.0).resolved(ROBOT)
+    pairs = (jnp.radians(jnp.array(pair)) for pair in angles)
+    run = system(ROBOT, conditions, ground(), Sequence(jnp.array([0.1, 0.8]), *pairs, over_time=True))
     steps = 10_000
 
     @jax.jit
@@ -179,7 +183,7 @@ def test_ten_thousand_steps_are_those_of_mujoco_under_the_same_forces(slope):
 
         return jax.lax.scan(one, motion, jnp.arange(steps))
 
-    start = climb.stand(run)
+    start = climb.stand(run, clear)
     _, (force, ours) = jax.device_get(driven(run, start, dict.fromkeys((*SOURCES, *LOSSES), jnp.zeros(()))))
     model = mujoco.MjModel.from_xml_string(_bodies(run, slope))
     model.opt.timestep = float(run.step)
@@ -191,8 +195,33 @@ def test_ten_thousand_steps_are_those_of_mujoco_under_the_same_forces(slope):
         data.qfrc_applied[:] = shared @ force[k]
         mujoco.mj_step(model, data)
         theirs[k] = data.qpos[[0, 1, 2, 3, 5, 6]]
+    return run, ours, theirs
+
+
+@pytest.mark.parametrize("slope", [0.0, 10.0])
+def test_ten_thousand_steps_are_those_of_mujoco_under_the_same_forces(slope):
+    """Of a second of driving off and swinging the levers."""
+    _, ours, theirs = beside_mujoco(slope, terrain.flat, ((45.0, 20.0), (-8.4, 30.0)), 12.0, 0.1)
     assert np.abs(ours - theirs).max() < 1e-6
     assert ours[-1, 0] - ours[0, 0] > 0.05 and np.ptp(ours[:, 4]) > 0.3 and np.ptp(ours[:, 5]) > 0.3
+
+
+@pytest.mark.slow
+def test_steps_across_a_corner_are_those_of_mujoco_until_contacts_first_differ():
+    """Onto a step, front levers first: which pairs touch is read off the coordinates of each."""
+    ground = functools.partial(terrain.step, 0.06)
+    run, ours, theirs = beside_mujoco(0.0, ground, ((45.0, 45.0), (-8.4, -8.4)), 24.0, 0.01)
+
+    def touching(q):
+        at = footing.footing(run.shape, run.terrain, q, 0 * q)
+        return at.force > 0, jnp.any((at.force > 0) & (at.place == 0.0))  # the corner is at 0
+
+    touch = jax.jit(jax.vmap(touching))
+    (mine, on_corner), (other, _) = jax.device_get((touch(ours), touch(theirs)))
+    differ = np.flatnonzero((mine != other).any(axis=1))
+    until = differ[0] if len(differ) else len(ours)
+    assert np.abs(ours - theirs)[:until].max() < 1e-6
+    assert on_corner[:until].sum() > 500 and np.ptp(ours[:until, 2]) > np.radians(5)
 
 
 #: Both pulleys turn as one.

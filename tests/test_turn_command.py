@@ -57,6 +57,18 @@ def test_turn_over_time_leaves_its_path(tmp_path, mmrjax):
 
 
 @pytest.mark.slow
+def test_the_track_model_turns_and_leaves_its_path(tmp_path, mmrjax):
+    told = "--left", "24", "--right", "10", "--model", "track", "--duration", "0.2", "--no-report"
+    assert mmrjax("simulate", *told, "--out", str(tmp_path / "run"))[0] == 0
+    first, *_, last = rows(tmp_path / "run" / "history.csv")
+    assert float(last["yaw_deg"]) < -0.5 < float(first["yaw_deg"]) < 0
+    assert float(last["motor_current_left_A"]) > float(last["motor_current_right_A"]) > 0.5
+    assert float(last["x_mm"]) > 20
+    (row,) = rows(tmp_path / "run" / "runs.csv")
+    assert 0.95 < float(row["guide_share"]) < 1
+
+
+@pytest.mark.slow
 def test_a_demanded_turn_is_that_of_the_voltages_found(tmp_path, mmrjax):
     told = "--speed", "0.3", "--yaw-rate", "1", "--voltage", "24", "--no-report"
     assert mmrjax("simulate", *told, "--out", str(tmp_path / "asked"))[0] == 0
@@ -84,7 +96,7 @@ REFUSED = {
         "left_V acts without speed_m_s",
     ),
     "volts on the battery": (("--left", "3", "--right", "1", "--battery"), "state duty_left and duty_right"),
-    "track": (("--left", "3", "--right", "1", "--model", "track"), "without model track"),
+    "track, one side": (("--left", "3", "--model", "track"), "left_V acts with right_V only"),
     "profile": (("--left", "3", "--right", "1", "--profile", "patrol"), "without profile"),
     "supply too low": (("--left", "33", "--right", "1", "--voltage", "20"), "expected at least 33 V"),
     "slope": (("--left", "33", "--right", "1", "--slope", "5"), "its heading changes there all the time"),

@@ -127,7 +127,8 @@ class Passed(eqx.Module):
         energy: in and lost, by the names of `SOURCES` and `LOSSES`, of the whole robot [J].
         stored: in motion, height, contacts and windings, of the whole robot [J].
         body: share of all normal force that the body bears [-].
-        margin: how far the centre of mass is within the outermost contacts [m].
+        grip: share of what its friction could hold that the ground gives to all that rolls [-].
+        centre: x of the centre of mass [m]; margin: how far it is within the outermost contacts [m].
     """
 
     time: Scalar
@@ -143,6 +144,8 @@ class Passed(eqx.Module):
     stored: Scalar
     normal: Scalar
     body: Scalar
+    grip: Scalar
+    centre: Scalar
     margin: Scalar
 
 
@@ -415,6 +418,8 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
     stored = kinetic / 2 + signals.inductance * motion.current**2 / 2 + height + jnp.sum(at.energy)
     up = jnp.array([1.0, -1.0])  # of a rear lever that is where ψ falls
     total = jnp.sum(at.force)
+    held = run.chassis.ground.force_adhesion(jnp.sum(at.force * at.rolls), signals.adhesion)
+    centre = motion.q[0] - matrix[1, PITCH] / matrix[0, 0]
     passed = Passed(
         time=time,
         motion=motion,
@@ -429,17 +434,16 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
         stored=robot.sides * stored + pair.inertia * motion.v[LED] @ motion.v[LED] / 2,
         normal=total,
         body=jnp.sum(at.force * (1 - at.rolls)) / jnp.maximum(total, 1e-9),
-        margin=_margin(run, motion, at, matrix),
+        grip=jnp.sum(jnp.abs(pulled.force) * at.rolls) / jnp.maximum(held, 1e-9),
+        centre=centre,
+        margin=_margin(centre, at),
     )
     return after, spent, passed
 
 
-def _margin(run: System, motion: Motion, at: Footing, matrix: Array) -> Scalar:
+def _margin(centre: Scalar, at: Footing) -> Scalar:
     """How far gravity's line through the centre of mass is within the outermost contacts [m], level ground assumed
     below."""
-    total = matrix[0, 0]
-    ahead = -matrix[1, PITCH] / total
-    centre = motion.q[0] + ahead
     bears = at.force > 0
     first = jnp.min(jnp.where(bears, at.place, jnp.inf))
     last = jnp.max(jnp.where(bears, at.place, -jnp.inf))

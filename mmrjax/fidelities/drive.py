@@ -317,10 +317,8 @@ def _histories(
     robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
 ) -> Run:
     kept = drive_batch(robot, conditions, jnp.asarray(_instants(options["duration"])))
-    signals, shown = kept.signals, None
-    if conditions.turns:
-        signals, shown = turning.together(signals), turning.shown(robot, signals)
-    return Run(kept.result, history=History.of(robot, kept.time, kept.distance, signals, shown=shown))
+    of = turning.history if conditions.turns else History.of
+    return Run(kept.result, history=of(robot, kept.time, kept.distance, kept.signals))
 
 
 def _from_standstill(robot: Robot, conditions: Conditions) -> list[str]:

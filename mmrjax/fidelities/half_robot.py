@@ -67,14 +67,13 @@ class System(eqx.Module):
 
 
 def system(robot: Robot, conditions: Conditions, step: Scalar) -> System:
-    """Constants of one run (scalar fields); the robot may hold tracers."""
+    """Constants of one run (scalar fields), of all of a robot that is free to turn; the robot may hold tracers."""
     zero = jnp.zeros_like(conditions.voltage)
     mass = balances.begin(robot, conditions, State(zero, zero, zero, zero)).mass
     half = masses(robot, conditions, mass)
-    model, data = mjcf.template()
-    gear = robot.running_gear
-    model = mjcf.member(model, half, conditions.slope, gear.wheelbase, step)
-    path, chassis = Path(robot.radius_pulley, gear), robot.chassis(conditions.configuration)
+    model, data = mjcf.template(conditions.turns)
+    model = mjcf.member(model, mjcf.bodies(robot, half, conditions), conditions.slope, step)
+    path, chassis = Path(robot.radius_pulley, robot.running_gear), robot.chassis(conditions.configuration)
     return System(robot, conditions, path, half, chassis, model, data, jnp.asarray(step, float))
 
 
@@ -126,10 +125,11 @@ def _losses(run: System, motion: Motion, mover: balances.Mover) -> tuple[Scalar,
 def generalized(run: System, signals: Signals, pulled: Pull) -> tuple[Float[Array, " 5"], Float[Array, " 5"]]:
     """Generalized forces on q [N, N·m], and the armature's inertia seen at each joint [kg·m²], eq. (31)."""
     force = jnp.insert(pulled.generalized, 3, signals.torque_net)
-    return force, jnp.zeros_like(force).at[3].set(_rotating(run, signals))
+    return force, jnp.zeros_like(force).at[3].set(rotating(run, signals))
 
 
-def _rotating(run: System, signals: Signals) -> Scalar:
+def rotating(run: System, signals: Signals) -> Scalar:
+    """The armature's inertia seen at the driving shaft [kg·m²], eq. (31)."""
     motor, ratio = run.robot.motor.inertia, run.robot.gearbox.ratio
     return inertia_reduced(motor, ratio, signals.efficiency_load, signals.inertia_added)
 
@@ -143,7 +143,8 @@ def current_after(robot: Robot, conditions: Conditions, step: Scalar, signals: S
     """
 
     def left(current: Scalar) -> Scalar:
-        shifted = dataclasses.replace(signals, current=current, total_current=robot.sides * current)
+        total = signals.total_current + robot.sides * signals.duty * (current - signals.current)
+        shifted = dataclasses.replace(signals, current=current, total_current=total)
         return balances.electrical(robot, conditions, balances.supply(robot, conditions, shifted)).voltage_left
 
     voltage, slope = jax.jvp(left, (signals.current,), (jnp.ones_like(signals.current),))
@@ -207,7 +208,7 @@ def _step(run: System, motion: Motion) -> _Step:
     damping = resistance(run, motion, signals, at, pulled)
     factors = factorise(mass + run.step * damping)
     gained = substitute(factors, mass @ (pushed - motion.v))
-    after, over = _moved(motion, run.step, _later(run, motion, signals), damping @ gained, gained, signals)
+    after, over = _moved(motion, run.step, later(run, motion, signals), damping @ gained, gained, signals)
     return _Step(after, over, pulled.guided, damping, factors, gained, jnp.asarray(signals.speed_slip_terms))
 
 
@@ -219,7 +220,8 @@ class _Later(eqx.Module):
     memory: Mapping[str, Scalar]
 
 
-def _later(run: System, motion: Motion, signals: Signals) -> _Later:
+def later(run: System, motion: Motion, signals: Signals) -> _Later:
+    """Currents, charge and memories one step on."""
     charge = run.robot.battery.current(signals.total_current) * (run.conditions.battery > 0.5)
     memory = {
         effect.name: motion.memory[effect.name] + run.step * effect.rate(run.robot, signals)
@@ -321,10 +323,10 @@ def _held(
             drawn.rear + belt.torque_rear,
         ]
     )
-    gear, rotating = run.path.gear, _rotating(run, signals)
-    spent = mjcf.impulse(run.half, gear.wheelbase, run.conditions, q[2], v[2], rotating, gained, run.step)
+    gear, spins = run.path.gear, rotating(run, signals)
+    spent = mjcf.impulse(run.half, gear.wheelbase, run.conditions, q[2], v[2], spins, gained, run.step)
     fallen = jnp.stack([sums.fallen_x + losses[0], sums.fallen_z])
-    return run.step * force - spent, fallen, _later(run, motion, signals), signals, drawn.guided
+    return run.step * force - spent, fallen, later(run, motion, signals), signals, drawn.guided
 
 
 def margin(run: System) -> Scalar:

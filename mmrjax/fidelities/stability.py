@@ -9,11 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mmrjax import params
+from mmrjax import balances, masses, mjcf, params
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.half_robot import Motion, System, advance, roll, stand, system
+from mmrjax.params import Scalar
 from mmrjax.robot import Robot
+from mmrjax.signals import State
 from mmrjax.undercarriage import lever_tips
 
 SAFETY = 0.75  # of the linear limit: contacts bear more than when standing, by their ripple
@@ -51,13 +53,27 @@ def _unhurried(robot: Robot) -> Robot:
     return params.replace(robot, {p.name: jnp.maximum(p.value, LEAST) for p in laws})
 
 
+def _roll_period(robot: Robot, conditions: Conditions) -> Scalar:
+    """Period of rolling over that of bouncing, of a robot on contacts at ±B/2 [-]."""
+    zero = jnp.zeros_like(conditions.voltage)
+    mass = balances.begin(robot, conditions, State(zero, zero, zero, zero)).mass
+    parts = mjcf.bodies(robot, masses.masses(robot, conditions, mass), conditions)
+    aside = robot.chassis(conditions.configuration).turning.width / 2
+    inertia = jnp.sum(parts.inertia[:, 0] + parts.mass * parts.place[:, 1] ** 2)
+    return jnp.sqrt(inertia / jnp.sum(parts.mass)) / aside
+
+
 def largest_step(robot: Robot, conditions: Conditions) -> Float[np.ndarray, " runs"]:
     """Largest stable step [s] of each run of a batch of `conditions`.
 
     Three quarters of the step that, linearised about the robot standing and rolling, would make a small disturbance
     grow; the quarter is for the ripple of the contacts. A small V_s is no limit: friction is implicit in a step, and
-    what is left of its chatter stays within V_s.
+    what is left of its chatter stays within V_s. A robot free to turn has that of one that travels straight, less by
+    as much as it rolls faster on its contacts than it bounces.
     """
+    if conditions.turns:
+        slower = np.asarray(jax.vmap(lambda c: _roll_period(robot, c))(conditions))
+        return np.minimum(slower, 1.0) * largest_step(robot, conditions.straight())
     robot = params.strong(_unhurried(robot))
 
     def maps(steps: Float[np.ndarray, "runs starts"]) -> Float[np.ndarray, "runs starts 11 11"]:

@@ -1,10 +1,12 @@
-"""Fidelity `track`: half a robot as multibody dynamics in MJX, its contacts resolved one by one."""
+"""Fidelity `track`: half a robot, or all of one free to turn, as multibody dynamics in MJX, its contacts resolved one
+by one."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,11 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mmrjax import contact, fidelities, masses, undercarriage
+from mmrjax import balances, contact, fidelities, masses, undercarriage
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
+from mmrjax.fidelities import both_sides, half_robot, turning
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
-from mmrjax.fidelities.half_robot import Motion, System, advance, axle_height, instant, margin, roll, stand, system
+from mmrjax.fidelities.half_robot import Motion, System, axle_height, margin, system
 from mmrjax.fidelities.rest import STARTS, creeps, direction, unless_slipping, voltage_at_rest
 from mmrjax.fidelities.result import mask, result, travels, withhold
 from mmrjax.fidelities.stability import largest_step, refuse
@@ -25,6 +28,7 @@ from mmrjax.programs import has_tracer
 from mmrjax.robot import Robot
 from mmrjax.signals import (
     BATTERY_EMPTY,
+    CONVERGED,
     FAILED,
     NOT_SETTLED,
     STALLED,
@@ -32,7 +36,7 @@ from mmrjax.signals import (
     Result,
     Signals,
 )
-from mmrjax.undercarriage import Reactions
+from mmrjax.undercarriage import Pull, Reactions, Touch
 
 STEP = fidelities.facts("track").resolved()["step"]  # [s]
 SAMPLE = 1e-3  # [s]
@@ -48,8 +52,13 @@ OVER, HIGH = 0.5, 20.0
 SETTLED = 1e-3  # largest relative change of the speeds from one half of the window to the other
 
 
+#: Changes of some signals, and their sizes.
+Changes = Sequence[tuple[Scalar, Scalar]]
+
+
 class Steady(eqx.Module):
-    """Averages over the last whole number of grouser periods of a run.
+    """Averages over the last whole number of grouser periods of a run; of a robot that turns a leading axis of left
+    and right side, each over periods of its own.
 
     Attributes:
         signals: means.
@@ -57,20 +66,22 @@ class Steady(eqx.Module):
             parameter in the other fidelities.
         periods: grouser periods averaged [-]; 0: the plain window, the belt hardly moved.
         change: largest relative change of current, motor speed and speed between the window's halves [-].
+        travel: means of all of an instant, of a robot that turns.
     """
 
     signals: Signals
     guide_share: Scalar
-    periods: Int[Array, ""]
+    periods: Int[Array, "..."]
     change: Scalar
+    travel: balances.Travel | None = None
 
 
 class Record(eqx.Module):
     """What is kept of each sample: motion and loads at its end, means over it (`guided`: of the guides' load)."""
 
     motions: Motion
-    signals: Signals
-    guided: Float[Array, " samples"]
+    passed: Signals | balances.Travel
+    guided: Float[Array, "samples ..."]
     reactions: Reactions
 
 
@@ -79,23 +90,28 @@ class Trajectory(eqx.Module):
 
     Attributes:
         time: ends of the sample intervals [s], shape (samples,).
-        q, v: coordinates and velocities at those times (see `undercarriage`), shape (samples, 5).
-        signals: means over each interval; each field has shape (samples,).
+        q, v: coordinates and velocities at those times (see `undercarriage`), shape (samples, 5); of a robot free to
+            turn those of `both_sides`, shape (samples, 10).
+        signals: means over each interval; each field has shape (samples,), of a robot free to turn (samples, 2), for
+            left and right side, and so have the others.
         reactions: loads at those times, of one side.
         steady: averages at the end of the run.
         result: the observation of those averages, with the run's status.
     """
 
     time: Float[Array, " samples"]
-    q: Float[Array, "samples 5"]
-    v: Float[Array, "samples 5"]
+    q: Float[Array, "samples coordinates"]
+    v: Float[Array, "samples coordinates"]
     signals: Signals
     reactions: Reactions
     steady: Steady
     result: Result
 
 
-def _average(run: System, time: Array, travelled: Array, sums: tuple[Signals, Array]) -> Steady:
+def _average(
+    run: System, time: Array, travelled: Array, sums: tuple[Any, Array]
+) -> tuple[Any, Scalar, Array, Changes]:
+    """Means of signals (or `Travel`) and guides' load, periods averaged, and of three signals the change and size."""
     # Weights over the belt's travel that rise over one pitch and fall over another by the cubic step, which
     # adds up to one with its neighbour a pitch on: the mean of an orbit that repeats with the pitch is exact
     # and varies smoothly with the place at which the run happens to end.
@@ -106,7 +122,7 @@ def _average(run: System, time: Array, travelled: Array, sums: tuple[Signals, Ar
     periods = jnp.floor(jax.lax.stop_gradient((end - first) / pitch))
     periods = jnp.where(jnp.isfinite(periods) & (periods >= 2), periods, 0)
 
-    def mean(begin: Array, until: Scalar, otherwise: Array) -> tuple[Signals, Array]:
+    def mean(begin: Array, until: Scalar, otherwise: Array) -> tuple[Any, Array]:
         rise = contact.step(middle, end - begin * pitch, 0.0, end - (begin - 1) * pitch, 1.0)
         fall = contact.step(middle, end - (until + 1) * pitch, 1.0, end - until * pitch, 0.0)
         weight = jnp.where(periods > 0, rise * fall, otherwise)
@@ -114,17 +130,57 @@ def _average(run: System, time: Array, travelled: Array, sums: tuple[Signals, Ar
 
     half = jnp.floor(periods / 2) + 1
     early = plain * (jnp.cumsum(plain) <= jnp.sum(plain) / 2)
-    signals, guided = mean(periods, 0.0, plain)
-    earlier, later = mean(periods, periods - half, early)[0], mean(half, 0.0, plain - early)[0]
+    found, guided = mean(periods, 0.0, plain)
+    halves = mean(periods, periods - half, early)[0], mean(half, 0.0, plain - early)[0]
+    earlier, later, whole = (x.signals if run.conditions.turns else x for x in (*halves, found))
     changes = [
-        jnp.abs(getattr(later, f) - getattr(earlier, f)) / jnp.maximum(jnp.abs(getattr(signals, f)), 1e-3)
+        (jnp.abs(getattr(later, f) - getattr(earlier, f)), jnp.abs(getattr(whole, f)))
         for f in ("total_current", "speed_motor", "speed")
     ]
-    share = guided / jnp.maximum(signals.normal, 1e-9)
-    return Steady(signals, share, periods.astype(int), jnp.max(jnp.stack(changes)))
+    return found, guided, periods.astype(int), changes
+
+
+def _steady(run: System, time: Array, travelled: Array, record: Record) -> Steady:
+    if not run.conditions.turns:
+        signals, guided, periods, changes = _average(run, time, travelled, (record.passed, record.guided))
+        share = guided / jnp.maximum(signals.normal, 1e-9)
+        return Steady(signals, share, periods, jnp.max(_relative(changes)))
+
+    def side(travelled: Array, of_side: tuple[Any, Array]) -> tuple[Any, Scalar, Array, Changes]:
+        return _average(run, time, travelled, of_side)
+
+    # What is of the whole robot is averaged over the periods of either side.
+    passed = jax.tree.map(lambda x: jnp.broadcast_to(x.reshape(*x.shape[:1], -1), (*x.shape[:1], 2)), record.passed)
+    found, guided, periods, changes = jax.vmap(side, in_axes=1)(jnp.abs(travelled), (passed, record.guided))
+    travel = jax.tree.map(lambda x, of: x if of.ndim > 1 else jnp.mean(x), found, record.passed)
+    share = jnp.sum(guided) / jnp.maximum(jnp.sum(travel.signals.normal), 1e-9)
+    # A side that hardly moves has settled where its changes are small beside what the other one does.
+    larger = [(change, jnp.max(size)) for change, size in changes]
+    return Steady(travel.signals, share, periods, jnp.max(_relative(larger)), travel)
+
+
+def _relative(changes: Changes) -> Array:
+    return jnp.stack([change / jnp.maximum(size, 1e-3) for change, size in changes])
+
+
+def _status_turning(run: System, steady: Steady, end: Motion) -> Array:
+    travel, signals = steady.travel, jax.tree.map(jnp.mean, steady.signals)
+    assert travel is not None
+    plane = both_sides.plane_motion(run, end)
+    over = {name: getattr(signals, name) for name in ("speed", "speed_lateral", "yaw_rate")}
+    status = turning.status_keeping(run.robot, run.conditions, travel, dataclasses.replace(plane, **over))
+    status = jnp.where((steady.change > SETTLED) & (status == CONVERGED), NOT_SETTLED, status)
+    q, height = end.q, axle_height(run)
+    tilt = jnp.maximum(jnp.abs(q[both_sides.PITCH]), jnp.abs(q[both_sides.ROLL]))
+    status = jnp.where((tilt > OVER) & (tilt < 2 * jnp.pi), TIPS, status)
+    finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(end.v)) & jnp.isfinite(signals.total_current)
+    grounded = (jnp.abs(q[both_sides.HEIGHT] - height) < 0.5 * height) | (status == TIPS)
+    return jnp.where(finite & grounded, status, FAILED)
 
 
 def _status(run: System, steady: Steady, end: Motion) -> Array:
+    if run.conditions.turns:
+        return _status_turning(run, steady, end)
     robot, conditions, signals = run.robot, run.conditions, steady.signals
     status = jnp.where(steady.change > SETTLED, NOT_SETTLED, travels(signals.speed, signals.voltage))
     sense, rest = direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
@@ -175,22 +231,33 @@ def track(
         for more than a hundredth of the averaging window.
     """
     run = system(robot, conditions, step)
-    start = roll(run) if rolling else stand(run)
+    start = _start(run, rolling)
     end, record = _record(run, start, round(sample / step), round(duration / sample))
     return _trajectory(run, start, end, record, sample)
 
 
+def _start(run: System, rolling: bool) -> Motion:
+    kind = both_sides if run.conditions.turns else half_robot
+    return kind.roll(run) if rolling else kind.stand(run)
+
+
 def _record(run: System, start: Motion, steps: int, samples: int) -> tuple[Motion, Record]:
-    def small(motion: Motion, _: None) -> tuple[Motion, tuple[Signals, Array]]:
-        after, signals, guided = advance(run, motion)
-        return after, (signals, guided)
+    kind = both_sides if run.conditions.turns else half_robot
+
+    def small(motion: Motion, _: None) -> tuple[Motion, tuple[Any, Array]]:
+        after, passed, guided = kind.advance(run, motion)
+        return after, (passed, guided)
+
+    def loads(at: Touch, pulled: Pull) -> Reactions:
+        return undercarriage.reactions(run.path, at, pulled)
 
     @jax.checkpoint  # reverse mode keeps one motion a sample and recomputes the steps between
     def interval(motion: Motion, _: None) -> tuple[Motion, Record]:
         after, every = jax.lax.scan(small, motion, None, length=steps)
-        signals, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), every)
-        at, pulled = instant(run, after)[1:]
-        return after, Record(after, signals, guided, undercarriage.reactions(run.path, at, pulled))
+        passed, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), every)
+        at, pulled = kind.instant(run, after)[1:]
+        each = jax.vmap(loads) if run.conditions.turns else loads
+        return after, Record(after, passed, guided, each(at, pulled))
 
     return jax.lax.scan(interval, start, None, length=samples)
 
@@ -198,17 +265,27 @@ def _record(run: System, start: Motion, steps: int, samples: int) -> tuple[Motio
 def _trajectory(run: System, start: Motion, end: Motion, record: Record, sample: float) -> Trajectory:
     motions = record.motions
     time = sample * jnp.arange(len(motions.q) + 1)
-    travelled = run.path.radius * jnp.concatenate([start.q[None, 3], motions.q[:, 3]])
-    averages = _average(run, time, travelled, (record.signals, record.guided))
+    shafts = both_sides.PULLEYS[:, 0] if run.conditions.turns else 3
+    travelled = run.path.radius * jnp.concatenate([start.q[None, shafts], motions.q[:, shafts]])
+    averages = _steady(run, time, travelled, record)
     status = _status(run, averages, end)
     there = (status != FAILED) & (status != TIPS)
-    answer = result(run.robot, averages.signals, status)
     window = time[1:] > time[-1] - WINDOW * (time[-1] - time[0])
-    aloft = window & (record.signals.normal < ALOFT * averages.signals.normal)
+    signals, load = _signals(record), _signals(record).normal
+    if averages.travel is None:
+        answer = result(run.robot, averages.signals, status)
+    else:
+        answer = turning.result_of(run.robot, averages.travel, status)
+        load = jnp.sum(load, axis=-1)
+    aloft = window & (load < ALOFT * jnp.sum(averages.signals.normal))
     jumps = jnp.sum(aloft) > JUMPS * jnp.sum(window)
     flags = answer.flags | mask({"jumps": jumps})
     answer = withhold(dataclasses.replace(answer, flags=flags), there, status != FAILED)
-    return Trajectory(time[1:], motions.q, motions.v, record.signals, record.reactions, averages, answer)
+    return Trajectory(time[1:], motions.q, motions.v, signals, record.reactions, averages, answer)
+
+
+def _signals(record: Record) -> Signals:
+    return record.passed.signals if isinstance(record.passed, balances.Travel) else record.passed
 
 
 def check(robot: Robot, conditions: Conditions, *, duration: float, step: float, sample: float = SAMPLE) -> None:
@@ -226,6 +303,8 @@ def check(robot: Robot, conditions: Conditions, *, duration: float, step: float,
         raise ValueError(
             f"the motors' {what} is imposed, and this model drives them by their voltage; use steady or drive"
         )
+    if conditions.motor_speed is not None or (conditions.turns and conditions.of_sides().motor_speed is not None):
+        raise ValueError("motor_speed: got an imposed one; this model drives the motors by their voltage")
     if sample < step or abs(sample / step - round(sample / step)) > 1e-6:
         raise ValueError(f"step: got {step:g} s; expected {sample:g} s, a sample, divided by a whole number")
     if duration < sample or abs(duration / sample - round(duration / sample)) > 1e-6:
@@ -305,8 +384,7 @@ def _in_parts(
 
 @compiled
 def _begin(robot: Robot, conditions: Conditions, step: float, rolling: bool) -> Motion:
-    begin = roll if rolling else stand
-    return jax.vmap(lambda one: begin(system(robot, one, step)))(conditions)
+    return jax.vmap(lambda one: _start(system(robot, one, step), rolling))(conditions)
 
 
 @compiled
@@ -352,7 +430,11 @@ def _histories(
     robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
 ) -> Run:
     runs = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=progress)
-    history = History.of(robot, runs.time, runs.q[..., 0], runs.signals, runs.reactions)
+    if conditions.turns:
+        away = jnp.hypot(runs.q[..., both_sides.X], runs.q[..., both_sides.Y])
+        history = turning.history(robot, runs.time, away, runs.signals)
+    else:
+        history = History.of(robot, runs.time, runs.q[..., 0], runs.signals, runs.reactions)
     return Run(runs.result, {"guide_share": runs.steady.guide_share}, history)
 
 

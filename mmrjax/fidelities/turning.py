@@ -19,6 +19,7 @@ from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.effects.base import Effect
 from mmrjax.fidelities import lanes, rest
+from mmrjax.fidelities.base import History
 from mmrjax.fidelities.rest import SHARE, TIME, voltage_at_rest
 from mmrjax.fidelities.result import efficiency, result, withhold
 from mmrjax.fidelities.rosenbrock import inverse
@@ -256,11 +257,11 @@ def circling(robot: Robot, conditions: Conditions) -> tuple[balances.Travel, Pla
     """
     motion, loads, solved = _settled(robot, conditions)
     travel = balances.turning(robot, conditions, motion, loads)
-    status = _status(robot, conditions, travel, motion)
+    status = status_keeping(robot, conditions, travel, motion)
     return travel, motion, jnp.where(solved, status, NOT_SETTLED)
 
 
-def _status(robot: Robot, conditions: Conditions, travel: balances.Travel, motion: PlaneMotion) -> Array:
+def status_keeping(robot: Robot, conditions: Conditions, travel: balances.Travel, motion: PlaneMotion) -> Array:
     """Status of a robot that keeps its motion."""
     chassis = robot.chassis(conditions.configuration)
     shafts = jnp.max(jnp.abs(travel.signals.speed_theoretical))
@@ -281,7 +282,7 @@ def status_moving(robot: Robot, conditions: Conditions, travel: balances.Travel,
     change = (
         jnp.abs(travel.acceleration) + jnp.abs(travel.acceleration_lateral) + arm * jnp.abs(travel.acceleration_yaw)
     )
-    status = _status(robot, conditions, travel, motion)
+    status = status_keeping(robot, conditions, travel, motion)
     return jnp.where((change * TIME > SHARE * size) & (status == CONVERGED), NOT_SETTLED, status)
 
 
@@ -342,6 +343,11 @@ def tips(robot: Robot, travel: balances.Travel) -> Array:
 def together(signals: Signals) -> Signals:
     """Signals of both sides as those of one motor on average, from which totals follow as of sides alike."""
     return jax.tree.map(lambda x: jnp.mean(x, axis=-1) if jnp.ndim(x) else x, signals)
+
+
+def history(robot: Robot, time: Array, away: Array, signals: Signals) -> History:
+    """Runs over time, of signals whose last axis is that of the sides; `away`: from where they started [m]."""
+    return History.of(robot, time, away, together(signals), shown=shown(robot, signals))
 
 
 def shown(robot: Robot, signals: Signals) -> dict[str, Scalar]:

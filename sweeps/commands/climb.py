@@ -9,28 +9,37 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from rich.table import Table
 
 from calibration.data import robot_file, terrains
-from calibration.data.errors import BadConfiguration
-from mmrjax import terrain
+from calibration.data.errors import BadConfiguration, choices
+from mmrjax import params, terrain
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import climb as fidelity
 from mmrjax.fidelities.climb import Climb, Sequence, climb_batch
+from mmrjax.fidelities.climb_derivatives import Derivatives, Given, climb_derivatives
+from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.tables import adhesion_ratio
 from mmrjax.terrain import Terrain
+from mmrjax.variation import Variation
 from sweeps import config as configuration
+from sweeps.config_campaign import SIZE
 from sweeps.console import progress, say
 from sweeps.inputs import check_configurations, load_robot
 from sweeps.points import imposed
 from sweeps.points.climbs import NEAR, SLOW, SOUGHT, refused
-from sweeps.results.climb import VERDICTS, ClimbResult
+from sweeps.results.climb import VERDICTS, Along, ClimbResult
 from sweeps.skeleton import leave, page
 from sweeps.store import open_folder
 
 #: Runs of a round of a search.
 ROUND = 12
+#: Outputs whose derivatives are printed.
+SHOWN = ("margin_success", "crest_time_s", "crest_energy_J", "crest_current_rms_A")
+#: Widths over which slopes are taken, in the units of axes; of others this share of their value.
+WIDTHS, WIDTH = {"payload": 0.2, "levers_front_deg": 1.0, "levers_rear_deg": 1.0, SIZE: 1.0}, 0.02
 
 
 def climb(config: configuration.Climb, out: Path | None, force: bool) -> int:
@@ -56,6 +65,7 @@ def climb(config: configuration.Climb, out: Path | None, force: bool) -> int:
         name, voltage, payload=config.payload_kg, battery=config.battery, discharge=3.6 * config.discharge_mAh,
         adhesion=adhesion_ratio(config.surface, bool(np.asarray(robot.configurations[name].on_tracks) > 0.5)),
     ).resolved(robot)  # fmt: skip
+    along = _along(config, robot, conditions, sequence)
     with open_folder("climb", config, robot, out, force) as folder:
 
         def run(sizes: np.ndarray) -> tuple[Terrain, Climb]:
@@ -79,18 +89,34 @@ def climb(config: configuration.Climb, out: Path | None, force: bool) -> int:
                 told(1.0)
             return grounds, ended
 
-        if config.find is None:
-            grounds, ended = run(np.array([np.nan]))
-            chosen, largest = 0, None
-            tried: tuple[tuple[float, str], ...] = ()
-        else:
+        chosen, largest = 0, None
+        tried: tuple[tuple[float, str], ...] = ()
+        derivatives: Derivatives | None = None
+        if config.find is not None:
             grounds, ended, chosen, tried, largest = _searched(config.find, run)
+        elif along is None:
+            grounds, ended = run(np.array([np.nan]))
+        else:
+            with progress(1, quiet=False) as advance:
+                derivatives = climb_derivatives(
+                    along.given,
+                    along.values,
+                    along.widths,
+                    duration=config.duration_s,
+                    step=config.time_step_s,
+                    progress=_shares(advance),
+                )
+            ended = derivatives.climb
+            grounds = jax.tree.map(lambda x: x[None], along.given(along.values).terrain)
         one = jax.tree.map(lambda x: x[chosen : chosen + 1], ended)
         found = ClimbResult(
             robot, name, words, jax.tree.map(lambda x: x[chosen], grounds), one, tried, largest,
             {"step": "step", "stairs": "rise of such stairs", "gap": "gap", None: ""}[config.find],
+            along, derivatives,
         )  # fmt: skip
         folder.write_table("history.csv", found.table)
+        if derivatives is not None:
+            folder.write_table("derivatives.csv", found.slopes)
         folder.write_json("result.json", found.to_json())
         robot_file.write(robot, folder.partial / "robot.toml", note=f"the robot of this climb, from {config.robot}")
         if config.film:
@@ -111,6 +137,53 @@ def _shares(advance: Callable[[float], None]) -> Callable[[float], None]:
         done = max(done, share)
 
     return told
+
+
+def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, sequence: Sequence) -> Along | None:
+    """What derivatives are asked by; None: no derivatives.
+
+    Raises:
+        BadConfiguration: a name that is none, or that does not act here.
+    """
+    names = config.derivatives
+    if not names:
+        return None
+    sizes = {"step": config.step_mm, "gap": config.gap_mm}
+    if config.stairs is not None:
+        sizes["stairs"] = 1000 * terrains.stairs(config.stairs)[0]
+    kind = next((k for k, size in sizes.items() if size is not None), None)
+    levers = {"levers_front_deg": "front", "levers_rear_deg": "rear"}
+    known = ["adhesion", "payload", "discharge" if config.battery else "voltage"]
+    known += [*(levers if sequence.begins is None else ()), *([SIZE] if kind is not None else [])]
+    for k, name in enumerate(names):
+        if name in names[:k]:
+            raise BadConfiguration(f"--derivatives: got {name} twice; expected each once")
+        if name not in known and name not in (every := [p.name for p in params.walk(robot)]):
+            raise BadConfiguration(f"--derivatives: got {name}; {choices(name, (*known, *every), 5)}")
+    of_run = tuple(name for name in names if name not in (*levers, SIZE))
+    variation = Variation(robot, of_run)
+    axes = variation.axes
+    usual = {name: float(np.asarray(getattr(conditions, name))) for name in of_run if hasattr(conditions, name)}
+    usual |= {name: a.value for name, a in axes.items() if name not in usual and a.value is not None}
+    usual |= {name: float(np.degrees(np.asarray(getattr(sequence, end))[0])) for name, end in levers.items()}
+    usual |= {SIZE: sizes[kind] or 0.0} if kind is not None else {}
+    units = {name: a.unit for name, a in axes.items()} | dict.fromkeys(levers, "deg") | {SIZE: "mm"}
+    searched = config.model_copy(update={"step_mm": None, "gap_mm": None, "find": kind})
+
+    def given(values: Array) -> Given:
+        at = dict(zip(names, values, strict=True))
+        own, run = variation.at(jnp.stack([at[name] for name in of_run] or [jnp.zeros(())]), conditions)
+        moved = {
+            end: getattr(sequence, end) + jnp.radians(at[name] - usual[name])
+            for name, end in levers.items()
+            if name in at
+        }
+        ground = _terrain(searched, at[SIZE] / 1000) if SIZE in at else _terrain(config, 0.1)
+        return Given(own, run, ground[0], dataclasses.replace(sequence, **moved))
+
+    values = [usual[name] for name in names]
+    widths = [WIDTHS.get(name, WIDTH * abs(value) or 1.0) for name, value in zip(names, values, strict=True)]
+    return Along(names, tuple(units[name] for name in names), jnp.array(values), jnp.array(widths), given)
 
 
 def _searched(
@@ -137,7 +210,7 @@ def _searched(
         sizes = np.unique(np.round(inner, 1))
 
 
-def _terrain(config: configuration.Climb, size: float) -> tuple[Terrain, str]:
+def _terrain(config: configuration.Climb, size: Scalar) -> tuple[Terrain, str]:
     """The obstacle, of a search of a `size` [m], and what it is in words."""
     nose = config.nose_mm / 1000
     if config.terrain is not None:
@@ -209,5 +282,18 @@ def print_climb(found: ClimbResult) -> None:
         stem, _, unit = key.rpartition("_")
         shown.add_row(stem.replace("_", " "), f"{value:.3g}", unit)
     say(shown)
+    if found.derivatives is not None and found.along is not None:
+        _print_derivatives(found.along, found.derivatives)
     if found.tried:
         say(", ".join(f"{size:g} mm {VERDICTS[verdict][0]}" for size, verdict in found.tried))
+
+
+def _print_derivatives(along: Along, found: Derivatives) -> None:
+    """Some derivatives, with slopes of runs side by side in brackets; all are in derivatives.csv."""
+    shown = Table(title="derivative (slope over the width, ± sd)", title_justify="left", box=None, pad_edge=False)
+    for heading in ("by", "width", *SHOWN):
+        shown.add_column(heading)
+    for k, (name, unit, _, width) in enumerate(along.rows):
+        of = ((found.by[n][k], found.slope[n][k], found.slope_sd[n][k]) for n in SHOWN)
+        shown.add_row(name, f"{width:.2g} {unit}", *(f"{d:.2g} ({s:.2g} ± {sd:.1g})" for d, s, sd in of))
+    say(shown)

@@ -93,13 +93,8 @@ def _into_store(config: Campaign, file: RobotFile, where: str, out: Path | None,
     try:
         device = scale.device_kind() if pool is None else pool.device
         wanted = options.outputs or config.outputs or usual(config, robot)
-        chunk = config.chunk or (
-            scale.default_chunk(config.model, None if pool is None else device)
-            if config.obstacle is None
-            else climbs.AT_ONCE
-            if device.startswith("cpu")
-            else climbs.AT_ONCE_ACCELERATED
-        )
+        model = config.model if config.obstacle is None else climbs.CLIMB
+        chunk = config.chunk or scale.default_chunk(model, None if pool is None else device)
         config = config.model_copy(update={"chunk": chunk, "outputs": wanted})
         job = prepare(config, robot, plan, where)
         layout = laid_out(config, job)

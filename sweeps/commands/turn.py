@@ -23,10 +23,10 @@ from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.rest import voltage_at_rest
 from mmrjax.robot import Robot
 from sweeps import config as configuration
-from sweeps.console import say
+from sweeps.console import progress, say
 from sweeps.inputs import load_robot, one_run
 from sweeps.pages import posture_words, turn_words
-from sweeps.points import run
+from sweeps.points import run, scale
 from sweeps.results import posture
 from sweeps.skeleton import page
 from sweeps.store import open_folder
@@ -64,12 +64,16 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
             first, history = jax.tree.map(lambda x: x[:1], batch), None
         else:
             fidelity = fidelities.get(config.model)
-            assert fidelity.histories is not None  # of `drive`
-            first = jax.device_get(fidelity.histories(robot, asked, config.options))
+            assert fidelity.histories is not None  # of `drive` and `track`
+            with progress(1, quiet=not fidelity.facts.slow) as advance:
+                told = scale.shares(advance, 1)
+                first = jax.device_get(fidelity.histories(robot, asked, config.options, told))
+                told(1.0)
             turns, history = None, first.history
             assert history is not None
             folder.write_table("history.csv", history_table(history, shown))
-        table = {**run.conditions(robot, runs), **_columns(robot, shown, asked, first)}
+        own = {name: np.asarray(values) for name, values in first.columns.items()}
+        table = {**run.conditions(robot, runs), **_columns(robot, shown, asked, first), **own}
         turn = {name: _number(table[name][0]) for name in derived.COLUMNS}
         facts = turn_words.turn(robot, {name: values[0] for name, values in table.items()}, _ended(history))
         say(facts.answer)

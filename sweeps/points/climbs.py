@@ -29,8 +29,9 @@ SOUGHT = {"step": (10.0, 450.0), "stairs": (20.0, 400.0), "gap": (20.0, 800.0)}
 NEAR = 1.0
 #: Voltage where none is stated [V]: slow enough that a robot climbs rather than leaps.
 SLOW = 12.0
-#: Climbs in one call on processors, and on an accelerator; interval of their record [s].
-AT_ONCE, AT_ONCE_ACCELERATED, SAMPLE = 64, 1024, 0.05
+#: Model of points that climb; how many in one call on a processor and an accelerator; interval of their record [s].
+CLIMB = "climb"
+AT_ONCE, SAMPLE = (64, 2048), 0.05
 #: Outputs with units and words, a search has the first two: currents are the largest, places those of the robot's
 #: middle from where the obstacle begins; 0 where nothing is got over.
 VERDICT, LARGEST = "verdict", "largest_mm"

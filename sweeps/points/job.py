@@ -26,8 +26,6 @@ from sweeps.points import axes, climbs, scale
 from sweeps.points.design import Blocks
 from sweeps.points.zarr_store import ABSENT, Layout, Variable
 
-#: Model of points that climb.
-CLIMB = "climb"
 #: Points at which a fidelity is asked, before the first is simulated, whether it could bear them.
 ASKED = 48
 
@@ -74,7 +72,7 @@ def prepare(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> scal
         assert config.chunk is not None
         blocks = Blocks.of(plan.design.shape, config.chunk)
         return scale.Job(
-            robot, CLIMB, config.options, plan, config.outputs, config.storage, blocks, obstacle=config.obstacle
+            robot, climbs.CLIMB, config.options, plan, config.outputs, config.storage, blocks, None, config.obstacle
         )
     try:
         check_outputs(variation, config.model, plan.fixed(), config.options, config.outputs, profile)

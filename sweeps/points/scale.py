@@ -91,7 +91,9 @@ def device_kind() -> str:
 def default_chunk(model: str, device: str | None = None) -> int:
     """Points of a chunk where none is stated, over all local devices, or on one of a kind elsewhere."""
     count = len(jax.local_devices()) if device is None else 1
-    return fidelities.facts(model).at_once(not (device or device_kind()).startswith("cpu")) * count
+    accelerator = not (device or device_kind()).startswith("cpu")
+    at_once = climbs.AT_ONCE[accelerator] if model == climbs.CLIMB else fidelities.facts(model).at_once(accelerator)
+    return at_once * count
 
 
 class Compiled:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from mmrjax.fidelities.climb import LOSSES, NAMES, OVER, SOURCES, Climb
+from mmrjax.fidelities.climb_derivatives import OUTPUTS, Derivatives, Given, crest, outputs
 from mmrjax.footing import FRONT, PITCH, REAR, SHAFT
 from mmrjax.robot import Robot
 from mmrjax.terrain import Terrain
@@ -26,6 +30,26 @@ VERDICTS: dict[str, tuple[str, str]] = {
 
 
 @dataclasses.dataclass(frozen=True)
+class Along:
+    """What derivatives are by.
+
+    Attributes:
+        names, units: of the values; values, widths: in these units; given: the run that such values make.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Array
+    widths: Array
+    given: Callable[[Array], Given]
+
+    @property
+    def rows(self) -> list[tuple[str, str, float, float]]:
+        """Name, unit, value and width of each."""
+        return list(zip(self.names, self.units, self.values.tolist(), self.widths.tolist(), strict=True))
+
+
+@dataclasses.dataclass(frozen=True)
 class ClimbResult:
     """What the command found.
 
@@ -35,6 +59,7 @@ class ClimbResult:
         radius: of the pulleys [m].
         tried: sizes [mm] and verdicts of a search; largest: that it got over [mm], None: no search or none.
         sought: what was searched for, empty: nothing.
+        along, derivatives: where they were asked for.
     """
 
     robot: Robot
@@ -45,6 +70,8 @@ class ClimbResult:
     tried: tuple[tuple[float, str], ...] = ()
     largest: float | None = None
     sought: str = ""
+    along: Along | None = None
+    derivatives: Derivatives | None = None
 
     @property
     def verdict(self) -> str:
@@ -93,6 +120,40 @@ class ClimbResult:
             "stored_J": r.stored[0] - r.stored[0, 0],
         }
 
+    @property
+    def margins(self) -> dict[str, float]:
+        """Margins of the run, shares by the names of `OUTPUTS`; none of a run without numbers."""
+        if self.verdict == "failed":
+            return {}
+        count = len(self.table["time_s"])
+        record = jax.tree.map(lambda x: jnp.asarray(x[0, :count]), self.climb.record)
+        found = outputs(self.robot, self.terrain, record, crest(self.terrain, record, self.over))
+        return {name: float(value) for name, value in found.items() if name.startswith("margin_")}
+
+    @property
+    def slopes(self) -> dict[str, np.ndarray]:
+        """Derivatives as a table, a row an output and value that it is derived by."""
+        along, found = self.along, self.derivatives
+        assert along is not None and found is not None
+        rows = [
+            (name, unit, found.found[name], *by, found.by[name][k], found.slope[name][k], found.slope_sd[name][k])
+            for name, (unit, _) in OUTPUTS.items()
+            for k, by in enumerate(along.rows)
+        ]
+        names = (
+            "output",
+            "unit",
+            "value",
+            "by",
+            "by_unit",
+            "by_value",
+            "by_width",
+            "derivative",
+            "slope",
+            "slope_sd",
+        )
+        return {name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
+
     def statement(self) -> str:
         """The answer in a sentence."""
         if self.sought:
@@ -139,4 +200,24 @@ class ClimbResult:
             "largest_mm": self.largest,
             "tried": [{"size_mm": size, "verdict": verdict} for size, verdict in self.tried],
             "run": self.numbers(),
+            "margins": self.margins,
+            "derivatives": self._derivatives(),
+        }
+
+    def _derivatives(self) -> dict[str, Any] | None:
+        along, found = self.along, self.derivatives
+        if along is None or found is None:
+            return None
+        return {
+            "by": [dict(zip(("name", "unit", "value", "width"), row, strict=True)) for row in along.rows],
+            "outputs": {
+                name: {
+                    "unit": unit,
+                    "value": found.found[name],
+                    "derivatives": found.by[name].tolist(),
+                    "slopes": found.slope[name].tolist(),
+                    "slopes_sd": found.slope_sd[name].tolist(),
+                }
+                for name, (unit, _) in OUTPUTS.items()
+            },
         }

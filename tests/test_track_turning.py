@@ -1,0 +1,218 @@
+"""The track model of both sides: energy, symmetry, straight travel, its masses and its friction."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mmrjax import balances, mjcf, params
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities import both_sides, half_robot
+from mmrjax.fidelities.half_robot import system
+from mmrjax.masses import masses
+from mmrjax.signals import GRAVITY, State
+from mmrjax.turning import SIDES, Law
+
+STEP, STEPS = 1e-4, 3000
+#: Two turns that mirror one another, one on the spot across a slope, one of wheels under load, and sides alike.
+RUNS = Conditions(
+    configuration=[0, 0, 0, 1, 0],
+    voltage=[24.0, 24.0, 15.0, 24.0, 15.0],
+    slope_deg=[0.0, 0.0, 8.0, 3.0, 5.0],
+    payload=[0.0, 0.0, 0.0, 5.0, 3.0],
+    duty_left=[1.0, 0.4, -1.0, 1.0, 1.0],
+    duty_right=[0.4, 1.0, 1.0, 0.2, 1.0],
+    heading_deg=[0.0, 0.0, 60.0, -30.0, 0.0],
+)
+MIRRORED, ALIKE = (0, 1), 4
+
+
+def _power(run, motion):
+    """A step, and where its power goes [W], of the whole robot; what is stored after it [J]."""
+    robot, b = run.robot, both_sides
+    sides, plane = b._contacts(run, motion), b.plane_motion(run, motion)
+    signals, pulled = b._resolved(run, plane, sides)
+    _, levers, rises = b.resistance(run, motion, signals, sides, pulled)
+    after, travel, _ = b.advance(run, motion)
+    gained = after.v - motion.v
+    mean, at = motion.v + gained / 2, sides.at
+    ahead, aside, normal = b.forces_after(at, pulled, levers, rises, gained)
+    moves = [jnp.einsum("sci,si->sc", x, mean[b.OF_SIDE]) for x in (levers.along, levers.across, levers.off)]
+    front, rear = mean[b.PULLEYS].T
+    belt = run.path.radius * (front[:, None] * (1 - at.weight) + rear[:, None] * at.weight)
+    losses = b._losses(run, plane, sides)
+    motor, rate = robot.gearbox.ratio * front, robot.gearbox.ratio * gained[b.PULLEYS[:, 0]] / STEP
+    mesh = signals.torque_motor - signals.torque_idle - robot.motor.inertia * rate
+    charge = after.current + motion.current
+    y = SIDES * run.chassis.turning.width
+    speed = (jnp.cos(motion.q[3]) * mean[0] + jnp.sin(motion.q[3]) * mean[1]) - y * mean[3]
+    faster = (jnp.cos(motion.q[3]) * gained[0] + jnp.sin(motion.q[3]) * gained[1]) - y * gained[3]
+    loss = signals.torque_track_loss - run.path.radius * jnp.sum(pulled.guide, axis=-1)
+    powers = {
+        "in": signals.voltage * charge / 2,
+        "winding": (signals.voltage_drop + robot.motor.resistance * (after.current - motion.current) / 2)
+        * charge
+        / 2,
+        "motor": signals.torque_motor_loss * motor,
+        "gearbox": (signals.torque_idle + (1 - signals.efficiency_load) * mesh) * motor,
+        "track": (loss + losses[1] * gained[b.PULLEYS[:, 0]]) * front,
+        "guide": jnp.sum(pulled.guide * belt, axis=-1),
+        "sliding": -jnp.sum(ahead * moves[0] + aside * moves[1], axis=-1),
+        "contact": -jnp.sum(normal * moves[2], axis=-1),
+        "belt": -(at.belt.torque_front * front + at.belt.torque_rear * rear),
+        "rolling": signals.resistance * (speed - sides.height * mean[b.PITCH]) + losses[0] * faster * speed,
+    }
+    return after, {name: jnp.sum(jnp.asarray(x)) for name, x in powers.items()}, travel
+
+
+def _stored(run, motion):
+    robot, b, q, v = run.robot, both_sides, motion.q, motion.v
+    none = jnp.zeros(b.COORDINATES)
+    mass, _ = b.dynamics(run, motion, none[:2])
+    forward, up = run.half.centre
+    rotors = robot.motor.inertia * (robot.gearbox.ratio * v[b.PULLEYS[:, 0]]) ** 2
+    level = forward * jnp.cos(q[b.PITCH]) + up * jnp.sin(q[b.PITCH])
+    place = q[0] + jnp.cos(q[3]) * level - jnp.sin(q[3]) * -up * q[b.ROLL]
+    high = q[2] - forward * jnp.sin(q[b.PITCH]) + up * jnp.cos(q[b.PITCH]) * jnp.cos(q[b.ROLL])
+    lift = mass[0, 0] * GRAVITY * (jnp.sin(run.conditions.slope) * place + jnp.cos(run.conditions.slope) * high)
+    return (v @ mass @ v + jnp.sum(rotors + robot.motor.inductance * motion.current**2)) / 2 + lift
+
+
+@pytest.fixture(scope="module")
+def runs(robot):
+    """Motions, energy that went each way, and what is stored, from standstill on."""
+
+    @jax.jit
+    @jax.vmap
+    def every(conditions):
+        run = system(robot, conditions, STEP)
+
+        def step(motion, _):
+            after, powers, travel = _power(run, motion)
+            return after, (after, powers, _stored(run, after), travel)
+
+        start = both_sides.stand(run)
+        _, (motions, powers, stored, travel) = jax.lax.scan(step, start, None, length=STEPS)
+        energy = jax.tree.map(lambda p: STEP * jnp.cumsum(p), powers)
+        return motions, energy, stored - _stored(run, start), travel
+
+    return jax.device_get(every(RUNS))
+
+
+def since(energy, stored, first=200):
+    """Energies since that step, when the currents' inrush is over, of every instant from as many steps later on.
+
+    In it a step's torque is that of the current at its beginning: what is left of the balance then is of the order of
+    the step.
+    """
+    energy = {name: (x - x[:, first, None])[:, 2 * first :] for name, x in energy.items()}
+    return energy, (stored - stored[:, first, None])[:, 2 * first :]
+
+
+@pytest.mark.slow
+def test_energy_in_is_lost_or_stored_at_every_instant(runs):
+    """To 1e-3 of what the supplies have given."""
+    energy, stored = since(*runs[1:3])
+    spent = stored + sum(value for name, value in energy.items() if name != "in")
+    assert (energy["in"] > 0.3).all()
+    np.testing.assert_allclose(spent / energy["in"], 1.0, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_ledger_can_fail(runs):
+    """Leaving out the sliding upsets it."""
+    energy, stored = since(*runs[1:3])
+    spent = stored + sum(value for name, value in energy.items() if name not in ("in", "sliding"))
+    assert np.abs(spent / energy["in"] - 1)[:4, -1].min() > 1e-2
+
+
+@pytest.mark.slow
+def test_friction_never_adds(runs):
+    _, energy, _, _ = runs
+    slid = np.diff(energy["sliding"], axis=1)
+    assert slid.min() >= 0 and slid.max() > 1e-3
+
+
+@pytest.mark.slow
+def test_sides_swapped_mirror(runs):
+    motions = runs[0]
+    one, other = (jax.tree.map(lambda x, k=k: x[k], motions) for k in MIRRORED)
+    sign = np.array([1, -1, 1, -1, 1, -1, 1, 1, 1, 1.0])
+    place = [0, 1, 2, 3, 4, 5, 8, 9, 6, 7]
+    for name in ("q", "v"):
+        a, b = getattr(one, name), (sign * getattr(other, name))[:, place]
+        np.testing.assert_allclose(a, b, atol=1e-9 * np.abs(a).max(axis=0).max())
+    np.testing.assert_allclose(one.current, other.current[:, ::-1], rtol=1e-9, atol=1e-9)
+    assert abs(one.q[-1, 3]) > 0.01
+
+
+@pytest.mark.slow
+def test_sides_alike_are_the_half_robot(robot, runs):
+    """To 1e-6 of every coordinate's and rate's size, and of the current; nothing to the side."""
+    straight = jax.tree.map(lambda x: x[ALIKE], RUNS).straight()
+    run = system(robot, straight, STEP)
+
+    def step(motion, _):
+        after = half_robot.advance(run, motion)[0]
+        return after, after
+
+    half = jax.jit(lambda m: jax.lax.scan(step, m, None, length=STEPS)[1])(half_robot.stand(run))
+    mine = jax.tree.map(lambda x: x[ALIKE], runs[0])
+    for name in ("q", "v"):
+        theirs, ours = np.asarray(getattr(half, name)), getattr(mine, name)
+        for column, theirs_column in zip(([0], [2], [4], [6, 8], [7, 9]), theirs.T, strict=True):
+            size = np.abs(theirs_column).max()
+            np.testing.assert_allclose(
+                ours[:, column], theirs_column[:, None].repeat(len(column), 1), atol=1e-6 * size
+            )
+        assert np.abs(ours[:, [1, 3, 5]]).max() < 1e-9
+    np.testing.assert_allclose(mine.current, np.asarray(half.current)[:, None].repeat(2, 1), rtol=1e-6)
+
+
+@pytest.mark.parametrize("configuration", [0, 1])
+def test_bodies_are_the_robot_that_mujoco_compiles(robot, configuration):
+    """Mass, and the moment of inertia in yaw about the centre, of all; and of half a robot twice the planar ones."""
+    run = Conditions(configuration, payload=3.0, heading_deg=0.0)
+    zero = jnp.asarray(0.0)
+    total = balances.begin(robot, run, State(zero, zero, zero, zero)).mass
+    changed = params.replace(robot, {"running_gear.centre_offset": jnp.asarray(0.02)})
+    model = mujoco.MjModel.from_xml_string(mjcf.text(changed, run, float(total), STEP))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    half = masses(changed, run, total)
+    turning = robot.chassis(configuration).turning
+    ahead = float(half.centre[0])
+    assert mass[0, 0] == pytest.approx(float(total))
+    assert mass[3, 3] - mass[0, 0] * ahead**2 == pytest.approx(float(turning.inertia))
+    pitching = 2 * float(half.pitching(robot.running_gear.wheelbase) + 2 * half.inertia_pulley)
+    assert mass[4, 4] == pytest.approx(pitching)
+    assert 0.02 < mass[5, 5] < mass[3, 3]
+    ours, _ = mjcf.template(True)
+    ours = mjcf.member(ours, mjcf.bodies(changed, half, run), run.slope, STEP)
+    for field in ("body_mass", "body_subtreemass", "body_inertia", "body_ipos", "body_pos", "jnt_axis"):
+        np.testing.assert_allclose(getattr(ours, field), getattr(model, field), rtol=1e-12, atol=1e-15, err_msg=field)
+
+
+@pytest.mark.parametrize("rule", [1.0, 2.0])
+def test_friction_rises_as_differences_say_and_never_falls_along_its_sliding(robot, rule):
+    law = Law(robot.configurations["6T2A"].ground.friction, 1.3 ** (2 * rule - 2), 1.0, 16)
+    slow, fast = jnp.asarray([[0.004, -0.003]]), jnp.asarray([[0.05, 0.03]])
+
+    def forces(u):
+        return law.per_speed(u[..., 0] ** 2, u[..., 1] ** 2)[..., None] * u
+
+    for speeds in (slow, fast):
+        (a, b), (c, d) = law.rises(speeds[:, 0], speeds[:, 1])
+        found = np.array([[a[0], b[0]], [c[0], d[0]]])
+        differences = np.stack(
+            [np.asarray(forces(speeds + h) - forces(speeds - h))[0] / 2e-7 for h in 1e-7 * jnp.eye(2)], axis=1
+        )
+        if speeds is slow:
+            np.testing.assert_allclose(found, differences, rtol=1e-6)
+        else:  # where friction falls: as differences say across the sliding, and none along it
+            u = np.asarray(speeds[0])
+            assert u @ differences @ u < 0
+            np.testing.assert_allclose(found @ u, 0.0, atol=1e-12)
