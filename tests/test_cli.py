@@ -516,12 +516,13 @@ def test_track_model_runs_xla_on_one_thread_unless_told_otherwise(monkeypatch, g
     assert os.environ.get("XLA_FLAGS") == (ours if given is None else given)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "flag"),
     [
         (["sweep", "--config", "grid.toml"], "--xla_cpu_multi_thread_eigen=false"),
-        pytest.param(["compare", "--model", "track"], "--xla_cpu_multi_thread_eigen=false", marks=pytest.mark.slow),
-        pytest.param(["sweep"], "None", marks=pytest.mark.slow),
+        (["compare", "--model", "track"], "--xla_cpu_multi_thread_eigen=false"),
+        (["sweep"], "None"),
     ],
 )
 def test_flag_is_set_before_jax_is_imported(tmp_path, arguments, flag):

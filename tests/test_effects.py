@@ -771,7 +771,7 @@ def test_dimensions_of_products():
 
 #: In `make test` one of a balance of the electrical side, one of the mechanical, one with a memory and one of an
 #: instrument; that every effect is alive at zero in its own balance, and in `steady`, is a law above.
-FELT = ("supply_sag", "churning", "pulley_eccentricity", "ammeter_gain")
+FELT = ("supply_sag", "churning", "ammeter_gain")
 #: Instants at which `drive` is read [s]: what acts at a crawl shows at the first, what warms up at the last.
 DRIVEN = (0.0, 0.003, 0.1, 1.0, 4.0)
 

@@ -63,6 +63,7 @@ def test_clean_histories_agree_with_drive(package, battery):
     assert apart(package(battery), y) < CLEAN
 
 
+@pytest.mark.slow
 def test_comparison_with_drive_can_fail(package):
     _, y = gs.histories(RUNS, DURATION, EVERY, g.CLIMBING | {"motor.inertia": 3.36e-6})
     assert apart(package(0.0), y) > 5 * ERROR

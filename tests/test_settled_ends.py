@@ -103,6 +103,7 @@ def test_a_run_that_slides_is_not_taken_for_settled(monkeypatch):
     np.testing.assert_array_equal(slides, ~sound)
 
 
+@pytest.mark.slow
 def test_a_reading_that_still_changes_has_no_settled_end(gripping):
     runs, _ = gripping
     mine = runs["run_id"] == "start4"

@@ -18,6 +18,8 @@ from calibration.inference.observers.turns import TurnLinearization
 from mmrjax import effects, params
 from mmrjax.effects.curve import weights
 
+pytestmark = pytest.mark.slow
+
 #: Of the library, one of each balance that a turn shows, beside those of turns.
 SOME = ("supply_sag", "iron_loss")
 COUNT = 8
@@ -67,11 +69,7 @@ def test_loop_looks_for_effects_of_turns_beside_the_library(posed):
 
 @pytest.mark.parametrize(
     "name",
-    [
-        "side_voltage",
-        "lateral_grip",
-        *(pytest.param(n, marks=pytest.mark.slow) for n in ("side_torque", "turning_resistance", "iron_loss")),
-    ],
+    ["side_voltage", "side_torque", "turning_resistance", "lateral_grip", "iron_loss"],
 )
 def test_signature_is_what_the_effect_does(posed, linear, shown, name):
     _, space = posed
@@ -90,10 +88,7 @@ def test_signature_is_what_the_effect_does(posed, linear, shown, name):
 
 @pytest.mark.parametrize(
     "name",
-    [
-        "curve_track_side",
-        *(pytest.param(n, marks=pytest.mark.slow) for n in ("curve_yaw_yaw_rate", "curve_slip_yaw_rate")),
-    ],
+    ["curve_track_side", "curve_yaw_yaw_rate", "curve_slip_yaw_rate"],
 )
 def test_column_of_a_curve_is_what_the_curve_does(linear, shown, name):
     """A curve that the loop fits is the one whose columns it scored."""
@@ -144,7 +139,6 @@ FOUND = {
 }  # fmt: skip
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", FOUND)
 def test_what_a_second_implementation_planted_is_found(tmp_path, mmrjax, case):
     table, robot = planted.write(tmp_path, case)
