@@ -163,9 +163,21 @@ def assumptions() -> dict:
     return found
 
 
+def turning(size: int = 32) -> dict:
+    """Processor time of a step of the half robot and of both sides, `size` runs of 0.1 s, the least of five."""
+    robot, found = robots.nominal(), {}
+    alike = Conditions("6T2A", voltage=np.linspace(12.0, 33.0, size)).resolved(robot)
+    apart = dataclasses.replace(alike, duty_left=jnp.ones(size), duty_right=jnp.linspace(-1.0, 1.0, size))
+    for name, runs in (("half_robot", alike), ("both_sides", apart)):
+        first = timed(lambda runs=runs: _batch(robot, runs, 0.1, 1e-4, 1e-3, False))
+        took = min(timed(lambda runs=runs: _batch(robot, runs, 0.1, 1e-4, 1e-3, False))[1] for _ in range(5))
+        found[name] = {"compile_cpu_s": first[1], "step_us": 1e6 * took / (1000 * size)}
+    return found
+
+
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    options.add_argument("--only", choices=("speed", "derivatives", "assumptions", "step"))
+    options.add_argument("--only", choices=("speed", "derivatives", "assumptions", "step", "turning"))
     options.add_argument("--batches", default="180")
     options.add_argument("--json", type=Path)
     chosen = options.parse_args()
@@ -174,6 +186,7 @@ def main() -> None:
         "speed": lambda: speed(batches),
         "derivatives": derivatives,
         "assumptions": assumptions,
+        "turning": turning,
         "step": lambda: {"largest_step_s": float(largest_step(robots.nominal(), table8()).min())},
     }
     found = {name: call() for name, call in parts.items() if chosen.only in (None, name)}

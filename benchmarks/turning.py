@@ -1,8 +1,9 @@
 """The paper's robot on the spot: on each surface of Table 5, what turning takes, and from which voltage it turns.
 
-    python benchmarks/turning.py [--speed]
+    python benchmarks/turning.py [--speed] [--track]
 
-With --speed: settled turns a second in one batch, and runs of 2 s that turn beside runs that travel straight.
+With --speed: settled turns a second in one batch, and runs of 2 s that turn beside runs that travel straight. With
+--track: turns of the track model beside settled ones, and of these on a contact as long as an even load would be.
 """
 
 from __future__ import annotations
@@ -15,8 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import mmrjax as mm
-from mmrjax.fidelities import drive, steady
-from mmrjax.signals import NOT_SETTLED
+from mmrjax import params
+from mmrjax.belt import Path, tips
+from mmrjax.fidelities import drive, steady, track
+from mmrjax.signals import NOT_SETTLED, STATUSES
 from mmrjax.tables import SURFACES, adhesion_ratio, lateral_ratio
 
 VOLTAGES = np.concatenate([np.arange(0.5, 8.0, 0.25), [15.0, 24.0, 33.0]])
@@ -80,7 +83,39 @@ def speed() -> None:
           f"{took['turning'] / took['straight']:.1f} times")  # fmt: skip
 
 
+def tracks() -> None:
+    """Print the table of docs/turning.md, Beside the track model."""
+    robot = mm.nominal()
+    rows = [(24, 24, 10), (15, 15, -15), (33, 33, 14.85), (15, 10.5, 15), (24, -24, 24), (24, 24, 12)]
+    names = ["6T2A"] * 4 + ["4W2T"] * 2
+    supply, left, right = np.array(rows, float).T
+    runs = mm.Conditions(names, voltage=supply, duty_left=left / supply, duty_right=right / supply).resolved(robot)
+    found = track.track_batch(robot, runs, duration=1.0, rolling=True)
+    half = found.time.shape[1] // 2
+    load, place = (np.asarray(x)[:, half:] for x in (found.reactions.grouser, found.reactions.place))
+    along = np.asarray(tips(Path(robot.radius_pulley, robot.running_gear), jnp.asarray(place.ravel())).forward)
+    spread = (load * along.reshape(place.shape) ** 2).sum((1, 2, 3)) / np.maximum(load.sum((1, 2, 3)), 1e-9)
+    lengths = np.where(np.asarray(runs.configuration) == 0, np.sqrt(12 * spread), robot.running_gear.wheelbase)
+
+    @jax.jit
+    @jax.vmap
+    def settled(run, share, length):
+        changed = {"6T2A.track.guide_share": share, "running_gear.wheelbase": length}
+        return steady.steady(params.replace(robot, changed), run).reading
+
+    whole = settled(runs, found.steady.guide_share, robot.running_gear.wheelbase * np.ones(len(rows)))
+    even = settled(runs, found.steady.guide_share, jnp.asarray(lengths))
+    for k, (name, row) in enumerate(zip(names, rows, strict=True)):
+        print(f"{name} {row[1]:g} and {row[2]:g} V, an even load over {1e3 * lengths[k]:.1f} mm, guides' share "
+              f"{float(found.steady.guide_share[k]):.3f}, {STATUSES[int(found.result.status[k])]}")  # fmt: skip
+        for column in ("yaw_rate", "motor_current_left", "motor_current_right", "speed", "lateral_speed"):
+            values = (float(x[column][k]) for x in (whole, found.result.reading, even))
+            print("  {:20s} steady {:8.4f}  track {:8.4f}  steady on that length {:8.4f}".format(column, *values))
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--speed", action="store_true")
-    (speed if parser.parse_args().speed else surfaces)()
+    parser.add_argument("--track", action="store_true")
+    chosen = parser.parse_args()
+    (speed if chosen.speed else tracks if chosen.track else surfaces)()

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from collections.abc import Iterable
 from pathlib import Path as File
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax.numpy as jnp
 import numpy as np
@@ -63,6 +62,33 @@ class Scene(NamedTuple):
     resistance: Float[np.ndarray, " n"]
     weight: float
 
+    def sheet(self, k: int) -> Any:
+        """A figure of sample `k`."""
+        return figure(self, k)
+
+
+class View(Protocol):
+    """A run that can be drawn: its samples' times [s], and a figure of each."""
+
+    @property
+    def time(self) -> np.ndarray:
+        """Of the samples [s]."""
+        ...
+
+    def sheet(self, k: int) -> Any:
+        """A figure of sample `k`."""
+        ...
+
+
+def check_finite(run: Trajectory) -> None:
+    """Refuse a run of which nothing can be drawn.
+
+    Raises:
+        ValueError: it holds numbers that are not finite (a failed member).
+    """
+    if not np.isfinite(np.asarray(run.q)).all():
+        raise ValueError("run: its coordinates are not finite, there is nothing to draw; expected a run that ended")
+
 
 def scene(robot: Robot, conditions: Conditions, run: Trajectory) -> Scene:
     """Gather one run (scalar conditions, one member of a batch) for drawing.
@@ -71,8 +97,7 @@ def scene(robot: Robot, conditions: Conditions, run: Trajectory) -> Scene:
         ValueError: the run holds numbers that are not finite (a failed member).
     """
     gear = robot.running_gear
-    if not np.isfinite(np.asarray(run.q)).all():
-        raise ValueError("run: its coordinates are not finite, there is nothing to draw; expected a run that ended")
+    check_finite(run)
     chassis = robot.chassis(conditions.configuration)
     path, wheeled = Path(robot.radius_pulley, gear), bool(chassis.on_tracks < 0.5)
     levers = [] if wheeled else lever_tips(gear, conditions)
@@ -105,8 +130,8 @@ def _turn(points: Any, angle: float, about: tuple[float, float] = (0.0, 0.0)) ->
     return np.asarray(points) @ np.array([[cos, sin], [-sin, cos]]) + np.asarray(about)
 
 
-def _outline(path: Path, height: float, places: np.ndarray) -> np.ndarray:
-    # Points of the belt (height 0) or of grouser tips in the chassis frame.
+def outline(path: Path, height: float, places: np.ndarray) -> np.ndarray:
+    """Points of the belt (height 0) or of grouser tips in the chassis frame [m], at places on its path."""
     gear = params.replace(path.gear, {"grouser_height": jnp.asarray(height)})
     at = tips(Path(path.radius, gear), jnp.asarray(places))
     return np.stack([np.asarray(at.forward), np.asarray(at.up)], axis=1)
@@ -141,17 +166,17 @@ def draw(axes: Any, view: Scene, k: int) -> None:
     axes.add_patch(Polygon(world(body), facecolor=_BODY, edgecolor=_INK, lw=1, alpha=0.85))
     for (x, z), start in zip(view.levers, (view.axle, -view.axle), strict=False):
         axes.plot(*world([(start, 0), (x, z)]).T, color="#8fa3b0", lw=7, solid_capstyle="round", alpha=0.7, zorder=2)
-    belt = world(_outline(view.path, 0.0, np.linspace(0.0, float(view.path.length), 400)))
+    belt = world(outline(view.path, 0.0, np.linspace(0.0, float(view.path.length), 400)))
     axes.plot(*belt.T, color=_BELT, lw=2.2, zorder=3)
     if view.wheeled:
         for x, phi in ((view.axle, q[3]), (-view.axle, q[4])):
             _disc(axes, Circle, world, x, view.wheel, phi, "#9aa5ad")
     else:
-        base = world(_outline(view.path, 0.0, view.place[k]))
-        tip = world(_outline(view.path, float(view.path.gear.grouser_height), view.place[k]))
+        base = world(outline(view.path, 0.0, view.place[k]))
+        tip = world(outline(view.path, float(view.path.gear.grouser_height), view.place[k]))
         axes.add_collection(LineCollection(list(np.stack([base, tip], axis=1)), colors=_BELT, lw=4, zorder=3))
     teeth = (view.place[k][:, None] + np.arange(7) * float(view.path.pitch) / 7).ravel() % float(view.path.length)
-    root, inner = (world(_outline(view.path, h, teeth[:TEETH_BELT])) for h in (0.0, -0.0022))
+    root, inner = (world(outline(view.path, h, teeth[:TEETH_BELT])) for h in (0.0, -0.0022))
     axes.add_collection(LineCollection(list(np.stack([root, inner], axis=1)), colors=_BELT, lw=0.9, zorder=3))
     for x, phi in ((view.axle, q[3]), (-view.axle, q[4])):
         _disc(axes, Circle, world, x, radius - 0.003, phi, "#d9dee2")
@@ -178,7 +203,7 @@ def _forces(axes: Any, view: Scene, k: int, world: Any, ground: Any) -> None:
         for x, force in zip((view.axle, -view.axle), view.support[k], strict=True):
             arrow((x, -force * FORCE), (0.0, force), _NORMAL)
     else:
-        tip = _outline(view.path, float(view.path.gear.grouser_height), view.place[k])
+        tip = outline(view.path, float(view.path.gear.grouser_height), view.place[k])
         for j in range(GROUSERS):
             force = view.normal[k, j]
             x = _turn([tip[j]], -q[2])[0, 0]
@@ -268,12 +293,12 @@ def instants(
 
 
 def render(
-    view: Scene, file: str | File, begin: float = 0.0, end: float | None = None, slow: float = 10.0, rate: int = RATE
+    view: View, file: str | File, begin: float = 0.0, end: float | None = None, slow: float = 10.0, rate: int = RATE
 ) -> File:
     """Write a picture (.png, of the instant `begin`) or a film (.gif, .mp4) of a scene.
 
     Args:
-        view: from `scene`.
+        view: from `scene`, of this module or of `render_above`.
         file: its suffix decides what is written.
         begin, end: part of the run to film [s]; None: to its end.
         slow: how many times slower than life; a pitch lasts 36 ms at 1 m/s.
@@ -286,11 +311,15 @@ def render(
     times = instants(file, begin, end, slow, float(view.time[-1]), rate)
     frames = [int(np.argmin(np.abs(view.time - t))) for t in times]
     if file.suffix == ".png":
-        figure(view, frames[0]).savefig(file)
+        view.sheet(frames[0]).savefig(file)
         return file
     if file.suffix == ".gif":
-        return film_gif((figure(view, k) for k in frames), file, rate)
-    pictures = (_pixels(figure(view, k)) for k in frames)
+        from PIL import Image
+
+        images = [Image.fromarray(_pixels(view.sheet(k))).quantize(256) for k in frames]
+        images[0].save(file, save_all=True, append_images=images[1:], duration=round(1000 / rate), loop=0)
+        return file
+    pictures = (_pixels(view.sheet(k)) for k in frames)
     first = next(pictures)
     import imageio_ffmpeg
 
@@ -302,13 +331,4 @@ def render(
     for picture in itertools.chain([first], pictures):
         writer.send(picture.tobytes())
     writer.close()
-    return file
-
-
-def film_gif(sheets: Iterable[Any], file: File, rate: int) -> File:
-    """Write figures of one size as a film (.gif) of `rate` frames a second."""
-    from PIL import Image
-
-    images = [Image.fromarray(_pixels(sheet)).quantize(256) for sheet in sheets]
-    images[0].save(file, save_all=True, append_images=images[1:], duration=round(1000 / rate), loop=0)
     return file

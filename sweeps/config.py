@@ -295,6 +295,11 @@ class TurnPart(Part):
         """Whether the robot is free to turn."""
         return any(getattr(self, name) is not None for name in TurnPart.model_fields)
 
+    def refuse_volts(self, battery: bool) -> None:
+        """Refuse volts of either side where a battery decides them."""
+        if battery and self.left_V is not None:
+            raise PydanticCustomError("idle", "left_V acts without battery only; state duty_left and duty_right")
+
     @model_validator(mode="after")
     def _of_both_sides(self) -> Self:
         pairs = ("left_V", "right_V"), ("duty_left", "duty_right"), ("speed_m_s", "yaw_rate_rad_s")
@@ -369,8 +374,7 @@ class Simulate(RobotPart, ProfilePart, SupplyPart, TurnPart, PosteriorPart, Outp
             beside = [name for name in ("profile", "posterior") if getattr(self, name) is not None]
             if beside:
                 raise PydanticCustomError("idle", f"left, right and heading act without {beside[0]} only")
-            if self.battery and self.left_V is not None:
-                raise PydanticCustomError("idle", "left_V acts without battery only; state duty_left and duty_right")
+            self.refuse_volts(self.battery)
         if self.profile is not None and self.posterior is not None:
             raise PydanticCustomError("idle", "posterior acts without profile only")
         return self
@@ -392,10 +396,17 @@ class Compare(RobotPart, FidelityPart, PosteriorPart, OutputPart):
     """The runs of a measured table."""
 
 
-class Render(RobotPart, FidelityPart, SupplyPart):
+class Render(RobotPart, FidelityPart, SupplyPart, TurnPart):
     """One run of the fidelity that pictures are made from."""
 
     model: Literal["track"] = "track"
+
+    @model_validator(mode="after")
+    def _driven(self) -> Self:
+        if self.demands:
+            raise PydanticCustomError("idle", "speed_m_s acts with simulate only; state left_V and right_V")
+        self.refuse_volts(self.battery)
+        return self
 
 
 class Resonance(RobotPart, FidelityPart, OutputPart):

@@ -109,7 +109,7 @@ CONJUGATE = {
     "gearbox": "speed_wheel",
     "track": "speed_wheel",
     "ground": "speed",
-    "slip": "traction",
+    "slip": "demand",  # the traction in steady travel
 }
 CONDITIONS = Conditions(
     voltage=[33.0, 15.0, 24.0, 24.0, 24.0],

@@ -8,7 +8,7 @@ import pytest
 from calibration.data import runs as records
 from calibration.data.errors import BadData
 from mmrjax import robots
-from sweeps.pages import turn_words
+from sweeps.pages import mission_figures, turn_words
 from sweeps.points.job import showing_turns
 from tests.commands import rows
 
@@ -187,3 +187,10 @@ def test_a_sweep_over_duties_leaves_yaw_rates(tmp_path, mmrjax):
     spot, straight = rows(tmp_path / "run" / "runs.csv")
     assert float(spot["yaw_rate_rad_s"]) > 3 and float(spot["speed_mm_s"]) == pytest.approx(0.0, abs=1e-6)
     assert float(straight["yaw_rate_rad_s"]) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_currents_of_a_turn_on_the_spot_do_not_cancel_on_the_page_of_a_mission():
+    sides = {f"motor_current_{side}_A": np.array([sign * 1.6, 1.0]) for side, sign in (("left", -1), ("right", 1))}
+    rows = {"motor_current_A": np.array([0.0, 1.0])}
+    np.testing.assert_allclose(mission_figures.of_motors(rows | sides, "motor_current", "_A"), [1.6, 1.0])
+    np.testing.assert_allclose(mission_figures.of_motors(rows, "motor_current", "_A"), [0.0, 1.0])

@@ -49,7 +49,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
     file = load_robot(config)
     robot = file.robot
     check(robot, given.get("configuration") or robot.configurations.names[0])
-    runs = one_run(robot, {**given, **_cells(config, given)}, config.battery)
+    runs = one_run(robot, {**given, **cells(config, given)}, config.battery)
     settled = config.model == fidelities.NAMES[0]
     with open_folder("simulate", config, robot, out, force, runs) as folder:
         asked = run.commanded(robot, runs, config)
@@ -167,7 +167,7 @@ def check(robot: Robot, named: str) -> None:
         raise BadConfiguration("--left, --right: the robot's file says that its motors are not driven by voltage")
 
 
-def _cells(config: configuration.Simulate, given: dict[str, Any]) -> dict[str, Any]:
+def cells(config: configuration.TurnPart, given: dict[str, Any]) -> dict[str, Any]:
     """Columns of the run: duties of the supply's voltage, which is the larger one where it is not stated."""
     found: dict[str, Any] = {} if config.heading_deg is None else {"heading_deg": config.heading_deg}
     if config.duty_left is not None:

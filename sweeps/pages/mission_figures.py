@@ -44,7 +44,8 @@ def course(rows: Mapping[str, np.ndarray], cycle: float | None, limit: float, li
         first = column == 0
         axes[0].set_title(f"{title}: speed" + (" and slope" if np.any(rows.get("slope_deg", 0.0)) else ""))
         _speed(axes[0], time, shown, linear, legend=first)
-        axes[1].set_title("current of all motors, and duty of the driver")
+        sizes = ", sizes of both sides" if "duty_left" in rows else ""
+        axes[1].set_title(f"current of all motors, and duty of the driver{sizes}")
         _current(axes[1], time, shown, sides, legend=first)
         unlimited = limit >= UNLIMITED or "housing_temperature_C" not in rows
         beyond = (
@@ -119,17 +120,24 @@ def _speed(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], linear:
 
 
 def _current(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], sides: float, legend: bool) -> None:
-    current = sides * rows["motor_current_A"]
+    current, driven = (of_motors(rows, *name) for name in (("motor_current", "_A"), ("duty", "")))
+    current = sides * current
     axes.plot(time, current, color=VERMILION, lw=1.0, label="current")
     top = int(np.argmax(np.abs(current)))
     axes.plot(time[top], current[top], marker="o", ms=4, color=INK, ls="none", label=f"peak {current[top]:.2f} A")
     axes.set_ylabel("current [A]")
     duty = _beside(axes, "duty [%]", PURPLE)
-    duty.plot(time, 100 * rows["duty"], color=PURPLE, lw=0.9, alpha=0.8, label="duty")
-    low = -110 if (rows["duty"] < 0).any() else 0
+    duty.plot(time, 100 * driven, color=PURPLE, lw=0.9, alpha=0.8, label="duty")
+    low = -110 if (driven < 0).any() else 0
     duty.set_ylim(low, 110)
     if legend:
         _legend(axes, duty)
+
+
+def of_motors(rows: Mapping[str, np.ndarray], name: str, unit: str) -> np.ndarray:
+    """Of a motor on average; of motors of two sides, which cancel one another on the spot, of their sizes."""
+    of_sides = [np.abs(rows[f"{name}_{side}{unit}"]) for side in ("left", "right") if f"{name}_{side}{unit}" in rows]
+    return np.asarray(np.mean(of_sides, axis=0) if of_sides else rows[f"{name}{unit}"])
 
 
 def _near(rows: Mapping[str, np.ndarray], limit: float) -> bool:
