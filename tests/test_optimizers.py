@@ -382,6 +382,17 @@ def test_coverage_can_fail(posed, truth):
     assert inside.min() < 0.85
 
 
+def test_directions_that_no_data_tell_apart_are_the_same_from_any_basis():
+    random = np.random.default_rng(4)
+    plane = np.linalg.qr(np.stack([np.eye(6)[2], [3.0, 4.0, 0, 0, 0, 0], [0, 0, 0, 1.0, -1.0, 2.0]], 1))[0].T
+    turned = np.linalg.qr(random.standard_normal((3, 3)))[0] @ plane
+    found = identifiability.told_apart(turned)
+    np.testing.assert_allclose(found, identifiability.told_apart(plane), atol=1e-12)
+    np.testing.assert_allclose(found.T @ found, plane.T @ plane, atol=1e-12)
+    np.testing.assert_allclose(found[:2], [np.eye(6)[2], np.array([0, 0, 0, 1.0, -1.0, 2.0]) / 6**0.5], atol=1e-12)
+    assert identifiability.told_apart(np.zeros((0, 6))).shape == (0, 6)
+
+
 @pytest.mark.slow
 def test_what_only_its_prior_holds_is_said(measured):
     robot = robots.nominal()
