@@ -87,7 +87,7 @@ MORE = {
     "largest_mm": "largest obstacle that a search got over",
     "z_mm": "middle of the robot above the ground before the obstacle",
     "nose_mm": "radius of rounded noses", "time_step_s": "step of a climb",
-    "shaft_deg": "of the pulleys, relative to the body", "finish_mm": "where an obstacle ends",
+    "shaft_deg": "of the pulleys, relative to the body", "finish_mm": "where an obstacle ends", "points_mm": "of its ground",
     **{name: meaning for name, (_, meaning) in OUTPUTS.items()},
     "front_deg": "front levers", "rear_deg": "rear levers", "belt_mm_s": "of the main belt",
     "motors_current_A": "of all motors, from the supply", "front_voltage_V": "at the motor of the front levers",
