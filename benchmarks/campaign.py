@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import functools
 import gc
+import itertools
 import json
 import multiprocessing
 import os
@@ -164,7 +165,10 @@ class Shares:
         return self.waiting[shape].pop(0), shape
 
 
-def _worker(work: Callable[[Task], dict], line: Connection) -> None:
+def _worker(work: Callable[[Task], dict], line: Connection, core: int | None) -> None:
+    """Judge what comes along a line, on one core if one is given: XLA's pool has a thread for each it may use."""
+    if core is not None:
+        os.sched_setaffinity(0, {core})
     while (task := line.recv()) is not None:
         line.send(guarded(work, task))
 
@@ -176,13 +180,14 @@ def judged(work: Callable[[Task], dict], shares: Shares, jobs: int, limit: float
     """
     began, spawn = time.monotonic(), multiprocessing.get_context("spawn")
     workers: dict[Connection, tuple[BaseProcess, Task, Hashable]] = {}
+    cores = itertools.cycle(sorted(os.sched_getaffinity(0)) if jobs > 1 else [None])
 
     def hire() -> None:
         dealt = shares.next(None)
         if dealt is None:
             return
         mine, theirs = spawn.Pipe()
-        process = spawn.Process(target=_worker, args=(work, theirs), daemon=True)
+        process = spawn.Process(target=_worker, args=(work, theirs, next(cores)), daemon=True)
         process.start()
         theirs.close()
         mine.send(dealt[0])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from collections.abc import Iterable
 from pathlib import Path as File
 from typing import Any, NamedTuple, Protocol
 
@@ -315,7 +314,11 @@ def render(
         view.sheet(frames[0]).savefig(file)
         return file
     if file.suffix == ".gif":
-        return film_gif((view.sheet(k) for k in frames), file, rate)
+        from PIL import Image
+
+        images = [Image.fromarray(_pixels(view.sheet(k))).quantize(256) for k in frames]
+        images[0].save(file, save_all=True, append_images=images[1:], duration=round(1000 / rate), loop=0)
+        return file
     pictures = (_pixels(view.sheet(k)) for k in frames)
     first = next(pictures)
     import imageio_ffmpeg
@@ -328,13 +331,4 @@ def render(
     for picture in itertools.chain([first], pictures):
         writer.send(picture.tobytes())
     writer.close()
-    return file
-
-
-def film_gif(sheets: Iterable[Any], file: File, rate: int) -> File:
-    """Write figures of one size as a film (.gif) of `rate` frames a second."""
-    from PIL import Image
-
-    images = [Image.fromarray(_pixels(sheet)).quantize(256) for sheet in sheets]
-    images[0].save(file, save_all=True, append_images=images[1:], duration=round(1000 / rate), loop=0)
     return file

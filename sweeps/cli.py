@@ -249,15 +249,26 @@ def render(
         typer.Option(help="Instant of a picture, first one of a film (s).  \\[default: 0; of a picture 0.8]"),
     ] = None,
     end: Annotated[float | None, typer.Option(help="Last instant of a film (s).  \\[default: begin + 0.1]")] = None,
-    slow: Annotated[float, typer.Option(help="How many times slower than life a film runs.", min=0.01)] = 20.0,
+    slow: Annotated[
+        float | None, typer.Option(help="How many times slower than life a film runs.  \\[default: 20]", min=0.01)
+    ] = None,
+    climb: Annotated[
+        Path | None,
+        typer.Option(help="A folder of mmrjax climb to draw in its place, by default whole and at half speed."),
+    ] = None,
     force: _Force = False,
 ) -> int:
     """Draw a run of the track model from standstill: the robot on its slope, its track running, its forces.
 
-    With --left and --right it turns, and is seen from above. Needs no display.
+    With --left and --right it turns, and is seen from above. With --climb a climb that has been computed is drawn.
+    Needs no display.
     """
     from sweeps.commands import render as room
 
+    if climb is not None:
+        stated = told.config != config.Render() or any(v is not None for v in told.beside.model_dump().values())
+        return room.render_climb(climb, stated, file, begin, end, slow, force)
+    slow = 20.0 if slow is None else slow
     begin = (0.8 if file.suffix == ".png" else 0.0) if begin is None else begin
     end = begin + 0.1 if end is None else end
     return room.render(told.config, told.beside.model_dump(), file, begin, end, slow, force)

@@ -15,6 +15,7 @@ from calibration.data.errors import BadConfiguration, BadData
 from mmrjax.fidelities.climb import LOSSES
 from mmrjax.robots import nominal
 from sweeps.commands import climb as room
+from sweeps.results.climb import Seen, coordinates
 
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "climb.schema.json").read_text("utf-8"))
 
@@ -34,6 +35,9 @@ REFUSED = {
                                          r"s\.csv states all angles"),
     "a search of another kind": (["--find", "gap", "--step", "50"], r"find gap acts without step_mm"),
     "no such terrain": (["--terrain", "none.csv"], r"--terrain: none\.csv cannot be read"),
+    "a derivative by nothing": (["--step", "50", "--derivatives", "payload,motor.resistence"],
+                                r"got motor\.resistence; expected adhesion, payload, voltage, .*did you mean motor\.resistance"),
+    "a size that the terrain has not": (["--terrain", "t.csv", "--derivatives", "obstacle_mm"], r"got obstacle_mm; expected"),
     "a bench": (["--step", "50", "--robot", "bench.toml"], r"climb: the robot's load is a shaft"),
 }  # fmt: skip
 
@@ -45,6 +49,7 @@ def test_what_cannot_be_climbed_is_refused_in_one_sentence(mmrjax, tmp_path, cas
         assert mmrjax("rig", "new", "bench.toml", "--kind", "bench")[0] == 0
         message = r"climb: |bench\.toml"
     (tmp_path / "s.csv").write_text("time_s,front_deg,rear_deg\n0,45,180\n")
+    (tmp_path / "t.csv").write_text("x_mm,z_mm\n0,0\n0,50\n")
     code, _, err = mmrjax("climb", *arguments, "--out", "c")
     assert code == 2 and err.count("\n") == 1, err
     assert re.search(message, err), err
@@ -145,3 +150,14 @@ def test_one_climb_leaves_a_folder_whose_energy_adds_up(mmrjax, tmp_path):
     assert last["supply_J"] + last["levers_J"] == pytest.approx(lost + last["stored_J"], rel=5e-3)
     page = (folder / "report.html").read_text("utf-8")
     assert "The robot gets over: a gap of 60 mm." in page and page.count("<svg") == 2
+    assert 0 < result["margins"]["margin_success"] < 1 == result["margins"]["margin_reach"]
+
+    seen = Seen.read(folder)
+    assert coordinates(seen.table)[-1, 4] == pytest.approx(np.radians(45), abs=2e-3)
+    assert float(seen.terrain.finish) == pytest.approx(0.06)
+    code, out, _ = mmrjax("render", "c.png", "--climb", "c")
+    assert code == 0 and (tmp_path / "c.png").stat().st_size > 5000
+    code, _, err = mmrjax("render", "d.gif", "--climb", "c", "--voltage", "12")
+    assert code == 2 and "expected one of the two" in err
+    code, _, err = mmrjax("render", "d.gif", "--climb", "tests")
+    assert code == 2 and "tests cannot be read; expected a folder of mmrjax climb" in err

@@ -25,6 +25,7 @@ from calibration.data import columns
 from mmrjax import channels, derived, missions, outputs, requirements
 from mmrjax.derived import turn
 from mmrjax.fidelities.climb import LOSSES, SOURCES
+from mmrjax.fidelities.climb_derivatives import OUTPUTS
 from mmrjax.fidelities.resonance import SIGNALS
 from sweeps import capabilities, cli, config
 from sweeps.points import export
@@ -86,6 +87,8 @@ MORE = {
     "largest_mm": "largest obstacle that a search got over",
     "z_mm": "middle of the robot above the ground before the obstacle",
     "nose_mm": "radius of rounded noses", "time_step_s": "step of a climb",
+    "shaft_deg": "of the pulleys, relative to the body", "finish_mm": "where an obstacle ends", "points_mm": "of its ground",
+    **{name: meaning for name, (_, meaning) in OUTPUTS.items()},
     "front_deg": "front levers", "rear_deg": "rear levers", "belt_mm_s": "of the main belt",
     "motors_current_A": "of all motors, from the supply", "front_voltage_V": "at the motor of the front levers",
     "rear_voltage_V": "at that of the rear ones", "front_holds": "1 where its worm alone holds a pair", "rear_holds": "the same",

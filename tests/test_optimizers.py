@@ -382,6 +382,17 @@ def test_coverage_can_fail(posed, truth):
     assert inside.min() < 0.85
 
 
+def test_directions_that_no_data_tell_apart_are_the_same_from_any_basis():
+    random = np.random.default_rng(4)
+    plane = np.linalg.qr(np.stack([np.eye(6)[2], [3.0, 4.0, 0, 0, 0, 0], [0, 0, 0, 1.0, -1.0, 2.0]], 1))[0].T
+    turned = np.linalg.qr(random.standard_normal((3, 3)))[0] @ plane
+    found = identifiability.told_apart(turned)
+    np.testing.assert_allclose(found, identifiability.told_apart(plane), atol=1e-12)
+    np.testing.assert_allclose(found.T @ found, plane.T @ plane, atol=1e-12)
+    np.testing.assert_allclose(found[:2], [np.eye(6)[2], np.array([0, 0, 0, 1.0, -1.0, 2.0]) / 6**0.5], atol=1e-12)
+    assert identifiability.told_apart(np.zeros((0, 6))).shape == (0, 6)
+
+
 @pytest.mark.slow
 def test_what_only_its_prior_holds_is_said(measured):
     robot = robots.nominal()
@@ -401,6 +412,7 @@ def test_what_only_its_prior_holds_is_said(measured):
     assert set(weakest[0]) == {"6T2A.track.guide_friction", "6T2A.track.guide_share"}
 
 
+@pytest.mark.slow
 def test_profile_of_a_linear_problem_is_its_interval(clean, truth):
     """With little noise the model is linear over an interval, so profile and curvature agree."""
     quiet = dataclasses.replace(clean.data, sd=clean.data.sd / 500)
@@ -515,6 +527,7 @@ def test_histories_pad_runs_of_different_length():
     np.testing.assert_allclose(seen, runs.measured()[kept], rtol=5e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_rival_searches_end_where_three_agree_unless_one_is_lower():
     """Members 0-2 rest in a basin of 30, 3 and 4 descend a curved valley to 0, 5 creeps at a cost of 2000."""
 

@@ -200,6 +200,8 @@ def test_name_stands_by_its_score_its_curves_and_its_rows(root, without, evidenc
         dataclasses.replace(test, **bad).established
         for bad in ({"again": 0.75}, {"larger": ("b",)}, {"remains": True})
     )
+    of_runs = dataclasses.replace(test, what="run")  # of histories: chance alone
+    assert of_runs.rests_on == (10 if without < 3.3 else None)
     renumbered = NameSupport(True, tests=(test,)).numbered(np.arange(1, 21) * 2)
     assert renumbered.rests_on("a") == (None if rests_on is None else 20) and renumbered.rests_on("b") is None
 

@@ -120,6 +120,39 @@ def test_map_of_verdicts_has_each_point_in_its_colour():
     assert axes.get_ylabel() == "obstacle_mm [mm]"
 
 
+MAP = """
+chunk = 2
+report = false
+[obstacle]
+kind = "step"
+[axes]
+levers_front_deg = [0, 30, 60]
+obstacle_mm = [60, 500]
+"""
+
+
+def test_interrupted_map_goes_on_after_its_last_chunk(mmrjax, tmp_path, monkeypatch):
+    """Climbs in closed form: what a chunk has is kept, what was under way is climbed again."""
+    climbed, ends = [], iter([False, True, False, False])
+
+    def closed(of, variation, conditions, values, sizes, told):
+        if next(ends):
+            raise KeyboardInterrupt
+        climbed.append(np.asarray(values)[:, 0].tolist())
+        found = {name: np.asarray(values)[:, 0] + sizes for name in climbs.names(of)}
+        return {**found, climbs.VERDICT: np.zeros(2, np.uint8), STATUS: np.zeros(2, np.uint8)}
+
+    monkeypatch.setattr(climbs, "computed", closed)
+    (tmp_path / "map.toml").write_text(MAP)
+    assert mmrjax("sweep", "map.toml", "--out", "map")[0] == 130
+    assert climbed == [[0.0, 0.0]] and (tmp_path / "map.partial").is_dir()
+    code, out, err = mmrjax("sweep", "map.toml", "--out", "map")
+    assert code == 0 and "goes on after 2 of 6 points" in err and "came to a verdict" in out
+    assert climbed == [[0.0, 0.0], [30.0, 30.0], [60.0, 60.0]]
+    store = zarr.open_group(tmp_path / "map" / "results.zarr", mode="r")
+    assert store["energy_J"][:].tolist() == [[60, 560 - 60], [90, 530], [120, 560]]
+
+
 @pytest.mark.slow
 def test_store_of_climbs_is_filled_in_shares_and_its_page_has_the_map(mmrjax, tmp_path):
     (tmp_path / "map.toml").write_text(

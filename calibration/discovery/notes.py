@@ -31,8 +31,10 @@ class CurveOver(NamedTuple):
 #: Evidence by which a smooth curve of an effect's own equation has to be the better explanation [σ²]: of 369 right
 #: names of two campaigns 7 have less than -6, of 6 wrong ones of laws outside the library 3 (docs/lab/findings.md).
 BETTER = 6.0
-#: Share of its root that an effect has to keep without any one row.
-KEPT = 1 / math.sqrt(3)
+#: Share of its root that an effect has to keep without any one run: without a row of a table, whose readings may be
+#: wrong by themselves; without a run of a history, hundreds of samples of few runs that differ on purpose, chance is
+#: asked alone.
+KEPT = {"row": 1 / math.sqrt(3), "run": 0.0}
 #: Share of the blocks left out, of those that leave half of what is known of an effect, in which it has to be chosen
 #: again.
 AGAIN = 0.8
@@ -74,7 +76,7 @@ class NameTest:
     @property
     def rests_on(self) -> int | None:
         """Number of the row without which it would not stand; None where it needs none."""
-        return self.row if self.root_without < max(self.needed, KEPT * self.root) else None
+        return self.row if self.root_without < max(self.needed, KEPT[self.what] * self.root) else None
 
     @property
     def fails(self) -> tuple[str, ...]:

@@ -144,10 +144,11 @@ def _nominal() -> tuple[Robot, Signals]:
 
 
 def _size(x: object) -> float:
-    """Root mean square of what is finite and not zero; NaN for nothing."""
+    """Root mean square of what is finite and not zero, however small; NaN for nothing."""
     sizes = np.abs(np.ravel(np.asarray(x, float)))
     sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
-    return float(np.sqrt(np.mean(sizes**2))) if sizes.size else math.nan
+    largest = np.max(sizes, initial=0.0)  # squares of less than 1e-162 are zero
+    return float(largest * np.sqrt(np.mean((sizes / largest) ** 2))) if sizes.size else math.nan
 
 
 def _ratio(mine: float, theirs: float) -> float:

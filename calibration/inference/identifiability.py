@@ -43,7 +43,7 @@ class Identifiability:
         sd: posterior sd of z, thus the square root of the posterior over the prior variance.
         singular_values: of the whitened Jacobian of the readings alone: prior sd over data sd along each
             direction, largest first; above 1 the data say more than the prior.
-        directions: right singular vectors, one a row.
+        directions: right singular vectors, one a row; those beyond the rank as `told_apart` has them.
         rank: singular values above 1e-8 of the largest.
         sensitivity: norm of each column of that Jacobian: how many data sds one prior sd moves the
             readings; 0 for a parameter that nothing measures.
@@ -89,6 +89,21 @@ class Identifiability:
         return weak
 
 
+def told_apart(directions: np.ndarray) -> np.ndarray:
+    """Of a plane of directions, of which any orthonormal ones are as good, those next to one parameter each, the
+    parameter that lies in it most first: the same whatever basis rounding chose.
+
+    Args:
+        directions: orthonormal, shape (directions, parameters), as the answer is.
+    """
+    left, found = directions.T @ directions, np.zeros_like(directions)
+    for row in found:
+        k = int(np.argmax(np.round(np.diag(left), 6)))
+        row[:] = left[k] / np.sqrt(left[k, k])
+        left = left - np.outer(row, row)
+    return found
+
+
 @compiled
 def _jacobians(problem: Problem, z: Array, data: Data) -> tuple[Array, Array]:
     readings = problem.linearised(problem.robot, z, data)[1][: data.measured.size]
@@ -112,6 +127,8 @@ def analyse(problem: Problem, z: Array, data: Data | None = None, slope: np.ndar
     _, s, v = np.linalg.svd(whole, full_matrices=False)
     covariance = (v.T / s**2) @ v
     _, singular, directions = np.linalg.svd(readings, full_matrices=False)
+    rank = int(np.sum(singular > 1e-8 * singular.max()))
+    directions[rank:] = told_apart(directions[rank:])
     leverage = np.einsum("ij,jk,ik->i", readings, covariance, readings)
     return Identifiability(
         names=problem.coordinates.names,
@@ -119,7 +136,7 @@ def analyse(problem: Problem, z: Array, data: Data | None = None, slope: np.ndar
         sd=np.sqrt(np.diag(covariance)),
         singular_values=singular,
         directions=directions,
-        rank=int(np.sum(singular > 1e-8 * singular.max())),
+        rank=rank,
         sensitivity=np.linalg.norm(readings, axis=0),
         leverage=leverage.reshape(data.measured.shape),
         jacobian=readings,

@@ -55,7 +55,8 @@ class Effect(eqx.Module):
             it is the same share everywhere.
         rests_on: dotted names of parameters of the robot in proportion to which its term is, for whoever finds its
             amplitude too large.
-        dissipative: whether a positive amplitude may only take power out.
+        dissipative: whether a positive amplitude may only take power out; in `slip` that of the demand, which is the
+            traction in steady travel.
         channel: for `sensor` alone: the channel that it changes, one of `channels.EVERY`.
         transient: whether settled travel shows nothing of it, so that only histories can.
         settles_to: name of the effect from which settled travel cannot tell it, so that only histories can.

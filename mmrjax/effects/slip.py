@@ -48,10 +48,11 @@ class BeltCreep(SlipEffect):
 
     Source: Firbank, Mechanics of the belt drive, Int. J. Mech. Sci. 12 (1970) 1053: creep = change of
     tension over the belt's stiffness E A; so a = 1/(E A). The demand stands for the traction, equal to it in
-    steady travel; where the two differ in sign it is no loss.
+    steady travel.
     """
 
     driver = "demand"
+    dissipative = True
 
     amplitude: Scalar = amplitude(
         unit="1/N",
@@ -71,11 +72,11 @@ class NonlinearSlip(SlipEffect):
     Slip that grows steeply as the adhesion is used up.
 
     Source: Janosi and Hanamoto (1961): traction saturates over slip; the cube is the steep part of its
-    inverse. u is held within 2, beyond which the robot slides anyway. A loss where demand and traction agree
-    in sign.
+    inverse. u is held within 2, beyond which the robot slides anyway.
     """
 
     driver = "demand"
+    dissipative = True
 
     amplitude: Scalar = amplitude(
         unit="-",
@@ -177,6 +178,7 @@ class VibrationSlip(SlipEffect):
     """
 
     driver = "demand"
+    dissipative = True
     movers = "tracks"
     resolved = True
 

@@ -166,9 +166,9 @@ def climb_derivatives(
     slope, sd = {}, {}
     for name in found:
         y = np.array([float(other[name]) for other in others]).reshape(-1, BESIDE)
-        square = np.sum(offsets**2)
-        rise = y @ offsets / square
-        left = y - y.mean(axis=1, keepdims=True) - np.outer(rise, offsets)
+        square, off = np.sum(offsets**2), y - y.mean(axis=1, keepdims=True)
+        rise = off @ offsets / square
+        left = off - np.outer(rise, offsets)
         slope[name] = rise / np.asarray(widths)
         sd[name] = np.sqrt(np.sum(left**2, axis=1) / (BESIDE - 2) / square) / np.asarray(widths)
     return Derivatives(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from jaxtyping import Array
 from rich.table import Table
 
 from calibration.data import robot_file, terrains
-from calibration.data.errors import BadConfiguration, choices
+from calibration.data.errors import BadConfiguration
 from mmrjax import params, terrain
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import climb as fidelity
@@ -122,7 +123,7 @@ def climb(config: configuration.Climb, out: Path | None, force: bool) -> int:
         if config.film:
             from sweeps.pages import climb_figures
 
-            climb_figures.film(found, folder.partial / "climb.gif")
+            climb_figures.render(found, folder.partial / "climb.gif")
         print_climb(found)
         manifest = {"seed": None, "verdict": found.verdict}
         return leave(folder, config, manifest, solved=found.verdict != "failed", page=page("climb", found, file))
@@ -159,7 +160,11 @@ def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, se
         if name in names[:k]:
             raise BadConfiguration(f"--derivatives: got {name} twice; expected each once")
         if name not in known and name not in (every := [p.name for p in params.walk(robot)]):
-            raise BadConfiguration(f"--derivatives: got {name}; {choices(name, (*known, *every), 5)}")
+            near = " or ".join(difflib.get_close_matches(name, (*known, *every), 2))
+            raise BadConfiguration(
+                f"--derivatives: got {name}; expected {', '.join(known)} or a parameter of the robot"
+                + (f"; did you mean {near}?" if near else "")
+            )
     of_run = tuple(name for name in names if name not in (*levers, SIZE))
     variation = Variation(robot, of_run)
     axes = variation.axes

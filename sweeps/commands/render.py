@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from sweeps.console import progress, say, tell
 from sweeps.inputs import load_robot, one_run
 from sweeps.pages import words
 from sweeps.points import imposed, run, scale
+from sweeps.results.climb import Seen
 from sweeps.store import DONE, SOLVER_FAILED
 
 
@@ -35,10 +37,7 @@ def render(
         pictures.instants(file, begin, end, slow, options["duration"])
     except ValueError as error:
         raise BadConfiguration(f"render: {error}") from error
-    if file.exists() and not force:
-        raise BadConfiguration(f"FILE: {file} exists already; choose another name (--force replaces it)")
-    if not file.parent.is_dir():
-        raise BadConfiguration(f"FILE: {file.parent} is no folder; choose another path")
+    _check_free(file, force)
     robot = load_robot(config).robot
     imposed.check_on_ground(robot, "render")
     if config.turns:
@@ -53,18 +52,49 @@ def render(
         trajectory = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=told)
         told(1.0)
     trajectory, conditions = jax.tree.map(lambda x: x[0], (trajectory, conditions))
-    aside = file.with_name(f".{file.stem}.writing{file.suffix}")
-    try:
+
+    def draw(aside: Path) -> None:
         view = (render_above if config.turns else pictures).scene(robot, conditions, trajectory)
-        with progress(1, quiet=False, doing="drawing") as advance:
-            pictures.render(view, aside, begin, end, slow)
-            advance(1)
-        aside.replace(file)
-    except ValueError as error:
-        raise BadConfiguration(f"render: {error}") from error
-    finally:
-        aside.unlink(missing_ok=True)
+        pictures.render(view, aside, begin, end, slow)
+
+    _write(file, draw)
     status = STATUSES[int(trajectory.result.status)]
     say(f"{status}: {words.STATUSES[status].why}")
     say(str(file))
     return SOLVER_FAILED if status == "failed" else DONE
+
+
+def render_climb(
+    folder: Path, stated: bool, file: Path, begin: float | None, end: float | None, slow: float | None, force: bool
+) -> int:
+    """Draw a climb that is in a folder; returns the exit code. `stated`: whether conditions of a run are, too."""
+    if stated:
+        raise BadConfiguration("--climb: got it beside options of a run of the track model; expected one of the two")
+    _check_free(file, force)
+    found = Seen.read(folder)
+    from sweeps.pages import climb_figures
+
+    _write(file, lambda aside: climb_figures.render(found, aside, begin, end, slow))
+    say(str(file))
+    return DONE
+
+
+def _check_free(file: Path, force: bool) -> None:
+    if file.exists() and not force:
+        raise BadConfiguration(f"FILE: {file} exists already; choose another name (--force replaces it)")
+    if not file.parent.is_dir():
+        raise BadConfiguration(f"FILE: {file.parent} is no folder; choose another path")
+
+
+def _write(file: Path, draw: Callable[[Path], Any]) -> None:
+    """Draw into a file that is whole or not there."""
+    aside = file.with_name(f".{file.stem}.writing{file.suffix}")
+    try:
+        with progress(1, quiet=False, doing="drawing") as advance:
+            draw(aside)
+            advance(1)
+        aside.replace(file)
+    except ValueError as error:
+        raise BadConfiguration(f"render: {error}".replace(aside.name, file.name)) from error
+    finally:
+        aside.unlink(missing_ok=True)

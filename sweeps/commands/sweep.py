@@ -269,7 +269,7 @@ def finish(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job,
             tell(str(export.export(kind, store.path, store.layout)))
     counts = statuses(done.values())
     if not left:
-        print_counts(counts, "points")
+        print_counts(counts, "points", job.model)
         say(str(store.path))
     return DONE if words.solved(counts) else SOLVER_FAILED
 
@@ -279,7 +279,7 @@ def leave(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, 
     robot_file.write(job.robot, store.partial / "robot.toml", note=f"the robot of this sweep, from {config.robot}")
     found = summary(store.layout, job, store.done().values())
     store.write_json("result.json", found)
-    print_counts(found["statuses"], "points")
+    print_counts(found["statuses"], "points", job.model)
     manifest = {"statuses": found["statuses"], "seed": config.samples.get("seed", 0), "hashes": same["data"]}
     skeleton.leave(store, config, manifest, page=page("campaign", file, store.layout, found))
 
@@ -315,12 +315,13 @@ def statuses(done: Iterable[Done]) -> dict[str, int]:
     return dict(zip(STATUSES, np.broadcast_to(total, len(STATUSES)).tolist(), strict=True))
 
 
-def print_counts(counts: Mapping[str, int], things: str) -> None:
-    """How the runs or points ended, in words."""
+def print_counts(counts: Mapping[str, int], things: str, model: str = "") -> None:
+    """How the runs or points of a model ended, in words."""
     shown = Table(title=f"{sum(counts.values()):,} {things}", title_justify="left")
     for heading in ("status", things, "meaning"):
         shown.add_column(heading, justify="right" if heading == things else "left")
     for status, count in counts.items():
         if count:
-            shown.add_row(status, f"{count:,}", words.STATUSES[status].why)
+            ended = words.VERDICT if (model, status) == (climbs.CLIMB, "converged") else words.STATUSES[status].why
+            shown.add_row(status, f"{count:,}", ended)
     say(shown)

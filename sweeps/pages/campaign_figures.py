@@ -60,8 +60,9 @@ def endings(codes: np.ndarray, names: Sequence[str], across: Varied, up: Varied)
     grid = np.full((len(y), len(x)), np.nan)
     grid[np.searchsorted(y, up.values), np.searchsorted(x, across.values)] = codes
     ax.pcolormesh(
-        x, y, grid, cmap=ListedColormap(ENDINGS[: len(names)]), vmin=-0.5, vmax=len(names) - 0.5, shading="nearest"
-    )
+        x, y, grid, cmap=ListedColormap(ENDINGS[: len(names)]), vmin=-0.5, vmax=len(names) - 0.5, shading="nearest",
+        rasterized=True,
+    )  # fmt: skip
     for k in np.unique(codes):
         ax.plot([], [], "s", color=ENDINGS[k], label=names[k])
     ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))

@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mmrjax.fidelities.climb_derivatives import OUTPUTS
 from sweeps.pages import climb_figures
 from sweeps.pages.page import Album, named, render
 from sweeps.results.climb import VERDICTS
@@ -36,6 +37,27 @@ def write(folder: Path, found: ClimbResult, file: RobotFile) -> Path:
             }
             for name, value in found.numbers().items()
         ],
+        margins=[
+            {"name": name.removeprefix("margin_"), "percent": f"{100 * value:.3g}", "meaning": OUTPUTS[name][1]}
+            for name, value in found.margins.items()
+        ],
+        outputs=[
+            {
+                "name": name,
+                "unit": unit,
+                "meaning": meaning,
+                "value": f"{of.found[name]:.4g}",
+                "by": [
+                    {"derivative": f"{d:.3g}", "slope": f"{s:.3g}", "sd": f"{sd:.1g}"}
+                    for d, s, sd in zip(of.by[name], of.slope[name], of.slope_sd[name], strict=True)
+                ],
+            }
+            for of in ([found.derivatives] if found.derivatives else [])
+            for name, (unit, meaning) in OUTPUTS.items()
+        ],
+        by=[{"name": n, "unit": u, "value": f"{v:.4g}", "width": f"{w:.2g}"} for n, u, v, w in found.along.rows]
+        if found.along
+        else [],
         verdicts=[{"name": name, "short": short, "meaning": meaning} for name, (short, meaning) in VERDICTS.items()],
         **named(file),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,18 +11,22 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from mmrjax import footing, loop
+from mmrjax import render as pictures
 from mmrjax.footing import PITCH, SHAFT
-from mmrjax.render import film_gif
 from mmrjax.tables import BODY_HEIGHT
 from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, figure, style
-from sweeps.results.climb import ClimbResult
+from sweeps.results.climb import SHOWN as IN_TITLE
+from sweeps.results.climb import ClimbResult, Seen, coordinates
+
+#: What can be drawn.
+Drawable = ClimbResult | Seen
 
 _GROUND = "#b8a98f"
 #: Silhouettes of a page at most; frames of a film a second, and how often it is slower than life.
 SHOWN, RATE, SLOW = 6, 12, 2.0
 
 
-def _outlines(found: ClimbResult, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def _outlines(found: Drawable, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Closed outlines of the belts, and tips of their grousers, in the world [m]."""
     robot = found.robot
     chassis = robot.configurations[found.configuration]
@@ -43,7 +47,7 @@ def _outlines(found: ClimbResult, q: np.ndarray) -> list[tuple[np.ndarray, np.nd
     return drawn
 
 
-def _ground(axes: Any, found: ClimbResult, begin: float, end: float) -> None:
+def _ground(axes: Any, found: Drawable, begin: float, end: float) -> None:
     points = np.asarray(found.terrain.points) + np.array([-1.0, 1.0]) * float(found.terrain.nose)
     points = points[(points[:, 0] > begin - 200) & (points[:, 0] < end + 200)]
     bottom = points[:, 1].min() - 0.08 if points[:, 1].min() > -1 else -0.25
@@ -52,7 +56,7 @@ def _ground(axes: Any, found: ClimbResult, begin: float, end: float) -> None:
     axes.plot(*points.T, color=INK, lw=1.2)
 
 
-def _draw(axes: Any, found: ClimbResult, q: np.ndarray, colour: str = BLUE) -> None:
+def _draw(axes: Any, found: Drawable, q: np.ndarray, colour: str = BLUE) -> None:
     outlines = _outlines(found, q)
     cos, sin = np.cos(-q[PITCH]), np.sin(-q[PITCH])
     chassis = found.robot.configurations[found.configuration]
@@ -69,7 +73,7 @@ def _draw(axes: Any, found: ClimbResult, q: np.ndarray, colour: str = BLUE) -> N
             axes.plot(*tips.T, ".", color=INK, ms=2.5)
 
 
-def instants(found: ClimbResult) -> list[tuple[str, int]]:
+def instants(found: Drawable) -> list[tuple[str, int]]:
     """Samples of the run that decide it, in the order of time: what is there, and which."""
     t = found.table
     picked = {
@@ -89,7 +93,7 @@ def instants(found: ClimbResult) -> list[tuple[str, int]]:
 def silhouettes(found: ClimbResult) -> Figure:
     """The robot at the decisive instants."""
     shown = instants(found)
-    q = np.asarray(found.climb.record.motion.q)[0]
+    q = coordinates(found.table)
     fig, axes = figure(-(-len(shown) // 3), 3, 2.7 * -(-len(shown) // 3))
     for ax, (name, k) in zip(axes.ravel(), shown, strict=False):
         _ground(ax, found, q[k, 0] - 0.5, q[k, 0] + 0.5)
@@ -143,22 +147,37 @@ def search(found: ClimbResult) -> Figure:
     return fig
 
 
-def film(found: ClimbResult, path: Path) -> None:
-    """The run as a film."""
-    record = found.climb.record
-    time, q = found.table["time_s"], np.asarray(record.motion.q)[0]
-    frames = [int(np.argmin(np.abs(time - t))) for t in np.arange(time[0], time[-1], 1 / (RATE * SLOW))]
-    low, high = q[:, 1].min() - 0.3, q[:, 1].max() + 0.35
+class Film(NamedTuple):
+    """A climb as `mmrjax.render` draws it."""
 
-    def picture(k: int) -> Figure:
+    found: Drawable
+
+    @property
+    def time(self) -> np.ndarray:
+        """Of the samples [s]."""
+        return self.found.table["time_s"]
+
+    def sheet(self, k: int) -> Figure:
+        """The robot at sample `k`."""
+        found, q = self.found, coordinates(self.found.table)
+        low, high = q[:, 1].min() - 0.3, q[:, 1].max() + 0.35
         with style():
             sheet = Figure(figsize=(7.2, 4.6), dpi=80, layout="constrained")
             ax = sheet.subplots()
             _ground(ax, found, q[k, 0] - 0.7, q[k, 0] + 0.7)
             _draw(ax, found, q[k])
             ax.set(xlim=(q[k, 0] - 0.6, q[k, 0] + 0.6), ylim=(low, high), aspect="equal")
-            ax.set_title(f"{found.obstacle}, {time[k]:.2f} s, motors {np.asarray(record.current)[0, k]:.1f} A")
+            time, current = (found.table[name][k] for name in IN_TITLE)
+            ax.set_title(f"{found.obstacle}, {time:.2f} s, motors {current:.1f} A")
             ax.axis("off")
         return sheet
 
-    film_gif((picture(k) for k in frames), path, RATE)
+
+def render(
+    found: Drawable, file: Path, begin: float | None = None, end: float | None = None, slow: float | None = None
+) -> Path:
+    """The run as a film (.gif, .mp4) or a picture (.png), of the instant `begin` or else of the largest pitch."""
+    view = Film(found)
+    if begin is None:
+        begin = float(view.time[np.argmax(np.abs(found.table["pitch_deg"]))]) if file.suffix == ".png" else 0.0
+    return pictures.render(view, file, begin, end, SLOW if slow is None else slow, RATE)

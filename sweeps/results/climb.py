@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -11,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from calibration.data import robot_file
+from calibration.data.errors import BadConfiguration
 from mmrjax.fidelities.climb import LOSSES, NAMES, OVER, SOURCES, Climb
 from mmrjax.fidelities.climb_derivatives import OUTPUTS, Derivatives, Given, crest, outputs
 from mmrjax.footing import FRONT, PITCH, REAR, SHAFT
@@ -27,6 +32,18 @@ VERDICTS: dict[str, tuple[str, str]] = {
     "unfinished": ("is under way", "the time was over while it still went on; take a longer --duration"),
     "failed": ("failed", "numbers of the run went wrong; please report the conditions"),
 }
+
+
+#: Columns of `history.csv` that are the coordinates, and others that a film shows.
+COORDINATES = ("x_mm", "z_mm", "pitch_deg", "shaft_deg", "front_deg", "rear_deg")
+SHOWN = ("time_s", "traction_current_A")
+
+
+def coordinates(table: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Coordinates of `mmrjax.footing` at every sample of a history, (samples, 6)."""
+    x, z, pitch, shaft, front, rear = (table[name] for name in COORDINATES)
+    turned = np.radians([-pitch, shaft, front, 180 - rear])
+    return np.stack([x / 1000, z / 1000, *turned], axis=1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +64,38 @@ class Along:
     def rows(self) -> list[tuple[str, str, float, float]]:
         """Name, unit, value and width of each."""
         return list(zip(self.names, self.units, self.values.tolist(), self.widths.tolist(), strict=True))
+
+
+@dataclasses.dataclass(frozen=True)
+class Seen:
+    """What is drawn of a climb: as a `ClimbResult` has it, read from the folder that it left."""
+
+    robot: Robot
+    configuration: str
+    obstacle: str
+    terrain: Terrain
+    table: dict[str, np.ndarray]
+
+    @staticmethod
+    def read(folder: Path) -> Seen:
+        """Of a folder of `mmrjax climb`.
+
+        Raises:
+            BadConfiguration: it is none.
+        """
+        try:
+            found = json.loads((folder / "result.json").read_text("utf-8"))
+            ground = found["terrain"]
+            with (folder / "history.csv").open(newline="", encoding="utf-8") as stream:
+                rows = list(csv.DictReader(stream))
+            table = {name: np.array([float(row[name]) for row in rows]) for name in (*COORDINATES, *SHOWN)}
+            lengths = (jnp.asarray(ground[name]) / 1000 for name in ("points_mm", "nose_mm", "finish_mm"))
+            return Seen(
+                robot_file.find(str(folder / "robot.toml")).robot, found["configuration"], found["obstacle"],
+                Terrain(*lengths), table,
+            )  # fmt: skip
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise BadConfiguration(f"--climb: {folder} cannot be read; expected a folder of mmrjax climb") from error
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,6 +148,7 @@ class ClimbResult:
             "x_mm": 1000 * q[:, 0],
             "z_mm": 1000 * q[:, 1],
             "pitch_deg": -np.degrees(q[:, PITCH]),
+            "shaft_deg": np.degrees(q[:, SHAFT]),
             "front_deg": np.degrees(q[:, FRONT]),
             "rear_deg": 180 - np.degrees(q[:, REAR]),
             "speed_mm_s": 1000 * np.hypot(v[:, 0], v[:, 1]),
@@ -195,6 +245,11 @@ class ClimbResult:
             "statement": self.statement(),
             "configuration": self.configuration,
             "obstacle": self.obstacle,
+            "terrain": {
+                "points_mm": (1000 * np.asarray(self.terrain.points)).tolist(),
+                "nose_mm": 1000 * float(self.terrain.nose),
+                "finish_mm": 1000 * float(self.terrain.finish),
+            },
             "verdict": self.verdict,
             "sought": self.sought or None,
             "largest_mm": self.largest,
