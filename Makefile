@@ -2,7 +2,10 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+# What the program needs; and what its tests need besides.
 READY := $(VENV)/ready
+TOOLS := $(VENV)/tools
 
 .PHONY: demo test test-all slow lint mutants campaign bench docs clean
 
@@ -16,32 +19,33 @@ PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --
 # slower, which short tests don't feel.
 QUICK := XLA_FLAGS="--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
 
+# Bytecode is kept, whatever a machine's settings: tests start processes of their own.
 test: lint
-	$(QUICK) $(PYTEST) -m "not slow"
+	PYTHONDONTWRITEBYTECODE= $(QUICK) $(PYTEST) -m "not slow"
 
 # Everything, compiled as users compile it: the tests that compile or run for long too, less than an hour on two cores.
 test-all: lint
 	$(PYTEST)
 
-slow: $(READY)
+slow: $(TOOLS)
 	$(PYTEST) -m slow
 
-lint: $(READY)
+lint: $(TOOLS)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/python -m mypy
 
 # Whether `make test` notices plausible mistakes; a quarter of an hour on two cores.
-mutants: $(READY)
+mutants: $(TOOLS)
 	$(QUICK) $(BIN)/python benchmarks/mutants.py --jobs 2
 
-campaign: $(READY)
+campaign: $(TOOLS)
 	$(BIN)/python benchmarks/loop.py --clean-wide 1000 --noise 100 --library 500 --variants 300 --outside 300 --pairs 200 --triples 150 --drift 100 --cluster 120 --coverage 600 --clean-unstated 300 --clean-heavy 120 --clean-uneven 120 --clean-rounded 120 --library-unstated 150 --outside-unstated 100 --pairs-unstated 60
 	$(BIN)/python benchmarks/loop_series.py --clean-wide 300 --noise 20 --library 120 --outside 60 --pairs 60 --event 60
 	$(BIN)/python benchmarks/rigs.py --clean 500 --library 400 --outside 250
 	$(BIN)/python benchmarks/rig_logs.py --clean 80 --library 80 --outside 40
 
-bench: $(READY)
+bench: $(TOOLS)
 	$(BIN)/python benchmarks/steady.py
 	$(BIN)/python benchmarks/drive.py
 
@@ -56,9 +60,15 @@ docs: $(READY)
 clean:
 	rm -rf $(VENV) runs site
 
+# Bytecode is compiled on all cores afterwards, not of OpenGL, which only `render` imports.
 $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -c "import sys; sys.exit('mmrjax needs Python 3.11 or newer' if sys.version_info < (3, 11) else 0)"
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps -e .
+	$(INSTALL) --no-compile -c requirements.lock setuptools
+	$(INSTALL) --no-compile -c requirements.lock --no-build-isolation -e .
+	$(BIN)/python -m compileall -qq -j 0 -x OpenGL $(VENV)/lib mmrjax calibration sweeps || true
 	touch $(READY)
+
+$(TOOLS): $(READY)
+	$(INSTALL) -r requirements.lock
+	touch $(TOOLS)

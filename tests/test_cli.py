@@ -470,6 +470,7 @@ def test_partial_folder_of_another_run_is_not_taken_up(mmrjax, tmp_path, monkeyp
     assert (tmp_path / "s" / "runs.csv").read_text() == (tmp_path / "t" / "runs.csv").read_text()
 
 
+@pytest.mark.slow
 def test_progress_is_on_stderr_and_stdout_ends_with_the_path(tmp_path):
     arguments = ["sweep", "--slopes", "0:4:0.5", "--chunk", "50", "--no-report", "--out", str(tmp_path / "s")]
     done = subprocess.run(
@@ -515,12 +516,13 @@ def test_track_model_runs_xla_on_one_thread_unless_told_otherwise(monkeypatch, g
     assert os.environ.get("XLA_FLAGS") == (ours if given is None else given)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "flag"),
     [
         (["sweep", "--config", "grid.toml"], "--xla_cpu_multi_thread_eigen=false"),
-        pytest.param(["compare", "--model", "track"], "--xla_cpu_multi_thread_eigen=false", marks=pytest.mark.slow),
-        pytest.param(["sweep"], "None", marks=pytest.mark.slow),
+        (["compare", "--model", "track"], "--xla_cpu_multi_thread_eigen=false"),
+        (["sweep"], "None"),
     ],
 )
 def test_flag_is_set_before_jax_is_imported(tmp_path, arguments, flag):

@@ -268,6 +268,7 @@ def test_rates_of_all_gaps_are_the_derivatives_of_the_gaps():
     assert np.median(off) < 1e-7 and (off > 1e-5).mean() < 0.03
 
 
+@pytest.mark.slow
 def test_polyline_of_constant_slope_is_tilted_gravity():
     angle = np.radians(10.0)
     conditions = [Conditions(0, voltage=10.0, slope_deg=slope).resolved(ROBOT) for slope in (0.0, 10.0)]
@@ -314,6 +315,7 @@ def test_largest_step_of_a_nose_up_robot_is_that_of_statics():
     assert batch(runs, duration=14.0, step=2e-4).names == ["over", "tips"]
 
 
+@pytest.mark.slow
 def test_level_ground_is_travelled_as_settled_balances_have_it():
     """With the share of its load on the guide that its belt has: the same laws, but for the ripple of its grousers.
 

@@ -62,7 +62,7 @@ def clean(runs):
 ONE = dataclasses.replace(ANALYST, library={"pulley_eccentricity": BY_NAME["pulley_eccentricity"]})
 
 
-@pytest.fixture(scope="module", params=["prior", pytest.param("fitted", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=[pytest.param(x, marks=pytest.mark.slow) for x in ("prior", "fitted")])
 def seen(request, runs):
     """Runs, space, coordinates and the linear model there: at the prior's mean, and where the loop's fit ends."""
     if request.param == "fitted":
@@ -273,6 +273,7 @@ def test_memory_tells_noise_from_what_remembers(seen):
     assert of(slow) > 2 * np.max(white) > 0
 
 
+@pytest.mark.slow
 def test_knots_of_a_short_run_in_any_order_end_with_its_last_sample(runs):
     short = runs.where((runs["run_id"] != "start2") | (runs["time_s"] < 0.5))
     mixed = short.where(np.random.default_rng(0).permutation(len(short)))

@@ -91,6 +91,7 @@ def _terms(case):
     return tuple((gl.LAWS[e["name"]], e["amplitude"], e["shapes"]) for e in case.label["effects"])
 
 
+@pytest.mark.slow
 def test_a_log_is_reproducible_and_its_effect_has_its_strength():
     rig = gl.rig(np.random.default_rng(7), "voltage", 0.005)
     clean, again = (gl.case(rig, "", 0.0, 4).table for _ in range(2))

@@ -56,12 +56,14 @@ def test_series_generator_holds_every_effect_that_only_a_series_shows():
     assert sum(not f.cls for f in gs.FORMS.values()) >= 4
 
 
-@pytest.mark.parametrize("battery", [0.0, pytest.param(1.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("battery", [0.0, 1.0])
 def test_clean_histories_agree_with_drive(package, battery):
     _, y = gs.histories(RUNS, DURATION, EVERY, battery=np.full(6, battery))
     assert apart(package(battery), y) < CLEAN
 
 
+@pytest.mark.slow
 def test_comparison_with_drive_can_fail(package):
     _, y = gs.histories(RUNS, DURATION, EVERY, g.CLIMBING | {"motor.inertia": 3.36e-6})
     assert apart(package(0.0), y) > 5 * ERROR

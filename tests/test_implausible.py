@@ -30,6 +30,9 @@ def steep(p):
     return g.table8(p, payloads=(0.0, 8.0), slopes=(0.0, 20.0))
 
 
+pytestmark = pytest.mark.slow
+
+
 @functools.cache
 def traced():
     """The stages of the loop on 24 runs of a robot that heats three times as much as is plausible, and those runs."""
@@ -48,7 +51,7 @@ def unnamed():
 LOOKS = {"few": (FEW, small), "many": (SETTLED, g.table8)}
 
 
-@pytest.fixture(scope="module", params=["few", pytest.param("many", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=["few", "many"])
 def looks(request):
     return LOOKS[request.param]
 
@@ -63,7 +66,6 @@ def listed(traced, cost):
     return findings.alternatives(space, base, cost, traced.searched.ladder, SETTLED.settings)
 
 
-@pytest.mark.slow
 def test_heating_of_a_plausible_size_is_named():
     found = SETTLED.trace(heated(0.6))
     assert found.verdict == "named" and found.members == (("winding_heating",),)
@@ -133,7 +135,6 @@ def test_own_p_is_the_share_of_tables_whose_strongest_effect_explains_as_much():
     assert own_p(0.0, null) == 1.0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("names", "sigmas"),
     [(["stribeck_track", "gear_load_loss"], 9.0), (["churning", "mass_offset"], 9.0), (["series_resistance"], 25.0)],

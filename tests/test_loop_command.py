@@ -202,6 +202,7 @@ def test_copies_count_once_and_are_said(done):
     )
 
 
+@pytest.mark.slow
 def test_robot_is_accepted_by_the_other_commands(done):
     robot = tomllib.loads((done.folder / "found" / "robot.toml").read_text())
     (name,) = robot["effects"]

@@ -48,7 +48,7 @@ MADE = {
     "heated": lambda: SETTLED.discover(heated(3.0)),
     "happening": lambda: SETTLED.discover(happening()),
 }
-CASES = [n if n in ("churning", "hot") else pytest.param(n, marks=pytest.mark.slow) for n in MADE]
+CASES = [n if n == "churning" else pytest.param(n, marks=pytest.mark.slow) for n in MADE]
 
 
 @pytest.fixture(scope="module")
@@ -145,6 +145,7 @@ def test_class_with_a_stated_value_is_listed_and_said(shown, capsys, tmp_path):
     assert "motor.resistance is 1.41 ohm" in " ".join(capsys.readouterr().out.split())
 
 
+@pytest.mark.slow
 def test_what_is_ruled_out_by_its_size_is_on_the_page(shown, capsys, tmp_path):
     reasons = (RuledOut("winding_heating", "size", 2.9, ("motor.resistance_thermal_housing",)),)
     why = words.why_ruled_out(reasons)

@@ -100,6 +100,7 @@ def expected(voltages, times, slope, tolerance=1e-10):
     return np.array(ends)
 
 
+@pytest.mark.slow
 def test_mission_matches_scipy_through_a_reversal(robot):
     """No stop on the way: the voltage is turned round while the robot travels."""
     found = expected([24.0, -15.0, 20.0], [0.0, 1.0, 2.5, 4.0], 3.0)

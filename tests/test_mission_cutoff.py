@@ -131,6 +131,7 @@ def beside(found, robot, cutoff):
     assert float(found.total.of["path"]) == pytest.approx(distance, rel=5e-5)
 
 
+@pytest.mark.slow
 def test_cutoff_ends_the_mission_where_an_independent_integration_does(cut, robot):
     """990.3 s and 816 m, where whole steps gave 1161 s and 944 m."""
     beside(cut, robot, 3.3)

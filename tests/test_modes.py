@@ -47,6 +47,7 @@ def test_bounce_on_wheels_is_that_of_a_mass_on_two_springs(robot, wheeled, k):
     assert named(wheeled[k], "bounce").natural == pytest.approx(expected, rel=0.01)
 
 
+@pytest.mark.slow
 def test_bounce_on_tracks_is_that_of_a_mass_on_its_grousers(robot):
     """Nine grousers half a pitch from the arcs; towards the ends the belt yields as a string of 100 N."""
     rates, masses = jax.device_get(_linearised(params.strong(robot), conditions(robot, "6T2A"), POSITIONS))
@@ -96,6 +97,7 @@ def test_a_small_vibration_rings_at_the_damped_frequency(robot, wheeled):
     assert decay / np.hypot(1, decay) == pytest.approx(bounce.damping, abs=0.02)
 
 
+@pytest.mark.slow
 def test_modes_of_the_tracked_robot_have_names_and_bands(tracked):
     """Heavier: bounce falls towards pitch; each holds most of its energy in its own coordinate; the drive is too damped."""
     light, heavy = tracked

@@ -412,6 +412,7 @@ def test_what_only_its_prior_holds_is_said(measured):
     assert set(weakest[0]) == {"6T2A.track.guide_friction", "6T2A.track.guide_share"}
 
 
+@pytest.mark.slow
 def test_profile_of_a_linear_problem_is_its_interval(clean, truth):
     """With little noise the model is linear over an interval, so profile and curvature agree."""
     quiet = dataclasses.replace(clean.data, sd=clean.data.sd / 500)
@@ -526,6 +527,7 @@ def test_histories_pad_runs_of_different_length():
     np.testing.assert_allclose(seen, runs.measured()[kept], rtol=5e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_rival_searches_end_where_three_agree_unless_one_is_lower():
     """Members 0-2 rest in a basin of 30, 3 and 4 descend a curved valley to 0, 5 creeps at a cost of 2000."""
 

@@ -51,6 +51,7 @@ def test_runs_without_levers_have_no_posture(robot):
     assert posture.postures(robot, runs, runs.conditions(robot)) is None
 
 
+@pytest.mark.slow
 def test_one_pair_alone_leaves_the_other_as_the_robot_states_it(robot):
     raised = params.replace(robot, {"running_gear.lever_rear": np.pi / 2})
     conditions = one_run(raised, {"levers_front_deg": 20.0}).conditions(raised)
@@ -106,6 +107,7 @@ def test_simulate_leaves_posture_and_page(tmp_path, mmrjax):
     assert 'id="posture-section"' in page and (folder / "figures" / "steps.svg").exists()
 
 
+@pytest.mark.slow
 def test_page_of_a_check_draws_the_robot_as_its_geometry_is_asked_about(robot):
     outcomes = [
         SimpleNamespace(

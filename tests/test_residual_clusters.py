@@ -65,6 +65,7 @@ def left(seed, columns=None, shift=None, channel=SPEED):
     return leaving(made, whitened)
 
 
+@pytest.mark.slow
 def test_clean_residuals_cluster_no_more_often_than_stated():
     """Of 300 tables of five columns, three channels and tests over all rows and by configuration."""
     assert sum(bool(residual_clusters(left(s), seed=s)) for s in range(300)) <= 0.015 * 300

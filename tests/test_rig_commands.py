@@ -302,6 +302,7 @@ def test_a_vehicle_is_drawn(mmrjax, tmp_path):
 # --- measured tables ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_compare_and_calibrate_take_one_channel_both_ways(mmrjax, tmp_path, bench):
     rig, data = bench
     code, out, err = mmrjax("compare", data, "--robot", rig, "--out", "compared")

@@ -70,6 +70,7 @@ def test_local_derivatives_are_finite_differences_and_zero_across_configurations
     assert found.statuses == {"steady": {"converged": 3, "slides": 1}}
 
 
+@pytest.mark.slow
 def test_swings_are_runs_at_the_ends_of_the_intervals(study, robot):
     found = local(study)
     coordinates = priors.coordinates(robot, NAMES)
@@ -104,6 +105,7 @@ def test_default_inputs_are_what_has_a_prior_and_acts_here(robot):
     assert "battery.resistance" in room.default_names(robot, ("4W2T",), battery=True)
 
 
+@pytest.mark.slow
 def test_sobol_of_a_nearly_linear_study_is_its_linear_share(study):
     found = {method: analyse(study, method, 40_000) for method in ("local", "sobol")}
     assert sum(found["sobol"].sampled["steady"].values()) == found["sobol"].evaluations > 0

@@ -83,6 +83,7 @@ def ends_of(runs, p):
     return ends, settled_ends._sliding(problem, ends), truth.T, sound
 
 
+@pytest.mark.slow
 def test_ends_of_runs_that_grip_are_those_of_settled_travel(gripping):
     ends, slides, truth, sound = ends_of(*gripping)
     assert sound.all() and not slides.any()
@@ -102,6 +103,7 @@ def test_a_run_that_slides_is_not_taken_for_settled(monkeypatch):
     np.testing.assert_array_equal(slides, ~sound)
 
 
+@pytest.mark.slow
 def test_a_reading_that_still_changes_has_no_settled_end(gripping):
     runs, _ = gripping
     mine = runs["run_id"] == "start4"

@@ -90,6 +90,7 @@ def test_alternatives_meet_every_requirement(asked, found):
         meets(f, asked)
 
 
+@pytest.mark.slow
 def test_best_is_of_the_sheets(found):
     """A ratio that is made, with a gearbox that its source combines with the motor; whole cells."""
     for f in (found.best, *found.alternatives):
@@ -100,6 +101,7 @@ def test_best_is_of_the_sheets(found):
     assert {m.name for m in motors() if m.gearboxes} == set(found.motors)
 
 
+@pytest.mark.slow
 def test_no_design_of_a_grid_is_lighter(robot, asked, found):
     """20 000 of the lightest choices, their ratio, radius and cells in parallel on a grid."""
     of, choice = space(robot, asked, found)
@@ -118,6 +120,7 @@ def test_no_design_of_a_grid_is_lighter(robot, asked, found):
     assert good.sum() > 20 and f[good, 0].min() >= ideal.objectives["mass"]
 
 
+@pytest.mark.slow
 def test_binding_limits_are_why_it_is_no_lighter(robot, asked, found):
     """The ideal is at a limit, and fewer cells in parallel or fewer in series violate one."""
     ideal = found.ideal

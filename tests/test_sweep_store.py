@@ -140,6 +140,7 @@ def test_result_counts_statuses_and_states_ranges(whole):
     assert manifest["statuses"] == result["statuses"] and manifest["seed"] == 7
 
 
+@pytest.mark.slow
 def test_large_grid_of_options_leaves_a_store_with_the_numbers_of_the_table(mmrjax, tmp_path, monkeypatch):
     """Above the limit: no runs.csv, which is said; the same command with --export csv writes it, simulating nothing."""
     grid = ["sweep", "--slopes", "0,5,20", "--voltages", "24", "--payloads", "0,3", "--no-report"]
@@ -703,6 +704,7 @@ def test_four_devices_give_the_same_samples_and_results_to_1e_12(whole, tmp_path
     compare(tmp_path / "s", whole)
 
 
+@pytest.mark.slow
 def test_chunk_is_split_along_the_points_among_all_devices(tmp_path):
     probe = (
         "import numpy as np, jax, mmrjax\n"

@@ -12,6 +12,8 @@ from mmrjax.fidelities.ripple import period_pitch, ripple, stages, touchdowns
 from mmrjax.fidelities.track import _batch, track_batch
 from mmrjax.signals import FLAGS, STATUSES
 
+pytestmark = pytest.mark.slow
+
 #: (wheeled, slope [deg], payload [kg], voltage [V]), from standstill.
 RUNS = [
     (0, 0, 0, 33),
@@ -49,7 +51,6 @@ def tail(runs, k, name):
     return ripple(runs.time[k, TAIL], series(runs, k, name)[TAIL])
 
 
-@pytest.mark.slow
 def test_statuses_are_each_member_s_own(runs):
     names = [STATUSES[s] for s in runs.result.status]
     assert names == ["converged"] * 7 + ["slides", "tips", "failed", "stalled"]
@@ -62,7 +63,6 @@ def test_broken_member_withholds_its_numbers_and_harms_no_other(runs):
     assert np.isfinite(runs.q[[*TRACKED, *WHEELED, SLIDING, UNPOWERED]]).all()
 
 
-@pytest.mark.slow
 def test_robot_that_slips_on_average_and_goes_on_steadily_has_settled(robot):
     """Set S of docs/vibration.md, guides recessed by 0.36 mm: the robot shakes and slides beyond V_s on 20°."""
     shaking = params.replace(
@@ -198,7 +198,6 @@ def test_averages_are_over_whole_periods(runs, robot):
     assert runs.steady.periods[UNPOWERED] == 0
 
 
-@pytest.mark.slow
 def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
     """Within 1.5 % on current and both speeds, at the share of the weight that the track model puts out.
 
@@ -226,7 +225,6 @@ def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
     assert float(jnp.max(jnp.abs(ours.result.reading["total_current"] / theirs.reading["total_current"] - 1))) < 0.005
 
 
-@pytest.mark.slow
 def test_batch_is_its_members(robot):
     """vmap = loop: a run does not depend on who runs beside it."""
     from mmrjax.fidelities.track import _batch
@@ -238,7 +236,6 @@ def test_batch_is_its_members(robot):
     np.testing.assert_allclose(a.q, b.q[::-1], rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_batch_compiles_once(robot, compilations):
     commands = Conditions(voltage=jnp.asarray([33.0, 15.0]), configuration=jnp.asarray([0.0, 1.0]))
     keywords = dict(duration=0.02, sample=1e-3)
@@ -248,7 +245,6 @@ def test_batch_compiles_once(robot, compilations):
     assert len(compilations) == before
 
 
-@pytest.mark.slow
 def test_run_in_parts_is_the_run_in_one(robot):
     """What a progress bar asks for: the same numbers, also where the parts do not divide the run."""
     from mmrjax.fidelities.track import PARTS, _batch

@@ -18,6 +18,8 @@ from calibration.inference.observers.turns import TurnLinearization
 from mmrjax import effects, params
 from mmrjax.effects.curve import weights
 
+pytestmark = pytest.mark.slow
+
 #: Of the library, one of each balance that a turn shows, beside those of turns.
 SOME = ("supply_sag", "iron_loss")
 COUNT = 8
@@ -65,7 +67,10 @@ def test_loop_looks_for_effects_of_turns_beside_the_library(posed):
     assert {"6T2A.turning.width", "6T2A.turning.lateral"} < set(space.coordinates.base.names)
 
 
-@pytest.mark.parametrize("name", ["side_voltage", "side_torque", "turning_resistance", "lateral_grip", "iron_loss"])
+@pytest.mark.parametrize(
+    "name",
+    ["side_voltage", "side_torque", "turning_resistance", "lateral_grip", "iron_loss"],
+)
 def test_signature_is_what_the_effect_does(posed, linear, shown, name):
     _, space = posed
     k = space.library.names.index(name)
@@ -81,7 +86,10 @@ def test_signature_is_what_the_effect_does(posed, linear, shown, name):
     np.testing.assert_allclose(mine[:, at], wanted, rtol=1e-3, atol=1e-4 * np.abs(wanted).max())
 
 
-@pytest.mark.parametrize("name", ["curve_track_side", "curve_yaw_yaw_rate", "curve_slip_yaw_rate"])
+@pytest.mark.parametrize(
+    "name",
+    ["curve_track_side", "curve_yaw_yaw_rate", "curve_slip_yaw_rate"],
+)
 def test_column_of_a_curve_is_what_the_curve_does(linear, shown, name):
     """A curve that the loop fits is the one whose columns it scored."""
     _, balance, variable = name.split("_", 2)
@@ -131,7 +139,6 @@ FOUND = {
 }  # fmt: skip
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", FOUND)
 def test_what_a_second_implementation_planted_is_found(tmp_path, mmrjax, case):
     table, robot = planted.write(tmp_path, case)

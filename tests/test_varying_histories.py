@@ -205,6 +205,7 @@ def test_derivatives_of_a_varying_run_are_differences(observer, monkeypatch):
         assert (error < DERIVATIVES).all(), (name, error)
 
 
+@pytest.mark.slow
 def test_derivative_of_a_varying_run_along_one_direction_is_a_difference(observer, monkeypatch):
     """All of these parameters at once, by shares drawn at random."""
     monkeypatch.setattr("mmrjax.fidelities.histories.SOLVED", 1e-12)
