@@ -36,34 +36,28 @@ from sweeps import cli
 #: Memory mappings of a process from which its compiled programs are dropped; Linux allows 65530, and the
 #: compiler crashes or hangs beyond. A program takes some dozens.
 MAPPINGS = 30_000
-#: Memory from which they are dropped too [bytes]; one file may add as much again.
-MEMORY = 2.2e9
-#: The same between files that share results, which make the same programs.
-MEMORY_SHARING = 3.2e9
+#: Memory from which they are dropped too [bytes]; a file adds 0.8e9 at most.
+MEMORY = 3.0e9
 #: What a test that is not marked slow may take [s of processor time, on a core that does nothing else].
 LIMIT = 10.0
 STARTED = pytest.StashKey[float]()
 
 
-def _crowded(limit: float) -> bool:
-    """Whether this process has too many programs to begin another file; where Linux's files are not there: no.
-
-    Args:
-        limit: of its memory [bytes].
-    """
+def _crowded() -> bool:
+    """Whether this process has too many programs to begin another file; where Linux's files are not there: no."""
     own = Path("/proc/self")
     if not (own / "statm").exists():
         return False
     resident = int((own / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    return resident > limit or (own / "maps").read_bytes().count(b"\n") > MAPPINGS
+    return resident > MEMORY or (own / "maps").read_bytes().count(b"\n") > MAPPINGS
 
 
-def _make_room(limit: float) -> None:
+def _make_room() -> None:
     """Forget compiled programs before the process has too many, and give their memory back."""
-    if not _crowded(limit):
+    if not _crowded():
         return
     gc.collect()  # what is no longer used, which may be enough
-    if _crowded(limit):
+    if _crowded():
         jax.clear_caches()
         gc.collect()
         with contextlib.suppress(OSError, AttributeError):  # not every C library has it
@@ -122,8 +116,7 @@ def pytest_runtest_protocol(item, nextitem):
     item.config.stash[STARTED] = start
     done = yield
     if nextitem is not None and nextitem.path != item.path:
-        groups = {GROUP.get(x.path.stem, x.path.stem) for x in (item, nextitem)}
-        _make_room(MEMORY_SHARING if len(groups) == 1 else MEMORY)
+        _make_room()
     return done
 
 

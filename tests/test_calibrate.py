@@ -308,6 +308,7 @@ def test_drive_reads_settled_rows_rolling_and_agrees_with_steady(measured):
     assert any(note.startswith("rows 3: read from a rolling start; from standstill") for note in made.notes)
 
 
+@pytest.mark.slow
 def test_the_command_leaves_a_folder_that_other_commands_take(tmp_path, monkeypatch, capsys):
     from sweeps import cli
 

@@ -401,6 +401,7 @@ def of_posture(robot):
     return {o.requirement.name: o for o in sheet.check(robot, asked, changes=False)}
 
 
+@pytest.mark.slow
 def test_steps_and_sizes_of_section_2_2(of_posture):
     """300 mm no posture allows; 400 and 100 mm hold."""
     assert of_posture["step_mm"].value == pytest.approx(245.6, abs=0.1) and not of_posture["step_mm"].met

@@ -64,6 +64,7 @@ def test_drive_sweep_agrees_with_steady(mmrjax, tmp_path):
             assert float(b[column]) == pytest.approx(float(a[column]), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_simulate_drive_leaves_a_history_that_ends_on_its_run(mmrjax, tmp_path):
     code, out, _ = mmrjax("simulate", "--model", "drive", "--slope", "5", "--no-report", "--out", "d")
     assert code == 0 and "total current [A]" in out and "total mass [kg]" in out
@@ -620,6 +621,7 @@ def crawler(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_robot_with_one_configuration_simulates_and_sweeps_it(mmrjax, tmp_path, crawler):
     assert mmrjax("simulate", "--robot", crawler, "--no-report", "--out", "one")[0] == 0
     (run,) = table(tmp_path / "one" / "runs.csv")

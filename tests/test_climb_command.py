@@ -132,6 +132,7 @@ def test_search_ends_within_a_millimetre_of_the_largest_that_is_got_over(limit):
     assert len(rounds) <= 4 and dict(tried)[best] == "over"
 
 
+@pytest.mark.slow
 def test_one_climb_leaves_a_folder_whose_energy_adds_up(mmrjax, tmp_path):
     code, out, _ = mmrjax(
         "climb", "--gap", "60", "--levers-front", "45", "--voltage", "24", "--duration", "2", "--time-step", "4e-4",

@@ -113,6 +113,7 @@ def test_steepest_slope_of_a_batch_is_that_of_each(robot):
 CONDITIONS = asked(0, 24.0, slope_deg=5.0, payload=3.0)
 
 
+@pytest.mark.slow
 def test_start_is_that_of_a_run_kept_at_many_instants(robot):
     found = {k: float(v) for k, v in start.compute(robot, CONDITIONS).items()}
     times = np.concatenate([np.linspace(0, 0.05, 5000, endpoint=False), np.linspace(0.05, 4.0, 40_000)])

@@ -84,6 +84,7 @@ def test_effect_of_a_series_agrees_with_drive(package, name):
     assert apart(there, package(battery)) > 3e-5
 
 
+@pytest.mark.slow
 def test_series_passes_the_input_checks_and_is_reproducible(tmp_path):
     options = dict(seed=3, duration=0.2, free=g.FRICTION[:2])
     table, label = gs.case(["rotating_inertia"], 6.0, **options)

@@ -151,6 +151,7 @@ def test_a_calibration_of_histories_gives_the_friction_back(robot, tmp_path):
     assert abs(dry.value - 0.25) < 4 * dry.sd < 0.05
 
 
+@pytest.mark.slow
 def test_commands_take_a_current_or_say_what_to_state(robot, tmp_path, mmrjax):
     code, _, err = mmrjax("simulate", "--robot", "rig.toml", "--motor-current", "2", "--no-report", "--out", "one")
     assert code == 0, err

@@ -137,7 +137,8 @@ def test_cutoff_ends_the_mission_where_an_independent_integration_does(cut, robo
     beside(cut, robot, 3.3)
 
 
-@pytest.mark.parametrize("case", [pytest.param("resistance", marks=pytest.mark.slow), "random"])
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["resistance", "random"])
 def test_other_cutoffs_end_where_an_independent_integration_does(robot, followed, case):
     changed = with_battery(robot, 3.0, resistance=0.09) if case == "resistance" else random_robot(robot)
     beside(followed(changed), changed, changed.battery.voltage_cutoff)

@@ -339,6 +339,7 @@ def test_search_of_rollouts_ends_at_the_limit_of_adhesion_from_inside(measured):
     assert float(found.cost) == pytest.approx(float(limit.cost[0]), abs=2 * fit.DECREMENT)
 
 
+@pytest.mark.slow
 def test_truth_is_recovered_from_clean_readings(clean, truth):
     found, _, _ = fit.searches(clean, starts(len(truth), 16), clean.data)
     assert np.all(found.converged)

@@ -205,6 +205,7 @@ def test_the_loop_looks_for_a_delay_that_no_file_rules_out(tmp_path, stated, fre
     assert "rig.delay" not in of_settled
 
 
+@pytest.mark.slow
 def test_steps_follow_the_rows_of_a_log_whose_input_changes_at_each(tmp_path, monkeypatch):
     """A second of a voltage at 50 Hz, against steps that stay short after each change."""
     path = tmp_path / "rig.toml"

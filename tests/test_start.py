@@ -65,6 +65,7 @@ def by_hand():
     return (first, second, under_way), (lost(0, first), lost(first, second), lost(second, 5.0), lost(0, under_way))
 
 
+@pytest.mark.slow
 def test_slip_over_the_stages_is_that_of_an_independent_integration(written):
     history, result = written()
     jsonschema.validate(result, SCHEMA)

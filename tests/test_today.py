@@ -103,11 +103,12 @@ DOWNHILL = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "model",
     [
         pytest.param((), id="steady"),
-        pytest.param(("--model", "drive", "--duration", "20"), id="drive", marks=pytest.mark.slow),
+        pytest.param(("--model", "drive", "--duration", "20"), id="drive"),
     ],
 )
 def test_charging_above_the_charge_voltage_is_flagged_with_the_voltage_of_a_cell(mmrjax, tmp_path, model):
@@ -191,6 +192,7 @@ def test_a_sweep_on_the_battery_has_no_axis_of_voltages(mmrjax, tmp_path):
     assert row["total_current_A"] in {r["total_current_A"] for r in rows}
 
 
+@pytest.mark.slow
 def test_the_command_line_reverses(mmrjax, tmp_path):
     code, out, _ = mmrjax("simulate", "--voltage", "-15", "--no-report", "--out", "a")
     assert code == 0 and "reverses: steady travel backward" in out
