@@ -27,6 +27,7 @@ def flush(robot):
     return posture.postures(robot, runs, runs.conditions(robot))
 
 
+@pytest.mark.slow
 def test_posture_of_a_run(flush):
     table = flush.table
     assert table["levers_rear_deg"] == [-8.5] and table["bears"] == ["all along"]

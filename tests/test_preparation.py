@@ -36,6 +36,7 @@ def test_a_prior_of_a_mass_that_the_table_states_is_refused_by_the_loop_too():
         discover.prepared(records.read("measured"), robots.nominal(), stated={"4W2T.mass": (11.0, 0.5)})
 
 
+@pytest.mark.slow
 def test_a_campaign_sees_the_instruments_that_the_table_shows(tmp_path):
     """Signs and steps that a rig's file leaves to its table: campaigns left them open."""
     path = tmp_path / "rig.toml"

@@ -62,6 +62,7 @@ def paper(reproduced):
     return folder, page, Tables(page)
 
 
+@pytest.mark.slow
 def test_run_folder_has_the_papers_rows(paper):
     folder = paper[0]
     result = json.loads((folder / "result.json").read_text())
@@ -74,6 +75,7 @@ def test_run_folder_has_the_papers_rows(paper):
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_page_has_every_figure_and_refers_to_nothing_outside(paper):
     folder, page, _ = paper
     assert drawn(page) == FIGURES == {p.stem for p in (folder / "figures").glob("*.svg")}
@@ -93,6 +95,7 @@ def test_robot_of_another_kind_is_shown_and_not_set_against_the_bench(reproduced
     assert "not set against the bench" in page and not (folder / "rows.csv").exists()
 
 
+@pytest.mark.slow
 def test_error_table_equals_equation_35(paper):
     tables = paper[2]
     measured, printed = (data.stacked(records.read(n).columns) for n in ("measured", "simulated_by_paper"))
@@ -112,6 +115,7 @@ def test_error_table_equals_equation_35(paper):
                 assert row[4 + 2 * k] == f"{np.abs(values).max():.1f}"
 
 
+@pytest.mark.slow
 def test_error_table_gives_the_papers_own_errors(paper):
     tables = paper[2]
     last = tables.tables["errors"][-3]
@@ -119,6 +123,7 @@ def test_error_table_gives_the_papers_own_errors(paper):
     assert [last[k] for k in (3, 5, 7)] == ["4.0", "4.5", "4.6"]
 
 
+@pytest.mark.slow
 def test_row_table_shows_bench_paper_and_own_numbers(paper):
     tables = paper[2]
     measured = records.read("measured")

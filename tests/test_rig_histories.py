@@ -165,7 +165,8 @@ def imposed_speed(tmp_path, runs):
     return robot, history(tmp_path, robot, robot, columns, [0.01], 3)
 
 
-@pytest.mark.parametrize("count", [1, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, 3])
 def test_an_imposed_speed_changes_within_each_run_and_nothing_else_does(tmp_path, count):
     robot, runs = imposed_speed(tmp_path, count)
     made = observers.kind(runs).of(runs, observers.kind(runs).with_initial_states(robot, runs, noise.of(runs, 1.0)))

@@ -206,7 +206,8 @@ def test_evaluations_are_those_whose_statuses_are_counted(robot, study, method):
 # --- the command ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("outputs", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("outputs", [2, 3])
 def test_command_leaves_indices_tables_and_a_page(mmrjax, tmp_path, outputs):
     code, out, _ = mmrjax(*SMALL[:-1], ",".join(("total_current", "speed", "steepest_slope")[:outputs]), "--out", "s")
     assert code == 0 and out.rstrip().splitlines()[-1] == "s"

@@ -101,6 +101,7 @@ def test_terms_are_their_equations():
     np.testing.assert_allclose(terms["lateral_grip"], dug, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_energy_is_kept_and_resistance_to_turning_takes_it():
     robot = with_amplitudes(robots.nominal(), {name: amplitude(name) for name in effects.OF_TURNS})
 

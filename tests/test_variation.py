@@ -129,6 +129,7 @@ def test_unknown_output_is_refused_with_the_choices(variation, model):
     check_outputs(variation, model, Conditions(), options, outputs.names(channels.usual()))
 
 
+@pytest.mark.slow
 def test_a_fidelitys_own_column_is_an_output(variation):
     options = fidelities.facts("track").resolved(duration=0.002)
     check_outputs(variation, "track", Conditions(), options, ("guide_share", "speed"))
