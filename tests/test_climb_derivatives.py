@@ -70,7 +70,7 @@ def test_derivatives_are_the_limits_of_finite_differences_with_contacts_at_the_e
     beside = jax.vmap(given)(jnp.concatenate([values + moves, values - moves]))
     batch = climb.climb_batch(*beside, **options)
     each = [jax.tree.map(lambda x, k=k: x[k], (beside.robot, beside.terrain)) for k in range(4)]
-    ends = [room._ended(*of, batch, k) for k, of in enumerate(each)]
+    ends = [room.outputs_of_run(*of, batch, k) for k, of in enumerate(each)]
     for name in ("margin_success", "margin_reach", "margin_upright", "crest_energy_J", "crest_current_rms_A"):
         up, down = (np.array([float(end[name]) for end in half]) for half in (ends[:2], ends[2:]))
         finite = (up - down) / (2 * np.diag(moves))

@@ -569,6 +569,16 @@ class Climb(eqx.Module):
         """The verdicts in words."""
         return [NAMES[k] for k in self.verdict]
 
+    @property
+    def during(self) -> np.ndarray:
+        """Which samples are before a run's verdict, after which it stays as it ended; shape (runs, samples)."""
+        return np.asarray(self.record.time) <= np.asarray(self.ended)[:, None] + 1e-9
+
+    def run(self, k: int) -> Passed:
+        """The record of run `k` until its verdict, shape (samples,)."""
+        count = int(np.sum(self.during[k]))
+        return jax.tree.map(lambda x: x[k, :count], self.record)
+
 
 def _alike(robot: Robot) -> int | None:
     """Axis of the runs in a robot's parameters; None where one robot runs them all."""

@@ -146,8 +146,8 @@ def climb_derivatives(
     verdict, ended = int(state[2].verdict), state[2].ended
     last = UNFINISHED if verdict < 0 else verdict, ended, state[2].furthest
     whole = Climb(*jax.tree.map(lambda x: np.asarray(x)[None], (*last, record)))
-    count = int(jnp.sum(record.time <= ended + 1e-9))
-    ran = jax.tree.map(lambda x: x[:count], record)
+    ran = jax.tree.map(jnp.asarray, whole.run(0))
+    count = len(ran.time)
     top = crest(run.terrain, ran, verdict == OVER)
     found, by = _along(
         lambda of: outputs(of[0].robot, of[0].terrain, of[1], top),
@@ -162,7 +162,7 @@ def climb_derivatives(
         progress=None if progress is None else lambda share: progress((1 + share) / 2),
     )  # fmt: skip
     each = (jax.tree.map(lambda x, k=k: x[k], (more.robot, more.terrain)) for k in range(len(beside)))
-    others = [_ended(robot, terrain, batch, k) for k, (robot, terrain) in enumerate(each)]
+    others = [outputs_of_run(robot, terrain, batch, k) for k, (robot, terrain) in enumerate(each)]
     slope, sd = {}, {}
     for name in found:
         y = np.array([float(other[name]) for other in others]).reshape(-1, BESIDE)
@@ -176,10 +176,9 @@ def climb_derivatives(
     )
 
 
-def _ended(robot: Robot, terrain: Terrain, ended: Climb, k: int) -> dict[str, Scalar]:
+def outputs_of_run(robot: Robot, terrain: Terrain, ended: Climb, k: int) -> dict[str, Scalar]:
     """`OUTPUTS` of run `k` of a batch."""
-    count = int(np.sum(np.asarray(ended.record.time)[k] <= ended.ended[k] + 1e-9))
-    record = jax.tree.map(lambda x: jnp.asarray(x[k, :count]), ended.record)
+    record = jax.tree.map(jnp.asarray, ended.run(k))
     return outputs(robot, terrain, record, crest(terrain, record, bool(ended.verdict[k] == OVER)))
 
 

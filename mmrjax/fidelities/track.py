@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
+from types import ModuleType
 from typing import Any
 
 import equinox as eqx
@@ -237,12 +238,16 @@ def track(
 
 
 def _start(run: System, rolling: bool) -> Motion:
-    kind = both_sides if run.conditions.turns else half_robot
-    return kind.roll(run) if rolling else kind.stand(run)
+    return _kind(run).roll(run) if rolling else _kind(run).stand(run)
+
+
+def _kind(run: System) -> ModuleType:
+    """The room of what moves: half a robot, or all of one that is free to turn."""
+    return both_sides if run.conditions.turns else half_robot
 
 
 def _record(run: System, start: Motion, steps: int, samples: int) -> tuple[Motion, Record]:
-    kind = both_sides if run.conditions.turns else half_robot
+    kind = _kind(run)
 
     def small(motion: Motion, _: None) -> tuple[Motion, tuple[Any, Array]]:
         after, passed, guided = kind.advance(run, motion)

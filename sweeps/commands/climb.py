@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from calibration.data import robot_file, terrains
 from calibration.data.errors import BadConfiguration
 from mmrjax import params, terrain
 from mmrjax.conditions import Conditions
+from mmrjax.errors import near
 from mmrjax.fidelities import climb as fidelity
 from mmrjax.fidelities.climb import Climb, Sequence, climb_batch
 from mmrjax.fidelities.climb_derivatives import Derivatives, Given, climb_derivatives
@@ -160,10 +160,10 @@ def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, se
         if name in names[:k]:
             raise BadConfiguration(f"--derivatives: got {name} twice; expected each once")
         if name not in known and name not in (every := [p.name for p in params.walk(robot)]):
-            near = " or ".join(difflib.get_close_matches(name, (*known, *every), 2))
+            meant = " or ".join(near(name, (*known, *every), 2))
             raise BadConfiguration(
                 f"--derivatives: got {name}; expected {', '.join(known)} or a parameter of the robot"
-                + (f"; did you mean {near}?" if near else "")
+                + (f"; did you mean {meant}?" if meant else "")
             )
     of_run = tuple(name for name in names if name not in (*levers, SIZE))
     variation = Variation(robot, of_run)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import functools
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -17,7 +17,7 @@ from jaxtyping import Array
 from calibration.data import robot_file
 from calibration.data.errors import BadConfiguration
 from mmrjax.fidelities.climb import LOSSES, NAMES, OVER, SOURCES, Climb
-from mmrjax.fidelities.climb_derivatives import OUTPUTS, Derivatives, Given, crest, outputs
+from mmrjax.fidelities.climb_derivatives import OUTPUTS, Derivatives, Given, outputs_of_run
 from mmrjax.footing import FRONT, PITCH, REAR, SHAFT
 from mmrjax.robot import Robot
 from mmrjax.terrain import Terrain
@@ -132,19 +132,16 @@ class ClimbResult:
         """Whether it got over."""
         return int(self.climb.verdict[0]) == OVER
 
-    @property
+    @functools.cached_property
     def table(self) -> dict[str, np.ndarray]:
         """The run over time."""
-        count = int(
-            np.sum(np.asarray(self.climb.record.time)[0] <= self.climb.ended[0] + 1e-9)
-        )  # it stays as it ended
-        r = jax.tree.map(lambda x: x[:, :count], self.climb.record)
-        q, v = r.motion.q[0], r.motion.v[0]
-        energy = {f"{name}_J": r.energy[name][0] for name in (*SOURCES, *LOSSES)}
+        r: Any = self.climb.run(0)
+        q, v = r.motion.q, r.motion.v
+        energy = {f"{name}_J": r.energy[name] for name in (*SOURCES, *LOSSES)}
         sides = float(self.robot.sides)
         radius = float(self.robot.radius_pulley)
         return {
-            "time_s": r.time[0],
+            "time_s": r.time,
             "x_mm": 1000 * q[:, 0],
             "z_mm": 1000 * q[:, 1],
             "pitch_deg": -np.degrees(q[:, PITCH]),
@@ -153,21 +150,21 @@ class ClimbResult:
             "rear_deg": 180 - np.degrees(q[:, REAR]),
             "speed_mm_s": 1000 * np.hypot(v[:, 0], v[:, 1]),
             "belt_mm_s": 1000 * radius * v[:, SHAFT],
-            "traction_current_A": r.current[0],
-            "front_current_A": r.lever_current[0, :, 0],
-            "rear_current_A": r.lever_current[0, :, 1],
-            "motors_current_A": r.total_current[0],
-            "front_voltage_V": r.lever_voltage[0, :, 0],
-            "rear_voltage_V": r.lever_voltage[0, :, 1],
-            "front_holds": r.holds[0, :, 0],
-            "rear_holds": r.holds[0, :, 1],
-            "front_torque_Nm": r.torque[0, :, 0],
-            "rear_torque_Nm": r.torque[0, :, 1],
-            "margin_mm": 1000 * r.margin[0],
-            "reaction_N": sides * r.normal[0],
-            "body_share": r.body[0],
+            "traction_current_A": r.current,
+            "front_current_A": r.lever_current[:, 0],
+            "rear_current_A": r.lever_current[:, 1],
+            "motors_current_A": r.total_current,
+            "front_voltage_V": r.lever_voltage[:, 0],
+            "rear_voltage_V": r.lever_voltage[:, 1],
+            "front_holds": r.holds[:, 0],
+            "rear_holds": r.holds[:, 1],
+            "front_torque_Nm": r.torque[:, 0],
+            "rear_torque_Nm": r.torque[:, 1],
+            "margin_mm": 1000 * r.margin,
+            "reaction_N": sides * r.normal,
+            "body_share": r.body,
             **energy,
-            "stored_J": r.stored[0] - r.stored[0, 0],
+            "stored_J": r.stored - r.stored[0],
         }
 
     @property
@@ -175,9 +172,7 @@ class ClimbResult:
         """Margins of the run, shares by the names of `OUTPUTS`; none of a run without numbers."""
         if self.verdict == "failed":
             return {}
-        count = len(self.table["time_s"])
-        record = jax.tree.map(lambda x: jnp.asarray(x[0, :count]), self.climb.record)
-        found = outputs(self.robot, self.terrain, record, crest(self.terrain, record, self.over))
+        found = outputs_of_run(self.robot, self.terrain, self.climb, 0)
         return {name: float(value) for name, value in found.items() if name.startswith("margin_")}
 
     @property
@@ -190,18 +185,8 @@ class ClimbResult:
             for name, (unit, _) in OUTPUTS.items()
             for k, by in enumerate(along.rows)
         ]
-        names = (
-            "output",
-            "unit",
-            "value",
-            "by",
-            "by_unit",
-            "by_value",
-            "by_width",
-            "derivative",
-            "slope",
-            "slope_sd",
-        )
+        by = ("by", "by_unit", "by_value", "by_width")
+        names = ("output", "unit", "value", *by, "derivative", "slope", "slope_sd")
         return {name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
 
     def statement(self) -> str:
