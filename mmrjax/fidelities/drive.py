@@ -208,13 +208,23 @@ def drive(
     )
     end = jax.tree.map(lambda x: x[-1], signals)
     status = _status(robot, conditions, end, parked, went)
-    # The battery's parabola goes on past empty, the run does not: a clear end, and no numbers after it.
-    going = (conditions.battery < 0.5) | ~robot.battery.empty(signals.discharge)
-    signals, distance = jax.tree.map(lambda x: jnp.where(going, x, jnp.nan), (signals, ys[:, 3] * _UNITS[3]))
-    time_end = jnp.max(jnp.where(going, times, times[0]))
-    there = (status != BATTERY_EMPTY) & (status != FAILED)
-    answer = withhold(result(robot, end, status), there, status != FAILED)
-    return Trajectory(times, distance, signals, time_end, answer)
+    return _kept(
+        robot, conditions, times, ys[:, 3] * _UNITS[3], signals, signals.discharge, result(robot, end, status)
+    )
+
+
+def _kept(
+    robot: Robot, conditions: Conditions, times: Array, away: Array, signals: Signals, discharge: Scalar, end: Result
+) -> Trajectory:
+    """What is kept of a run: the battery's parabola goes on past empty, the run does not: a clear end, and no numbers
+    after it."""
+    going = jnp.asarray((conditions.battery < 0.5) | ~robot.battery.empty(discharge))
+    signals, away = jax.tree.map(
+        lambda x: jnp.where(going.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan), (signals, away)
+    )
+    there = (end.status != BATTERY_EMPTY) & (end.status != FAILED)
+    answer = withhold(end, there, end.status != FAILED)
+    return Trajectory(times, away, signals, jnp.max(jnp.where(going, times, times[0])), answer)
 
 
 def _integrated(
@@ -266,12 +276,8 @@ def _turning(
     end = jax.tree.map(lambda x: x[-1], (travel, motion))
     status = jnp.where(parked, STALLED, turning.status_moving(robot, conditions, *end))
     status = jnp.where(went, status, FAILED)
-    going = (conditions.battery < 0.5) | ~robot.battery.empty(motion.discharge)
-    signals = jax.tree.map(lambda x: jnp.where(going.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan), travel.signals)
-    away = jnp.where(going, jnp.hypot(motion.place_x, motion.place_y), jnp.nan)
-    there = (status != BATTERY_EMPTY) & (status != FAILED)
-    answer = withhold(turning.result_of(robot, end[0], status), there, status != FAILED)
-    return Trajectory(times, away, signals, jnp.max(jnp.where(going, times, times[0])), answer)
+    away, answer = jnp.hypot(motion.place_x, motion.place_y), turning.result_of(robot, end[0], status)
+    return _kept(robot, conditions, times, away, travel.signals, motion.discharge, answer)
 
 
 def _status(robot: Robot, conditions: Conditions, end: Signals, parked: Array, done: Array) -> Array:
