@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.rest import least
 from mmrjax.fidelities.result import mask
-from mmrjax.fidelities.rosenbrock import stages
+from mmrjax.fidelities.rosenbrock import stages, step_longest
 from mmrjax.params import Scalar
 from mmrjax.profile import Profile
 from mmrjax.rarely import rarely
@@ -272,7 +272,8 @@ def follow(
     clock = law.CLOCK
     length = (segment.time[1] - segment.time[0]).astype(carry.y.dtype)
     first, nearly = carry.accepted + carry.rejected, length * (1 - 1e-12 if carry.y.dtype == float else 1 - 1e-6)
-    longest = _step_longest(robot, otherwise)
+    limit = step_longest(robot, otherwise)
+    longest = jnp.inf if limit is None else limit
 
     def rates(y: Array, stands: Array) -> tuple[Array, Array]:
         _, dy, dq, _ = law.instant(robot, otherwise, segment, y, stands)
@@ -367,12 +368,6 @@ def _stayed_below(robot: Robot, below: Array, low: Array) -> Array:
     """Whether the cells have been below their cut-off for as long as they may."""
     rounding = 8 * jnp.finfo(low.dtype).eps
     return below & (low >= robot.battery.delay_cutoff * (1 - rounding))
-
-
-def _step_longest(robot: Robot, conditions: Conditions) -> Scalar:
-    """The longest step that still resolves every effect with a memory [s]."""
-    limits = [jnp.asarray(effect.step_longest(robot, conditions)) for effect in robot.remembering]
-    return jax.lax.stop_gradient(jnp.min(jnp.stack([*limits, jnp.asarray(jnp.inf)])))
 
 
 def _peaks_of(law: Law, robot: Robot, found: Any) -> Array:

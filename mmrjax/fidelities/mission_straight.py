@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from mmrjax import balances, energy
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities import rest, result
+from mmrjax.fidelities import rest, result, rosenbrock
 from mmrjax.fidelities.mission_steps import Asked
 from mmrjax.params import Scalar
 from mmrjax.profile import MOTOR_SPEED, SPEED, Profile
@@ -186,9 +186,7 @@ def over(robot: Robot, found: Signals) -> dict[str, Scalar]:
     return {**result.exceeded(robot, found), "too_hot": hot}
 
 
-def norm(error: Array) -> Scalar:
-    """Root mean square of the drive's own unknowns; memories add to it and never dilute it."""
-    return optx.rms_norm(error) * (error.shape[0] / len(UNITS)) ** 0.5
+norm = functools.partial(rosenbrock.norm, own=len(UNITS))
 
 
 def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:

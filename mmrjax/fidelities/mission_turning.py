@@ -12,14 +12,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax import balances, energy
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import mission_straight as straight
-from mmrjax.fidelities import turning
+from mmrjax.fidelities import rosenbrock, turning
 from mmrjax.fidelities.mission_steps import Asked
 from mmrjax.fidelities.rest import least
 from mmrjax.params import Scalar
@@ -194,11 +193,7 @@ def over(robot: Robot, found: Found) -> dict[str, Scalar]:
     return {name: jnp.any(x) for name, x in each.items()}
 
 
-def norm(error: Array) -> Scalar:
-    """That of straight travel, where sides are alike: both sides' errors count as one."""
-    weight = np.full(error.shape[0], 0.5)
-    weight[GROUND : CLOCK + 1] = 1.0
-    return jnp.sqrt(jnp.sum(weight * error**2) / len(straight.UNITS))
+norm = functools.partial(rosenbrock.norm_of_sides, whole=slice(GROUND, CLOCK + 1), own=len(straight.UNITS))
 
 
 def status(robot: Robot, conditions: Conditions, found: Found) -> Array:

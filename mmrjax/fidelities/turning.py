@@ -7,6 +7,7 @@ Both are parts of the fidelities `steady` and `drive`, which come here where con
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import jax
@@ -22,7 +23,7 @@ from mmrjax.effects.base import Effect
 from mmrjax.fidelities import lanes, rest
 from mmrjax.fidelities.rest import SHARE, TIME, voltage_at_rest
 from mmrjax.fidelities.result import efficiency, result, withhold
-from mmrjax.fidelities.rosenbrock import inverse
+from mmrjax.fidelities.rosenbrock import inverse, norm_of_sides
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import (
@@ -291,11 +292,7 @@ def at_rest(y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
     return jnp.zeros_like(y).at[jnp.asarray([0, 1, 10])].set(1.0)
 
 
-def norm(error: Float[Array, " unknowns"]) -> Scalar:
-    """Root mean square of an error, both sides' as one: steps are those of straight travel where the sides are
-    alike."""
-    weight = jnp.ones(error.shape[0]).at[:4].set(0.5).at[len(_UNITS) :].set(0.5)
-    return jnp.sqrt(jnp.sum(weight * error**2) / OF_STRAIGHT)
+norm = functools.partial(norm_of_sides, whole=slice(4, len(_UNITS)), own=OF_STRAIGHT)
 
 
 def _of_sides(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> tuple[Conditions, State]:
