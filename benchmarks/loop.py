@@ -3,7 +3,7 @@
     python benchmarks/loop.py --clean-wide 1000 --library 500 --variants 300 --outside 300 --pairs 200 --jobs 2
     python benchmarks/loop.py --clean-unstated 300 --clean-heavy 100 --clean-uneven 100 --clean-rounded 100 --jobs 2
 
-Tables come from `tests/generator.py` and `tests/generator_wide.py`, which share nothing with the simulator; labels
+Tables come from `tests/worlds/tables.py`, which shares nothing with the simulator; labels
 are read by the scorer alone. Every table is one line of `--out`, and a run that is started again goes on where it
 ended.
 Surfaces are wide (adhesion 0.2 to 1, V_s 2 to 60 mm/s, known by the fields' priors alone), and some tables come from
@@ -25,11 +25,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
-import generator as g
-import generator_wide as gw
 import loop_findings
 import loop_scores as scores
 from campaign import Task, campaign, plain, robot_of
+from worlds import foreign, tables
+from worlds.laws import LIBRARY, OUTSIDE, VARIANTS
+from worlds.tables import Case
 
 KINDS = (
     "clean", "clean_wide", "noise", "library", "variants", "outside", "blind", "pairs", "compensating", "triples",
@@ -73,31 +74,31 @@ FURTHER = ("families", "events", "events_alike", "noise_factor", "implausible", 
 # --- cases ------------------------------------------------------------------------------------------
 
 
-def make(kind: str, seed: int, narrow: bool = True) -> g.Case | None:
+def make(kind: str, seed: int, narrow: bool = True) -> Case | None:
     """The case of a kind and a seed; None where there is none."""
     made = attempt(kind, seed, narrow)
     return None if isinstance(made, str) else made
 
 
-def attempt(kind: str, seed: int, narrow: bool = False, only: str = "") -> g.Case | str:
+def attempt(kind: str, seed: int, narrow: bool = False, only: str = "") -> Case | str:
     """The case of a kind and a seed, or why there is none; `only` of a stratum."""
     rng = np.random.default_rng([KINDS.index(kind), seed])
     own, rounded = kind in NOISES, kind == "clean_rounded"
     kind, law, stated = NOISES.get(kind, (kind, "normal", True))
     low, high = SIGMAS.get(kind, (0.0, 0.0))
     if narrow or kind in NARROW:
-        names = _names(kind, seed, rng, tuple(g.LIBRARY))
+        names = _names(kind, seed, rng, tuple(LIBRARY))
         with np.errstate(all="ignore"):
             sigmas = float(rng.uniform(low, high)) if names else 0.0
-            case = g.case(names, sigmas, seed=seed, compensating=kind == "compensating")
+            case = tables.narrow(names, sigmas, seed=seed, compensating=kind == "compensating")
         return _refused(case, kind, low) or case
-    stratum, shares = gw.STRATA[seed % len(gw.STRATA)], SERIES if own else SHARES
+    stratum, shares = tables.STRATA[seed % len(tables.STRATA)], SERIES if own else SHARES
     if own or kind != "clean_wide":
         usual = [s for s in shares if kind not in ("noise", "coverage") or s in ("plain", "both", "tracks", "wheels")]
         share = np.array([shares[s] for s in usual])
         stratum = str(rng.choice(usual, p=share / share.sum()))
     stratum = only or ("quantised" if rounded else stratum)
-    world = gw.world(
+    world = tables.world(
         rng, stratum, noise=(0.5, 2.0)[seed % 2] if kind == "noise" else 1.0,
         shuffled=True if kind in ("drift", "cluster") else None, from_priors=kind == "coverage",
         law=law, stated=seed % 2 == 0 if stated is None else stated,
@@ -114,18 +115,16 @@ def attempt(kind: str, seed: int, narrow: bool = False, only: str = "") -> g.Cas
     return max(refused, key=refused.__getitem__)
 
 
-def _weakened(
-    world: gw.World, kind: str, names: list[str], wanted: list[float], seed: int
-) -> tuple[gw.WideCase, str]:
+def _weakened(world: tables.World, kind: str, names: list[str], wanted: list[float], seed: int) -> tuple[Case, str]:
     """A case and why it is none, if so; where effects would be too large for the sigmas that are wanted, as strong as
     they may be."""
     low = SIGMAS.get(kind, (0.0, 0.0))[0]
-    case = gw.case(world, names, wanted, seed=seed)
+    case = tables.case(world, names, wanted, seed=seed)
     why = _refused(case, kind, low)
     if why.startswith("needs") and wanted:
         most = max(e["sizes"] for e in case.label["effects"])
         weaker = [max(0.95 * x * SIZES / most, 1.01 * low) for x in wanted]
-        case = gw.case(world, names, weaker, seed=seed)
+        case = tables.case(world, names, weaker, seed=seed)
         why = _refused(case, kind, low)
     return case, why
 
@@ -138,14 +137,15 @@ def _names(kind: str, seed: int, rng: np.random.Generator, library: tuple[str, .
         return [str(n) for n in rng.choice(library, 3 if kind == "triples" else 2, replace=False)]
     if kind == "coverage":
         return [] if seed % 2 == 0 else [str(rng.choice(library))]
-    pool = {
-        "library": lambda: library, "variants": lambda: tuple(g.VARIANTS), "outside": lambda: tuple(g.OUTSIDE),
-        "blind": gw.foreign, "drift": lambda: tuple(gw.DRIFTS), "cluster": lambda: gw.CLUSTERS,
-    }[kind]()  # fmt: skip
+    pools = {
+        "library": library, "variants": VARIANTS, "outside": OUTSIDE, "blind": foreign.FOREIGN,
+        "drift": tables.DRIFTS, "cluster": tables.CLUSTERS,
+    }  # fmt: skip
+    pool = tuple(pools[kind])
     return [pool[seed % len(pool)]]
 
 
-def _refused(case: g.Case, kind: str, low: float) -> str:
+def _refused(case: Case, kind: str, low: float) -> str:
     """Why a case is none; empty for one that is."""
     effects = case.label["effects"]
     if case.label["rows_lost"]:
@@ -155,59 +155,6 @@ def _refused(case: g.Case, kind: str, low: float) -> str:
     if kind != "compensating" and any(e["sigmas"] <= 0.9 * low for e in effects):
         return f"leaves less than {low:g} sigma"
     return ""
-
-
-def slopes_of(case: g.Case) -> np.ndarray:
-    """Whitened change of the readings for one sd of what the analyst knows of each constant."""
-    if isinstance(case, gw.WideCase):
-        return case.world.slopes()
-    return g.base_slopes(case.conditions, case.constants, case.instruments)
-
-
-def pool_of(case: g.Case) -> dict[str, g.Form]:
-    """Effects of the library that a case's robot can have."""
-    names = case.world.pool if isinstance(case, gw.WideCase) else tuple(g.LIBRARY)
-    return {n: g.LIBRARY[n] for n in names}
-
-
-def remainders(case: g.Case) -> dict[str, list[np.ndarray]]:
-    """What a refit of the constants leaves of every library effect, unit norm, over a grid of its shape."""
-    c, p, show = case.conditions, case.constants, case.instruments
-    slopes = slopes_of(case)
-    found: dict[str, list[np.ndarray]] = {}
-    for name, form in pool_of(case).items():
-        grid = [{}]
-        for shape, (low, high) in form.shapes.items():
-            grid = [{**others, shape: v} for others in grid for v in np.geomspace(low, high, 5)]
-        for shapes in grid:
-            sign = g.signature(c, p, [g.Term(name, 0.02 * form.size, shapes)], show)
-            left = g.remainder(np.nan_to_num(sign), slopes)
-            norm = np.linalg.norm(left)
-            if norm > 1e-9:
-                found.setdefault(name, []).append(left / norm)
-    return found
-
-
-def oracle(case: g.Case) -> list[dict]:
-    """For each effect of a case: library effects that noise-free data could not tell from it, and what the best
-    one in its place would leave [σ]."""
-    units = remainders(case)
-    c, p, show = case.conditions, case.constants, case.instruments
-    slopes = slopes_of(case)
-    answers = []
-    for term in case.terms:
-        left = g.remainder(np.nan_to_num(g.signature(c, p, [term], show)), slopes)
-        size = np.linalg.norm(left)
-        apart = {}
-        for name, form in pool_of(case).items():
-            along = [float(left @ u) for u in units.get(name, []) if form.either or left @ u >= 0]
-            apart[name] = min((float(np.sqrt(max(size**2 - x**2, 0.0))) for x in along), default=float(size))
-        same = [n for n, d in apart.items() if d < 2.0 or d < np.sqrt(1 - 0.95**2) * size]
-        others = {n: d for n, d in apart.items() if n != term.form.cls}
-        answers.append(
-            {"class_oracle": same, "best_other": min(others.values()), "mimic": min(others, key=others.get)}
-        )
-    return answers
 
 
 # --- verdicts -----------------------------------------------------------------------------------------
@@ -226,11 +173,11 @@ def one(task: Task) -> dict:
         case.write(table, Path(folder) / "label.json")
         runs = records.read(table)
         robot = robot_of(task.robot)
-        if isinstance(case, gw.WideCase) and case.toml is not None:
+        if case.toml is not None:
             from calibration.data import robot_file
 
             robot = robot_file.read(table.with_suffix(".toml"))
-    stated = {} if isinstance(case, gw.WideCase) else STATED
+    stated = STATED if case.world is None else {}
     began, spent = time.perf_counter(), time.process_time()
     given = prepared(runs, robot, stated=stated, replicates=task.replicates, seed=task.seed)
     found = given.trace()
@@ -242,7 +189,7 @@ def one(task: Task) -> dict:
         **loop_findings.findings(given, found),
         **judged(task, case, given.runs, found, given.settings),
     }
-    if isinstance(case, gw.WideCase) and task.kind not in ("drift", "cluster"):
+    if case.world is not None and task.kind not in ("drift", "cluster"):
         further = dataclasses.replace(case, table=case.elsewhere(task.seed))
         with tempfile.TemporaryDirectory() as folder:
             further.write(Path(folder) / "further.csv", Path(folder) / "label.json")
@@ -276,7 +223,7 @@ def located(found) -> tuple | None:
 KEPT = ("surface", "robot", "rows", "shuffled", "noise", "law", "stated", "outliers", "missing", "refused")
 
 
-def judged(task: Task, case: g.Case, runs, found, settings) -> dict:
+def judged(task: Task, case: Case, runs, found, settings) -> dict:
     """The truth of a case, and what only the truth can judge.
 
     Args:
@@ -286,16 +233,15 @@ def judged(task: Task, case: g.Case, runs, found, settings) -> dict:
     facts = ("name", "class", "balance", "channel", "sigmas", "sizes", "amplitude", "where")
     told = [{k: e[k] for k in facts if k in e} for e in label["effects"]]
     if kind not in ("drift", "cluster"):
-        told = [{**e, **o} for e, o in zip(told, oracle(case), strict=True)]
+        told = [{**e, **o} for e, o in zip(told, tables.oracle(case), strict=True)]
     line = {
         "stratum": label.get("stratum", "narrow"),
         "made": {k: label[k] for k in KEPT if k in label},
         "truth": told,
     }
-    paper = not isinstance(case, gw.WideCase) or case.toml is None
     if kind == "library" and found.verdict in ("named", "class") and not task.brief:
         line |= after(case, runs, found)
-    if kind == "library" and found.verdict == "class" and paper and not task.brief:
+    if kind == "library" and found.verdict == "class" and case.toml is None and not task.brief:
         try:
             line["experiments"] = carried_out(case, found, settings)
         except Exception as error:  # a menu that the generator does not know costs a figure, not the table
@@ -305,7 +251,7 @@ def judged(task: Task, case: g.Case, runs, found, settings) -> dict:
     return line
 
 
-def deviates(case: gw.WideCase, found, settings) -> dict:
+def deviates(case: Case, found, settings) -> dict:
     """Distances of the fit from the truth in its own sds: of each base parameter, and of the amplitude.
 
     Empty where the truth is not in the class that is found, or something is found that is not there.
@@ -327,7 +273,7 @@ def deviates(case: gw.WideCase, found, settings) -> dict:
     coordinates, z = space.coordinates.base, case.label["z"]
     names, free = coordinates.names, space.free
     # Truths are drawn from the fields' priors; of the ground's friction the loop takes wider ones.
-    wider = {n: gw.spread(n) / float(coordinates.spread[k]) for k, n in enumerate(names) if coordinates.scale[k]}
+    wider = {n: tables.spread(n) / float(coordinates.spread[k]) for k, n in enumerate(names) if coordinates.scale[k]}
     line = {
         "deviates": {
             n: float((best.z[k] - z[n] * wider.get(n, 1.0)) / best.sd[k]) for k, n in enumerate(names) if n in z
@@ -343,7 +289,7 @@ def deviates(case: gw.WideCase, found, settings) -> dict:
     return line
 
 
-def after(case: g.Case, runs, found) -> dict:
+def after(case: Case, runs, found) -> dict:
     """Errors held out by slope before and after, over the noise's sd, and the bias of the base parameters."""
     from calibration.inference import blocks
     from calibration.inference.held_out import held_out
@@ -366,7 +312,7 @@ def after(case: g.Case, runs, found) -> dict:
     return {"held_out": [rms(x) for x in both], "bias": bias}
 
 
-def carried_out(case: g.Case, found, settings) -> list[dict]:
+def carried_out(case: Case, found, settings) -> list[dict]:
     """Experiments proposed and carried out one after the other, until one alternative or nothing to do is left."""
     import loop_experiments
 
@@ -406,7 +352,7 @@ def program(task: Task) -> tuple | dict:
     case = attempt(task.kind, task.seed, task.narrow, task.stratum)
     if isinstance(case, str):
         return {"skipped": case}
-    names = case.world.machine.names.values() if isinstance(case, gw.WideCase) else ()
+    names = () if case.world is None else case.world.machine.names.values()
     return len(padded(len(case.conditions.U), SettledRuns.sizes_padded)[0]), *names
 
 

@@ -18,8 +18,9 @@ import loop
 import numpy as np
 import pysindy
 from campaign import Task, campaign, robot_of
-from loop import STATED, make, oracle
+from loop import STATED, make
 from loop_scores import MIMIC, interval
+from worlds import tables
 
 KINDS = ("clean", "library", "outside", "pairs")
 #: Effects that are refitted beside a fit: the loop's own number.
@@ -221,7 +222,7 @@ def one(robot, kind: str, seed: int) -> dict:
     }  # fmt: skip
     truth = [
         {**{k: e[k] for k in ("name", "class", "balance", "sigmas", "sizes")}, **o}
-        for e, o in zip(case.label["effects"], oracle(case), strict=True)
+        for e, o in zip(case.label["effects"], tables.oracle(case), strict=True)
     ]
     return {
         "kind": kind, "seed": seed, "seconds": time.perf_counter() - began, "truth": truth,

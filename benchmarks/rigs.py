@@ -2,7 +2,7 @@
 
     python benchmarks/rigs.py --clean 500 --library 400 --outside 200 --jobs 16 --cache runs/cache
 
-Rigs come from `tests/generator_rigs.py`, which shares nothing with the simulator: one drive to six on wheels, tracks,
+Rigs come from `tests/worlds/rigs.py`, which shares nothing with the simulator: one drive to six on wheels, tracks,
 a bench, a winch or a linear unit; voltage, duty or motor speed imposed; one to three channels. What the loop gets is
 `rig.toml` and `table.csv`; labels are read by the scorer alone. Every rig is one line of `--out`, and a campaign that
 is started again goes on where it ended.
@@ -22,12 +22,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
-import generator_rigs as gr
-import generator_rigs_laws as laws
 import loop_findings
 import loop_scores as scores
 from campaign import Task, campaign, rig_input
 from loop import verdict
+from worlds import laws
+from worlds import rigs as gr
 
 KINDS = ("clean", "library", "outside")
 #: Sigmas of each effect, least and most.
@@ -68,7 +68,7 @@ def attempt(kind: str, seed: int) -> gr.Case | str:
     rng = np.random.default_rng([31, KINDS.index(kind), seed])
     if kind == "clean":
         return gr.case(gr.world(rng, like=like, rows=rows), seed=seed)
-    pool = laws.LIBRARY if kind == "library" else laws.OUTSIDE
+    pool = laws.RIGS if kind == "library" else laws.OUTSIDE_RIGS
     wanted = tuple(pool)[seed % len(pool)]
     refused: Counter[str] = Counter()
     for k in range(sum(TRIES)):

@@ -2,11 +2,10 @@
 
 import dataclasses
 
-import generator as g
-import generator_series as gs
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from worlds import histories, laws, settled
 
 from calibration.data import runs as records
 from mmrjax import params, robots
@@ -14,9 +13,9 @@ from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.drive import drive_batch
 
-RUNS = gs.starts(g.CLIMBING)
+RUNS = histories.starts(settled.CLIMBING)
 DURATION, EVERY = 0.6, 0.01
-PASSING = tuple(n for n, f in gs.FORMS.items() if f.cls)
+PASSING = tuple(n for n, f in laws.SERIES.items() if f.cls)
 #: What the library calls a shape parameter.
 SHAPES = {"knee": "current_ohmic", "fade": "speed_fade"}
 #: Of each channel's largest value in the run; 1.3e-5 at worst (brushes, 5 ohm more while the current rises), 4e-6 for a
@@ -29,7 +28,7 @@ CLEAN = 4e-6
 @pytest.fixture(scope="module")
 def package():
     """Histories of `drive` for amplitudes of PASSING, shape (3, runs, instants)."""
-    base = params.replace(robots.nominal(), g.CLIMBING)
+    base = params.replace(robots.nominal(), settled.CLIMBING)
     full = dataclasses.replace(base, effects=tuple(BY_NAME[n]() for n in PASSING))
     times = jnp.arange(round(DURATION / EVERY) + 1) * EVERY
     every = {p.name: p.value for p in params.walk(full)}
@@ -53,29 +52,29 @@ def apart(a, b):
 
 def test_series_generator_holds_every_effect_that_only_a_series_shows():
     assert {e.name for e in ALL if e.transient or e.memory_size is not None} <= set(PASSING)
-    assert sum(not f.cls for f in gs.FORMS.values()) >= 4
+    assert sum(not f.cls for f in laws.SERIES.values()) >= 4
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("battery", [0.0, 1.0])
 def test_clean_histories_agree_with_drive(package, battery):
-    _, y = gs.histories(RUNS, DURATION, EVERY, battery=np.full(6, battery))
+    _, y = histories.histories(RUNS, DURATION, EVERY, battery=np.full(6, battery))
     assert apart(package(battery), y) < CLEAN
 
 
 @pytest.mark.slow
 def test_comparison_with_drive_can_fail(package):
-    _, y = gs.histories(RUNS, DURATION, EVERY, g.CLIMBING | {"motor.inertia": 3.36e-6})
+    _, y = histories.histories(RUNS, DURATION, EVERY, settled.CLIMBING | {"motor.inertia": 3.36e-6})
     assert apart(package(0.0), y) > 5 * ERROR
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PASSING)
 def test_effect_of_a_series_agrees_with_drive(package, name):
-    form, battery = gs.FORMS[name], float(name == "battery_sag")
+    form, battery = laws.SERIES[name], float(name == "battery_sag")
     size = {"cogging": 10.0, "stick_slip": 3.0, "thermal_drift": 5.0}.get(name, 1.0) * form.size
     shapes = {k: 0.5 if k == "phase" else float(np.mean(b)) for k, b in form.shapes.items()}
-    _, y = gs.histories(RUNS, DURATION, EVERY, g.CLIMBING, [(form, size, shapes)], np.full(6, battery))
+    _, y = histories.histories(RUNS, DURATION, EVERY, settled.CLIMBING, [(form, size, shapes)], np.full(6, battery))
     values = {f"effects.{name}.amplitude": size} | {
         f"effects.{name}.{SHAPES.get(k, k)}": v for k, v in shapes.items()
     }
@@ -86,9 +85,9 @@ def test_effect_of_a_series_agrees_with_drive(package, name):
 
 @pytest.mark.slow
 def test_series_passes_the_input_checks_and_is_reproducible(tmp_path):
-    options = dict(seed=3, duration=0.2, free=g.FRICTION[:2])
-    table, label = gs.case(["rotating_inertia"], 6.0, **options)
-    again, _ = gs.case(["rotating_inertia"], 6.0, **options)
+    options = dict(seed=3, duration=0.2, free=settled.FRICTION[:2])
+    table, label = histories.narrow(["rotating_inertia"], 6.0, **options)
+    again, _ = histories.narrow(["rotating_inertia"], 6.0, **options)
     assert all((table[n] == again[n]).all() for n in table)
     (effect,) = label["effects"]
     assert effect["class"] == "rotating_inertia" and effect["sigmas"] == pytest.approx(6.0)

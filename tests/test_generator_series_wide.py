@@ -1,16 +1,11 @@
 """The wide generator of histories: surfaces, settings and samplings, gaps, events, sizes, and its physics at the end."""
 
-import ast
 import dataclasses
-from pathlib import Path
 
-import generator as g
-import generator_robots as robots
-import generator_series as gs
-import generator_series_wide as sw
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from worlds import histories, laws, machines, settled
 
 from calibration.data import robot_file
 from calibration.data import runs as records
@@ -20,30 +15,23 @@ from mmrjax import robots as mm_robots
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.drive import drive_batch
 
-VARIETIES = [(stratum, k) for stratum, names in sw.STRATA.items() for k in range(len(names))]
+VARIETIES = [(stratum, k) for stratum, names in histories.STRATA.items() for k in range(len(names))]
 
 
 def world(stratum, variety=0, seed=0, **options):
-    return sw.world(np.random.default_rng([11, seed]), stratum, variety, **options)
+    return histories.world(np.random.default_rng([11, seed]), stratum, variety, **options)
 
 
 @pytest.fixture
 def quick(monkeypatch):
     """Fewer steps in the first instants: what they show is the same to some 1e-4."""
-    monkeypatch.setattr(gs, "FINER", 2)
+    monkeypatch.setattr(histories, "FINER", 2)
 
 
 def brief(w, duration=0.2, every=4):
     """The first and the last run of a world, cut short."""
     rows = np.array([0, len(w.conditions.U) - 1])
     return dataclasses.replace(w, conditions=w.conditions.at(rows), design=((duration, every),) * 2)
-
-
-def test_wide_histories_import_nothing_of_the_package():
-    tree = ast.parse((Path(__file__).parent / "generator_series_wide.py").read_text(encoding="utf-8"))
-    modules = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
-    modules |= {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
-    assert not {m for m in modules if m.split(".")[0] in ("mmrjax", "calibration", "sweeps", "jax")}
 
 
 def test_histories_span_surfaces_and_settings():
@@ -54,7 +42,7 @@ def test_histories_span_surfaces_and_settings():
     for w in made:
         c = w.conditions
         assert len(set(c.wheeled)) == 2 and len(set(c.U)) == 3 and len(set(np.round(c.slope, 4))) >= 2
-        s = g._instant(g.solve(c, w.constants)[0], c, w.constants, ())
+        s, _ = settled.solve(c, w.constants)
         assert (s.D / s.D_max < 0.65).all()  # below μ_d / μ_s: a start that slides grips in the end
         ratio = w.constants["6T2A.ground.friction.speed_dynamic"] / w.constants["6T2A.ground.friction.speed_static"]
         assert ratio == pytest.approx(10)  # as the model ties it
@@ -63,25 +51,25 @@ def test_histories_span_surfaces_and_settings():
 @pytest.mark.parametrize(("stratum", "variety"), VARIETIES)
 def test_samples_are_those_of_the_design(stratum, variety):
     w = world(stratum, variety)
-    shown = sw._samples(w)
+    shown = histories.samples(w)
     for k, (duration, every) in enumerate(w.design):
-        times = np.flatnonzero(shown[k]) * sw.BASE
+        times = np.flatnonzero(shown[k]) * histories.BASE
         assert times[0] == 0 and times[-1] == pytest.approx(duration)
-        gaps = np.diff(times) / (every * sw.BASE)
+        gaps = np.diff(times) / (every * histories.BASE)
         np.testing.assert_allclose(gaps, np.round(gaps), atol=1e-9)
         assert (gaps.max() > 1.5) == (w.dropped > 0) and every in (1, 2, 4) and 0.6 <= duration <= 3.0
-    assert w.variety == sw.STRATA[stratum][variety]
-    again = sw._samples(world(stratum, variety, seed=5))
+    assert w.variety == histories.STRATA[stratum][variety]
+    again = histories.samples(world(stratum, variety, seed=5))
     assert (shown == again).all()  # so that programs serve all
 
 
-def settled(w):
+def at_rest(w):
     """States of settled travel, shape (states, runs), and the fastest that each changes [per second]."""
-    x, sound = g.solve(w.conditions, w.constants)
-    y = np.zeros((len(gs.STATES), x.shape[1]))
-    y[:3] = x
-    p = gs._of_runs(w.conditions, w.constants)
-    rates = gs._rates(10.0, y, w.conditions, np.zeros(x.shape[1]), p, ())
+    s, sound = settled.solve(w.conditions, w.constants)
+    y = np.zeros((len(histories.STATES), len(s.I)))
+    y[:3] = s.x
+    p = settled.of_rows(w.conditions, w.constants)
+    rates = histories.rates(10.0, y, w.conditions, 0.0, p, ())
     assert sound.all()
     return y, np.abs(rates[:3] / y[:3]).max()
 
@@ -89,9 +77,9 @@ def settled(w):
 def test_settled_travel_of_another_robot_does_not_change():
     for variety in range(3):
         w = world("robots", variety, seed=2)
-        assert settled(w)[1] < 1e-5
+        assert at_rest(w)[1] < 1e-5
         other = dict(w.constants) | {"gearbox.efficiency_load": 1.01 * w.constants["gearbox.efficiency_load"]}
-        moved = gs._rates(10.0, settled(w)[0], w.conditions, 0 * w.conditions.U, gs._of_runs(w.conditions, other), ())
+        moved = histories.rates(10.0, at_rest(w)[0], w.conditions, 0.0, settled.of_rows(w.conditions, other), ())
         assert np.abs(moved[1]).max() > 1.0  # rad/s²
 
 
@@ -99,12 +87,12 @@ def test_settled_travel_of_another_robot_does_not_change():
 def test_steps_are_fine_enough_for_the_stickiest_contact():
     w = brief(world("plain"), 0.06)
     p = dict(w.constants)
-    for role in robots.ROLES:
+    for role in machines.ROLES:
         p |= {f"{role}.ground.friction.static": 1.0, f"{role}.ground.friction.speed_static": 0.002,
               f"{role}.ground.friction.speed_dynamic": 0.02}  # fmt: skip
-    assert sw.fastest(w.conditions, p) > 2.0 / gs.STEP
-    _, y = sw.simulated(w, p, w.conditions)
-    _, finer = gs.histories(w.conditions, 0.06, sw.BASE, p, step=4e-5)
+    assert histories.fastest(w.conditions, p) > 2.0 / histories.STEP
+    _, y = histories.simulated(w, p, w.conditions)
+    _, finer = histories.histories(w.conditions, 0.06, histories.BASE, p, step=4e-5)
     assert (np.abs(y - finer).max(-1) / np.abs(finer).max(-1)).max() < 2e-4
 
 
@@ -112,8 +100,8 @@ def test_steps_are_fine_enough_for_the_stickiest_contact():
 def test_long_runs_of_another_robot_end_where_settled_travel_is():
     for variety in range(3):
         w = brief(world("robots", variety, seed=2), 3.0)
-        _, y = sw.simulated(w, w.constants, w.conditions)
-        np.testing.assert_allclose(y[:, :, -1], g.readings(w.conditions, w.constants)[0], rtol=2e-3)
+        _, y = histories.simulated(w, w.constants, w.conditions)
+        np.testing.assert_allclose(y[:, :, -1], settled.readings(w.conditions, w.constants)[0], rtol=2e-3)
 
 
 @pytest.mark.slow
@@ -123,17 +111,15 @@ def test_histories_of_another_robot_agree_with_drive(tmp_path, variety):
     (tmp_path / "robot.toml").write_text(w.machine.toml)
     robot = robot_file.read(tmp_path / "robot.toml")
     kept = {
-        sw._public(w.machine, n): v
-        for n, v in w.constants.items()
-        if n.split(".")[0] not in (*robots.ROLES, "battery")
+        w.machine.public(n): v for n, v in w.constants.items() if n.split(".")[0] not in (*machines.ROLES, "battery")
     }
     for role in w.machine.names:
-        kept |= {sw._public(w.machine, n): v for n, v in w.constants.items() if n.startswith(f"{role}.")}
+        kept |= {w.machine.public(n): v for n, v in w.constants.items() if n.startswith(f"{role}.")}
     robot = params.replace(robot, {n: jnp.asarray(v, float) for n, v in kept.items()})
     c = w.conditions
-    index = [robot.configurations.index(w.machine.names[robots.ROLES[int(k)]]) for k in c.wheeled]
+    index = [robot.configurations.index(w.machine.names[machines.ROLES[int(k)]]) for k in c.wheeled]
     run = Conditions(index, c.U, np.degrees(c.slope), c.payload, total_mass=c.mass)
-    times, y = sw.simulated(w, w.constants, c)
+    times, y = histories.simulated(w, w.constants, c)
     s = drive_batch(robot, run, jnp.asarray(times), 1e-9, 20000).signals
     ours = np.stack([s.total_current, s.speed_motor, s.speed])
     assert (np.abs(ours - y).max(-1) / np.abs(y).max(-1)).max() < 1e-4
@@ -143,7 +129,7 @@ def test_table_of_histories_passes_the_input_checks(quick, tmp_path):
     for variety, stratum in ((1, "faults"), (2, "faults"), (2, "robots")):
         w = world(stratum, variety, seed=4)
         w = brief(w)
-        made = sw.case(w, seed=1)
+        made = histories.case(w, seed=1)
         rows = zip(*made.table.values(), strict=True)
         lines = [",".join("" if x != x else str(x) for x in r) for r in rows]
         (tmp_path / "runs.csv").write_text("\n".join([",".join(made.table), *lines]) + "\n")
@@ -162,10 +148,10 @@ def test_table_of_histories_passes_the_input_checks(quick, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sw.EVENTS)
+@pytest.mark.parametrize("name", histories.EVENTS)
 def test_event_happens_at_the_same_instant_of_every_run(quick, name):
     w = brief(world("plain"), 0.25, 1)
-    made = sw.case(w, [name], 10.0, seed=3)
+    made = histories.case(w, [name], 10.0, seed=3)
     (effect,) = made.label["effects"]
     a, b = effect["where"]["window"]
     assert (
@@ -174,41 +160,43 @@ def test_event_happens_at_the_same_instant_of_every_run(quick, name):
         and effect["where"]["variable"] == "time"
         and effect["sigmas"] == pytest.approx(10, rel=0.05)
     )
-    times, y = sw._readings(w, w.constants, w.conditions, made.terms)
-    change = np.abs(y - sw._readings(w, w.constants, w.conditions, ())[1])
-    scale = w.instruments.stated[:, None, None] / g._SHOWN[:, :, None]
+    times, y = histories.shown_by(w, w.constants, w.conditions, made.terms)
+    change = np.abs(y - histories.shown_by(w, w.constants, w.conditions, ())[1])
+    scale = w.instruments.stated[:, None, None] / settled.SHOWN[:, :, None]
     moved = (change / scale).max(0)
     during = (times >= a) & (times < b)
     assert (moved[:, during].max(1) > 0.1).all() and moved[:, times < a].max() < 1e-9
-    if sw.EVENTS[name][0] in g.CHANNELS:
+    if histories.EVENTS[name][0] in laws.CHANNELS:
         assert moved[:, ~during].max() < 1e-9
-        assert effect["balance"] == "sensor" and effect["channel"] == sw.EVENTS[name][0]
+        assert effect["balance"] == "sensor" and effect["channel"] == histories.EVENTS[name][0]
     else:
-        assert effect["balance"] == sw.EVENTS[name][0]
+        assert effect["balance"] == histories.EVENTS[name][0]
 
 
 @pytest.mark.slow
 def test_each_of_two_leaves_its_sigmas_beside_the_other(quick):
     w = brief(world("plain"), 0.25, 1)
-    made = sw.case(w, ["rolling_radius", "supply_sag"], [9.0, 10.0], seed=2)
+    made = histories.case(w, ["rolling_radius", "supply_sag"], [9.0, 10.0], seed=2)
     effects = made.label["effects"]
     assert [e["sigmas"] for e in effects] == pytest.approx([9, 10])
-    small = [(f, 0.1 * f.size, q) for f, _, q in made.terms]
-    good = np.broadcast_to(sw._samples(w), (3, *sw._samples(w).shape))
-    changes, slopes = sw.signatures(w, small, good)
-    first = g.remainder(changes[0], np.concatenate([slopes, 1e4 * changes[1][:, None]], 1))
+    small = [dataclasses.replace(t, amplitude=0.1 * t.law.size) for t in made.terms]
+    good = np.broadcast_to(histories.samples(w), (3, *histories.samples(w).shape))
+    changes, slopes = histories.signatures(w, small, good)
+    first = settled.remainder(changes[0], np.concatenate([slopes, 1e4 * changes[1][:, None]], 1))
     assert np.linalg.norm(first) * effects[0]["sizes"] / 0.1 == pytest.approx(9, rel=0.02)
-    assert np.linalg.norm(g.remainder(changes[0], slopes)) > np.linalg.norm(first)
+    assert np.linalg.norm(settled.remainder(changes[0], slopes)) > np.linalg.norm(first)
 
 
 @pytest.mark.slow
 def test_oracle_finds_a_mimic_and_none_for_a_law_of_its_own(quick):
     w = brief(world("plain"), 0.25, 1)
-    near = dataclasses.replace(gs.FORMS["churning"], cls="", of=lambda s, q: s.w_k**2 * s.sign * 1.0001)
-    odd = gs.FORMS["supply_recovery"]
-    made = sw.case(w, ["supply_recovery"], 30.0, seed=1)
-    both = dataclasses.replace(made, terms=((near, 5e-4, {}), (odd, made.terms[0][1], {})))
-    mimic, own = sw.oracle(both)
+    near = dataclasses.replace(laws.SERIES["churning"], cls="", of=lambda s, q: s.w_k**2 * s.d * 1.0001)
+    odd = laws.SERIES["supply_recovery"]
+    made = histories.case(w, ["supply_recovery"], 30.0, seed=1)
+    both = dataclasses.replace(
+        made, terms=(laws.Term("", 5e-4, {}, near), laws.Term("", made.terms[0].amplitude, {}, odd))
+    )
+    mimic, own = histories.oracle(both)
     assert mimic["mimic"] == "churning" and mimic["best_other"] < 0.5
     assert own["best_other"] > 3.0
 
@@ -217,9 +205,9 @@ def test_oracle_finds_a_mimic_and_none_for_a_law_of_its_own(quick):
 def test_noise_of_histories_is_a_factor_of_what_is_stated(quick):
     for factor in (2.0,):
         w = brief(world("plain", noise=factor), 0.4, 1)
-        made = sw.case(w, seed=6)
-        _, y = sw._readings(w, w.constants, w.conditions, ())
-        run, instant = np.nonzero(sw._samples(w))
+        made = histories.case(w, seed=6)
+        _, y = histories.shown_by(w, w.constants, w.conditions, ())
+        run, instant = np.nonzero(histories.samples(w))
         columns = np.stack([made.table[n] for n in ("total_current_A", "motor_speed_rpm", "speed_mm_s")])
-        left = (columns - (y * g._SHOWN[:, :, None])[:, run, instant]) / w.instruments.stated[:, None]
+        left = (columns - (y * settled.SHOWN[:, :, None])[:, run, instant]) / w.instruments.stated[:, None]
         assert left.std() == pytest.approx(factor, rel=0.1)

@@ -770,8 +770,3 @@ def test_toml_is_read_in_one_place():
         if "tomllib" in (text := path.read_text(encoding="utf-8")) and "tomllib" in dict(imports(ast.parse(text), ""))
     }
     assert found == {"calibration/data/errors.py", "calibration/data/profiles.py"}
-
-
-def test_reference_implementation_imports_nothing_of_ours():
-    tree = ast.parse((ROOT / "tests" / "reference.py").read_text(encoding="utf-8"))
-    assert not {name.partition(".")[0] for name, _ in imports(tree, "tests")} & {*LAYERS, "jax"}
