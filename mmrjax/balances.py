@@ -127,6 +127,11 @@ def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
     return _fill(signals, voltage_source=source, voltage=jnp.where(blocked, back, voltage))
 
 
+def charge_drawn(robot: Robot, conditions: Conditions, total_current: Scalar) -> Scalar:
+    """Current out of the on-board battery, by which its charge falls [A], eq. (11); 0 on an external supply."""
+    return robot.battery.current(total_current) * (conditions.battery > 0.5)
+
+
 def electrical(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
     """What of the supply voltage is left to change the current [V]; or the voltage that an imposed speed takes, or an
     amplifier gives that brings the current to what is imposed within the winding's time constant."""
@@ -568,3 +573,22 @@ def sensor(robot: Robot, signals: Signals) -> dict[str, Scalar]:
         c.name: robot.rig.instrument(c.name).shows(c.read(robot, signals) + added(robot, signals, "sensor", c.name))
         for c in channels.EVERY
     }
+
+
+def shown(robot: Robot, signals: Signals) -> dict[str, Scalar]:
+    """The same of signals whose last axis is that of left and right side: of a side its own, else their mean."""
+    read = sensor(robot, signals)
+    return {
+        c.name: jnp.mean(jnp.asarray(read[c.name]), -1) if c.side is None else jnp.asarray(read[c.name])[..., c.side]
+        for c in channels.EVERY
+    }
+
+
+def together(signals: Signals) -> Signals:
+    """Signals of both sides as those of one motor on average, from which totals follow as of sides alike."""
+    return jax.tree.map(lambda x: jnp.mean(x, axis=-1) if jnp.ndim(x) else x, signals)
+
+
+def signals_of(found: Signals | Travel) -> Signals:
+    """The signals of an instant; of a robot that turns of left and right side."""
+    return found.signals if isinstance(found, Travel) else found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -178,7 +178,8 @@ def profile(
     if unknown:
         raise UsageError(f"profile: no field {unknown[0]}; there are {', '.join(known)}")
     given: dict[str, Any] = {"demand": demand, **{name: v for name, v in values.items() if v is not None}}
-    _check_sides(given, modes)
+    if why := sides_refused(list(given), MODES[SPEED] in modes):
+        raise UsageError(f"profile: {why}")
     arrays = {}
     for name, value in given.items():
         x = np.asarray(value, float)
@@ -199,19 +200,19 @@ def profile(
     return Profile(time=jnp.asarray(rows), mode=index, linear=linear, cycles=int(cycles), **arrays)
 
 
-def _check_sides(given: dict[str, Any], modes: list[str]) -> None:
-    """Refuse one side without the other, both kinds at once, and a yaw rate without a demanded speed.
+def sides_refused(stated: Sequence[str], speed: bool, named: Callable[[str], str] = str) -> str | None:
+    """Why fields that a profile states of its sides cannot be: one side without the other, both kinds at once, a yaw
+    rate without a demanded speed; None: they can.
 
-    Raises:
-        UsageError: which.
+    Args:
+        stated: fields; speed: whether a ground speed is demanded; named: what a field is called where it is stated.
     """
-    for pair in PAIRS:
-        stated = [name for name in pair if name in given]
-        if len(stated) == 1:
-            other = pair[1 - pair.index(stated[0])]
-            raise UsageError(f"profile: got {stated[0]} without {other}; expected both")
-    kinds = [name for name in ("duty", PAIRS[0][0], PAIRS[1][0]) if name in given]
+    for left, right in (pair for either in PAIRS for pair in (either, either[::-1])):
+        if left in stated and right not in stated:
+            return f"got {named(left)} without {named(right)}; expected both"
+    kinds = [named(name) for name in ("duty", PAIRS[0][0], PAIRS[1][0]) if name in stated]
     if len(kinds) > 1:
-        raise UsageError(f"profile: got {kinds[0]} beside {kinds[1]}; expected one of the two")
-    if "yaw_rate" in given and MODES[SPEED] not in modes:
-        raise UsageError("profile, yaw_rate: got one without mode speed; expected a demanded ground speed beside it")
+        return f"got {kinds[0]} beside {kinds[1]}; expected one of the two"
+    if "yaw_rate" in stated and not speed:
+        return f"got {named('yaw_rate')} without {named(MODES[SPEED])}; expected a demanded ground speed beside it"
+    return None

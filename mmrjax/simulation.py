@@ -16,7 +16,6 @@ from mmrjax import channels, fidelities, missions, params, power
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions, indices
 from mmrjax.errors import UsageError, choices
-from mmrjax.fidelities import turning
 from mmrjax.fidelities.base import Fidelity, History, Run
 from mmrjax.fidelities.mission import Start
 from mmrjax.params import Scalar
@@ -146,8 +145,7 @@ def _missions(robot: Robot, conditions: Conditions, profile: Profile, start: Sta
     further = missions.columns(missions.numbers(robot, flat, found))
     course = None
     if found.course is not None:
-        of = turning.history if profile.turns or conditions.turns else History.of
-        course = of(robot, found.course.time, found.course.distance, found.course.signals)
+        course = History.of(robot, found.course.time, found.course.distance, found.course.signals)
     found, further, course = _shaped((found, further, course), conditions.shape)
     names, mass = robot.configurations.names, total_mass(robot, conditions)
     return Results(

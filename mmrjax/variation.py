@@ -224,27 +224,3 @@ def _known(names: tuple[str, ...], known: tuple[str, ...]) -> None:
     for name in names:
         if name not in known and name != FLAGS:
             raise UsageError(f"outputs: got {name}; {choices(name, (*known, FLAGS), 3)}")
-
-
-def check_outputs(
-    variation: Variation,
-    fidelity: str,
-    conditions: Conditions,
-    options: Mapping[str, float],
-    names: tuple[str, ...],
-    profile: Profile | None = None,
-) -> None:
-    """Refuse an output that the fidelity does not have; traces the fidelity only for names of its own.
-
-    Raises:
-        UsageError: lists the outputs that there are.
-    """
-    if profile is not None:
-        from mmrjax import missions  # which imports an integrator
-
-        _known(names, missions.names(profile.turns))
-        return
-    if set(names) <= {*table_of_outputs.names(variation.robot.channels), FLAGS}:
-        return
-    values = jax.ShapeDtypeStruct((1, len(variation.names)), jnp.result_type(float))
-    eqx.filter_eval_shape(evaluate, variation, fidelity, values, conditions, options, names)

@@ -65,12 +65,12 @@ def test_files_of_terrain_and_sequence_are_read_with_their_units(tmp_path):
     assert np.asarray(gaps) == pytest.approx([0.02, -0.03, -0.01 * np.sqrt(2)])
     (tmp_path / "s.csv").write_text("x_mm,front_deg,rear_deg\n-300,45,180\n0,0,-8\n")
     sequence = terrains.read_sequence(tmp_path / "s.csv", nominal(), (0.0, 0.0))
-    assert np.degrees(np.asarray(sequence.angles(-0.15, 0.0))) == pytest.approx([22.5, 180 - 86])
+    assert np.degrees(np.asarray(sequence.asked(-0.15, 0.0))) == pytest.approx([22.5, 86])
     assert not sequence.over_time
     (tmp_path / "v.csv").write_text("time_s,front_V,rear_V\n0,0,0\n1,6,-12\n")
     sequence = terrains.read_sequence(tmp_path / "v.csv", nominal(), (0.5, 0.1))
     assert np.asarray(sequence.first) == pytest.approx([0.5, np.pi - 0.1]) and sequence.over_time
-    assert np.asarray(sequence.voltages(0.0, 0.5)) == pytest.approx([3.0, 6.0])  # up of a rear lever is where ψ falls
+    assert np.asarray(sequence.asked(0.0, 0.5)) == pytest.approx([3.0, -6.0])
 
 
 FILES = {

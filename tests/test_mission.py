@@ -467,7 +467,7 @@ WRONG = {
         time=[0, 1], duty_left=1.0, duty_right=1.0, voltage_left=9.0, voltage_right=9.0
     ),
     "duty_right: got 1.5; expected -1 to 1": dict(time=[0, 1], duty_left=1.0, duty_right=1.5),
-    "yaw_rate: got one without mode speed": dict(time=[0, 1], yaw_rate=1.0),
+    "got yaw_rate without speed; expected a demanded ground speed": dict(time=[0, 1], yaw_rate=1.0),
 }
 
 

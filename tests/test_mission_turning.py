@@ -6,12 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import zarr
 
 import mmrjax as mm
-from mmrjax import missions
+from mmrjax import missions, params
 from mmrjax.fidelities import mission_straight
 from mmrjax.fidelities.drive import drive
-from mmrjax.fidelities.mission import Mission, Start, Totals
+from mmrjax.fidelities.mission import Mission, Start, Totals, mission
 from mmrjax.fidelities.mission_steps import BREAKS_AWAY, events_of
 from mmrjax.missions import simulate_batch
 from mmrjax.profile import profile
@@ -145,3 +146,47 @@ def test_held_duties_are_a_run_of_drive(robot, driven):
     for name in ("place_x", "place_y"):
         assert float(found.total.of[name][0]) == pytest.approx(float(getattr(end, name)[0]), rel=1e-5)
     assert float(found.total.of["turned"][0]) == pytest.approx(float(end.heading[0]), rel=1e-5)
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_turn_match_differences(robot):
+    """Of energy and of what it turns by, by parameters of the robot and by speed and yaw rate that are demanded."""
+    names = ("motor.resistance", "6T2A.turning.width", "6T2A.turning.lateral", "6T2A.ground.friction.static")
+    base = {p.name: float(p.value) for p in params.walk(robot) if p.name in names}
+    asks = profile([0.0, 0.4, 1.0], "speed", demand=[0.0, 0.3, 0.3], yaw_rate=[0.0, 0.6, 0.6], linear=True)
+    one = jax.tree.map(lambda x: x[0], conditions(1, configuration=np.zeros(1, int)).resolved(robot))
+
+    def outputs(x):
+        changed = params.replace(robot, {name: value * x[k] for k, (name, value) in enumerate(base.items())})
+        asked = dataclasses.replace(asks, demand=asks.demand * x[-2], yaw_rate=asks.yaw_rate * x[-1])
+        total = mission(changed, one, asked, tolerance=1e-8).total
+        return jnp.stack([total.energy, total.of["turned"]])
+
+    x, compiled, step = jnp.ones(len(base) + 2), jax.jit(outputs), 1e-3
+    exact, value = np.asarray(jax.jit(jax.jacfwd(outputs))(x)), np.asarray(compiled(x))
+    assert len(base) == len(names) and np.abs(exact).min(axis=0).max() > 1e-3
+    for k in range(len(x)):
+        apart = (np.asarray(compiled(x.at[k].add(step))) - np.asarray(compiled(x.at[k].add(-step)))) / (2 * step)
+        assert (np.abs(exact[:, k] - apart) < 1e-4 * np.abs(apart) + 1e-5 * np.abs(value)).all(), (
+            k,
+            exact[:, k],
+            apart,
+        )
+
+
+@pytest.mark.slow
+def test_sweep_of_missions_has_the_numbers_of_both_sides(robot, mmrjax, tmp_path):
+    (tmp_path / "turn.csv").write_text("time_s,speed_mm_s,yaw_rate_rad_s\n0,300,0.8\n0.5,300,0\n")
+    (tmp_path / "plan.toml").write_text(
+        'profile = "turn.csv"\nmodel = "drive"\nreport = false\noutputs = ["energy_Wh", "turned_deg"]\n'
+        "[conditions]\nvoltage = 24\n[axes]\npayload = [0, 4]\n"
+    )
+    code, _, err = mmrjax("sweep", "plan.toml", "--out", "run")
+    assert code == 0, err
+    store = zarr.open_group(tmp_path / "run" / "results.zarr", mode="r")
+    asks = profile([0.0, 0.5], "speed", demand=[0.3, 0.3], yaw_rate=[0.8, 0.0])
+    own = conditions(2, configuration=np.zeros(2, int), payload=np.array([0.0, 4.0])).resolved(robot)
+    found = missions.columns(missions.numbers(robot, own, missions.batch(robot, own, asks)))
+    for name in ("energy_Wh", "turned_deg"):
+        np.testing.assert_allclose(store[name][:], found[name], rtol=1e-9)
+    assert store["turned_deg"][0] > 1

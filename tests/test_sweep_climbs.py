@@ -139,7 +139,7 @@ def test_interrupted_map_goes_on_after_its_last_chunk(mmrjax, tmp_path, monkeypa
         if next(ends):
             raise KeyboardInterrupt
         climbed.append(np.asarray(values)[:, 0].tolist())
-        found = {name: np.asarray(values)[:, 0] + sizes for name in climbs.names(of)}
+        found = {name: np.asarray(values)[:, 0] + sizes for name in climbs.attributes(of)}
         return {**found, climbs.VERDICT: np.zeros(2, np.uint8), STATUS: np.zeros(2, np.uint8)}
 
     monkeypatch.setattr(climbs, "computed", closed)

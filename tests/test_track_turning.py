@@ -172,6 +172,39 @@ def test_sides_alike_are_the_half_robot(robot, runs):
     np.testing.assert_allclose(mine.current, np.asarray(half.current)[:, None].repeat(2, 1), rtol=1e-6)
 
 
+def test_forces_do_the_work_of_contacts_and_friction_takes_it(robot):
+    """Generalized forces on any velocities, against the sum over contacts; lateral friction is λ of that along."""
+    conditions = Conditions(0, voltage=24.0, duty_left=1.0, duty_right=0.3, adhesion_lateral=0.6).resolved(robot)
+    b, v = both_sides, 1e-3 * np.array([3.0, 2.0, 0.4, 20.0, 0.7, 1.5, 90.0, 95.0, 60.0, 70.0])
+    q = np.zeros(10)
+    q[[b.HEIGHT, b.YAW]] = float(robot.radius_pulley + robot.running_gear.grouser_height) - 5e-4, 0.4
+
+    @jax.jit
+    def all_of(motion):
+        run = system(robot, conditions, STEP)
+        found = b.instant(run, motion)
+        return run.path, run.chassis, b._contacts(run, motion), *found, b.generalized(run, motion, *found)
+
+    motion = half_robot.Motion(jnp.asarray(q), jnp.asarray(v), jnp.zeros(2), jnp.zeros(()))
+    path, chassis, sides, signals, at, pulled, forces = jax.device_get(all_of(motion))
+    front, rear = v[b.PULLEYS].T
+    belt = path.radius * (front[:, None] * (1 - at.weight) + rear[:, None] * at.weight)
+    y = SIDES * chassis.turning.width
+    speed = np.cos(q[b.YAW]) * v[0] + np.sin(q[b.YAW]) * v[1] - y * v[b.YAW]
+    work = np.sum(
+        pulled.force * at.speed_x + pulled.aside * sides.aside + at.force * at.gap_rate - pulled.guide * belt
+    )
+    work += np.sum(
+        at.belt.torque_front * front + at.belt.torque_rear * rear + (signals.torque_net + pulled.load) * front
+    )
+    work -= np.sum(signals.resistance * (speed - sides.height * v[b.PITCH]))
+    assert forces @ v == pytest.approx(float(work), rel=1e-9)
+    bears = np.asarray(at.force) > 0
+    ratios = [(pulled.aside / sides.aside)[bears], (pulled.force / at.speed_x)[bears]]
+    np.testing.assert_allclose(ratios[0] / ratios[1], 0.6 * float(chassis.turning.lateral), rtol=1e-9)
+    assert bears.any(axis=1).all() and max(r.max() for r in ratios) < 0
+
+
 @pytest.mark.parametrize("configuration", [0, 1])
 def test_bodies_are_the_robot_that_mujoco_compiles(robot, configuration):
     """Mass, and the moment of inertia in yaw about the centre, of all; and of half a robot twice the planar ones."""

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import channels, fidelities, outputs, params, robots
+from mmrjax import fidelities, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.errors import UsageError
 from mmrjax.fidelities.steady import steady
 from mmrjax.tables import CONDITION_LIMITS
-from mmrjax.variation import CONDITIONS, Variation, check_outputs, evaluate
+from mmrjax.variation import CONDITIONS, Variation, evaluate
 
 NAMES = ("motor.resistance", "6T2A.ground.friction.static", "slope_deg", "voltage")
 VALUES = np.array([[0.7, 0.5, 0.0, 24.0], [0.9, 0.6, 5.0, 33.0], [0.611, 0.2, 20.0, 15.0]])
@@ -125,14 +125,7 @@ def test_unknown_and_repeated_names_are_refused_with_those_that_are_near():
 def test_unknown_output_is_refused_with_the_choices(variation, model):
     options = fidelities.facts(model).resolved()
     with pytest.raises(UsageError, match=r"outputs: got total_curent; did you mean total_current.*efficiency_motor"):
-        check_outputs(variation, model, Conditions(), options, ("total_curent",))
-    check_outputs(variation, model, Conditions(), options, outputs.names(channels.usual()))
-
-
-@pytest.mark.slow
-def test_a_fidelitys_own_column_is_an_output(variation):
-    options = fidelities.facts("track").resolved(duration=0.002)
-    check_outputs(variation, "track", Conditions(), options, ("guide_share", "speed"))
+        evaluate(variation, model, jnp.asarray(VALUES), Conditions(), options, ("total_curent",))
 
 
 def test_status_is_named_in_one_place():

@@ -21,7 +21,7 @@ from calibration.data.errors import BadConfiguration, BadData, choices, is_numbe
 from calibration.data.units import Quantity
 from mmrjax import channels
 from mmrjax.fidelities.mission import Start
-from mmrjax.profile import APART, MODES, MOTOR_SPEED, PAIRS, SPEED, VOLTAGE, profile
+from mmrjax.profile import APART, MODES, MOTOR_SPEED, PAIRS, SPEED, VOLTAGE, profile, sides_refused
 from mmrjax.tables import CONDITION_LIMITS, SURFACES, adhesion_ratio, lateral_ratio
 
 if TYPE_CHECKING:
@@ -249,7 +249,8 @@ def _parsed(content: bytes, name: str) -> ProfileTable:
             raise BadData(f"{name} row {k}: got {len(row)} cells; the header has {len(header)} columns")
     cells = _Cells(name, columns, {c: [row[j] for row in body] for j, c in enumerate(header)}, settings["linear"])
     time = _time(cells)
-    _check_sides(cells)
+    if why := sides_refused(list(cells.columns), cells.has(MODES[SPEED]), cells.called):
+        raise BadData(f"{name}: {why}")
     modes, driven = _driven(cells)
     demand = driven.pop("demand")
     values = {field: cells.held(field) for field in HELD if field in columns} | driven
@@ -350,6 +351,10 @@ class _Cells:
     def has(self, field: str) -> bool:
         return field in self.columns
 
+    def called(self, field: str) -> str:
+        """The column of a field, or the first that it could have."""
+        return self.columns[field][0] if self.has(field) else next(iter(QUANTITIES[field].columns()))
+
     def text(self, field: str, row: int) -> str:
         """The cell of a field; empty where the file has no such column."""
         return self.cells[self.columns[field][0]][row] if self.has(field) else ""
@@ -399,26 +404,6 @@ def _time(cells: _Cells) -> np.ndarray:
     for row in np.flatnonzero(np.diff(time) <= 0)[:1] + 1:
         cells.refuse("time", int(row), f"more than {cells.text('time', int(row) - 1)} of the row before")
     return time
-
-
-def _check_sides(cells: _Cells) -> None:
-    """Refuse columns of one side, two kinds of them, and a yaw rate without a speed."""
-    for pair in PAIRS:
-        stated = [name for name in pair if cells.has(name)]
-        if len(stated) == 1:
-            other = pair[1 - pair.index(stated[0])]
-            raise BadData(
-                f"{cells.source}: got the column {cells.columns[stated[0]][0]} without one of the other side; "
-                f"expected {next(iter(QUANTITIES[other].columns()))} beside it"
-            )
-    kinds = [cells.columns[name][0] for name in ("duty", *(pair[0] for pair in PAIRS)) if cells.has(name)]
-    if len(kinds) > 1:
-        raise BadData(f"{cells.source}: got the columns {kinds[0]} and {kinds[1]}; expected one kind of the two")
-    if cells.has(YAW_RATE) and not cells.has(MODES[SPEED]):
-        raise BadData(
-            f"{cells.source}: got the column {cells.columns[YAW_RATE][0]} without a speed; expected speed_mm_s "
-            "beside it"
-        )
 
 
 def _driven(cells: _Cells) -> tuple[tuple[str, ...], dict[str, np.ndarray]]:

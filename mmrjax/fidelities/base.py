@@ -50,11 +50,13 @@ class History(eqx.Module):
         distance: Array,
         signals: Signals,
         reactions: Reactions | None = None,
-        shown: Mapping[str, Scalar] | None = None,
     ) -> History:
-        """A history with its readings, of runs known at `time` since what is imposed acts; what its instruments show
-        follows from the signals where it is not given."""
-        shown = balances.sensor(robot, signals) if shown is None else shown
+        """A history with its readings, of runs known at `time` since what is imposed acts; of signals with a further
+        axis for left and right side their means."""
+        if jnp.ndim(signals.current) > jnp.ndim(time):
+            shown, signals = balances.shown(robot, signals), balances.together(signals)
+        else:
+            shown = balances.sensor(robot, signals)
         reading = {c.name: shown[c.name] for c in channels.EVERY if c.over_time}
         clock, (distance, signals, reading, reactions) = as_tables(
             robot.rig, time, (distance, signals, reading, reactions)

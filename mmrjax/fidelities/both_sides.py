@@ -24,17 +24,18 @@ from mmrjax.belt import Path
 from mmrjax.chassis import Chassis
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import elimination, half_robot, turning
-from mmrjax.fidelities.half_robot import Motion, System
+from mmrjax.fidelities.half_robot import Average, Motion, Steady, System
 from mmrjax.mjcf import mjx
 from mmrjax.params import Scalar
-from mmrjax.signals import PlaneMotion, Signals
+from mmrjax.signals import CONVERGED, FAILED, NOT_SETTLED, TIPS, PlaneMotion, Result, Signals
 from mmrjax.trigonometry import cosine, sine
 from mmrjax.turning import SIDES, Grip, Law
-from mmrjax.undercarriage import Pull, Touch
+from mmrjax.undercarriage import Pull, Reactions, Touch
 
 X, Y, HEIGHT, YAW, PITCH, ROLL = range(6)
 #: Driving and driven pulley of left and right side.
 PULLEYS = np.array([[6, 7], [8, 9]])
+SHAFTS = PULLEYS[:, 0]
 COORDINATES = 10
 #: Coordinates on which the contacts of left and right side act.
 OF_SIDE = np.array([[*range(6), *pulleys] for pulleys in PULLEYS])
@@ -81,7 +82,7 @@ def plane_motion(run: System, motion: Motion) -> PlaneMotion:
     forward, up = run.half.centre
     return PlaneMotion(
         current=motion.current,
-        speed_motor=run.robot.gearbox.ratio * v[PULLEYS[:, 0]],
+        speed_motor=run.robot.gearbox.ratio * v[SHAFTS],
         speed=speed,
         speed_lateral=lateral + forward * v[YAW] - up * v[ROLL],
         yaw_rate=v[YAW],
@@ -214,7 +215,7 @@ def dynamics(
     run: System, motion: Motion, armature: Float[Array, " 2"]
 ) -> tuple[Float[Array, "10 10"], Float[Array, " 10"]]:
     """Mass matrix and bias of MJX, with the rotors' `armature` at the driving shafts [kg·m²] in the first."""
-    model = run.model.replace(dof_armature=jnp.zeros(COORDINATES).at[PULLEYS[:, 0]].set(armature))
+    model = run.model.replace(dof_armature=jnp.zeros(COORDINATES).at[SHAFTS].set(armature))
     data = run.data.replace(qpos=motion.q, qvel=motion.v)
     data = mjx.com_pos(model, mjx.kinematics(model, data))
     data = mjx.rne(model, mjx.com_vel(model, mjx.crb(model, data)))
@@ -325,3 +326,46 @@ def roll(run: System) -> Motion:
     plane = [cos * rolls.speed - sin * lateral, sin * rolls.speed + cos * lateral, rolls.yaw_rate]
     v = begins.v.at[jnp.asarray([X, Y, YAW])].set(jnp.stack(plane)).at[PULLEYS].set(jnp.asarray(shafts)[:, None])
     return dataclasses.replace(begins, v=v, current=rolls.current, memory=rolls.memory)
+
+
+def loads(run: System, at: Touch, pulled: Pull) -> Reactions:
+    """See `half_robot.loads`, of either side."""
+    return jax.vmap(lambda at, pulled: half_robot.loads(run, at, pulled))(at, pulled)
+
+
+def away(q: Array, reactions: Reactions) -> tuple[Array, Reactions | None]:
+    """See `half_robot.away`: from where it started; a history has no loads of both sides."""
+    return jnp.hypot(q[..., X], q[..., Y]), None
+
+
+def averaged(average: Average, travelled: Array, passed: balances.Travel, guided: Array) -> Steady:
+    """See `half_robot.averaged`: what is of the whole robot over the periods of either side."""
+    both = jax.tree.map(lambda x: jnp.broadcast_to(x.reshape(*x.shape[:1], -1), (*x.shape[:1], 2)), passed)
+    found, load, periods, changes = jax.vmap(average, in_axes=1)(jnp.abs(travelled), (both, guided))
+    travel = jax.tree.map(lambda x, of: x if of.ndim > 1 else jnp.mean(x), found, passed)
+    share = jnp.sum(load) / jnp.maximum(jnp.sum(travel.signals.normal), 1e-9)
+    # A side that hardly moves has settled where its changes are small beside what the other one does.
+    larger = [(change, jnp.max(size)) for change, size in changes]
+    return Steady(travel.signals, share, periods, jnp.max(half_robot.relative(larger)), travel)
+
+
+def status(run: System, averages: Steady, end: Motion) -> Array:
+    """See `half_robot.status`."""
+    travel, signals = averages.travel, jax.tree.map(jnp.mean, averages.signals)
+    assert travel is not None
+    over = {name: getattr(signals, name) for name in ("speed", "speed_lateral", "yaw_rate")}
+    keeps = dataclasses.replace(plane_motion(run, end), **over)
+    status = turning.status_keeping(run.robot, run.conditions, travel, keeps)
+    status = jnp.where((averages.change > half_robot.SETTLED) & (status == CONVERGED), NOT_SETTLED, status)
+    q, height = end.q, half_robot.axle_height(run)
+    tilt = jnp.maximum(jnp.abs(q[PITCH]), jnp.abs(q[ROLL]))
+    status = jnp.where((tilt > half_robot.OVER) & (tilt < 2 * jnp.pi), TIPS, status)
+    finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(end.v)) & jnp.isfinite(signals.total_current)
+    grounded = (jnp.abs(q[HEIGHT] - height) < 0.5 * height) | (status == TIPS)
+    return jnp.where(finite & grounded, status, FAILED)
+
+
+def result_of(run: System, averages: Steady, status: Array) -> Result:
+    """See `half_robot.result_of`."""
+    assert averages.travel is not None
+    return turning.result_of(run.robot, averages.travel, status)

@@ -71,25 +71,20 @@ class Sequence(eqx.Module):
     over_time: bool = eqx.field(default=False, static=True)
     supply: Scalar | None = None
 
-    def _both(self, place: Scalar, time: Scalar) -> tuple[Array, Array]:
+    @property
+    def first(self) -> Float[Array, " 2"]:
+        """ψ of both levers in the beginning [rad]."""
+        return _turned(*(self.asked(-jnp.inf, 0.0) if self.begins is None else self.begins))
+
+    def asked(self, place: Scalar, time: Scalar) -> tuple[Array, Array]:
+        """Angles of front and rear that are asked for [rad], or voltages of their motors, positive up [V]."""
         at = time if self.over_time else place
         return jnp.interp(at, self.at, self.front), jnp.interp(at, self.at, self.rear)
 
-    @property
-    def first(self) -> Float[Array, " 2"]:
-        """ψ of both levers in the beginning, see `footing` [rad]."""
-        front, rear = self._both(-jnp.inf, 0.0) if self.begins is None else self.begins
-        return jnp.stack([front, jnp.pi - rear])
 
-    def angles(self, place: Scalar, time: Scalar) -> Float[Array, " 2"]:
-        """ψ of both levers that are asked for, see `footing` [rad]."""
-        front, rear = self._both(place, time)
-        return jnp.stack([front, jnp.pi - rear])
-
-    def voltages(self, place: Scalar, time: Scalar) -> Float[Array, " 2"]:
-        """Voltages of both motors, by ψ [V]."""
-        front, rear = self._both(place, time)
-        return jnp.stack([front, -rear])
+def _turned(front: Array, rear: Array) -> Float[Array, " 2"]:
+    """ψ of both levers at their angles, or their angles at ψ, see `footing` [rad]."""
+    return jnp.stack([front, jnp.pi - rear])
 
 
 def still(front: Scalar, rear: Scalar) -> Sequence:
@@ -310,7 +305,7 @@ def asked(run: System, motion: Motion, time: Scalar) -> Float[Array, " 2"]:
     """Angular speeds of the levers after a step that are asked for [rad/s]: towards the sequence's angles, at most at
     their rate; levers that have come there stand."""
     rate = run.robot.running_gear.levers.rate
-    toward = (run.sequence.angles(motion.q[0], time) - motion.q[LED]) / (4 * _SWINGS)
+    toward = (_turned(*run.sequence.asked(motion.q[0], time)) - motion.q[LED]) / (4 * _SWINGS)
     speed = motion.v[LED] + run.step / _SWINGS * (jnp.clip(toward, -rate, rate) - motion.v[LED])
     return jnp.where((jnp.abs(toward) < _STILL) & (jnp.abs(motion.v[LED]) < _STILL), 0.0, speed)
 
@@ -324,9 +319,10 @@ def _swung(run: System, motion: Motion, time: Scalar, source: Scalar, free: Arra
     aims = asked(run, motion, time)
     if sequence.begins is not None:
         aims = jnp.zeros_like(aims)
-        low = high = jnp.clip(sequence.voltages(motion.q[0], time), low, high)
+        front, rear = sequence.asked(motion.q[0], time)
+        low = high = jnp.clip(jnp.stack([front, -rear]), low, high)
     # beyond its range nothing drives a lever on
-    angles = jnp.stack([motion.q[FRONT], jnp.pi - motion.q[REAR]])
+    angles = _turned(*motion.q[LED])
     above, below = angles > levers.angle_most + 1e-3, angles < levers.angle_least - 1e-3
     up, down = jnp.stack([above[0], below[1]]), jnp.stack([below[0], above[1]])
     low, high = (jnp.where(up, jnp.minimum(x, 0.0), jnp.where(down, jnp.maximum(x, 0.0), x)) for x in (low, high))
@@ -383,7 +379,7 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
     v = motion.v + gained
     middle = motion.v + gained / 2
 
-    charge = robot.battery.current(signals.total_current) * (run.conditions.battery > 0.5)
+    charge = balances.charge_drawn(robot, run.conditions, signals.total_current)
     current = current_after(robot, _driven(run, on), step, signals)
     drawn = swung.voltage @ swung.current / jnp.maximum(jnp.abs(signals.voltage_source), 1e-9)
     after = Motion(motion.q + step * v, v, current, motion.discharge + step * charge, drawn)

@@ -86,7 +86,6 @@ moving = compiled(balances.moving)
 def rates(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
     """Rates of the unknowns, in their units [1/s]."""
     signals = moving(robot, conditions, state_of(robot, y))
-    current_battery = robot.battery.current(signals.total_current) * (conditions.battery > 0.5)  # eq. (11)
     winding = signals.voltage_left / signals.inductance
     shaft = signals.acceleration_wheel * robot.gearbox.ratio
     if conditions.motor_speed is not None:  # the current follows from torque, the shaft from what is imposed
@@ -97,7 +96,7 @@ def rates(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) ->
         shaft,
         signals.acceleration,
         signals.speed,
-        current_battery,
+        balances.charge_drawn(robot, conditions, signals.total_current),
         *(jnp.asarray(effect.rate(robot, signals), y.dtype) for effect in robot.remembering),
         *[signals.speed_wheel - signals.speed_output] * robot.loose,
     ]
@@ -317,8 +316,7 @@ def _histories(
     robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
 ) -> Run:
     kept = drive_batch(robot, conditions, jnp.asarray(_instants(options["duration"])))
-    of = turning.history if conditions.turns else History.of
-    return Run(kept.result, history=of(robot, kept.time, kept.distance, kept.signals))
+    return Run(kept.result, history=History.of(robot, kept.time, kept.distance, kept.signals))
 
 
 def _from_standstill(robot: Robot, conditions: Conditions) -> list[str]:

@@ -7,13 +7,13 @@ MJX carries chassis and pulleys (5 degrees of freedom, `mjcf`); grousers or whee
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from mmrjax import balances, contact_sums, mjcf, undercarriage
 from mmrjax.belt import Path, runs
@@ -21,13 +21,38 @@ from mmrjax.chassis import Chassis, inertia_reduced
 from mmrjax.conditions import Conditions
 from mmrjax.contact_sums import Linearized
 from mmrjax.fidelities.linear import Factors, factorise, substitute
-from mmrjax.fidelities.steady import steady, voltage_at_rest
+from mmrjax.fidelities.rest import STARTS, creeps, direction, unless_slipping, voltage_at_rest
+from mmrjax.fidelities.result import result, travels
+from mmrjax.fidelities.steady import steady
 from mmrjax.masses import Masses, masses
 from mmrjax.mjcf import mjx
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-from mmrjax.signals import GRAVITY, ROLLS_BACK, Signals, State, done
-from mmrjax.undercarriage import Pull, Touch
+from mmrjax.signals import (
+    BATTERY_EMPTY,
+    FAILED,
+    GRAVITY,
+    NOT_SETTLED,
+    ROLLS_BACK,
+    STALLED,
+    TIPS,
+    Result,
+    Signals,
+    State,
+    done,
+)
+from mmrjax.undercarriage import Pull, Reactions, Touch
+
+#: Coordinate of the driving pulley.
+SHAFTS = 3
+#: Pitch beyond which a robot has turned over [rad], and height within which that is a number [axle heights].
+OVER, HIGH = 0.5, 20.0
+SETTLED = 1e-3  # largest relative change of the speeds from one half of the window to the other
+#: Changes of some signals, and their sizes.
+Changes = Sequence[tuple[Scalar, Scalar]]
+#: Means of signals (or `balances.Travel`) and of the guides' load, periods averaged, and of three signals the change
+#: and size, of the places of a belt over time and of what has means.
+Average = Callable[[Array, tuple[Any, Array]], tuple[Any, Array, Array, Changes]]
 
 
 class Motion(eqx.Module):
@@ -45,6 +70,26 @@ class Motion(eqx.Module):
     current: Scalar
     discharge: Scalar
     memory: Mapping[str, Scalar] = eqx.field(default_factory=dict)
+
+
+class Steady(eqx.Module):
+    """Averages over the last whole number of grouser periods of a run; of a robot that turns a leading axis of left
+    and right side, each over periods of its own.
+
+    Attributes:
+        signals: means.
+        guide_share: of the ground's normal reaction that the lower guides carry [-]: an output here, a
+            parameter in the other fidelities.
+        periods: grouser periods averaged [-]; 0: the plain window, the belt hardly moved.
+        change: largest relative change of current, motor speed and speed between the window's halves [-].
+        travel: means of all of an instant, of a robot that turns.
+    """
+
+    signals: Signals
+    guide_share: Scalar
+    periods: Int[Array, "..."]
+    change: Scalar
+    travel: balances.Travel | None = None
 
 
 class System(eqx.Module):
@@ -222,7 +267,7 @@ class _Later(eqx.Module):
 
 def later(run: System, motion: Motion, signals: Signals) -> _Later:
     """Currents, charge and memories one step on."""
-    charge = run.robot.battery.current(signals.total_current) * (run.conditions.battery > 0.5)
+    charge = balances.charge_drawn(run.robot, run.conditions, signals.total_current)
     memory = {
         effect.name: motion.memory[effect.name] + run.step * effect.rate(run.robot, signals)
         for effect in run.robot.remembering
@@ -406,3 +451,51 @@ def roll(run: System) -> Motion:
     signals, _, _ = instant(run, start)  # what effects remember is settled too
     memory = {e.name: e.settled(run.robot, signals) * jnp.ones_like(current) for e in run.robot.remembering}
     return dataclasses.replace(start, memory=memory)
+
+
+def loads(run: System, at: Touch, pulled: Pull) -> Reactions:
+    """Loads inside the running gear at an instant."""
+    return undercarriage.reactions(run.path, at, pulled)
+
+
+def away(q: Array, reactions: Reactions) -> tuple[Array, Reactions | None]:
+    """How far a robot has come [m], and the loads inside its running gear."""
+    return q[..., 0], reactions
+
+
+def averaged(average: Average, travelled: Array, passed: Any, guided: Array) -> Steady:
+    """Averages at the end of a run, of its record."""
+    signals, load, periods, changes = average(travelled, (passed, guided))
+    return Steady(signals, load / jnp.maximum(signals.normal, 1e-9), periods, jnp.max(relative(changes)))
+
+
+def relative(changes: Changes) -> Array:
+    """Changes over their sizes [-]."""
+    return jnp.stack([change / jnp.maximum(size, 1e-3) for change, size in changes])
+
+
+def status(run: System, averages: Steady, end: Motion) -> Array:
+    """How a run has ended, by its averages and its last motion."""
+    robot, conditions, signals = run.robot, run.conditions, averages.signals
+    status = jnp.where(averages.change > SETTLED, NOT_SETTLED, travels(signals.speed, signals.voltage))
+    sense, rest = direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
+    stands = creeps(sense, voltage_at_rest(robot, conditions), signals.speed_theoretical, signals.speed, rest)
+    parked = (jnp.abs(signals.direction) < 0.999) | (stands & (sense * signals.acceleration < STARTS))
+    status = jnp.where(parked, STALLED, status)
+    # On average over the window.
+    status = unless_slipping(status, robot, signals, signals.acceleration * jnp.sign(signals.direction), 1e-2, stands)
+    empty = (conditions.battery > 0.5) & robot.battery.empty(end.discharge)
+    status = jnp.where(empty, BATTERY_EMPTY, status)
+    status = jnp.where(margin(run) < 0, TIPS, status)
+    finite = jnp.all(jnp.isfinite(end.q)) & jnp.all(jnp.isfinite(end.v)) & jnp.isfinite(signals.total_current)
+    # A run that has left the ground, sunk through it or turned over has numbers that mean nothing.
+    turned = (jnp.abs(end.q[2]) > OVER) & (jnp.abs(end.q[2]) < 2 * jnp.pi)
+    status = jnp.where(turned & (jnp.abs(end.q[1]) < HIGH * axle_height(run)), TIPS, status)
+    grounded = (jnp.abs(end.q[1] - axle_height(run)) < 0.5 * axle_height(run)) & (jnp.abs(end.q[2]) < OVER)
+    sane = grounded | (status == TIPS)
+    return jnp.where(finite & sane, status, FAILED)
+
+
+def result_of(run: System, averages: Steady, status: Array) -> Result:
+    """What is observed of a run that ends so."""
+    return result(run.robot, averages.signals, status)

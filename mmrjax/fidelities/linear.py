@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mmrjax.fidelities import elimination
+
 #: Rows of the factors, and for each column the row exchanges that pivoting made.
-Factors = tuple[list[list[Array]], list[list[Array]]]
+Factors = tuple[elimination.Factors, list[list[Array]]]
 
 
 def factorise(matrix: Float[Array, "n n"]) -> Factors:
@@ -16,7 +20,7 @@ def factorise(matrix: Float[Array, "n n"]) -> Factors:
     scalars, the arithmetic of a whole batch becomes one fused loop.
     """
     n = matrix.shape[0]
-    rows = [[matrix[i, j] for j in range(n)] for i in range(n)]
+    rows: Any = [[matrix[i, j] for j in range(n)] for i in range(n)]
     exchanges: list[list[Array]] = []
     for k in range(n):
         swaps = []
@@ -37,16 +41,9 @@ def factorise(matrix: Float[Array, "n n"]) -> Factors:
 def substitute(factors: Factors, vector: Float[Array, " n"]) -> Float[Array, " n"]:
     """Solve for one right-hand side with the factors of `factorise`."""
     rows, exchanges = factors
-    n = len(rows)
-    x = [vector[i] for i in range(n)]
-    for k in range(n):
-        for i, larger in zip(range(k + 1, n), exchanges[k], strict=True):
+    x = list(vector)
+    for k, swaps in enumerate(exchanges):
+        for i, larger in enumerate(swaps, k + 1):
             x[k], x[i] = jnp.where(larger, x[i], x[k]), jnp.where(larger, x[k], x[i])
-    for i in range(n):
-        for j in range(i):
-            x[i] = x[i] - rows[i][j] * x[j]
-    for i in reversed(range(n)):
-        for j in range(i + 1, n):
-            x[i] = x[i] - rows[i][j] * x[j]
-        x[i] = x[i] / rows[i][i]
-    return jnp.stack(x)
+    found: list[Any] = elimination.substitute(rows, x)
+    return jnp.stack(found)

@@ -132,13 +132,12 @@ def instant(
     winding, housing = (y[k] * UNITS[k] for k in (WINDING, HOUSING))
     copper = robot.motor.voltage_winding(signals.current, winding) * signals.current
     heating = robot.motor.heating(copper, winding, housing)
-    drawn = asked.robot.battery.current(signals.total_current) * (asked.conditions.battery > 0.5)  # eq. (11)
     still = jnp.where(stands, 0.0, 1.0)
     rates = [
         signals.voltage_left / signals.inductance,
         still * signals.acceleration_wheel * robot.gearbox.ratio,
         still * signals.acceleration,
-        drawn,
+        balances.charge_drawn(asked.robot, asked.conditions, signals.total_current),
         *heating,
         asked.integral_rate,
         1.0,

@@ -122,8 +122,7 @@ def instant(
     signals = travel.signals
     winding, housing = (y[k] * _EACH[2] for k in (WINDING, HOUSING))
     copper = robot.motor.voltage_winding(signals.current, winding) * signals.current
-    battery, still = asked.robot.battery, jnp.where(stands, 0.0, 1.0)
-    drawn = battery.current(jnp.asarray(signals.total_current)[0]) * (asked.conditions.battery > 0.5)  # eq. (11)
+    still = jnp.where(stands, 0.0, 1.0)
     rates = [
         signals.voltage_left / signals.inductance,
         still * signals.acceleration_wheel * robot.gearbox.ratio,
@@ -133,7 +132,7 @@ def instant(
         still * travel.acceleration_lateral,
         still * travel.acceleration_yaw,
         motion.yaw_rate,
-        drawn,
+        balances.charge_drawn(asked.robot, asked.conditions, jnp.asarray(signals.total_current)[0]),
         1.0,
         *(jax.vmap(lambda s, effect=effect: effect.rate(robot, s))(signals) for effect in robot.remembering),
     ]

@@ -4,8 +4,9 @@ by one."""
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from types import ModuleType
 from typing import Any
 
@@ -13,31 +14,27 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-from mmrjax import balances, contact, fidelities, masses, undercarriage
+from mmrjax import balances, contact, fidelities, masses
+from mmrjax.balances import signals_of
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities import both_sides, half_robot, turning
+from mmrjax.fidelities import both_sides, half_robot
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
-from mmrjax.fidelities.half_robot import Motion, System, axle_height, margin, system
-from mmrjax.fidelities.rest import STARTS, creeps, direction, unless_slipping, voltage_at_rest
-from mmrjax.fidelities.result import mask, result, travels, withhold
+from mmrjax.fidelities.half_robot import Changes, Motion, Steady, System, system
+from mmrjax.fidelities.result import mask, withhold
 from mmrjax.fidelities.stability import largest_step, refuse
 from mmrjax.params import Scalar
 from mmrjax.programs import has_tracer
 from mmrjax.robot import Robot
 from mmrjax.signals import (
-    BATTERY_EMPTY,
-    CONVERGED,
     FAILED,
-    NOT_SETTLED,
-    STALLED,
     TIPS,
     Result,
     Signals,
 )
-from mmrjax.undercarriage import Pull, Reactions, Touch
+from mmrjax.undercarriage import Reactions
 
 STEP = fidelities.facts("track").resolved()["step"]  # [s]
 SAMPLE = 1e-3  # [s]
@@ -48,33 +45,6 @@ PARTS = 20  # of a run between which progress is told
 TIME_ROLLED = 0.6
 #: A robot jumps where for this share of the window its reaction is less than this share of its mean [-].
 JUMPS, ALOFT = 0.01, 0.01
-#: Pitch beyond which it has turned over [rad], and height within which that is no number gone wrong [axle heights].
-OVER, HIGH = 0.5, 20.0
-SETTLED = 1e-3  # largest relative change of the speeds from one half of the window to the other
-
-
-#: Changes of some signals, and their sizes.
-Changes = Sequence[tuple[Scalar, Scalar]]
-
-
-class Steady(eqx.Module):
-    """Averages over the last whole number of grouser periods of a run; of a robot that turns a leading axis of left
-    and right side, each over periods of its own.
-
-    Attributes:
-        signals: means.
-        guide_share: of the ground's normal reaction that the lower guides carry [-]: an output here, a
-            parameter in the other fidelities.
-        periods: grouser periods averaged [-]; 0: the plain window, the belt hardly moved.
-        change: largest relative change of current, motor speed and speed between the window's halves [-].
-        travel: means of all of an instant, of a robot that turns.
-    """
-
-    signals: Signals
-    guide_share: Scalar
-    periods: Int[Array, "..."]
-    change: Scalar
-    travel: balances.Travel | None = None
 
 
 class Record(eqx.Module):
@@ -133,73 +103,12 @@ def _average(
     early = plain * (jnp.cumsum(plain) <= jnp.sum(plain) / 2)
     found, guided = mean(periods, 0.0, plain)
     halves = mean(periods, periods - half, early)[0], mean(half, 0.0, plain - early)[0]
-    earlier, later, whole = (x.signals if run.conditions.turns else x for x in (*halves, found))
+    earlier, later, whole = (signals_of(x) for x in (*halves, found))
     changes = [
         (jnp.abs(getattr(later, f) - getattr(earlier, f)), jnp.abs(getattr(whole, f)))
         for f in ("total_current", "speed_motor", "speed")
     ]
     return found, guided, periods.astype(int), changes
-
-
-def _steady(run: System, time: Array, travelled: Array, record: Record) -> Steady:
-    if not run.conditions.turns:
-        signals, guided, periods, changes = _average(run, time, travelled, (record.passed, record.guided))
-        share = guided / jnp.maximum(signals.normal, 1e-9)
-        return Steady(signals, share, periods, jnp.max(_relative(changes)))
-
-    def side(travelled: Array, of_side: tuple[Any, Array]) -> tuple[Any, Scalar, Array, Changes]:
-        return _average(run, time, travelled, of_side)
-
-    # What is of the whole robot is averaged over the periods of either side.
-    passed = jax.tree.map(lambda x: jnp.broadcast_to(x.reshape(*x.shape[:1], -1), (*x.shape[:1], 2)), record.passed)
-    found, guided, periods, changes = jax.vmap(side, in_axes=1)(jnp.abs(travelled), (passed, record.guided))
-    travel = jax.tree.map(lambda x, of: x if of.ndim > 1 else jnp.mean(x), found, record.passed)
-    share = jnp.sum(guided) / jnp.maximum(jnp.sum(travel.signals.normal), 1e-9)
-    # A side that hardly moves has settled where its changes are small beside what the other one does.
-    larger = [(change, jnp.max(size)) for change, size in changes]
-    return Steady(travel.signals, share, periods, jnp.max(_relative(larger)), travel)
-
-
-def _relative(changes: Changes) -> Array:
-    return jnp.stack([change / jnp.maximum(size, 1e-3) for change, size in changes])
-
-
-def _status_turning(run: System, steady: Steady, end: Motion) -> Array:
-    travel, signals = steady.travel, jax.tree.map(jnp.mean, steady.signals)
-    assert travel is not None
-    plane = both_sides.plane_motion(run, end)
-    over = {name: getattr(signals, name) for name in ("speed", "speed_lateral", "yaw_rate")}
-    status = turning.status_keeping(run.robot, run.conditions, travel, dataclasses.replace(plane, **over))
-    status = jnp.where((steady.change > SETTLED) & (status == CONVERGED), NOT_SETTLED, status)
-    q, height = end.q, axle_height(run)
-    tilt = jnp.maximum(jnp.abs(q[both_sides.PITCH]), jnp.abs(q[both_sides.ROLL]))
-    status = jnp.where((tilt > OVER) & (tilt < 2 * jnp.pi), TIPS, status)
-    finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(end.v)) & jnp.isfinite(signals.total_current)
-    grounded = (jnp.abs(q[both_sides.HEIGHT] - height) < 0.5 * height) | (status == TIPS)
-    return jnp.where(finite & grounded, status, FAILED)
-
-
-def _status(run: System, steady: Steady, end: Motion) -> Array:
-    if run.conditions.turns:
-        return _status_turning(run, steady, end)
-    robot, conditions, signals = run.robot, run.conditions, steady.signals
-    status = jnp.where(steady.change > SETTLED, NOT_SETTLED, travels(signals.speed, signals.voltage))
-    sense, rest = direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
-    stands = creeps(sense, voltage_at_rest(robot, conditions), signals.speed_theoretical, signals.speed, rest)
-    parked = (jnp.abs(signals.direction) < 0.999) | (stands & (sense * signals.acceleration < STARTS))
-    status = jnp.where(parked, STALLED, status)
-    # On average over the window.
-    status = unless_slipping(status, robot, signals, signals.acceleration * jnp.sign(signals.direction), 1e-2, stands)
-    empty = (conditions.battery > 0.5) & robot.battery.empty(end.discharge)
-    status = jnp.where(empty, BATTERY_EMPTY, status)
-    status = jnp.where(margin(run) < 0, TIPS, status)
-    finite = jnp.all(jnp.isfinite(end.q)) & jnp.all(jnp.isfinite(end.v)) & jnp.isfinite(signals.total_current)
-    # A run that has left the ground, sunk through it or turned over has numbers that mean nothing.
-    turned = (jnp.abs(end.q[2]) > OVER) & (jnp.abs(end.q[2]) < 2 * jnp.pi)
-    status = jnp.where(turned & (jnp.abs(end.q[1]) < HIGH * axle_height(run)), TIPS, status)
-    grounded = (jnp.abs(end.q[1] - axle_height(run)) < 0.5 * axle_height(run)) & (jnp.abs(end.q[2]) < OVER)
-    sane = grounded | (status == TIPS)
-    return jnp.where(finite & sane, status, FAILED)
 
 
 def track(
@@ -237,60 +146,48 @@ def track(
     return _trajectory(run, start, end, record, sample)
 
 
-def _start(run: System, rolling: bool) -> Motion:
-    return _kind(run).roll(run) if rolling else _kind(run).stand(run)
-
-
-def _kind(run: System) -> ModuleType:
+def _kind(conditions: Conditions) -> ModuleType:
     """The room of what moves: half a robot, or all of one that is free to turn."""
-    return both_sides if run.conditions.turns else half_robot
+    return both_sides if conditions.turns else half_robot
+
+
+def _start(run: System, rolling: bool) -> Motion:
+    kind = _kind(run.conditions)
+    start: Motion = kind.roll(run) if rolling else kind.stand(run)
+    return start
 
 
 def _record(run: System, start: Motion, steps: int, samples: int) -> tuple[Motion, Record]:
-    kind = _kind(run)
+    kind = _kind(run.conditions)
 
     def small(motion: Motion, _: None) -> tuple[Motion, tuple[Any, Array]]:
         after, passed, guided = kind.advance(run, motion)
         return after, (passed, guided)
 
-    def loads(at: Touch, pulled: Pull) -> Reactions:
-        return undercarriage.reactions(run.path, at, pulled)
-
     @jax.checkpoint  # reverse mode keeps one motion a sample and recomputes the steps between
     def interval(motion: Motion, _: None) -> tuple[Motion, Record]:
         after, every = jax.lax.scan(small, motion, None, length=steps)
         passed, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), every)
-        at, pulled = kind.instant(run, after)[1:]
-        each = jax.vmap(loads) if run.conditions.turns else loads
-        return after, Record(after, passed, guided, each(at, pulled))
+        return after, Record(after, passed, guided, kind.loads(run, *kind.instant(run, after)[1:]))
 
     return jax.lax.scan(interval, start, None, length=samples)
 
 
 def _trajectory(run: System, start: Motion, end: Motion, record: Record, sample: float) -> Trajectory:
-    motions = record.motions
+    kind, motions = _kind(run.conditions), record.motions
     time = sample * jnp.arange(len(motions.q) + 1)
-    shafts = both_sides.PULLEYS[:, 0] if run.conditions.turns else 3
-    travelled = run.path.radius * jnp.concatenate([start.q[None, shafts], motions.q[:, shafts]])
-    averages = _steady(run, time, travelled, record)
-    status = _status(run, averages, end)
+    travelled = run.path.radius * jnp.concatenate([start.q[None, kind.SHAFTS], motions.q[:, kind.SHAFTS]])
+    averages = kind.averaged(functools.partial(_average, run, time), travelled, record.passed, record.guided)
+    status = kind.status(run, averages, end)
     there = (status != FAILED) & (status != TIPS)
     window = time[1:] > time[-1] - WINDOW * (time[-1] - time[0])
-    signals, load = _signals(record), _signals(record).normal
-    if averages.travel is None:
-        answer = result(run.robot, averages.signals, status)
-    else:
-        answer = turning.result_of(run.robot, averages.travel, status)
-        load = jnp.sum(load, axis=-1)
+    signals, answer = signals_of(record.passed), kind.result_of(run, averages, status)
+    load = jnp.sum(jnp.reshape(signals.normal, (len(motions.q), -1)), axis=-1)
     aloft = window & (load < ALOFT * jnp.sum(averages.signals.normal))
     jumps = jnp.sum(aloft) > JUMPS * jnp.sum(window)
     flags = answer.flags | mask({"jumps": jumps})
     answer = withhold(dataclasses.replace(answer, flags=flags), there, status != FAILED)
     return Trajectory(time[1:], motions.q, motions.v, signals, record.reactions, averages, answer)
-
-
-def _signals(record: Record) -> Signals:
-    return record.passed.signals if isinstance(record.passed, balances.Travel) else record.passed
 
 
 def check(robot: Robot, conditions: Conditions, *, duration: float, step: float, sample: float = SAMPLE) -> None:
@@ -435,11 +332,8 @@ def _histories(
     robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
 ) -> Run:
     runs = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=progress)
-    if conditions.turns:
-        away = jnp.hypot(runs.q[..., both_sides.X], runs.q[..., both_sides.Y])
-        history = turning.history(robot, runs.time, away, runs.signals)
-    else:
-        history = History.of(robot, runs.time, runs.q[..., 0], runs.signals, runs.reactions)
+    away, reactions = _kind(conditions).away(runs.q, runs.reactions)
+    history = History.of(robot, runs.time, away, runs.signals, reactions)
     return Run(runs.result, {"guide_share": runs.steady.guide_share}, history)
 
 

@@ -14,12 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mmrjax import balances, channels, ground
+from mmrjax import balances, ground
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.effects.base import Effect
 from mmrjax.fidelities import lanes, rest
-from mmrjax.fidelities.base import History
 from mmrjax.fidelities.rest import SHARE, TIME, voltage_at_rest
 from mmrjax.fidelities.result import efficiency, result, withhold
 from mmrjax.fidelities.rosenbrock import inverse
@@ -35,7 +34,6 @@ from mmrjax.signals import (
     TIPS,
     PlaneMotion,
     Result,
-    Signals,
     State,
 )
 from mmrjax.turning import SIDES
@@ -99,7 +97,7 @@ def _rates(robot: Robot, conditions: Conditions, y: Array, travel: balances.Trav
         motion.yaw_rate,
         motion.speed * cos - motion.speed_lateral * sin,
         motion.speed * sin + motion.speed_lateral * cos,
-        robot.battery.current(jnp.asarray(signals.total_current)[0]) * (conditions.battery > 0.5),  # eq. (11)
+        balances.charge_drawn(robot, conditions, jnp.asarray(signals.total_current)[0]),
     ]
     for effect in kept:
         found.extend(jax.vmap(lambda s, effect=effect: effect.rate(robot, s))(signals))
@@ -340,25 +338,6 @@ def tips(robot: Robot, travel: balances.Travel) -> Array:
     )
 
 
-def together(signals: Signals) -> Signals:
-    """Signals of both sides as those of one motor on average, from which totals follow as of sides alike."""
-    return jax.tree.map(lambda x: jnp.mean(x, axis=-1) if jnp.ndim(x) else x, signals)
-
-
-def history(robot: Robot, time: Array, away: Array, signals: Signals) -> History:
-    """Runs over time, of signals whose last axis is that of the sides; `away`: from where they started [m]."""
-    return History.of(robot, time, away, together(signals), shown=shown(robot, signals))
-
-
-def shown(robot: Robot, signals: Signals) -> dict[str, Scalar]:
-    """What the instruments show of every channel [SI], of signals whose last axis is that of the sides."""
-    read = balances.sensor(robot, signals)
-    return {
-        c.name: jnp.mean(jnp.asarray(read[c.name]), -1) if c.side is None else jnp.asarray(read[c.name])[..., c.side]
-        for c in channels.EVERY
-    }
-
-
 def result_of(robot: Robot, travel: balances.Travel, status: Array) -> Result:
     """Readings, powers and exceeded limits of an instant: means over both sides, and the worse of them."""
     signals = travel.signals
@@ -368,7 +347,7 @@ def result_of(robot: Robot, travel: balances.Travel, status: Array) -> Result:
     limit = robot.sides / 2 * signals.adhesion_limit
     return dataclasses.replace(
         mean,
-        reading=shown(robot, signals),
+        reading=balances.shown(robot, signals),
         slip=ground.slip(mean.speed, mean.theoretical_speed),
         adhesion_used=jnp.max(jnp.hypot(travel.grip.ahead, travel.grip.aside) / limit),
         efficiency_motor=efficiency(mean.power_motor, mean.power_supply),

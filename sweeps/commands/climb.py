@@ -116,8 +116,8 @@ def climb(config: configuration.Climb, out: Path | None, force: bool) -> int:
             along, derivatives,
         )  # fmt: skip
         folder.write_table("history.csv", found.table)
-        if derivatives is not None:
-            folder.write_table("derivatives.csv", found.slopes)
+        if rows := found.slopes:
+            folder.write_table("derivatives.csv", {name: np.array([row[name] for row in rows]) for name in rows[0]})
         folder.write_json("result.json", found.to_json())
         robot_file.write(robot, folder.partial / "robot.toml", note=f"the robot of this climb, from {config.robot}")
         if config.film:

@@ -19,7 +19,6 @@ from calibration.data.errors import BadConfiguration
 from calibration.data.profiles import ProfileTable
 from mmrjax import balances, channels, ground, missions, outputs
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities import turning
 from mmrjax.fidelities.mission import Mission
 from mmrjax.fidelities.mission_steps import MARKS
 from mmrjax.missions import JOULE_PER_WH
@@ -299,7 +298,7 @@ def _course(
     signals, of_sides = course.signals, {}
     winding, housing = course.temperature_winding, course.temperature_housing
     if source.turns:
-        reading, signals = turning.shown(robot, signals), turning.together(signals)
+        reading, signals = balances.shown(robot, signals), balances.together(signals)
         of_sides = {c.column: np.asarray(reading[c.name]) / c.factor for c in channels.OF_TURNS}
         for side, duty, hot in zip(("left", "right"), course.signals.duty.T, winding.T, strict=True):
             of_sides |= {f"duty_{side}": duty, f"winding_temperature_{side}_C": hot}

@@ -24,10 +24,11 @@ from sweeps.config_campaign import Campaign, How
 from sweeps.console import progress, say, tell
 from sweeps.inputs import beside_robot, load_robot
 from sweeps.pages import words
-from sweeps.points import axes, climbs, grid, run, scale, uncertainty
+from sweeps.points import axes, grid, run, scale, uncertainty
 from sweeps.points.design import Blocks
 from sweeps.points.identity import Identity, identity
-from sweeps.points.job import laid_out, prepare, showing_turns, usual
+from sweeps.points.job import laid_out, prepare, showing_turns
+from sweeps.points.tasks import task_of
 from sweeps.points.zarr_store import STORE, Done, Layout, SweepStore
 from sweeps.skeleton import page
 from sweeps.store import DONE, SOLVER_FAILED, default_path, open_folder
@@ -92,9 +93,9 @@ def _into_store(config: Campaign, file: RobotFile, where: str, out: Path | None,
         pool = cluster.connect(options.scheduler)
     try:
         device = scale.device_kind() if pool is None else pool.device
-        wanted = options.outputs or config.outputs or usual(config, robot)
-        model = config.model if config.obstacle is None else climbs.CLIMB
-        chunk = config.chunk or scale.default_chunk(model, None if pool is None else device)
+        task = task_of(config, robot)
+        wanted = options.outputs or config.outputs or task.usual
+        chunk = config.chunk or scale.default_chunk(task, None if pool is None else device)
         config = config.model_copy(update={"chunk": chunk, "outputs": wanted})
         job = prepare(config, robot, plan, where)
         layout = laid_out(config, job)
@@ -127,7 +128,7 @@ def _into_store(config: Campaign, file: RobotFile, where: str, out: Path | None,
 def dry_run(job: scale.Job, layout: Layout, path: Path) -> None:
     """Say how many points, chunks and bytes a sweep is, and how long it would take; nothing is written."""
     compiled = scale.Compiled(job)
-    blocks, slow = job.blocks, job.slow
+    blocks, slow = job.blocks, job.task.slow
     if slow and blocks.points > PROBED:
         small = Blocks.of(job.plan.design.shape, PROBED)
         compiled = scale.Compiled(dataclasses.replace(job, blocks=small))
@@ -269,7 +270,7 @@ def finish(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job,
             tell(str(export.export(kind, store.path, store.layout)))
     counts = statuses(done.values())
     if not left:
-        print_counts(counts, "points", job.model)
+        print_counts(counts, "points", job.task.model)
         say(str(store.path))
     return DONE if words.solved(counts) else SOLVER_FAILED
 
@@ -279,7 +280,7 @@ def leave(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, 
     robot_file.write(job.robot, store.partial / "robot.toml", note=f"the robot of this sweep, from {config.robot}")
     found = summary(store.layout, job, store.done().values())
     store.write_json("result.json", found)
-    print_counts(found["statuses"], "points", job.model)
+    print_counts(found["statuses"], "points", job.task.model)
     manifest = {"statuses": found["statuses"], "seed": config.samples.get("seed", 0), "hashes": same["data"]}
     skeleton.leave(store, config, manifest, page=page("campaign", file, store.layout, found))
 
@@ -293,7 +294,7 @@ def summary(layout: Layout, job: scale.Job, done: Iterable[Done]) -> dict[str, A
     return {
         "schema": "mmrjax.sweep_store/1",
         "store": STORE,
-        "model": job.model,
+        "model": job.task.model,
         "points": job.plan.design.points,
         "dimensions": dict(zip(job.plan.design.dimensions, job.plan.design.shape, strict=True)),
         "samples": list(job.plan.design.samples.names) if job.plan.design.samples is not None else [],
@@ -322,6 +323,5 @@ def print_counts(counts: Mapping[str, int], things: str, model: str = "") -> Non
         shown.add_column(heading, justify="right" if heading == things else "left")
     for status, count in counts.items():
         if count:
-            ended = words.VERDICT if (model, status) == (climbs.CLIMB, "converged") else words.STATUSES[status].why
-            shown.add_row(status, f"{count:,}", ended)
+            shown.add_row(status, f"{count:,}", words.VERDICTS.get((model, status)) or words.STATUSES[status].why)
     say(shown)

@@ -79,7 +79,7 @@ def write(folder: Path, file: RobotFile, layout: Layout, result: dict[str, Any])
             "name": s,
             "count": n,
             "percent": 100 * n / total,
-            "meaning": words.VERDICT if verdicts and s == signals.STATUSES[signals.CONVERGED] else words.meaning(s),
+            "meaning": words.VERDICTS.get((result["model"], s)) or words.meaning(s),
         }
         for s, n in result["statuses"].items()
         if n

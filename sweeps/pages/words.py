@@ -16,8 +16,8 @@ class Status(NamedTuple):
     meaning: str
 
 
-#: What of a climb that has converged is said.
-VERDICT = "came to a verdict"
+#: What is said of a status of a model where it means something else, by both names.
+VERDICTS = {("climb", "converged"): "came to a verdict"}
 STATUSES: dict[str, Status] = {
     "converged": Status("settled", "steady travel", "found a steady operating point"),
     "stalled": Status(

@@ -19,9 +19,10 @@ from mmrjax.robot import Robot
 from mmrjax.tables import SURFACES, adhesion_ratio
 from mmrjax.variation import Axis
 from sweeps import config as configuration
-from sweeps.config_campaign import SIZE, Campaign
-from sweeps.points import climbs, imposed
+from sweeps.config_campaign import Campaign
+from sweeps.points import imposed
 from sweeps.points.design import DESIGNS, ROW, Design, Drawn, Joint, Samples, in_blocks
+from sweeps.points.tasks import task_of
 
 if TYPE_CHECKING:
     from mmrjax.conditions import Conditions
@@ -62,6 +63,11 @@ class Plan:
         """The runs of a table, of shape (runs,), each crossed with every sample."""
         return Plan(Design({ROW: np.arange(rows.shape[0], dtype=float)}, samples), {}, {}, rows=rows)
 
+    def varied(self, robot: Robot) -> variation.Variation:
+        """The robot and what varies of it and of conditions, without axes that a task has of its own."""
+        known = variation.variable_names(robot)
+        return variation.Variation(robot, tuple(name for name in self.design.names if name in known))
+
     def fixed(self) -> Conditions:
         """The conditions that do not vary, of shape ()."""
         from mmrjax.conditions import Conditions
@@ -81,18 +87,15 @@ def plan(config: Campaign, robot: Robot, where: str) -> Plan:
             name stated twice, and the like; one sentence.
     """
     data: list[str] = []
-    extra = {} if config.obstacle is None else {SIZE: climbs.axis(config.obstacle)}
+    task = task_of(config, robot)
+    extra = task.axes
     axes = {name: _axis(name, stated, robot, f"{where}, axes.{name}", extra) for name, stated in config.axes.items()}
     samples = _samples(config.samples, robot, f"{where}, samples", data)
     if not axes and samples is None:
         raise BadConfiguration(f"{where}: got neither [axes] nor [samples]; expected at least one name that varies")
     design = Design(axes, samples)
     fixed, surface = _fixed(config.conditions, robot, f"{where}, conditions")
-    if config.obstacle is not None:
-        stated = {**{name: np.array([value]) for name, value in fixed.items()}, **axes}
-        climbs.check(config.obstacle, stated, robot, where)
-        if "voltage" not in stated and fixed.get("battery", 0.0) <= 0.5:
-            fixed["voltage"] = climbs.SLOW
+    fixed |= task.further({**{name: np.array([value]) for name, value in fixed.items()}, **axes}, robot, where)
     for k, name in enumerate(design.names):
         if name in fixed or name in design.names[:k]:
             raise BadConfiguration(f"{where}, {name}: stated twice; expected it in one of conditions, axes, samples")
@@ -109,9 +112,9 @@ def plan(config: Campaign, robot: Robot, where: str) -> Plan:
         raise BadConfiguration(f"{where}, conditions.surface: got {surface} beside adhesion; expected one of the two")
     if design.points > MOST:
         raise BadConfiguration(f"{where}: got {design.points:.3g} points; expected at most {MOST:.3g}")
-    varied = variation.Variation(robot, tuple(name for name in design.names if name not in extra)).axes
-    known = {name: extra.get(name) or varied[name] for name in design.names}
-    return Plan(design, known, fixed, surface, tuple(data))
+    found = Plan(design, dict(extra), fixed, surface, tuple(data))
+    varied = {**extra, **found.varied(robot).axes}
+    return dataclasses.replace(found, axes={name: varied[name] for name in design.names})
 
 
 def _acting(names: set[str], robot: Robot, where: str, surface: str | None) -> None:

@@ -29,8 +29,7 @@ SOUGHT = {"step": (10.0, 450.0), "stairs": (20.0, 400.0), "gap": (20.0, 800.0)}
 NEAR = 1.0
 #: Voltage where none is stated [V]: slow enough that a robot climbs rather than leaps.
 SLOW = 12.0
-#: Model of points that climb; how many in one call on a processor and an accelerator; interval of their record [s].
-CLIMB = "climb"
+#: How many points in one call on a processor and an accelerator; interval of their record [s].
 AT_ONCE, SAMPLE = (64, 2048), 0.05
 #: Outputs with units and words, a search has the first two: currents are the largest, places those of the robot's
 #: middle from where the obstacle begins; 0 where nothing is got over.
@@ -54,9 +53,20 @@ def axis(of: Obstacle) -> Axis:
     return Axis(SIZE, "mm", meaning[of.kind], (1.0, 5000.0), None)
 
 
-def names(of: Obstacle) -> tuple[str, ...]:
-    """Outputs that a point has."""
-    return (VERDICT, LARGEST) if of.find else tuple(name for name in OUTPUTS if name != LARGEST)
+def attributes(of: Obstacle) -> dict[str, dict[str, Any]]:
+    """Outputs that a point has, by name, with their attributes in a store."""
+    names = (VERDICT, LARGEST) if of.find else tuple(name for name in OUTPUTS if name != LARGEST)
+    found: dict[str, dict[str, Any]] = {
+        name: {"units": unit_of(OUTPUTS[name][0]), "long_name": OUTPUTS[name][1]} for name in names
+    }
+    del found[VERDICT]["units"]
+    found[VERDICT] |= {"flag_values": [*range(len(NAMES))], "flag_meanings": " ".join(NAMES)}
+    return found
+
+
+def unit_of(unit: str) -> str:
+    """A unit as a store has it."""
+    return "1" if unit in ("-", "") else unit
 
 
 def terrains_of(of: Obstacle, sizes: np.ndarray) -> Terrain:
@@ -70,8 +80,8 @@ def terrains_of(of: Obstacle, sizes: np.ndarray) -> Terrain:
     return jax.vmap(make[of.kind])(jnp.asarray(sizes) / 1000)
 
 
-def check(of: Obstacle, varied: Mapping[str, np.ndarray], robot: Robot, where: str) -> None:
-    """Refuse a sweep of climbs that cannot be.
+def further(of: Obstacle, varied: Mapping[str, np.ndarray], robot: Robot, where: str) -> dict[str, float]:
+    """A low voltage, where a sweep of climbs states none.
 
     Args:
         varied: what varies or is stated, with its values.
@@ -92,6 +102,7 @@ def check(of: Obstacle, varied: Mapping[str, np.ndarray], robot: Robot, where: s
         for angle in varied.get(name, ()):
             if why := terrains.beyond(robot, angle) or terrains.below(robot, angle):
                 raise BadConfiguration(f"{where}, {name}: {why}")
+    return {} if "voltage" in varied or np.all(varied.get("battery", 0.0) > 0.5) else {"voltage": SLOW}
 
 
 def refused(robot: Robot) -> str | None:
@@ -111,7 +122,7 @@ def computed(
     of: Obstacle,
     variation: Variation,
     conditions: Conditions,
-    values: np.ndarray,
+    values: np.ndarray | jax.Array,
     sizes: np.ndarray | None,
     told: Callable[[float], None],
 ) -> dict[str, np.ndarray]:
@@ -207,13 +218,3 @@ def _searched(
 
 def _share(told: Callable[[float], None], k: int, rounds: int, share: float) -> None:
     told((k + share) / rounds)
-
-
-def rows() -> dict[str, dict[str, Any]]:
-    """Attributes of the outputs in a store."""
-    about = {name: {"units": unit or "1", "long_name": words} for name, (unit, words) in OUTPUTS.items()}
-    del about[VERDICT]["units"]
-    return {
-        **about,
-        VERDICT: {**about[VERDICT], "flag_values": [*range(len(NAMES))], "flag_meanings": " ".join(NAMES)},
-    }

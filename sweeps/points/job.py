@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Collection
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,17 +12,17 @@ import numpy as np
 
 from calibration.data import profiles
 from calibration.data.errors import BadConfiguration, choices
-from mmrjax import __version__, channels, fidelities, outputs
+from mmrjax import __version__, channels, fidelities
 from mmrjax.conditions import OF_TURNS
-from mmrjax.errors import UsageError
 from mmrjax.profile import Profile
 from mmrjax.robot import Robot
-from mmrjax.signals import FLAGS, STATUSES
-from mmrjax.variation import STATUS, Variation, check_outputs
-from sweeps.config_campaign import SIZE, Campaign
+from mmrjax.signals import STATUSES
+from mmrjax.variation import STATUS, Variation
+from sweeps.config_campaign import Campaign
 from sweeps.console import tell
 from sweeps.points import axes, climbs, scale
 from sweeps.points.design import Blocks
+from sweeps.points.tasks import Task, task_of
 from sweeps.points.zarr_store import ABSENT, Layout, Variable
 
 #: Points at which a fidelity is asked, before the first is simulated, whether it could bear them.
@@ -39,25 +38,12 @@ def showing_turns(robot: Robot, conditions: Collection[str]) -> Robot:
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, channels=(*own, *more)))
 
 
-def usual(config: Campaign, robot: Robot) -> tuple[str, ...]:
-    """Outputs of a store where none are stated: what the instruments show, over a profile or an obstacle what it
-    comes to."""
-    if config.obstacle is not None:
-        return climbs.names(config.obstacle)
-    if config.profile is None:
-        return channels.names(robot.channels)
-    from mmrjax import missions  # which imports an integrator
-
-    return missions.USUAL
-
-
 def prepare(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> scale.Job:
     """The job of a resolved configuration.
 
     Raises:
         BadConfiguration: an output that the fidelity does not have, or a point that it cannot bear.
     """
-    variation = Variation(robot, tuple(name for name in plan.design.names if name != SIZE))
     profile = None if config.profile is None else _profile(config.profile, robot, plan, where)
     repeated = [name for k, name in enumerate(config.outputs) if name in config.outputs[:k]]
     if repeated:
@@ -65,23 +51,13 @@ def prepare(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> scal
     taken = [name for name in config.outputs if name in plan.design.names]
     if taken:
         raise BadConfiguration(f"{where}, outputs: got {taken[0]}, which varies; expected what comes out of a run")
-    if config.obstacle is not None:
-        allowed = climbs.names(config.obstacle)
-        if unknown := [name for name in config.outputs if name not in allowed]:
-            raise BadConfiguration(f"{where}, outputs: got {unknown[0]}; {choices(unknown[0], allowed)}")
-        assert config.chunk is not None
-        blocks = Blocks.of(plan.design.shape, config.chunk)
-        return scale.Job(
-            robot, climbs.CLIMB, config.options, plan, config.outputs, config.storage, blocks, None, config.obstacle
-        )
-    try:
-        check_outputs(variation, config.model, plan.fixed(), config.options, config.outputs, profile)
-    except UsageError as error:
-        raise BadConfiguration(f"{where}, {error}") from error
+    task = task_of(config, robot, profile is not None and profile.turns)
+    if unknown := [name for name in config.outputs if name not in task.attributes]:
+        raise BadConfiguration(f"{where}, outputs: got {unknown[0]}; {choices(unknown[0], task.attributes, 3)}")
     assert config.chunk is not None
     blocks = Blocks.of(plan.design.shape, config.chunk)
-    _bearable(variation, config, plan)
-    return scale.Job(robot, config.model, config.options, plan, config.outputs, config.storage, blocks, profile)
+    _bearable(plan.varied(robot), task, plan)
+    return scale.Job(robot, task, plan, config.outputs, config.storage, blocks, profile)
 
 
 def _profile(name: str, robot: Robot, plan: axes.Plan, where: str) -> Profile:
@@ -111,15 +87,15 @@ def _profile(name: str, robot: Robot, plan: axes.Plan, where: str) -> Profile:
     return source.profile(robot, plan.fixed())
 
 
-def _bearable(variation: Variation, config: Campaign, plan: axes.Plan) -> None:
+def _bearable(variation: Variation, task: Task, plan: axes.Plan) -> None:
     """Ask the fidelity about points spread over the design, its corners among them.
 
     Raises:
         BadConfiguration: one that it cannot bear.
     """
-    fidelity = fidelities.get(config.model)
-    if not config.options:
+    if not task.options:
         return
+    fidelity = fidelities.get(task.model)
     shape = plan.design.shape
     ends = itertools.product(*({0, n - 1} for n in shape[:4]))
     corners = [(*end, *(0 for _ in shape[4:])) for end in ends]
@@ -128,42 +104,25 @@ def _bearable(variation: Variation, config: Campaign, plan: axes.Plan) -> None:
     for values in plan.design.at(numbers):
         robot, conditions = variation.at(jnp.asarray(values), plan.fixed())
         try:
-            fidelity.check(robot, jax.tree.map(lambda x: jnp.asarray(x)[None], conditions), config.options)
+            fidelity.check(robot, jax.tree.map(lambda x: jnp.asarray(x)[None], conditions), task.options)
         except ValueError as error:
             at = ", ".join(f"{n} {v:g}" for n, v in zip(plan.design.names, values, strict=True))
-            raise BadConfiguration(f"--model {config.model}: at {at}: {error}") from error
+            raise BadConfiguration(f"--model {task.model}: at {at}: {error}") from error
 
 
 def laid_out(config: Campaign, job: scale.Job) -> Layout:
     """Arrays of the store of a job, with units and long names."""
-    rows: dict[str, Any] = {row.name: row for row in outputs.table(job.robot.channels)}
-    if job.profile is not None:
-        from mmrjax import missions
-
-        rows |= {row.column: row for row in (*missions.OUTPUTS, *missions.OF_TURNS)}
-    variables = []
-    of_climbs = climbs.rows()
-    for name in job.outputs:
-        if job.obstacle is not None:
-            kind = "uint8" if name == climbs.VERDICT else config.storage
-            variables.append(Variable(name, kind, of_climbs[name]))
-            continue
-        if name == "flags":
-            about = {"long_name": "limits exceeded", "flag_masks": [1 << k for k in range(len(FLAGS))]}
-            variables.append(Variable(name, "uint16", {**about, "flag_meanings": " ".join(FLAGS)}))
-            continue
-        unit, label = (rows[name].unit, rows[name].label) if name in rows else ("-", name.replace("_", " "))
-        variables.append(Variable(name, config.storage, {"units": _unit(unit), "long_name": label}))
+    variables = [
+        Variable(name, scale.KINDS.get(name, config.storage), job.task.attributes[name]) for name in job.outputs
+    ]
     meanings = {"flag_values": [*range(len(STATUSES)), ABSENT], "flag_meanings": " ".join((*STATUSES, "absent"))}
-    variables.append(Variable(STATUS, "uint8", {"long_name": "how the run ended", **meanings}))
+    variables.append(Variable(STATUS, scale.KINDS[STATUS], {"long_name": "how the run ended", **meanings}))
     known = job.plan.axes
-    coordinates = {name: {"units": _unit(axis.unit), "long_name": axis.meaning} for name, axis in known.items()}
+    coordinates = {
+        name: {"units": climbs.unit_of(axis.unit), "long_name": axis.meaning} for name, axis in known.items()
+    }
     for name in {axes.CONFIGURATION} & set(coordinates):
         del coordinates[name]["units"]
     labels = {axes.CONFIGURATION: job.robot.configurations.names}
-    about = {"title": "sweep of a robot", "source": f"mmrjax {__version__}, {job.model}"}
+    about = {"title": "sweep of a robot", "source": f"mmrjax {__version__}, {job.task.model}"}
     return Layout(job.plan.design, job.blocks, tuple(variables), coordinates, labels, about, config.compression)
-
-
-def _unit(unit: str) -> str:
-    return "1" if unit in ("-", "") else unit

@@ -32,6 +32,7 @@ from sweeps.points import scale
 from sweeps.points.axes import Plan
 from sweeps.points.design import Blocks, Drawn
 from sweeps.points.scale import Job
+from sweeps.points.tasks import of_fidelity
 from sweeps.skeleton import Page
 from sweeps.store import RunFolder
 
@@ -142,9 +143,10 @@ def job_of(robot: Robot, runs: Runs, config: FidelityPart, samples: Drawn | None
     refuse(robot, rows, config)
     plan = Plan.of_rows(jax.tree.map(np.asarray, rows), samples)
     wanted = (*outputs.names(robot.channels), FLAGS_CODE, *fidelities.get(config.model).columns)
-    chunk = getattr(config, "chunk", None) or scale.default_chunk(config.model)
+    task = of_fidelity(config.model, config.options, robot)
+    chunk = getattr(config, "chunk", None) or scale.default_chunk(task)
     blocks = Blocks.of(plan.design.shape, chunk)
-    return Job(robot, config.model, config.options, plan, wanted, "float64", blocks)
+    return Job(robot, task, plan, wanted, "float64", blocks)
 
 
 def evaluate(

@@ -28,10 +28,9 @@ from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.profile import Profile
 from mmrjax.variation import FLAGS, STATUS, Variation, evaluate, pick
-from sweeps.config_campaign import SIZE, Obstacle
-from sweeps.points import climbs
 from sweeps.points.axes import Plan, adhesions
 from sweeps.points.design import ROW, Blocks
+from sweeps.points.tasks import Task
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
@@ -41,6 +40,8 @@ POINTS = "points"
 SHARED = 16_384
 #: Chunks that may wait for the writer, besides the one that it writes and the one that is computed.
 WAITING = 1
+#: Types in which outputs that are no numbers are stored.
+KINDS = {STATUS: "uint8", FLAGS: "uint16", "verdict": "uint8"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,25 +49,17 @@ class Job:
     """All that is needed to compute any chunk of a sweep, here or in another process.
 
     Attributes:
-        robot: that is varied; model: fidelity, and its options.
-        outputs: names; storage: type that they are stored in.
-        profile: that every point follows, if any; obstacle: that every point climbs, in place of a fidelity's run.
+        robot: that is varied; task: what every point does.
+        outputs: names; storage: type that they are stored in; profile: that every point follows, if any.
     """
 
     robot: Robot
-    model: str
-    options: Mapping[str, float]
+    task: Task
     plan: Plan
     outputs: tuple[str, ...]
     storage: str
     blocks: Blocks
     profile: Profile | None = None
-    obstacle: Obstacle | None = None
-
-    @property
-    def slow(self) -> bool:
-        """Whether a call takes long and says how far it is."""
-        return self.obstacle is not None or fidelities.facts(self.model).slow
 
 
 @dataclasses.dataclass
@@ -88,12 +81,11 @@ def device_kind() -> str:
     return f"{device.platform}: {device.device_kind}"
 
 
-def default_chunk(model: str, device: str | None = None) -> int:
+def default_chunk(task: Task, device: str | None = None) -> int:
     """Points of a chunk where none is stated, over all local devices, or on one of a kind elsewhere."""
     count = len(jax.local_devices()) if device is None else 1
     accelerator = not (device or device_kind()).startswith("cpu")
-    at_once = climbs.AT_ONCE[accelerator] if model == climbs.CLIMB else fidelities.facts(model).at_once(accelerator)
-    return at_once * count
+    return task.at_once[accelerator] * count
 
 
 class Compiled:
@@ -107,20 +99,18 @@ class Compiled:
         each = -(-job.blocks.points // len(devices))
         each = each if each < SHARED else -(-each // SHARED) * SHARED
         self.size = each * len(devices)
-        names = tuple(name for name in job.plan.design.names if name not in (ROW, SIZE))
         everywhere = NamedSharding(self.mesh, PartitionSpec())
-        self._variation, self._fixed = _placed((Variation(job.robot, names), job.plan.fixed()), everywhere)
+        self._variation, self._fixed = _placed((job.plan.varied(job.robot), job.plan.fixed()), everywhere)
         self._split = NamedSharding(self.mesh, PartitionSpec(POINTS))
         factors = {row.name: row.factor for row in outputs.table(job.robot.channels)}
         surface = None if job.plan.surface is None else adhesions(job.robot, job.plan.surface)
         self._asked = _Asked(
-            job.model, tuple(job.options.items()), tuple((n, factors.get(n, 1.0)) for n in job.outputs), job.storage,
-            surface,
+            job.task.model, tuple(job.task.options.items()), tuple((n, factors.get(n, 1.0)) for n in job.outputs),
+            job.storage, surface,
         )  # fmt: skip
         # What takes long in one call is run in parts, between which it says how far it is and can be interrupted.
-        slow = job.slow and job.profile is None
         whole = len(devices) > 1 or self._variation.varies_robot
-        self.in_parts = job.obstacle is not None or (slow and not whole)
+        self.in_parts = job.task.slow and (job.task.run is not None or not whole)
         self._program = _one_device_kept if len(devices) == 1 else eqx.filter_jit(_split_among(self.mesh))
 
     def points(self, chunk: int) -> Float[np.ndarray, "points names"]:
@@ -142,25 +132,22 @@ class Compiled:
         if rows is not None:
             which, values = values[:, 0].astype(int), values[:, 1:]
             conditions = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[which], self._split), rows)
-        if self.job.obstacle is not None:
-            return self._climbed(self.job.obstacle, values, told or _not_told)
-        placed = jax.device_put(values, self._split)
+        names = [name for name in self.job.plan.design.names if name != ROW]
+        own = [k for k, name in enumerate(names) if name in self.job.task.axes]
+        placed = jax.device_put(np.delete(values, own, axis=1) if own else values, self._split)
         if self.in_parts:
-            conditions = _on_surface(self._variation, conditions, placed, self._asked.surface)
-            robot, conditions = self._variation.at(placed, _wide(conditions, len(values)))
-            run = fidelities.get(self.job.model).run(robot, conditions, self.job.options, told or _not_told)
-            return _stored(pick(run, robot.channels, self.job.outputs), self._asked)
+            conditions = _wide(_on_surface(self._variation, conditions, placed, self._asked.surface), len(values))
+            run = self.job.task.run or self._run
+            sizes = values[:, own[0]] if own else None
+            return _stored(run(self._variation, conditions, placed, sizes, told or _not_told), self._asked)
         found: dict[str, Array] = self._program(self._variation, conditions, placed, self._asked, self.job.profile)
         return found
 
-    def _climbed(self, of: Obstacle, values: np.ndarray, told: Callable[[float], None]) -> dict[str, Any]:
-        names = self.job.plan.design.names
-        sizes = values[:, names.index(SIZE)] if SIZE in names else None
-        others = values[:, [k for k, name in enumerate(names) if name != SIZE]]
-        placed = jax.device_put(others, self._split)
-        conditions = _wide(_on_surface(self._variation, self._fixed, placed, self._asked.surface), len(values))
-        found = climbs.computed(of, self._variation, conditions, placed, sizes, told)
-        return {name: found[name] for name in (*self.job.outputs, STATUS)}
+    def _run(self, variation: Variation, conditions: Conditions, values: Array, _: Any, told: Advance) -> Any:
+        """A run of the fidelity."""
+        robot, conditions = variation.at(values, conditions)
+        run = fidelities.get(self.job.task.model).run(robot, conditions, self.job.task.options, told)
+        return pick(run, robot.channels, self.job.outputs)
 
 
 class _Asked(NamedTuple):
@@ -216,10 +203,10 @@ _one_device_kept = compiled(_one_device)
 
 
 def _stored(found: Mapping[str, Array], asked: _Asked) -> dict[str, Array]:
-    """Outputs in the units of tables, in the stored type, statuses as bytes, flags as two."""
-    stored = {n: (found[n] / factor).astype(asked.storage) for n, factor in asked.factors if n != FLAGS}
-    kinds = {STATUS: jnp.uint8, FLAGS: jnp.uint16}
-    return {**stored, **{n: found[n].astype(kind) for n, kind in kinds.items() if n in found}}
+    """Outputs in the units of tables, in the stored type, but those of `KINDS` in their own."""
+    stored = {n: (found[n] / factor).astype(asked.storage) for n, factor in asked.factors if n not in KINDS}
+    named = (*(n for n, _ in asked.factors if n in KINDS), STATUS)
+    return {**stored, **{n: found[n].astype(KINDS[n]) for n in named}}
 
 
 def _split_among(mesh: Mesh) -> Callable[..., dict[str, Array]]:

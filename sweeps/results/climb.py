@@ -176,18 +176,19 @@ class ClimbResult:
         return {name: float(value) for name, value in found.items() if name.startswith("margin_")}
 
     @property
-    def slopes(self) -> dict[str, np.ndarray]:
-        """Derivatives as a table, a row an output and value that it is derived by."""
+    def slopes(self) -> list[dict[str, Any]] | None:
+        """Derivatives, a row an output and value that it is derived by; None: not asked for."""
         along, found = self.along, self.derivatives
-        assert along is not None and found is not None
-        rows = [
-            (name, unit, found.found[name], *by, found.by[name][k], found.slope[name][k], found.slope_sd[name][k])
-            for name, (unit, _) in OUTPUTS.items()
-            for k, by in enumerate(along.rows)
-        ]
+        if along is None or found is None:
+            return None
         by = ("by", "by_unit", "by_value", "by_width")
         names = ("output", "unit", "value", *by, "derivative", "slope", "slope_sd")
-        return {name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
+        found_by = {name: (found.by[name], found.slope[name], found.slope_sd[name]) for name in OUTPUTS}
+        return [
+            dict(zip(names, (n, unit, found.found[n], *of, *(float(x[k]) for x in found_by[n])), strict=True))
+            for n, (unit, _) in OUTPUTS.items()
+            for k, of in enumerate(along.rows)
+        ]
 
     def statement(self) -> str:
         """The answer in a sentence."""
@@ -241,23 +242,5 @@ class ClimbResult:
             "tried": [{"size_mm": size, "verdict": verdict} for size, verdict in self.tried],
             "run": self.numbers(),
             "margins": self.margins,
-            "derivatives": self._derivatives(),
-        }
-
-    def _derivatives(self) -> dict[str, Any] | None:
-        along, found = self.along, self.derivatives
-        if along is None or found is None:
-            return None
-        return {
-            "by": [dict(zip(("name", "unit", "value", "width"), row, strict=True)) for row in along.rows],
-            "outputs": {
-                name: {
-                    "unit": unit,
-                    "value": found.found[name],
-                    "derivatives": found.by[name].tolist(),
-                    "slopes": found.slope[name].tolist(),
-                    "slopes_sd": found.slope_sd[name].tolist(),
-                }
-                for name, (unit, _) in OUTPUTS.items()
-            },
+            "derivatives": self.slopes,
         }

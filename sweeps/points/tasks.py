@@ -1,0 +1,76 @@
+"""What every point of a sweep does: a run of a fidelity, over a profile where there is one, or a climb."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from mmrjax import channels, fidelities, outputs
+from mmrjax.robot import Robot
+from mmrjax.signals import FLAGS as LIMITS
+from mmrjax.variation import FLAGS, Axis
+from sweeps.config_campaign import SIZE, Campaign
+from sweeps.points import climbs
+
+Attributes = dict[str, dict[str, Any]]
+
+
+def nothing_further(stated: Mapping[str, np.ndarray], robot: Robot, where: str) -> dict[str, float]:
+    """No conditions besides."""
+    return {}
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """What every point of a sweep does.
+
+    Attributes:
+        model: its name; options: of a fidelity.
+        attributes: of its outputs in a store, by name; usual: those of a store where none are stated.
+        slow: whether a call takes long and says how far it is; at_once: points in one, on processors or accelerators.
+        axes: what may vary that is neither a condition nor a parameter of the robot.
+        further: conditions besides those that vary or are stated; refuses what cannot be done.
+        run: computes points, see `climbs.computed`; None: a program of the fidelity does.
+    """
+
+    model: str
+    options: Mapping[str, float]
+    attributes: Attributes
+    usual: tuple[str, ...]
+    slow: bool
+    at_once: tuple[int, int]
+    axes: Mapping[str, Axis] = dataclasses.field(default_factory=dict)
+    further: Callable[[Mapping[str, np.ndarray], Robot, str], dict[str, float]] = nothing_further
+    run: Callable[..., Mapping[str, Any]] | None = None
+
+
+def task_of(config: Campaign, robot: Robot, turns: bool = False) -> Task:
+    """The task that a configuration states; `turns`: whether its profile drives the sides apart."""
+    if config.obstacle is None:
+        return of_fidelity(config.model, config.options, robot, config.profile is not None, turns)
+    of, known = config.obstacle, climbs.attributes(config.obstacle)
+    own = {SIZE: climbs.axis(of)}, functools.partial(climbs.further, of), functools.partial(climbs.computed, of)
+    return Task("climb", {}, known, tuple(known), True, climbs.AT_ONCE, *own)
+
+
+def of_fidelity(
+    model: str, options: Mapping[str, float], robot: Robot, profiled: bool = False, turns: bool = False
+) -> Task:
+    """A run of a fidelity; `profiled`: over a profile, of which what it comes to is asked, `turns`: of both sides."""
+    facts, own, usual = fidelities.facts(model), fidelities.get(model).columns, channels.names(robot.channels)
+    rows: dict[str, tuple[str, str]] = {r.name: (r.unit, r.label) for r in outputs.table(robot.channels)}
+    rows |= {name: ("", name.replace("_", " ")) for name in own}
+    if profiled:
+        from mmrjax import missions  # which imports an integrator
+
+        every = (*missions.OUTPUTS, *(missions.OF_TURNS if turns else ()))
+        rows, usual = {r.column: (r.unit, r.label) for r in every}, missions.USUAL
+    flags = {"flag_masks": [1 << k for k in range(len(LIMITS))], "flag_meanings": " ".join(LIMITS)}
+    known: Attributes = {n: {"units": climbs.unit_of(unit), "long_name": label} for n, (unit, label) in rows.items()}
+    known[FLAGS] = {"long_name": "limits exceeded", **flags}
+    at_once = facts.at_once(False), facts.at_once(True)
+    return Task(model, options, known, usual, facts.slow and not profiled, at_once)
