@@ -16,8 +16,6 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-import tempfile
-import time
 from collections import Counter
 from pathlib import Path
 
@@ -27,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
 import loop_findings
 import loop_scores as scores
-from campaign import Task, campaign, plain, robot_of
+from campaign import SIZES, Task, campaign, looped, prepared, refused
 from worlds import foreign, tables
 from worlds.laws import LIBRARY, OUTSIDE, VARIANTS
 from worlds.tables import Case
@@ -59,25 +57,15 @@ SHARES = {
 }  # fmt: skip
 #: The same of kinds whose noise is their own: tables with series, and such as Tables A1 and A2.
 SERIES = {"plain": 0.5, "few": 0.3, "missing": 0.1, "both": 0.1}
-#: Amplitudes of more than so many ordinary sizes are left out: no library should believe them.
-SIZES = 3.0
 #: Draws of names until effects of the wanted strength are not too large together.
 TRIES = {"pairs": 6, "triples": 12}
 #: Proposals that are carried out, one after the other, to resolve a class.
 EXPERIMENTS = 3
 #: The analyst's prior on the one surface of narrow tables, which Table 5 does not know.
 STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("6T2A", "4W2T")}
-#: What a result may hold beside its verdict.
-FURTHER = ("families", "events", "events_alike", "noise_factor", "implausible", "hidden", "stands_for")
 
 
 # --- cases ------------------------------------------------------------------------------------------
-
-
-def make(kind: str, seed: int, narrow: bool = True) -> Case | None:
-    """The case of a kind and a seed; None where there is none."""
-    made = attempt(kind, seed, narrow)
-    return None if isinstance(made, str) else made
 
 
 def attempt(kind: str, seed: int, narrow: bool = False, only: str = "") -> Case | str:
@@ -103,16 +91,16 @@ def attempt(kind: str, seed: int, narrow: bool = False, only: str = "") -> Case 
         shuffled=True if kind in ("drift", "cluster") else None, from_priors=kind == "coverage",
         law=law, stated=seed % 2 == 0 if stated is None else stated,
     )  # fmt: skip
-    refused: Counter[str] = Counter()
+    whys: Counter[str] = Counter()
     for _ in range(TRIES.get(kind, 1)):
         names = _names(kind, seed, rng, world.pool)
         wanted = [float(rng.uniform(low, high)) for _ in names]
         case, why = _weakened(world, kind, names, wanted, seed)
         if not why:
-            case.label["refused"] = dict(refused)
+            case.label["refused"] = dict(whys)
             return case
-        refused[why] += 1
-    return max(refused, key=refused.__getitem__)
+        whys[why] += 1
+    return max(whys, key=whys.__getitem__)
 
 
 def _weakened(world: tables.World, kind: str, names: list[str], wanted: list[float], seed: int) -> tuple[Case, str]:
@@ -146,108 +134,34 @@ def _names(kind: str, seed: int, rng: np.random.Generator, library: tuple[str, .
 
 
 def _refused(case: Case, kind: str, low: float) -> str:
-    """Why a case is none; empty for one that is."""
-    effects = case.label["effects"]
-    if case.label["rows_lost"]:
-        return "rows would slide or stand still"
-    if kind not in ("drift", "cluster", "blind") and any(e["sizes"] >= SIZES for e in effects):
-        return f"needs more than {SIZES:g} ordinary sizes"
-    if kind != "compensating" and any(e["sigmas"] <= 0.9 * low for e in effects):
-        return f"leaves less than {low:g} sigma"
-    return ""
+    """Why a case of a kind is none; empty for one that is."""
+    return refused(case.label, low, kind not in ("drift", "cluster", "blind"), kind != "compensating")
 
 
 # --- verdicts -----------------------------------------------------------------------------------------
 
 
-def one(task: Task) -> dict:
-    """A case made, looped over and scored against its label."""
-    from calibration.data import runs as records
-    from calibration.discovery.discover import prepared
-
+def work(task: Task) -> dict:
+    """A case made, looped over and scored against its label, in a worker."""
     case = attempt(task.kind, task.seed, task.narrow, task.stratum)
     if isinstance(case, str):
         return {"skipped": case}
-    with tempfile.TemporaryDirectory() as folder:
-        table = Path(folder) / "runs.csv"
-        case.write(table, Path(folder) / "label.json")
-        runs = records.read(table)
-        robot = robot_of(task.robot)
-        if case.toml is not None:
-            from calibration.data import robot_file
-
-            robot = robot_file.read(table.with_suffix(".toml"))
-    stated = STATED if case.world is None else {}
-    began, spent = time.perf_counter(), time.process_time()
-    given = prepared(runs, robot, stated=stated, replicates=task.replicates, seed=task.seed)
-    found = given.trace()
-    seconds, processor = time.perf_counter() - began, time.process_time() - spent
-    line = {
-        "seconds": seconds,
-        "processor_seconds": processor,
-        **verdict(found),
-        **loop_findings.findings(given, found),
-        **judged(task, case, given.runs, found, given.settings),
-    }
-    if case.world is not None and task.kind not in ("drift", "cluster"):
-        further = dataclasses.replace(case, table=case.elsewhere(task.seed))
-        with tempfile.TemporaryDirectory() as folder:
-            further.write(Path(folder) / "further.csv", Path(folder) / "label.json")
-            line["elsewhere"] = loop_findings.elsewhere(given, found, records.read(Path(folder) / "further.csv"))
-    return line
-
-
-def verdict(found) -> dict:
-    """What a `LoopStages` says."""
-    base = found.screened.base.candidate
-    further = {name: plain(getattr(found, name)) for name in FURTHER if getattr(found, name, None) is not None}
-    return {
-        "verdict": found.verdict,
-        "classes": [list(members) for members in found.members],
-        "where": located(found),
-        "variables_alike": () if found.where is None else found.where.variables_alike,
-        "p_value": found.left.test.p_value,
-        "outliers": [int(k) for k in found.screened.outliers],
-        "chi2": [2 * base.cost, 2 * found.best.cost],
-        "readings": int(np.sum(found.screened.base.space.weight > 0)),
-        **further,
-    }
-
-
-def located(found) -> tuple | None:
-    """(balance, variable, balances that act alike) of what has no name, or remains."""
-    return None if found.where is None else (found.where.place, found.where.variable, list(found.where.alike))
-
-
-#: Of a label, what the scorer keeps of a case.
-KEPT = ("surface", "robot", "rows", "shuffled", "noise", "law", "stated", "outliers", "missing", "refused")
-
-
-def judged(task: Task, case: Case, runs, found, settings) -> dict:
-    """The truth of a case, and what only the truth can judge.
-
-    Args:
-        found: what the stages of the loop found, a `LoopStages`.
-    """
-    label, kind = case.label, task.kind
-    facts = ("name", "class", "balance", "channel", "sigmas", "sizes", "amplitude", "where")
-    told = [{k: e[k] for k in facts if k in e} for e in label["effects"]]
-    if kind not in ("drift", "cluster"):
-        told = [{**e, **o} for e, o in zip(told, tables.oracle(case), strict=True)]
-    line = {
-        "stratum": label.get("stratum", "narrow"),
-        "made": {k: label[k] for k in KEPT if k in label},
-        "truth": told,
-    }
+    kind, placed = task.kind, task.kind in ("drift", "cluster")
+    given, found, line = looped(case, task, STATED if case.world is None else {})
+    if not placed:
+        line["truth"] = [{**e, **o} for e, o in zip(line["truth"], tables.oracle(case), strict=True)]
     if kind == "library" and found.verdict in ("named", "class") and not task.brief:
-        line |= after(case, runs, found)
+        line |= after(case, given.runs, found)
     if kind == "library" and found.verdict == "class" and case.toml is None and not task.brief:
         try:
-            line["experiments"] = carried_out(case, found, settings)
+            line["experiments"] = carried_out(case, found, given.settings)
         except Exception as error:  # a menu that the generator does not know costs a figure, not the table
             line["experiments"], line["experiments_error"] = [], f"{type(error).__name__}: {error}"
     if kind == "coverage":
-        line |= deviates(case, found, settings)
+        line |= deviates(case, found, given.settings)
+    if case.world is not None and not placed:
+        further = prepared(dataclasses.replace(case, table=case.elsewhere(task.seed)), task)
+        line["elsewhere"] = loop_findings.elsewhere(given, found, further.runs)
     return line
 
 
@@ -337,11 +251,6 @@ def carried_out(case: Case, found, settings) -> list[dict]:
         said.append(what | {"chi2": says.chi2, "best": says.best, "left": says.left})
         seen = loop_experiments.among(whole, says.left)
     return said
-
-
-def work(task: Task) -> dict:
-    """One case in a worker."""
-    return one(task)
 
 
 def program(task: Task) -> tuple | dict:

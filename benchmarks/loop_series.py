@@ -11,18 +11,14 @@ scorer alone. Every set is one line of `--out`, and a run that is started again 
 from __future__ import annotations
 
 import sys
-import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
-import loop_findings
 import loop_scores as scores
-from campaign import Task, campaign, robot_of
-from loop import SIZES, verdict
+from campaign import SIZES, Task, campaign, looped, refused
 from worlds import foreign, histories, settled
 
 KINDS = ("clean", "library", "outside", "pairs", "clean_wide", "noise", "blind", "triples", "event")
@@ -45,8 +41,6 @@ STATED = {
     for c in ("6T2A", "4W2T")
     for name, prior in (("static", (0.6, 0.09)), ("dynamic", (0.48, 0.08)))
 }
-#: Of a label, what the scorer keeps of a case.
-KEPT = ("variety", "surface", "robot", "rows", "noise", "outliers", "missing", "grips")
 
 
 def attempt(kind: str, seed: int, narrow: bool = False, only: str = "") -> histories.SeriesCase | str:
@@ -62,7 +56,7 @@ def attempt(kind: str, seed: int, narrow: bool = False, only: str = "") -> histo
             "pairs": [str(n) for n in rng.choice(LIBRARY[:5], 2, replace=False)],
         }[kind]  # fmt: skip
         case = histories.narrow(names, float(rng.uniform(low, 15.0)), seed=seed, free=tuple(settled.TOLERANCES))
-        return _refused(case.label, kind, low) or case
+        return refused(case.label, low) or case
     strata = tuple(histories.STRATA)
     stratum, variety = strata[seed % len(strata)], seed // len(strata)
     if kind != "clean_wide":
@@ -85,19 +79,7 @@ def attempt(kind: str, seed: int, narrow: bool = False, only: str = "") -> histo
     weaker = [max(0.95 * x * SIZES / most, 1.01 * low) if most else x for x in wanted]
     if kind not in ("event", "blind") and most >= SIZES and min(weaker) > 0.5 * min(wanted):
         case = histories.case(w, names, weaker, seed=seed)  # as strong as may be believed
-    return _refused(case.label, kind, low) or case
-
-
-def _refused(label: dict, kind: str, low: float) -> str:
-    """Why a case is none; empty for one that is."""
-    effects = label["effects"]
-    if not label.get("sound", True):
-        return "too stiff for the generator's method"
-    if kind not in ("event", "blind") and any(e["sizes"] >= SIZES for e in effects):
-        return f"needs more than {SIZES:g} ordinary sizes"
-    if any(e["sigmas"] <= 0.9 * low for e in effects):
-        return f"leaves less than {low:g} sigma"
-    return ""
+    return refused(case.label, low, sizes=kind not in ("event", "blind")) or case
 
 
 def program(task: Task) -> tuple | dict:
@@ -115,43 +97,15 @@ def program(task: Task) -> tuple | dict:
 
 def work(task: Task) -> dict:
     """One case in a worker."""
-    from calibration.data import robot_file
-    from calibration.data import runs as records
-
     case = attempt(task.kind, task.seed, task.narrow, task.stratum)
     if isinstance(case, str):
         return {"skipped": case}
-    robot = robot_of(task.robot)
-    with tempfile.TemporaryDirectory() as folder:
-        if case.toml is not None:
-            (Path(folder) / "robot.toml").write_text(case.toml, encoding="utf-8")
-            robot = robot_file.read(Path(folder) / "robot.toml")
-        runs = records.read(settled.write_table(case.table, Path(folder) / "runs.csv"), robot=robot)
     wide = not case.world.stated
-    line = judged(robot, runs, case.label, {} if wide else STATED, task)
+    given, found, line = looped(case, task, {} if wide else STATED)
+    line["truth"] = [e | _left(found, e, given.settings) for e in line["truth"]]
     if task.kind in ("outside", "blind") and wide:
         line["truth"] = [{**t, **o} for t, o in zip(line["truth"], histories.oracle(case), strict=True)]
-    return line
-
-
-def judged(robot, runs, label: dict, stated: dict, task: Task) -> dict:
-    """The loop over a case, verdict and label side by side."""
-    from calibration.discovery.discover import prepared
-
-    began = time.perf_counter()
-    given = prepared(runs, robot, stated=stated, replicates=task.replicates, seed=task.seed)
-    found, settings = given.trace(), given.settings
-    seconds = time.perf_counter() - began
-    facts = ("name", "class", "balance", "channel", "sigmas", "sizes", "amplitude", "where")
-    return {
-        "seconds": seconds,
-        **verdict(found),
-        **loop_findings.findings(given, found),
-        "stratum": label.get("stratum", "narrow"),
-        "made": {k: label[k] for k in KEPT if k in label},
-        "truth": [{**{k: e[k] for k in facts if k in e}, **_left(found, e, settings)} for e in label["effects"]],
-        **_amplitudes(found, settings),
-    }
+    return line | _amplitudes(found, given.settings)
 
 
 def _left(found, effect: dict, settings) -> dict:

@@ -90,7 +90,7 @@ def test_a_line_that_was_cut_off_is_done_again(tmp_path):
 
 def test_what_a_result_holds_is_written_as_json():
     held = {"a": np.float64(1.0), "b": (np.arange(2), SimpleNamespace(x=1)), "c": tables.PAPER.instruments}
-    assert json.loads(json.dumps(campaign.plain(held)))["b"][0] == [0, 1]
+    assert json.loads(json.dumps(loop_findings.plain(held)))["b"][0] == [0, 1]
 
 
 @pytest.mark.parametrize("kind", [k for k in loop.KINDS if k != "blind"])

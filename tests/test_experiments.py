@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from loop_experiments import supported
 from synthetic import SETTLED, table
-from test_generator import SHAPES
+from test_worlds_tables import SHAPES
 from worlds import laws, settled, tables
 
 from calibration.data import robot_file

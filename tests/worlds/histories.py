@@ -27,6 +27,7 @@ from worlds.settled import (
     TOLERANCES,
     Conditions,
     Instruments,
+    Sealed,
     conditions,
     of_rows,
     perturbed,
@@ -342,19 +343,11 @@ EVERY: dict[str, Law] = {**SERIES, **foreign.FOREIGN_SERIES}
 
 
 @dataclasses.dataclass(frozen=True)
-class SeriesCase:
-    """A sealed set of histories: the columns of its table, one row a sample, NaN where a reading is missing; its label,
-    its world, and its terms."""
+class SeriesCase(Sealed):
+    """A sealed set of histories, one row a sample, with its world and its terms."""
 
-    table: dict[str, np.ndarray]
-    label: dict[str, Any]
     world: SeriesWorld
     terms: tuple[Term, ...] = ()
-
-    @property
-    def toml(self) -> str | None:
-        """The robot's file; None for the paper's."""
-        return self.world.machine.toml
 
 
 def starts(p: Mapping[str, float]) -> Conditions:
@@ -444,7 +437,7 @@ def _made(
         "missing": int((~seen & shown).sum()),
         "sound": bool(np.isfinite(y).all()),
     }
-    return SeriesCase(_columns(w, np.where(seen, read, np.nan), shown), label, w, tuple(terms))
+    return SeriesCase(_columns(w, np.where(seen, read, np.nan), shown), label, w.machine.toml, w, tuple(terms))
 
 
 def _faults(w: SeriesWorld, shown: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

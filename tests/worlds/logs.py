@@ -7,9 +7,7 @@ perturbed rigs go through the classical Runge-Kutta method at once, with steps o
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,7 +16,7 @@ from worlds import laws
 from worlds.histories import runge_kutta, soft_sign, teeth
 from worlds.laws import Term, shaped
 from worlds.rigs import RPM
-from worlds.settled import between, remainder, typed, write_table
+from worlds.settled import Sealed, between, remainder, typed
 
 IMPOSED = ("voltage", "motor_current", "motor_speed")
 RUNS, ROWS = 4, 200
@@ -226,20 +224,11 @@ def moved(p: Mapping[str, float], name: str, z: float) -> dict[str, float]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Case:
-    """A rig, its log and its label."""
+class Case(Sealed):
+    """A log with its label, its rig, and its whitened readings, shape (runs, readings)."""
 
     rig: Rig
-    measured: np.ndarray  # whitened, shape (runs, readings)
-    table: dict[str, np.ndarray]
-    label: dict[str, Any]
-
-    def write(self, folder: Path) -> None:
-        """`rig.toml`, `table.csv` and `label.json`."""
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "rig.toml").write_text(toml(self.rig), encoding="utf-8")
-        write_table(self.table, folder / "table.csv")
-        (folder / "label.json").write_text(json.dumps(self.label, indent=1), encoding="utf-8")
+    measured: np.ndarray
 
 
 def slopes(r: Rig, p: Mapping[str, float], terms: Sequence[Term], also: Sequence[Sequence[Term]] = ()):
@@ -285,11 +274,11 @@ def case(r: Rig, name: str, sigmas: float, seed: int) -> Case:
         table[CHANNELS[n][0]] = np.array([typed(x, 9) for x in measured[n].ravel()])
         table[f"{head}_sd_{unit}"] = np.full(RUNS * ROWS, r.sd[n])
     label = {
-        "kind": "clean" if not name else "library" if LAWS[name].cls else "outside", "seed": seed, "imposed": r.imposed,
+        "kind": "clean" if not name else "library" if LAWS[name].cls else "outside", "seed": seed, "stratum": r.imposed, "imposed": r.imposed,
         "every": r.every, "delay": r.delay, "effects": effects, "constants": r.p,
-        "finite": bool(all(np.isfinite(x).all() for x in shown.values())),
+        "sound": bool(all(np.isfinite(x).all() for x in shown.values())),
     }  # fmt: skip
-    return Case(r, whitened(r, measured), table, label)
+    return Case(table, label, toml(r), r, whitened(r, measured))
 
 
 def least_squares(c: Case, steps: int = 12) -> tuple[float, float]:

@@ -10,9 +10,7 @@ that it leaves the wanted number of sigmas after a refit of the constants, read 
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,7 +18,7 @@ import numpy as np
 from worlds import laws
 from worlds.laws import Law, Term
 from worlds.paper import G
-from worlds.settled import SUPPLIES, between, instant, newton, remainder, typed, write_table
+from worlds.settled import SUPPLIES, Sealed, between, instant, newton, remainder, typed, write_table
 from worlds.tables import told_apart
 
 RPM = np.pi / 30
@@ -607,26 +605,11 @@ FORMS = laws.RIGS | laws.OUTSIDE_RIGS
 
 
 @dataclasses.dataclass(frozen=True)
-class Case:
-    """A rig with its table and its label.
+class Case(Sealed):
+    """A rig with its table and its label, and what it was made from."""
 
-    Attributes:
-        toml: the rig's file; table: columns of a CSV; label: truth, for the scorer alone.
-        world, terms: what it was made from.
-    """
-
-    toml: str
-    table: dict[str, np.ndarray]
-    label: dict[str, Any]
     world: World
     terms: tuple[Term, ...]
-
-    def write(self, folder: Path) -> None:
-        """`rig.toml`, `table.csv` and `label.json` in a folder, which is made."""
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "rig.toml").write_text(self.toml, encoding="utf-8")
-        write_table(self.table, folder / "table.csv")
-        (folder / "label.json").write_text(json.dumps(self.label, indent=1), encoding="utf-8")
 
 
 def case(w: World, name: str = "", sigmas: float = 8.0, seed: int = 0) -> Case:
@@ -653,14 +636,14 @@ def case(w: World, name: str = "", sigmas: float = 8.0, seed: int = 0) -> Case:
         "schema": "mmrjax.sealed-rig/1",
         "seed": seed,
         "kind": "clean" if not name else "library" if name in laws.RIGS else "outside",
-        "load": r.kind, "imposed": r.imposed, "channels": list(r.channels), "sides": r.sides, "supply": r.supply,
+        "stratum": r.kind, "load": r.kind, "imposed": r.imposed, "channels": list(r.channels), "sides": r.sides, "supply": r.supply,
         "reverse": r.reverse, "unsigned": [n for n, s in r.signed.items() if not s], "quantum": dict(r.quantum),
         "rows": len(w.conditions), "rows_lost": int((~sound).sum()), "effects": effects,
         "constants": {r.public(n): w.constants[n] for n in r.tolerances},
         "z": {r.public(n): z for n, z in w.z.items()},
         "sd_over_prior": {r.public(n): x for n, x in w.posterior().items()},
     }  # fmt: skip
-    return Case(toml(r), _table(w, y, sound, rng), label, w, terms)
+    return Case(_table(w, y, sound, rng), label, toml(r), w, terms)
 
 
 def settings(r: Rig, c: Conditions) -> dict[str, np.ndarray]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -42,6 +43,28 @@ def write_table(table: Mapping[str, np.ndarray], path: Path) -> Path:
         for row in zip(*table.values(), strict=True):
             out.writerow(["" if isinstance(x, float) and np.isnan(x) else x for x in row])
     return path
+
+
+@dataclasses.dataclass(frozen=True)
+class Sealed:
+    """A table, what an analyst gets of it, and its label.
+
+    Attributes:
+        table: columns of a CSV, NaN where a reading is missing; label: truth, for the scorer alone.
+        toml: the robot's file; None for the paper's.
+    """
+
+    table: dict[str, np.ndarray]
+    label: dict[str, Any]
+    toml: str | None
+
+    def write(self, folder: Path) -> None:
+        """`table.csv`, `label.json` and, of another robot than the paper's, `rig.toml` in a folder, which is made."""
+        folder.mkdir(parents=True, exist_ok=True)
+        write_table(self.table, folder / "table.csv")
+        (folder / "label.json").write_text(json.dumps(self.label, indent=1), encoding="utf-8")
+        if self.toml is not None:
+            (folder / "rig.toml").write_text(self.toml, encoding="utf-8")
 
 
 # --- what is known of the robot ---------------------------------------------------------------------

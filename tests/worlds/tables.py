@@ -8,9 +8,7 @@ from the analyst's priors.
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +20,7 @@ from worlds.settled import (
     TOLERANCES,
     Conditions,
     Instruments,
+    Sealed,
     base_slopes,
     carried_out,
     conditions,
@@ -30,7 +29,6 @@ from worlds.settled import (
     remainder,
     signature,
     table8,
-    write_table,
 )  # fmt: skip
 
 #: Kinds of worlds. Surfaces are wide in all of them.
@@ -361,28 +359,19 @@ def sized_alone(
 
 
 @dataclasses.dataclass(frozen=True)
-class Case:
-    """One sealed table with its label; readings that are missing are NaN, and empty cells of its file.
+class Case(Sealed):
+    """One sealed table. Of effects the label holds class, balance, amplitude (`sizes`: in multiples of its ordinary size,
+    for whoever leaves implausible ones out), shapes and sigmas.
 
     Attributes:
-        table: columns of a CSV of runs.
-        label: kind, seed, constants; effects with class, balance, amplitude (`sizes`: in multiples of its
-            ordinary size, for whoever leaves implausible ones out), shapes and sigmas.
         conditions, constants, terms: what it was made from; world: too, None of the paper's robot on a stated surface.
     """
 
-    table: dict[str, np.ndarray]
-    label: dict[str, Any]
     conditions: Conditions
     constants: dict[str, float]
     terms: tuple[Term, ...]
     instruments: Instruments
     world: World | None = None
-
-    @property
-    def toml(self) -> str | None:
-        """The robot's file; None for the paper's."""
-        return None if self.world is None else self.world.machine.toml
 
     def slopes(self) -> np.ndarray:
         """Whitened change of the readings for one sd of what the analyst knows of each constant."""
@@ -393,10 +382,6 @@ class Case:
     def pool(self) -> dict[str, Law]:
         """Effects of the library that its robot can have."""
         return {n: LIBRARY[n] for n in (LIBRARY if self.world is None else self.world.pool)}
-
-    def more(self, c: Conditions, seed: int) -> dict[str, np.ndarray]:
-        """The table of another experiment with the same robot."""
-        return table_of(c, *readings(c, self.constants, self.terms), self.instruments, np.random.default_rng(seed))
 
     def carry_out(self, experiment: Any, seed: int) -> dict[str, np.ndarray]:
         """An experiment of the menu with the same robot: `value` and `sd` of its readings [SI], repeats averaged.
@@ -429,14 +414,6 @@ class Case:
         new = new.at(np.flatnonzero(sound)[:n])
         plain = dataclasses.replace(self.world, noise=1.0, law="normal", stated=True)
         return table_of(new, *readings(new, self.constants, self.terms), self.instruments, rng, plain)
-
-    def write(self, table: Path, label: Path) -> None:
-        """Table as CSV and label as JSON; two paths, so that they can be kept apart. The robot's file is beside the
-        table, with the ending of its own."""
-        write_table(self.table, table)
-        label.write_text(json.dumps(self.label, indent=1), encoding="utf-8")
-        if self.toml is not None:
-            table.with_suffix(".toml").write_text(self.toml, encoding="utf-8")
 
 
 def table_of(
@@ -532,13 +509,14 @@ def narrow(
         "schema": "mmrjax.sealed/1",
         "seed": seed,
         "kind": kind_of(names),
+        "stratum": "narrow",
         "compensating": compensating,
         "effects": [t.label | {"sigmas": left} for t, left in zip(terms, reached, strict=True)],
         "sigmas_together": together,
         "constants": {n: p[n] for n in free},
         "rows_lost": int((~sound).sum()),
     }
-    return Case(table_of(c, y, sound, instruments, rng), label, c, p, tuple(terms), instruments)
+    return Case(table_of(c, y, sound, instruments, rng), label, None, c, p, tuple(terms), instruments)
 
 
 def case(
@@ -601,7 +579,7 @@ def case(
         "rows_lost": int((~sound).sum()),
     }
     table = table_of(c, y, sound, w.instruments, rng, w, missing, odd)
-    return Case(table, label, c, dict(p), tuple(terms), w.instruments, w)
+    return Case(table, label, m.toml, c, dict(p), tuple(terms), w.instruments, w)
 
 
 def oracle(case: Case) -> list[dict]:

@@ -51,7 +51,7 @@ def test_a_log_is_that_of_the_simulator_with_the_same_truth(tmp_path, imposed, n
     if name and not laws.LOGS[name].needs(imposed):
         pytest.skip("nothing shows it there")
     case = logs.case(logs.rig(np.random.default_rng([3, logs.IMPOSED.index(imposed)]), imposed), name, 10.0, 1)
-    assert case.label["finite"]
+    assert case.label["sound"]
     sizes = {e["name"]: e["amplitude"] for e in case.label["effects"]}
     ours = shown(tmp_path, case, **sizes)
     clean = logs.whitened(case.rig, logs.histories(case.rig, [case.rig.p], [_terms(case)])[0])
