@@ -98,24 +98,24 @@ def refused(label: Mapping[str, Any], low: float, sizes: bool = True, sigmas: bo
 TRUTH = ("schema", "seed", "kind", "stratum", "effects", "constants", "z", "sd_over_prior")
 
 
-def prepared(case: Any, task: Task, stated: Mapping[str, tuple[float, float]] | None = None) -> Any:
+def begun(case: Any, task: Task, stated: Mapping[str, tuple[float, float]] | None = None) -> Any:
     """What the loop begins with, read from the files of a case as a user's are."""
     ready()
     from calibration.data import robot_file
     from calibration.data import runs as records
-    from calibration.discovery import discover
+    from calibration.discovery.discover import prepared
 
     with tempfile.TemporaryDirectory() as folder:
         case.write(Path(folder))
         robot = robot_of(task.robot) if case.toml is None else robot_file.read(Path(folder) / "rig.toml")
         runs = records.read(Path(folder) / "table.csv", robot=robot)
-    return discover.prepared(runs, robot, stated=stated, replicates=task.replicates, seed=task.seed)
+    return prepared(runs, robot, stated=stated, replicates=task.replicates, seed=task.seed)
 
 
 def looped(case: Any, task: Task, stated: Mapping[str, tuple[float, float]] | None = None) -> tuple[Any, Any, dict]:
     """What the loop began with, what it found, and the line of a case: verdict and findings beside its label."""
     began, spent = time.perf_counter(), time.process_time()
-    given = prepared(case, task, stated)
+    given = begun(case, task, stated)
     found = given.trace()
     line = {
         "seconds": time.perf_counter() - began,

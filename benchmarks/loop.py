@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
 import loop_findings
 import loop_scores as scores
-from campaign import SIZES, Task, campaign, looped, prepared, refused
+from campaign import SIZES, Task, begun, campaign, looped, refused
 from worlds import foreign, tables
 from worlds.laws import LIBRARY, OUTSIDE, VARIANTS
 from worlds.tables import Case
@@ -160,7 +160,7 @@ def work(task: Task) -> dict:
     if kind == "coverage":
         line |= deviates(case, found, given.settings)
     if case.world is not None and not placed:
-        further = prepared(dataclasses.replace(case, table=case.elsewhere(task.seed)), task)
+        further = begun(dataclasses.replace(case, table=case.elsewhere(task.seed)), task)
         line["elsewhere"] = loop_findings.elsewhere(given, found, further.runs)
     return line
 

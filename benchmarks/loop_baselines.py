@@ -15,7 +15,7 @@ import warnings
 import loop
 import numpy as np
 import pysindy
-from campaign import Task, campaign, prepared
+from campaign import Task, begun, campaign
 from loop_scores import MIMIC, interval
 from worlds import tables
 
@@ -202,7 +202,7 @@ def work(task: Task) -> dict:
     if isinstance(case, str):
         return {"skipped": case}
     began = time.perf_counter()
-    given = prepared(case, task, loop.STATED)
+    given = begun(case, task, loop.STATED)
     runs, settings = given.runs, given.settings
     space = pose(runs, given.robot, given.noise.sd, settings, given.stated)
     fitted = fit_base(space, settings, runs.source)

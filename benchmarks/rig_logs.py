@@ -54,7 +54,7 @@ def attempt(kind: str, seed: int) -> logs.Case | str:
         case = logs.case(logs.rig(rng, imposed, every), name, float(rng.uniform(*SIGMAS[kind])), seed)
         if not (why := refused(case.label, SIGMAS[kind][0])):
             return case
-    return f"{name}: {why}"
+    return f"{name} {why}"
 
 
 def work(task: Task) -> dict:

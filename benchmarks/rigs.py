@@ -73,7 +73,7 @@ def attempt(kind: str, seed: int) -> gr.Case | str:
         if not (why := refused(case.label, SIGMAS[kind][0])):
             case.label["refused"] = dict(whys)
             return case
-        whys[f"{wanted}: {why}"] += 1
+        whys[f"{wanted} {why}"] += 1
     return max(whys, key=whys.__getitem__, default="no rig can have it")
 
 
