@@ -10,7 +10,9 @@ import itertools
 import json
 import multiprocessing
 import os
+import resource
 import sys
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
@@ -19,6 +21,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+import loop_findings
 import numpy as np
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -33,6 +36,8 @@ ALONE = {
 }
 #: Memory mappings of a worker beyond which its compiled programs are dropped; Linux allows 65530.
 MAPPINGS = 30_000
+#: The same of resident memory [bytes].
+MEMORY = 5e9
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,30 +73,61 @@ def robot_of(name: str) -> Any:
     return robot_file.load(name)
 
 
-def rig_input(case: Any, folder: Path, task: Task) -> Any:
-    """What the loop begins with, read from the files of a rig and its table as a user's are."""
+#: Amplitudes of more than so many ordinary sizes are left out: no library should believe them.
+SIZES = 3.0
+
+
+def refused(label: Mapping[str, Any], low: float, sizes: bool = True, sigmas: bool = True) -> str:
+    """Why a case is none; empty for one that is.
+
+    Args:
+        low: sigmas that each effect has to leave; sizes, sigmas: whether these are asked for.
+    """
+    if label.get("rows_lost"):
+        return "rows would slide or stand still"
+    if not label.get("sound", True):
+        return "too stiff for the generator's method"
+    if sizes and any(e["sizes"] >= SIZES for e in label["effects"]):
+        return f"needs more than {SIZES:g} ordinary sizes"
+    if sigmas and not all(e["sigmas"] > 0.9 * low for e in label["effects"]):
+        return f"leaves less than {low:g} sigma"
+    return ""
+
+
+#: Of a label, what is no property of a case that a scorer looks at.
+TRUTH = ("schema", "seed", "kind", "stratum", "effects", "constants", "z", "sd_over_prior")
+
+
+def begun(case: Any, task: Task, stated: Mapping[str, tuple[float, float]] | None = None) -> Any:
+    """What the loop begins with, read from the files of a case as a user's are."""
     ready()
     from calibration.data import robot_file
     from calibration.data import runs as records
     from calibration.discovery.discover import prepared
 
-    case.write(folder)
-    robot = robot_file.read(folder / "rig.toml")
-    runs = records.read(folder / "table.csv", robot=robot)
-    return prepared(runs, robot, replicates=task.replicates, seed=task.seed)
+    with tempfile.TemporaryDirectory() as folder:
+        case.write(Path(folder))
+        robot = robot_of(task.robot) if case.toml is None else robot_file.read(Path(folder) / "rig.toml")
+        runs = records.read(Path(folder) / "table.csv", robot=robot)
+    return prepared(runs, robot, stated=stated, replicates=task.replicates, seed=task.seed)
 
 
-def plain(x: Any) -> Any:
-    """Anything that a result holds, as JSON can."""
-    if dataclasses.is_dataclass(x) and not isinstance(x, type):
-        return {f.name: plain(getattr(x, f.name)) for f in dataclasses.fields(x)}
-    if isinstance(x, Mapping):
-        return {str(k): plain(v) for k, v in x.items()}
-    if isinstance(x, list | tuple | set | frozenset):
-        return [plain(v) for v in x]
-    if isinstance(x, np.ndarray) or hasattr(x, "__array__"):
-        return np.asarray(x).tolist()
-    return x if isinstance(x, str | int | float | bool | type(None)) else str(x)
+def looped(case: Any, task: Task, stated: Mapping[str, tuple[float, float]] | None = None) -> tuple[Any, Any, dict]:
+    """What the loop began with, what it found, and the line of a case: verdict and findings beside its label."""
+    began, spent = time.perf_counter(), time.process_time()
+    given = begun(case, task, stated)
+    found = given.trace()
+    line = {
+        "seconds": time.perf_counter() - began,
+        "processor_seconds": time.process_time() - spent,
+        "memory": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+        **loop_findings.verdict(found),
+        **loop_findings.findings(given, found),
+        "stratum": case.label["stratum"],
+        "made": {k: v for k, v in case.label.items() if k not in TRUTH},
+        "truth": case.label["effects"],
+    }
+    return given, found, line
 
 
 def guarded(work: Callable[[Task], dict], task: Task) -> dict:
@@ -105,8 +141,11 @@ def guarded(work: Callable[[Task], dict], task: Task) -> dict:
 
 
 def _make_room() -> None:
-    mapped = Path("/proc/self/maps")
-    if "jax" in sys.modules and mapped.exists() and mapped.read_bytes().count(b"\n") > MAPPINGS:
+    mapped, pages = Path("/proc/self/maps"), Path("/proc/self/statm")
+    if "jax" not in sys.modules or not mapped.exists():
+        return
+    resident = int(pages.read_text().split()[1]) * resource.getpagesize()
+    if mapped.read_bytes().count(b"\n") > MAPPINGS or resident > MEMORY:
         sys.modules["jax"].clear_caches()
         gc.collect()
 
@@ -285,7 +324,7 @@ def campaign(
             nonlocal made
             made += 1
             lines.append(line)
-            file.write(json.dumps(plain(line)) + "\n")
+            file.write(json.dumps(loop_findings.plain(line)) + "\n")
             file.flush()
             if made % 50 == 0:
                 print(f"{made}/{len(tasks)} cases, {time.monotonic() - began:.0f} s", flush=True)

@@ -41,11 +41,11 @@ def baseline(ours: np.ndarray) -> dict:
     As accurate: in the median of the runs and in the worst one. (Two runs on 15 degrees start next to an
     unstable equilibrium, which magnifies any error; the worst alone would say little of the other 178.)
     """
-    import reference
+    from worlds import paper
 
     def loop(rows, method, tolerance):
         start = time.perf_counter()
-        runs = [reference.Side(v, s, p, w > 0) for w, s, p, v in rows]
+        runs = [paper.Side(v, s, p, w > 0) for w, s, p, v in rows]
         states = [run.drive(INSTANTS, method, tolerance, tolerance) for run in runs]
         return time.perf_counter() - start, np.stack(states)
 

@@ -3,7 +3,7 @@
     python benchmarks/loop.py --clean-wide 1000 --library 500 --variants 300 --outside 300 --pairs 200 --jobs 2
     python benchmarks/loop.py --clean-unstated 300 --clean-heavy 100 --clean-uneven 100 --clean-rounded 100 --jobs 2
 
-Tables come from `tests/generator.py` and `tests/generator_wide.py`, which share nothing with the simulator; labels
+Tables come from `tests/worlds/tables.py`, which shares nothing with the simulator; labels
 are read by the scorer alone. Every table is one line of `--out`, and a run that is started again goes on where it
 ended.
 Surfaces are wide (adhesion 0.2 to 1, V_s 2 to 60 mm/s, known by the fields' priors alone), and some tables come from
@@ -16,8 +16,6 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-import tempfile
-import time
 from collections import Counter
 from pathlib import Path
 
@@ -25,11 +23,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
-import generator as g
-import generator_wide as gw
 import loop_findings
 import loop_scores as scores
-from campaign import Task, campaign, plain, robot_of
+from campaign import SIZES, Task, begun, campaign, looped, refused
+from worlds import foreign, tables
+from worlds.laws import LIBRARY, OUTSIDE, VARIANTS
+from worlds.tables import Case
 
 KINDS = (
     "clean", "clean_wide", "noise", "library", "variants", "outside", "blind", "pairs", "compensating", "triples",
@@ -58,74 +57,62 @@ SHARES = {
 }  # fmt: skip
 #: The same of kinds whose noise is their own: tables with series, and such as Tables A1 and A2.
 SERIES = {"plain": 0.5, "few": 0.3, "missing": 0.1, "both": 0.1}
-#: Amplitudes of more than so many ordinary sizes are left out: no library should believe them.
-SIZES = 3.0
 #: Draws of names until effects of the wanted strength are not too large together.
 TRIES = {"pairs": 6, "triples": 12}
 #: Proposals that are carried out, one after the other, to resolve a class.
 EXPERIMENTS = 3
 #: The analyst's prior on the one surface of narrow tables, which Table 5 does not know.
 STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("6T2A", "4W2T")}
-#: What a result may hold beside its verdict.
-FURTHER = ("families", "events", "events_alike", "noise_factor", "implausible", "hidden", "stands_for")
 
 
 # --- cases ------------------------------------------------------------------------------------------
 
 
-def make(kind: str, seed: int, narrow: bool = True) -> g.Case | None:
-    """The case of a kind and a seed; None where there is none."""
-    made = attempt(kind, seed, narrow)
-    return None if isinstance(made, str) else made
-
-
-def attempt(kind: str, seed: int, narrow: bool = False, only: str = "") -> g.Case | str:
+def attempt(kind: str, seed: int, narrow: bool = False, only: str = "") -> Case | str:
     """The case of a kind and a seed, or why there is none; `only` of a stratum."""
     rng = np.random.default_rng([KINDS.index(kind), seed])
     own, rounded = kind in NOISES, kind == "clean_rounded"
     kind, law, stated = NOISES.get(kind, (kind, "normal", True))
     low, high = SIGMAS.get(kind, (0.0, 0.0))
     if narrow or kind in NARROW:
-        names = _names(kind, seed, rng, tuple(g.LIBRARY))
+        names = _names(kind, seed, rng, tuple(LIBRARY))
         with np.errstate(all="ignore"):
             sigmas = float(rng.uniform(low, high)) if names else 0.0
-            case = g.case(names, sigmas, seed=seed, compensating=kind == "compensating")
+            case = tables.narrow(names, sigmas, seed=seed, compensating=kind == "compensating")
         return _refused(case, kind, low) or case
-    stratum, shares = gw.STRATA[seed % len(gw.STRATA)], SERIES if own else SHARES
+    stratum, shares = tables.STRATA[seed % len(tables.STRATA)], SERIES if own else SHARES
     if own or kind != "clean_wide":
         usual = [s for s in shares if kind not in ("noise", "coverage") or s in ("plain", "both", "tracks", "wheels")]
         share = np.array([shares[s] for s in usual])
         stratum = str(rng.choice(usual, p=share / share.sum()))
     stratum = only or ("quantised" if rounded else stratum)
-    world = gw.world(
+    world = tables.world(
         rng, stratum, noise=(0.5, 2.0)[seed % 2] if kind == "noise" else 1.0,
         shuffled=True if kind in ("drift", "cluster") else None, from_priors=kind == "coverage",
         law=law, stated=seed % 2 == 0 if stated is None else stated,
     )  # fmt: skip
-    refused: Counter[str] = Counter()
+    whys: Counter[str] = Counter()
     for _ in range(TRIES.get(kind, 1)):
         names = _names(kind, seed, rng, world.pool)
         wanted = [float(rng.uniform(low, high)) for _ in names]
         case, why = _weakened(world, kind, names, wanted, seed)
         if not why:
-            case.label["refused"] = dict(refused)
+            case.label["refused"] = dict(whys)
             return case
-        refused[why] += 1
-    return max(refused, key=refused.__getitem__)
+        whys[why] += 1
+    return max(whys, key=whys.__getitem__)
 
 
-def _weakened(
-    world: gw.World, kind: str, names: list[str], wanted: list[float], seed: int
-) -> tuple[gw.WideCase, str]:
+def _weakened(world: tables.World, kind: str, names: list[str], wanted: list[float], seed: int) -> tuple[Case, str]:
     """A case and why it is none, if so; where effects would be too large for the sigmas that are wanted, as strong as
     they may be."""
     low = SIGMAS.get(kind, (0.0, 0.0))[0]
-    case = gw.case(world, names, wanted, seed=seed)
+    case = tables.case(world, names, wanted, seed=seed)
     why = _refused(case, kind, low)
     if why.startswith("needs") and wanted:
         most = max(e["sizes"] for e in case.label["effects"])
         weaker = [max(0.95 * x * SIZES / most, 1.01 * low) for x in wanted]
-        case = gw.case(world, names, weaker, seed=seed)
+        case = tables.case(world, names, weaker, seed=seed)
         why = _refused(case, kind, low)
     return case, why
 
@@ -138,174 +125,47 @@ def _names(kind: str, seed: int, rng: np.random.Generator, library: tuple[str, .
         return [str(n) for n in rng.choice(library, 3 if kind == "triples" else 2, replace=False)]
     if kind == "coverage":
         return [] if seed % 2 == 0 else [str(rng.choice(library))]
-    pool = {
-        "library": lambda: library, "variants": lambda: tuple(g.VARIANTS), "outside": lambda: tuple(g.OUTSIDE),
-        "blind": gw.foreign, "drift": lambda: tuple(gw.DRIFTS), "cluster": lambda: gw.CLUSTERS,
-    }[kind]()  # fmt: skip
+    pools = {
+        "library": library, "variants": VARIANTS, "outside": OUTSIDE, "blind": foreign.FOREIGN,
+        "drift": tables.DRIFTS, "cluster": tables.CLUSTERS,
+    }  # fmt: skip
+    pool = tuple(pools[kind])
     return [pool[seed % len(pool)]]
 
 
-def _refused(case: g.Case, kind: str, low: float) -> str:
-    """Why a case is none; empty for one that is."""
-    effects = case.label["effects"]
-    if case.label["rows_lost"]:
-        return "rows would slide or stand still"
-    if kind not in ("drift", "cluster", "blind") and any(e["sizes"] >= SIZES for e in effects):
-        return f"needs more than {SIZES:g} ordinary sizes"
-    if kind != "compensating" and any(e["sigmas"] <= 0.9 * low for e in effects):
-        return f"leaves less than {low:g} sigma"
-    return ""
-
-
-def slopes_of(case: g.Case) -> np.ndarray:
-    """Whitened change of the readings for one sd of what the analyst knows of each constant."""
-    if isinstance(case, gw.WideCase):
-        return case.world.slopes()
-    return g.base_slopes(case.conditions, case.constants, case.instruments)
-
-
-def pool_of(case: g.Case) -> dict[str, g.Form]:
-    """Effects of the library that a case's robot can have."""
-    names = case.world.pool if isinstance(case, gw.WideCase) else tuple(g.LIBRARY)
-    return {n: g.LIBRARY[n] for n in names}
-
-
-def remainders(case: g.Case) -> dict[str, list[np.ndarray]]:
-    """What a refit of the constants leaves of every library effect, unit norm, over a grid of its shape."""
-    c, p, show = case.conditions, case.constants, case.instruments
-    slopes = slopes_of(case)
-    found: dict[str, list[np.ndarray]] = {}
-    for name, form in pool_of(case).items():
-        grid = [{}]
-        for shape, (low, high) in form.shapes.items():
-            grid = [{**others, shape: v} for others in grid for v in np.geomspace(low, high, 5)]
-        for shapes in grid:
-            sign = g.signature(c, p, [g.Term(name, 0.02 * form.size, shapes)], show)
-            left = g.remainder(np.nan_to_num(sign), slopes)
-            norm = np.linalg.norm(left)
-            if norm > 1e-9:
-                found.setdefault(name, []).append(left / norm)
-    return found
-
-
-def oracle(case: g.Case) -> list[dict]:
-    """For each effect of a case: library effects that noise-free data could not tell from it, and what the best
-    one in its place would leave [σ]."""
-    units = remainders(case)
-    c, p, show = case.conditions, case.constants, case.instruments
-    slopes = slopes_of(case)
-    answers = []
-    for term in case.terms:
-        left = g.remainder(np.nan_to_num(g.signature(c, p, [term], show)), slopes)
-        size = np.linalg.norm(left)
-        apart = {}
-        for name, form in pool_of(case).items():
-            along = [float(left @ u) for u in units.get(name, []) if form.either or left @ u >= 0]
-            apart[name] = min((float(np.sqrt(max(size**2 - x**2, 0.0))) for x in along), default=float(size))
-        same = [n for n, d in apart.items() if d < 2.0 or d < np.sqrt(1 - 0.95**2) * size]
-        others = {n: d for n, d in apart.items() if n != term.form.cls}
-        answers.append(
-            {"class_oracle": same, "best_other": min(others.values()), "mimic": min(others, key=others.get)}
-        )
-    return answers
+def _refused(case: Case, kind: str, low: float) -> str:
+    """Why a case of a kind is none; empty for one that is."""
+    return refused(case.label, low, kind not in ("drift", "cluster", "blind"), kind != "compensating")
 
 
 # --- verdicts -----------------------------------------------------------------------------------------
 
 
-def one(task: Task) -> dict:
-    """A case made, looped over and scored against its label."""
-    from calibration.data import runs as records
-    from calibration.discovery.discover import prepared
-
+def work(task: Task) -> dict:
+    """A case made, looped over and scored against its label, in a worker."""
     case = attempt(task.kind, task.seed, task.narrow, task.stratum)
     if isinstance(case, str):
         return {"skipped": case}
-    with tempfile.TemporaryDirectory() as folder:
-        table = Path(folder) / "runs.csv"
-        case.write(table, Path(folder) / "label.json")
-        runs = records.read(table)
-        robot = robot_of(task.robot)
-        if isinstance(case, gw.WideCase) and case.toml is not None:
-            from calibration.data import robot_file
-
-            robot = robot_file.read(table.with_suffix(".toml"))
-    stated = {} if isinstance(case, gw.WideCase) else STATED
-    began, spent = time.perf_counter(), time.process_time()
-    given = prepared(runs, robot, stated=stated, replicates=task.replicates, seed=task.seed)
-    found = given.trace()
-    seconds, processor = time.perf_counter() - began, time.process_time() - spent
-    line = {
-        "seconds": seconds,
-        "processor_seconds": processor,
-        **verdict(found),
-        **loop_findings.findings(given, found),
-        **judged(task, case, given.runs, found, given.settings),
-    }
-    if isinstance(case, gw.WideCase) and task.kind not in ("drift", "cluster"):
-        further = dataclasses.replace(case, table=case.elsewhere(task.seed))
-        with tempfile.TemporaryDirectory() as folder:
-            further.write(Path(folder) / "further.csv", Path(folder) / "label.json")
-            line["elsewhere"] = loop_findings.elsewhere(given, found, records.read(Path(folder) / "further.csv"))
-    return line
-
-
-def verdict(found) -> dict:
-    """What a `LoopStages` says."""
-    base = found.screened.base.candidate
-    further = {name: plain(getattr(found, name)) for name in FURTHER if getattr(found, name, None) is not None}
-    return {
-        "verdict": found.verdict,
-        "classes": [list(members) for members in found.members],
-        "where": located(found),
-        "variables_alike": () if found.where is None else found.where.variables_alike,
-        "p_value": found.left.test.p_value,
-        "outliers": [int(k) for k in found.screened.outliers],
-        "chi2": [2 * base.cost, 2 * found.best.cost],
-        "readings": int(np.sum(found.screened.base.space.weight > 0)),
-        **further,
-    }
-
-
-def located(found) -> tuple | None:
-    """(balance, variable, balances that act alike) of what has no name, or remains."""
-    return None if found.where is None else (found.where.place, found.where.variable, list(found.where.alike))
-
-
-#: Of a label, what the scorer keeps of a case.
-KEPT = ("surface", "robot", "rows", "shuffled", "noise", "law", "stated", "outliers", "missing", "refused")
-
-
-def judged(task: Task, case: g.Case, runs, found, settings) -> dict:
-    """The truth of a case, and what only the truth can judge.
-
-    Args:
-        found: what the stages of the loop found, a `LoopStages`.
-    """
-    label, kind = case.label, task.kind
-    facts = ("name", "class", "balance", "channel", "sigmas", "sizes", "amplitude", "where")
-    told = [{k: e[k] for k in facts if k in e} for e in label["effects"]]
-    if kind not in ("drift", "cluster"):
-        told = [{**e, **o} for e, o in zip(told, oracle(case), strict=True)]
-    line = {
-        "stratum": label.get("stratum", "narrow"),
-        "made": {k: label[k] for k in KEPT if k in label},
-        "truth": told,
-    }
-    paper = not isinstance(case, gw.WideCase) or case.toml is None
+    kind, placed = task.kind, task.kind in ("drift", "cluster")
+    given, found, line = looped(case, task, STATED if case.world is None else {})
+    if not placed:
+        line["truth"] = [{**e, **o} for e, o in zip(line["truth"], tables.oracle(case), strict=True)]
     if kind == "library" and found.verdict in ("named", "class") and not task.brief:
-        line |= after(case, runs, found)
-    if kind == "library" and found.verdict == "class" and paper and not task.brief:
+        line |= after(case, given.runs, found)
+    if kind == "library" and found.verdict == "class" and case.toml is None and not task.brief:
         try:
-            line["experiments"] = carried_out(case, found, settings)
+            line["experiments"] = carried_out(case, found, given.settings)
         except Exception as error:  # a menu that the generator does not know costs a figure, not the table
             line["experiments"], line["experiments_error"] = [], f"{type(error).__name__}: {error}"
     if kind == "coverage":
-        line |= deviates(case, found, settings)
+        line |= deviates(case, found, given.settings)
+    if case.world is not None and not placed:
+        further = begun(dataclasses.replace(case, table=case.elsewhere(task.seed)), task)
+        line["elsewhere"] = loop_findings.elsewhere(given, found, further.runs)
     return line
 
 
-def deviates(case: gw.WideCase, found, settings) -> dict:
+def deviates(case: Case, found, settings) -> dict:
     """Distances of the fit from the truth in its own sds: of each base parameter, and of the amplitude.
 
     Empty where the truth is not in the class that is found, or something is found that is not there.
@@ -327,7 +187,7 @@ def deviates(case: gw.WideCase, found, settings) -> dict:
     coordinates, z = space.coordinates.base, case.label["z"]
     names, free = coordinates.names, space.free
     # Truths are drawn from the fields' priors; of the ground's friction the loop takes wider ones.
-    wider = {n: gw.spread(n) / float(coordinates.spread[k]) for k, n in enumerate(names) if coordinates.scale[k]}
+    wider = {n: tables.spread(n) / float(coordinates.spread[k]) for k, n in enumerate(names) if coordinates.scale[k]}
     line = {
         "deviates": {
             n: float((best.z[k] - z[n] * wider.get(n, 1.0)) / best.sd[k]) for k, n in enumerate(names) if n in z
@@ -343,7 +203,7 @@ def deviates(case: gw.WideCase, found, settings) -> dict:
     return line
 
 
-def after(case: g.Case, runs, found) -> dict:
+def after(case: Case, runs, found) -> dict:
     """Errors held out by slope before and after, over the noise's sd, and the bias of the base parameters."""
     from calibration.inference import blocks
     from calibration.inference.held_out import held_out
@@ -366,7 +226,7 @@ def after(case: g.Case, runs, found) -> dict:
     return {"held_out": [rms(x) for x in both], "bias": bias}
 
 
-def carried_out(case: g.Case, found, settings) -> list[dict]:
+def carried_out(case: Case, found, settings) -> list[dict]:
     """Experiments proposed and carried out one after the other, until one alternative or nothing to do is left."""
     import loop_experiments
 
@@ -393,11 +253,6 @@ def carried_out(case: g.Case, found, settings) -> list[dict]:
     return said
 
 
-def work(task: Task) -> dict:
-    """One case in a worker."""
-    return one(task)
-
-
 def program(task: Task) -> tuple | dict:
     """What tables have alike that share what is compiled; the line of a case that is none."""
     from calibration.discovery.discover import padded
@@ -406,7 +261,7 @@ def program(task: Task) -> tuple | dict:
     case = attempt(task.kind, task.seed, task.narrow, task.stratum)
     if isinstance(case, str):
         return {"skipped": case}
-    names = case.world.machine.names.values() if isinstance(case, gw.WideCase) else ()
+    names = () if case.world is None else case.world.machine.names.values()
     return len(padded(len(case.conditions.U), SettledRuns.sizes_padded)[0]), *names
 
 

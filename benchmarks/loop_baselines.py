@@ -9,17 +9,15 @@ Tables, priors and fits are the loop's; only the choice of effects is plain. PyS
 from __future__ import annotations
 
 import dataclasses
-import tempfile
 import time
 import warnings
-from pathlib import Path
 
 import loop
 import numpy as np
 import pysindy
-from campaign import Task, campaign, robot_of
-from loop import STATED, make, oracle
+from campaign import Task, begun, campaign
 from loop_scores import MIMIC, interval
+from worlds import tables
 
 KINDS = ("clean", "library", "outside", "pairs")
 #: Effects that are refitted beside a fit: the loop's own number.
@@ -195,21 +193,16 @@ def sindy_refit(space, linear, scores) -> list[str]:
 # --- the campaign ---------------------------------------------------------------------------------------
 
 
-def one(robot, kind: str, seed: int) -> dict:
-    """A case made, and what each method names."""
-    from calibration.data import runs as records
+def work(task: Task) -> dict:
+    """A case made, and what each method names, in a worker."""
     from calibration.discovery.candidates import fit_base
-    from calibration.discovery.discover import pose, prepared
+    from calibration.discovery.discover import pose
 
-    case = make(kind, seed)
-    if case is None:
-        return {"kind": kind, "seed": seed, "skipped": True}
-    with tempfile.TemporaryDirectory() as folder:
-        table = Path(folder) / "runs.csv"
-        case.write(table, Path(folder) / "label.json")
-        runs = records.read(table)
+    case = loop.attempt(task.kind, task.seed, narrow=True)
+    if isinstance(case, str):
+        return {"skipped": case}
     began = time.perf_counter()
-    given = prepared(runs, robot, stated=STATED, seed=seed)
+    given = begun(case, task, loop.STATED)
     runs, settings = given.runs, given.settings
     space = pose(runs, given.robot, given.noise.sd, settings, given.stated)
     fitted = fit_base(space, settings, runs.source)
@@ -221,11 +214,10 @@ def one(robot, kind: str, seed: int) -> dict:
     }  # fmt: skip
     truth = [
         {**{k: e[k] for k in ("name", "class", "balance", "sigmas", "sizes")}, **o}
-        for e, o in zip(case.label["effects"], oracle(case), strict=True)
+        for e, o in zip(case.label["effects"], tables.oracle(case), strict=True)
     ]
     return {
-        "kind": kind, "seed": seed, "seconds": time.perf_counter() - began, "truth": truth,
-        "fits": len(ladder.fitted), "named": named,
+        "seconds": time.perf_counter() - began, "truth": truth, "fits": len(ladder.fitted), "named": named,
     }  # fmt: skip
 
 
@@ -287,11 +279,6 @@ def summary(lines: list[dict]) -> list[str]:
     if spent:
         out.append(f"seconds a table, all methods: median {np.median(spent):.2f}, mean {np.mean(spent):.2f}")
     return out
-
-
-def work(task: Task) -> dict:
-    """One case in a worker."""
-    return one(robot_of(task.robot), task.kind, task.seed)
 
 
 def program(task: Task) -> tuple | dict:

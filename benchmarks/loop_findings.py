@@ -6,10 +6,48 @@ Numbers are raw, so that the constants of the tests can be chosen again from the
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+
+#: What a result may hold beside its verdict.
+FURTHER = ("families", "events", "events_alike", "noise_factor", "implausible", "hidden", "stands_for")
+
+
+def plain(x: Any) -> Any:
+    """Anything that a result holds, as JSON can."""
+    if dataclasses.is_dataclass(x) and not isinstance(x, type):
+        return {f.name: plain(getattr(x, f.name)) for f in dataclasses.fields(x)}
+    if isinstance(x, Mapping):
+        return {str(k): plain(v) for k, v in x.items()}
+    if isinstance(x, list | tuple | set | frozenset):
+        return [plain(v) for v in x]
+    if isinstance(x, np.ndarray) or hasattr(x, "__array__"):
+        return np.asarray(x).tolist()
+    return x if isinstance(x, str | int | float | bool | type(None)) else str(x)
+
+
+def verdict(found) -> dict:
+    """What a `LoopStages` says."""
+    base = found.screened.base.candidate
+    further = {name: plain(getattr(found, name)) for name in FURTHER if getattr(found, name, None) is not None}
+    return {
+        "verdict": found.verdict,
+        "classes": [list(members) for members in found.members],
+        "where": located(found),
+        "variables_alike": () if found.where is None else found.where.variables_alike,
+        "p_value": found.left.test.p_value,
+        "outliers": [int(k) for k in found.screened.outliers],
+        "chi2": [2 * base.cost, 2 * found.best.cost],
+        "readings": int(np.sum(found.screened.base.space.weight > 0)),
+        **further,
+    }
+
+
+def located(found) -> tuple | None:
+    """(balance, variable, balances that act alike) of what has no name, or remains."""
+    return None if found.where is None else (found.where.place, found.where.variable, list(found.where.alike))
 
 
 def findings(given: Any, found: Any) -> dict[str, Any]:

@@ -364,11 +364,16 @@ def outside(f: Figures, kind: str) -> None:
     )
     f.say(f"{kind}, with a mimic: a library name", mimics, lambda x: x["classes"])
     f.say("  unnamed in the right equation", mimics, placed)
-    for name in dict.fromkeys(sorted(x["truth"][0]["name"] for x in free)):
-        some = [x for x in free if x["truth"][0]["name"] == name]
-        wrong = Counter(str(x["classes"]) if x["classes"] else x["verdict"] for x in some if not placed(x))
-        if wrong:
-            f.note(f"    {name}: right {sum(map(placed, some))} of {len(some)}; {dict(wrong)}")
+    by_name(f, free, placed)
+
+
+def by_name(f: Figures, those: Sequence[dict], hit: Callable[[dict], object]) -> None:
+    """Of each effect that was not always right, how often it was, and what was said instead."""
+    for name in sorted({x["truth"][0]["name"] for x in those}):
+        some = [x for x in those if x["truth"][0]["name"] == name]
+        other = Counter(str(x["classes"]) if x["classes"] else x["verdict"] for x in some if not hit(x))
+        if other:
+            f.note(f"    {name}: right {len(some) - other.total()} of {len(some)}; {dict(other)}")
 
 
 def several(f: Figures) -> None:

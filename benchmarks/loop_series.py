@@ -2,31 +2,24 @@
 
     python benchmarks/loop_series.py --clean-wide 300 --library 80 --outside 40 --event 40 --pairs 20 --jobs 2
 
-Sets of starts from `tests/generator_series_wide.py`, which shares nothing with the simulator: any surface, several
+Sets of starts from `tests/worlds/histories.py`, which shares nothing with the simulator: any surface, several
 durations and samplings, poor instruments, other robots (foreign laws on the paper's alone). Labels are read by the
 scorer alone. Every set is one line of `--out`, and a run that is started again goes on where it ended. With
-`--narrow`, six starts of 1.5 s of the paper's robot on one surface that is stated, from `tests/generator_series.py`.
+`--narrow`, six starts of 1.5 s of the paper's robot on one surface that is stated.
 """
 
 from __future__ import annotations
 
-import csv
 import sys
-import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
-import generator as g
-import generator_series as gs
-import generator_series_wide as sw
-import loop_findings
 import loop_scores as scores
-from campaign import Task, campaign, robot_of
-from loop import SIZES, verdict
+from campaign import SIZES, Task, campaign, looped, refused
+from worlds import foreign, histories, settled
 
 KINDS = ("clean", "library", "outside", "pairs", "clean_wide", "noise", "blind", "triples", "event")
 #: Kinds that keep to the paper's robot on one stated surface.
@@ -48,14 +41,10 @@ STATED = {
     for c in ("6T2A", "4W2T")
     for name, prior in (("static", (0.6, 0.09)), ("dynamic", (0.48, 0.08)))
 }
-#: Of a label, what the scorer keeps of a case.
-KEPT = ("variety", "surface", "robot", "rows", "noise", "outliers", "missing", "grips")
 
 
-def attempt(
-    kind: str, seed: int, narrow: bool = False, only: str = ""
-) -> tuple[dict, dict, sw.SeriesCase | None] | str:
-    """Table, label and case of a kind and a seed, or why there is none.
+def attempt(kind: str, seed: int, narrow: bool = False, only: str = "") -> histories.SeriesCase | str:
+    """The case of a kind and a seed, or why there is none.
 
     Every constant that has a prior is off its nominal value, and refitted when an effect is sized, as in the loop.
     """
@@ -66,45 +55,31 @@ def attempt(
             "clean": [], "library": [LIBRARY[seed % len(LIBRARY)]], "outside": [OUTSIDE[seed % len(OUTSIDE)]],
             "pairs": [str(n) for n in rng.choice(LIBRARY[:5], 2, replace=False)],
         }[kind]  # fmt: skip
-        table, label = gs.case(names, float(rng.uniform(low, 15.0)), seed=seed, free=tuple(g.TOLERANCES))
-        return _refused(label, kind, low) or (table, label, None)
-    strata = tuple(sw.STRATA)
+        case = histories.narrow(names, float(rng.uniform(low, 15.0)), seed=seed, free=tuple(settled.TOLERANCES))
+        return refused(case.label, low) or case
+    strata = tuple(histories.STRATA)
     stratum, variety = strata[seed % len(strata)], seed // len(strata)
     if kind != "clean_wide":
         usual = [s for s in strata if s != "robots" or kind in ("library", "pairs", "triples", "noise")]
         share = np.array([SHARES[s] for s in usual])
         stratum = str(rng.choice(usual, p=share / share.sum()))
     stratum = only or stratum
-    w = sw.world(rng, stratum, variety, noise=(0.5, 2.0)[seed % 2] if kind == "noise" else 1.0)
-    pool = {
-        "library": lambda: w.pool, "outside": lambda: OUTSIDE, "blind": sw.foreign, "event": lambda: tuple(sw.EVENTS),
-    }  # fmt: skip
+    w = histories.world(rng, stratum, variety, noise=(0.5, 2.0)[seed % 2] if kind == "noise" else 1.0)
+    pool = {"library": w.pool, "outside": OUTSIDE, "blind": foreign.FOREIGN_SERIES, "event": histories.EVENTS}
     if kind in pool:
-        choices = pool[kind]()
+        choices = tuple(pool[kind])
         names = [choices[seed % len(choices)]]
     else:
         count = {"pairs": 2, "triples": 3}.get(kind, 0)
         strong = [n for n in w.pool if n not in WEAK]
         names = [str(n) for n in rng.choice(strong, count, replace=False)]
     wanted = [float(rng.uniform(low, 15.0)) for _ in names]
-    case = sw.case(w, names, wanted, seed=seed)
+    case = histories.case(w, names, wanted, seed=seed)
     most = max((e["sizes"] for e in case.label["effects"]), default=0.0)
     weaker = [max(0.95 * x * SIZES / most, 1.01 * low) if most else x for x in wanted]
     if kind not in ("event", "blind") and most >= SIZES and min(weaker) > 0.5 * min(wanted):
-        case = sw.case(w, names, weaker, seed=seed)  # as strong as may be believed
-    return _refused(case.label, kind, low) or (case.table, case.label, case)
-
-
-def _refused(label: dict, kind: str, low: float) -> str:
-    """Why a case is none; empty for one that is."""
-    effects = label["effects"]
-    if not label.get("sound", True):
-        return "too stiff for the generator's method"
-    if kind not in ("event", "blind") and any(e["sizes"] >= SIZES for e in effects):
-        return f"needs more than {SIZES:g} ordinary sizes"
-    if any(e["sigmas"] <= 0.9 * low for e in effects):
-        return f"leaves less than {low:g} sigma"
-    return ""
+        case = histories.case(w, names, weaker, seed=seed)  # as strong as may be believed
+    return refused(case.label, low, sizes=kind not in ("event", "blind")) or case
 
 
 def program(task: Task) -> tuple | dict:
@@ -114,66 +89,23 @@ def program(task: Task) -> tuple | dict:
     """
     if task.stratum == "plain":
         return ("plain",)
-    made = attempt(task.kind, task.seed, task.narrow, task.stratum)
-    if isinstance(made, str):
-        return {"skipped": made}
-    table, _, case = made
-    if case is None:
-        return ("narrow",)
-    return len(table["time_s"]), *case.world.machine.names.values(), case.world.design
+    case = attempt(task.kind, task.seed, task.narrow, task.stratum)
+    if isinstance(case, str):
+        return {"skipped": case}
+    return len(case.table["time_s"]), *case.world.machine.names.values(), case.world.design
 
 
 def work(task: Task) -> dict:
     """One case in a worker."""
-    from calibration.data import robot_file
-    from calibration.data import runs as records
-
-    made = attempt(task.kind, task.seed, task.narrow, task.stratum)
-    if isinstance(made, str):
-        return {"skipped": made}
-    table, label, case = made
-    robot = robot_of(task.robot)
-    with tempfile.TemporaryDirectory() as folder:
-        if case is not None and case.toml is not None:
-            (Path(folder) / "robot.toml").write_text(case.toml, encoding="utf-8")
-            robot = robot_file.read(Path(folder) / "robot.toml")
-        runs = records.read(written(table, Path(folder) / "runs.csv"), robot=robot)
-    line = judged(robot, runs, label, STATED if case is None else {}, task)
-    if task.kind in ("outside", "blind") and case is not None:
-        line["truth"] = [{**t, **o} for t, o in zip(line["truth"], sw.oracle(case), strict=True)]
-    return line
-
-
-def written(table: dict, path: Path) -> Path:
-    """A table as the file that a user has, missing readings as empty cells."""
-    cells = [
-        ["" if isinstance(x, float) and np.isnan(x) else x for x in np.asarray(c).tolist()] for c in table.values()
-    ]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        out = csv.writer(file)
-        out.writerow(table)
-        out.writerows(zip(*cells, strict=True))
-    return path
-
-
-def judged(robot, runs, label: dict, stated: dict, task: Task) -> dict:
-    """The loop over a case, verdict and label side by side."""
-    from calibration.discovery.discover import prepared
-
-    began = time.perf_counter()
-    given = prepared(runs, robot, stated=stated, replicates=task.replicates, seed=task.seed)
-    found, settings = given.trace(), given.settings
-    seconds = time.perf_counter() - began
-    facts = ("name", "class", "balance", "channel", "sigmas", "sizes", "amplitude", "where")
-    return {
-        "seconds": seconds,
-        **verdict(found),
-        **loop_findings.findings(given, found),
-        "stratum": label.get("stratum", "narrow"),
-        "made": {k: label[k] for k in KEPT if k in label},
-        "truth": [{**{k: e[k] for k in facts if k in e}, **_left(found, e, settings)} for e in label["effects"]],
-        **_amplitudes(found, settings),
-    }
+    case = attempt(task.kind, task.seed, task.narrow, task.stratum)
+    if isinstance(case, str):
+        return {"skipped": case}
+    wide = not case.world.stated
+    given, found, line = looped(case, task, {} if wide else STATED)
+    line["truth"] = [e | _left(found, e, given.settings) for e in line["truth"]]
+    if task.kind in ("outside", "blind") and wide:
+        line["truth"] = [{**t, **o} for t, o in zip(line["truth"], histories.oracle(case), strict=True)]
+    return line | _amplitudes(found, given.settings)
 
 
 def _left(found, effect: dict, settings) -> dict:

@@ -86,10 +86,10 @@ def scipy_hour(conditions: Conditions, k: int, cycles: int = 2) -> float:
     """Seconds that SciPy takes for an hour of one run, from a few cycles: plain rates with heat and with where the
     energy goes, which is what a mission gives. LSODA was the fastest of its stiff methods."""
     sys.path.append(str(Path(__file__).parent.parent / "tests"))
-    import reference
+    from worlds import paper
 
     c = jax.tree.map(lambda x: float(x[k]), conditions)
-    side = reference.Side(VOLTAGE, np.radians(c.slope_deg), c.payload, wheeled=c.configuration > 0.5)
+    side = paper.Side(VOLTAGE, np.radians(c.slope_deg), c.payload, wheeled=c.configuration > 0.5)
     cold, R_wh, R_ha = side.R, 1.7, 6.0
 
     def rates(t: float, y: np.ndarray) -> list[float]:
@@ -97,15 +97,15 @@ def scipy_hour(conditions: Conditions, k: int, cycles: int = 2) -> float:
         side.R = cold * (1 + 0.00393 * (T_w - 25))
         own = side.rates(t, y[:5])
         w_k = w / side.i
-        rolled, sign = side.r * w_k, reference.soft_sign(side.r * w_k, 0.1 * side.V_s)
-        traction = side.N * reference.friction(rolled - V, side.mu_s, side.mu_d, side.V_s, side.V_d)
+        rolled, sign = side.r * w_k, paper.soft_sign(side.r * w_k, 0.1 * side.V_s)
+        traction = side.N * paper.friction(rolled - V, side.mu_s, side.mu_d, side.V_s, side.V_d)
         motor = (side.M_df0 * sign + side.K_fd * w) * w
         track = (side.M_t0 * sign + side.K_ft * w_k + side.r * side.mu_t * side.share * side.N * sign) * w_k
         into = (side.C * current - side.J_d * own[1]) * w - motor
         out = side.J_w * w_k * own[1] / side.i + track + traction * rolled
         copper, flow = side.R * current**2, (T_w - T_h) / R_wh
         heat = [(copper - flow) * R_wh / 16.3, (flow - (T_h - 25) / R_ha) * R_ha / 593.0]
-        rolling = side.roll * reference.soft_sign(V, 0.1 * side.V_s) * V
+        rolling = side.roll * paper.soft_sign(V, 0.1 * side.V_s) * V
         ways = [copper, motor, into - out, track, traction * (rolled - V), rolling, side.pull * V]
         return [*own, *heat, side.U * current, *ways, current**2, (out / w_k) ** 2 if w_k else 0.0]
 

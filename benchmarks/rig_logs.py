@@ -3,7 +3,7 @@ and errors held out against least squares of one's own.
 
     python benchmarks/rig_logs.py --clean 80 --library 80 --outside 40 --jobs 16 --cache runs/cache --limit 3000
 
-Logs come from `tests/generator_rig_logs.py`, which shares nothing with the simulator: four runs of 200 rows, 50 to
+Logs come from `tests/worlds/logs.py`, which shares nothing with the simulator: four runs of 200 rows, 50 to
 200 Hz, of one drive and a load on a shaft; voltage, current or speed imposed by turns; some read late, which no file
 states. What the loop gets is `rig.toml` and `table.csv`; labels are read by the scorer alone. Every log is one line
 of `--out` as it ends, and a campaign that is started again goes on where it ended. With `--brief` nothing is
@@ -13,26 +13,22 @@ held out.
 from __future__ import annotations
 
 import functools
-import resource
 import sys
 import tempfile
 import time
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
-import generator_rig_logs as gl
-import loop_findings
 import loop_scores as scores
-from campaign import Task, campaign, rig_input
-from loop import verdict
+from campaign import Task, campaign, looped, refused
+from worlds import laws, logs
 
 KINDS = ("clean", "library", "outside")
-#: Sigmas of each effect, least and most; amplitudes of more than so many ordinary sizes are left out.
-SIGMAS, SIZES = {"library": (5.0, 15.0), "outside": (8.0, 15.0)}, 3.0
+#: Sigmas of each effect, least and most.
+SIGMAS = {"library": (5.0, 15.0), "outside": (8.0, 15.0)}
 #: Rigs that are drawn until one can have an effect of the wanted strength.
 TRIES = 6
 #: Of the error of one's own least squares, by how much the loop's may be larger.
@@ -41,28 +37,24 @@ TENTH = 0.1
 
 def inputs(seed: int) -> tuple[str, float]:
     """What is imposed and how often it is sampled [s], by turns; with each effect each step comes up."""
-    turn = seed // len(gl.IMPOSED)
-    return gl.IMPOSED[seed % len(gl.IMPOSED)], gl.EVERY[(turn + turn // 9) % len(gl.EVERY)]
+    turn = seed // len(logs.IMPOSED)
+    return logs.IMPOSED[seed % len(logs.IMPOSED)], logs.EVERY[(turn + turn // 9) % len(logs.EVERY)]
 
 
 @functools.lru_cache(maxsize=2)
-def attempt(kind: str, seed: int) -> gl.Case | str:
+def attempt(kind: str, seed: int) -> logs.Case | str:
     """The case of a kind and a seed, or why there is none."""
     rng = np.random.default_rng([41, KINDS.index(kind), seed])
     imposed, every = inputs(seed)
     if kind == "clean":
-        return gl.case(gl.rig(rng, imposed, every), "", 0.0, seed)
-    pool = [n for n, x in (gl.LIBRARY if kind == "library" else gl.OUTSIDE).items() if imposed in x.imposed]
-    name, why = pool[(seed // len(gl.IMPOSED)) % len(pool)], "no rig can have it"
+        return logs.case(logs.rig(rng, imposed, every), "", 0.0, seed)
+    pool = [n for n, x in (laws.LOGS if kind == "library" else laws.OUTSIDE_LOGS).items() if x.needs(imposed)]
+    name, why = pool[(seed // len(logs.IMPOSED)) % len(pool)], ""
     for _ in range(TRIES):
-        case = gl.case(gl.rig(rng, imposed, every), name, float(rng.uniform(*SIGMAS[kind])), seed)
-        effect = case.label["effects"][0]
-        if case.label["finite"] and effect["sizes"] < SIZES and effect["sigmas"] > 0.9 * SIGMAS[kind][0]:
+        case = logs.case(logs.rig(rng, imposed, every), name, float(rng.uniform(*SIGMAS[kind])), seed)
+        if not (why := refused(case.label, SIGMAS[kind][0])):
             return case
-        why = (
-            f"{name} needs more than {SIZES:g} ordinary sizes" if case.label["finite"] else f"{name} is not followed"
-        )
-    return why
+    return f"{name} {why}"
 
 
 def work(task: Task) -> dict:
@@ -70,32 +62,22 @@ def work(task: Task) -> dict:
     case = attempt(task.kind, task.seed)
     if isinstance(case, str):
         return {"skipped": case}
-    began = time.perf_counter()
-    with tempfile.TemporaryDirectory() as folder:
-        given = rig_input(case, Path(folder), task)
-        found = given.trace()
-        line = {**verdict(found), **loop_findings.findings(given, found), "seconds": time.perf_counter() - began}
-        if not task.brief:
-            from calibration.data import robot_file
-            from calibration.discovery.discover import assemble_result
+    given, found, line = looped(case, task)
+    if not task.brief:
+        from calibration.data import robot_file
+        from calibration.discovery.discover import assemble_result
 
-            whole = assemble_result(
-                found, given.runs, given.numbers, given.settings, given.library, lambda note: None
-            )
-            line |= held_out(whole, case) | {"seconds_whole": time.perf_counter() - began}
+        began = time.perf_counter()
+        whole = assemble_result(found, given.runs, given.numbers, given.settings, given.library, lambda note: None)
+        line |= held_out(whole, case) | {"seconds_whole": line["seconds"] + time.perf_counter() - began}
+        with tempfile.TemporaryDirectory() as folder:
             robot_file.write(whole.robot, Path(folder) / "robot.toml")
             again = robot_file.read(Path(folder) / "robot.toml")
-            line["read_again"] = [e.name for e in again.effects] == [e.name for e in whole.robot.effects]
-    kept = ("imposed", "every", "delay")
-    return {
-        **line,
-        "memory": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
-        "made": {k: case.label[k] for k in kept},
-        "truth": case.label["effects"],
-    }
+        line["read_again"] = [e.name for e in again.effects] == [e.name for e in whole.robot.effects]
+    return line
 
 
-def held_out(whole, case: gl.Case) -> dict:
+def held_out(whole, case: logs.Case) -> dict:
     """Errors of runs held out [sds, rms]: of the refit, of what is proposed, of least squares of one's own without
     and with the true term; and the gain of what is proposed over the refit."""
     seen = whole.readings_of_rows
@@ -103,7 +85,7 @@ def held_out(whole, case: gl.Case) -> dict:
     if "run" in seen.held_out:
         errors = [(x - seen.measured) / seen.sd for x in seen.held_out["run"]]
         off = [float(np.sqrt(np.nanmean(e**2))) for e in errors]
-    without, with_term = gl.least_squares(case)
+    without, with_term = logs.least_squares(case)
     delay = whole.base_shift.get("rig.delay")
     return {
         "held_out": {"refit": off[0], "found": off[1], "own": without, "own_with_term": with_term},
@@ -126,16 +108,12 @@ def summary(lines: list[dict]) -> list[str]:
     f.say("clean: a false finding (goal <= 5 %)", clean, scores.false_finding)
     f.say("  with a name", clean, lambda x: x["classes"])
     f.say("library, >= 5 sigma left: class right (goal >= 90 %)", library, scores.contains)
-    for name in gl.LIBRARY:
-        some = [x for x in library if x["truth"][0]["name"] == name]
-        wrong = Counter(str(x["classes"]) if x["classes"] else x["verdict"] for x in some if not scores.contains(x))
-        if wrong:
-            f.note(f"    {name}: right {len(some) - wrong.total()} of {len(some)}; {dict(wrong)}")
+    scores.by_name(f, library, scores.contains)
     f.say("outside: a wrong established name (goal <= 3 %)", outside, lambda x: x["classes"])
     f.say("  unnamed in the right equation", outside, scores.placed)
     f.say("  nothing found", outside, lambda x: x["verdict"] == "none")
     every = f.of(*KINDS)
-    for imposed in gl.IMPOSED:
+    for imposed in logs.IMPOSED:
         some = [x for x in every if x["made"]["imposed"] == imposed]
         f.say(f"  {imposed}: clean without a finding, library right, outside without a name", some, right)
     f.say("robots read again (goal 100 %)", [x for x in every if "read_again" in x], lambda x: x["read_again"])

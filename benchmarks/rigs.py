@@ -2,7 +2,7 @@
 
     python benchmarks/rigs.py --clean 500 --library 400 --outside 200 --jobs 16 --cache runs/cache
 
-Rigs come from `tests/generator_rigs.py`, which shares nothing with the simulator: one drive to six on wheels, tracks,
+Rigs come from `tests/worlds/rigs.py`, which shares nothing with the simulator: one drive to six on wheels, tracks,
 a bench, a winch or a linear unit; voltage, duty or motor speed imposed; one to three channels. What the loop gets is
 `rig.toml` and `table.csv`; labels are read by the scorer alone. Every rig is one line of `--out`, and a campaign that
 is started again goes on where it ended.
@@ -11,10 +11,7 @@ is started again goes on where it ended.
 from __future__ import annotations
 
 import functools
-import resource
 import sys
-import tempfile
-import time
 from collections import Counter
 from pathlib import Path
 
@@ -22,25 +19,19 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
-import generator_rigs as gr
-import generator_rigs_laws as laws
-import loop_findings
 import loop_scores as scores
-from campaign import Task, campaign, rig_input
-from loop import verdict
+from campaign import Task, campaign, looped, refused
+from worlds import laws
+from worlds import rigs as gr
 
 KINDS = ("clean", "library", "outside")
 #: Sigmas of each effect, least and most.
 SIGMAS = {"library": (5.0, 15.0), "outside": (8.0, 15.0)}
-#: Amplitudes of more than so many ordinary sizes are left out, see `benchmarks/loop.py`.
-SIZES = 3.0
 #: Rigs that are drawn until one can have an effect of the wanted strength: first of one effect, then of any.
 TRIES = (15, 30)
 #: Posterior sd over the prior's above which a parameter has to be reported as held by its prior. The generator's own
 #: figure is linear at the truth and of the file's tolerances alone, so more of it is asked for.
 HELD, SURE = 0.9, 0.97
-#: Resident memory of a worker beyond which its compiled programs are dropped [bytes].
-MEMORY = 5e9
 #: So many rigs one after the other have their equations, channels, directions and about their number of rows in
 #: common, so that their loops are the same programs: compiling takes a minute and judging a second.
 ALIKE = 10
@@ -68,9 +59,9 @@ def attempt(kind: str, seed: int) -> gr.Case | str:
     rng = np.random.default_rng([31, KINDS.index(kind), seed])
     if kind == "clean":
         return gr.case(gr.world(rng, like=like, rows=rows), seed=seed)
-    pool = laws.LIBRARY if kind == "library" else laws.OUTSIDE
+    pool = laws.RIGS if kind == "library" else laws.OUTSIDE_RIGS
     wanted = tuple(pool)[seed % len(pool)]
-    refused: Counter[str] = Counter()
+    whys: Counter[str] = Counter()
     for k in range(sum(TRIES)):
         world = gr.world(rng, like=like, rows=rows)
         able = world.applicable(pool)
@@ -79,23 +70,11 @@ def attempt(kind: str, seed: int) -> gr.Case | str:
         if wanted not in able:
             continue
         case = gr.case(world, wanted, float(rng.uniform(*SIGMAS[kind])), seed)
-        if not (why := _refused(case, SIGMAS[kind][0])):
-            case.label["refused"] = dict(refused)
+        if not (why := refused(case.label, SIGMAS[kind][0])):
+            case.label["refused"] = dict(whys)
             return case
-        refused[f"{wanted} {why}"] += 1
-    return max(refused, key=refused.__getitem__, default="no rig can have it")
-
-
-def _refused(case: gr.Case, low: float) -> str:
-    """Why a case is none; empty for one that is."""
-    effect = case.label["effects"][0]
-    if case.label["rows_lost"]:
-        return "makes rows slide or stand still"
-    if effect["sizes"] >= SIZES:
-        return f"needs more than {SIZES:g} ordinary sizes"
-    if not effect["sigmas"] > 0.9 * low:
-        return f"leaves less than {low:g} sigma"
-    return ""
+        whys[f"{wanted} {why}"] += 1
+    return max(whys, key=whys.__getitem__, default="no rig can have it")
 
 
 # --- verdicts -----------------------------------------------------------------------------------------
@@ -106,23 +85,8 @@ def work(task: Task) -> dict:
     case = attempt(task.kind, task.seed)
     if isinstance(case, str):
         return {"skipped": case}
-    began = time.perf_counter()
-    with tempfile.TemporaryDirectory() as folder:
-        given = rig_input(case, Path(folder), task)
-        found = given.trace()
-        said = {**verdict(found), **loop_findings.findings(given, found)}
-        parameters = identified(found, case)
-    line = {
-        "seconds": time.perf_counter() - began,
-        "memory": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
-        "stratum": case.label["load"],
-        "made": {k: v for k, v in case.label.items() if k not in ("effects", "z", "constants", "sd_over_prior")},
-        "truth": case.label["effects"],
-        "parameters": parameters,
-        **said,
-    }
-    _make_room()
-    return line
+    _, found, line = looped(case, task)
+    return line | {"parameters": identified(found, case)}
 
 
 def identified(found, case: gr.Case) -> dict[str, dict]:
@@ -137,15 +101,6 @@ def identified(found, case: gr.Case) -> dict[str, dict]:
         name: {"ratio": float(best.sd[k]), "held": shift.held_by_prior, "own": own.get(name)}
         for k, (name, shift) in enumerate(shifts.items())
     }
-
-
-def _make_room() -> None:
-    pages = Path("/proc/self/statm")
-    if pages.exists() and int(pages.read_text().split()[1]) * resource.getpagesize() > MEMORY:
-        import gc
-
-        sys.modules["jax"].clear_caches()
-        gc.collect()
 
 
 def program(task: Task) -> tuple[str, int]:
@@ -206,11 +161,7 @@ def _library(f: scores.Figures) -> None:
         alone,
         lambda x: scores.contains(x) and scores.single(x),
     )
-    for name in sorted({x["truth"][0]["name"] for x in strong}):
-        some = [x for x in strong if x["truth"][0]["name"] == name]
-        wrong = Counter(str(x["classes"]) if x["classes"] else x["verdict"] for x in some if not scores.contains(x))
-        if wrong:
-            f.note(f"    {name}: right {len(some) - wrong.total()} of {len(some)}; {dict(wrong)}")
+    scores.by_name(f, strong, scores.contains)
 
 
 def _outside(f: scores.Figures) -> None:

@@ -4,7 +4,7 @@
     python benchmarks/sensitivity.py speed          # model evaluations of a study: SciPy loop, NumPy, ours
     python benchmarks/sensitivity.py table8         # derivative-based indices of the whole of Table 8
 
-The SciPy implementation is `tests/reference.py`, a loop of `scipy.optimize.root` over points; the NumPy one is the
+The SciPy implementation is `tests/worlds/paper.py`, a loop of `scipy.optimize.root` over points; the NumPy one is the
 closed form of the same balances without effects, vectorised. `--json FILE` keeps every number.
 """
 
@@ -25,8 +25,8 @@ os.environ.setdefault("JAX_ENABLE_X64", "true")
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
-import reference  # noqa: E402
 from measure import machine  # noqa: E402
+from worlds import paper  # noqa: E402
 
 from calibration.sensitivity import inputs as room  # noqa: E402
 from calibration.sensitivity import sobol  # noqa: E402
@@ -77,20 +77,20 @@ def by_scipy(values: np.ndarray) -> np.ndarray:
     """Current of both motors, motor speed and speed [SI] at rows of parameters, a root at a time."""
     found = np.empty((len(values), 3))
     for k, row in enumerate(values):
-        p = {**reference.NOMINAL, **ADHESION, **dict(zip(NAMES, row, strict=True))}
-        current, motor, speed = reference.Side(VOLTAGE, math.radians(SLOPE), PAYLOAD, p=p).steady(tolerance=None)
+        p = {**paper.NOMINAL, **ADHESION, **dict(zip(NAMES, row, strict=True))}
+        current, motor, speed = paper.Side(VOLTAGE, math.radians(SLOPE), PAYLOAD, p=p).steady(tolerance=None)
         found[k] = 2 * current, motor, speed
     return found
 
 
 def by_numpy(values: np.ndarray) -> np.ndarray:
     """The same by the closed form, vectorised over rows: two linear balances, then the creep."""
-    p: dict[str, Any] = {**reference.NOMINAL, **ADHESION}
+    p: dict[str, Any] = {**paper.NOMINAL, **ADHESION}
     p |= {name: values[:, k] for k, name in enumerate(NAMES)}
     c, alpha = "6T2A.", math.radians(SLOPE)
     mass = (p[c + "mass"] + PAYLOAD) / 2
-    normal = mass * reference.G * math.cos(alpha)
-    demand = p[c + "ground.rolling_resistance"] * normal + mass * reference.G * math.sin(alpha)
+    normal = mass * paper.G * math.cos(alpha)
+    demand = p[c + "ground.rolling_resistance"] * normal + mass * paper.G * math.sin(alpha)
     ratio, radius, constant = p["gearbox.ratio"], p[c + "radius"], p["motor.torque_constant"]
     drive = ratio * p["gearbox.efficiency_load"]
     dry = p["motor.friction_coulomb"] + p["gearbox.friction_coulomb"]

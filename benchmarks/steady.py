@@ -53,7 +53,7 @@ def main() -> None:
     print(f"limit: {record['limit']}")
 
     if not arguments.no_baseline:
-        import reference
+        from worlds import paper
 
         count = arguments.baseline_points
         answer = steady_batch(robot, batch(count))
@@ -64,9 +64,9 @@ def main() -> None:
         for _ in range(2):
             start = time.perf_counter()
             # SciPy's own default tolerance, 1.5e-8: looser than ours
-            loop = [reference.Side(*row).steady(tolerance=None) for row in rows]
+            loop = [paper.Side(*row).steady(tolerance=None) for row in rows]
             best = min(best, time.perf_counter() - start)
-        tight = np.array([reference.Side(*row).steady(tolerance=1e-13) for row in rows])
+        tight = np.array([paper.Side(*row).steady(tolerance=1e-13) for row in rows])
         top = max((r for r in record["batches"] if "per_s" in r), key=lambda r: r["per_s"])
         record["baseline"] = {
             "points": count,

@@ -188,7 +188,7 @@ def drive_table8(robot, table8, times_fine):
 
 
 #: One effect of each balance (of `inductance` none: it would be motor.inductance again), one with a memory;
-#: tests/test_effects.py and tests/test_generator_series.py try every one, each by itself.
+#: tests/test_effects.py and tests/test_worlds_histories.py try every one, each by itself.
 REPRESENTATIVE = (
     "mass_offset",
     "rotating_inertia",

@@ -6,9 +6,9 @@ import dataclasses
 import functools
 from collections.abc import Mapping
 from types import SimpleNamespace
+from typing import Any
 
-import generator as g
-import numpy as np
+from worlds import settled
 
 from calibration.data.runs import Runs
 from calibration.data.runs import read as read_runs
@@ -31,9 +31,9 @@ from mmrjax.effects import BY_NAME, Effect
 STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("6T2A", "4W2T")}
 
 
-def table(made: g.Case | Mapping[str, np.ndarray]) -> Runs:
-    """The runs of a case, without its label."""
-    return Runs("synthetic", dict(made.table if isinstance(made, g.Case) else made))
+def table(made: Any) -> Runs:
+    """The runs of a case without its label, or of columns."""
+    return Runs("synthetic", dict(getattr(made, "table", made)))
 
 
 def known(runs: Runs) -> Noise:
@@ -90,9 +90,9 @@ FEWEST = (
 FEW = Analyst(settings_for(SettledRuns, 250), {name: BY_NAME[name] for name in FEWEST})
 
 
-def small(p: Mapping[str, float] = g.CLIMBING) -> g.Conditions:
+def small(p: Mapping[str, float] = settled.CLIMBING) -> settled.Conditions:
     """24 runs: two slopes, two payloads, three voltages, both configurations."""
-    return g.table8(p, payloads=(0.0, 8.0), slopes=(0.0, 10.0))
+    return settled.table8(p, payloads=(0.0, 8.0), slopes=(0.0, 10.0))
 
 
 @functools.cache

@@ -2,12 +2,12 @@
 
 import csv
 
-import generator as g
-import generator_series as gs
 import numpy as np
 import pytest
+import worlds.histories
 from synthetic import SETTLED, known, table
 from test_loop_command import mmrjax
+from worlds import settled, tables
 
 from calibration.data.runs import Runs
 from calibration.inference import checks
@@ -16,15 +16,15 @@ from calibration.inference.conduct import conduct
 from calibration.inference.notes import EndsEarly, Fact, NeverGrips, NoiseOff, Shown
 from mmrjax import params, robots
 
-CLIMBING = params.replace(robots.nominal(), g.CLIMBING)
+CLIMBING = params.replace(robots.nominal(), settled.CLIMBING)
 
 
-def started(p=g.CLIMBING, duration=0.8, every=0.02):
+def started(p=settled.CLIMBING, duration=0.8, every=0.02):
     """Six starts without effects, as the generator follows them, and a little noise."""
-    c = gs.starts(p)
-    times, y = gs.histories(c, duration, every, p, [], np.zeros(len(c.U)))
-    instruments = g.Instruments(sd=(0.05, 15.0, 5.0))
-    shown = y * g._SHOWN[:, :, None]
+    c = worlds.histories.starts(p)
+    times, y = worlds.histories.histories(c, duration, every, p)
+    instruments = settled.Instruments(sd=(0.05, 15.0, 5.0))
+    shown = y * settled.SHOWN[:, :, None]
     shown = shown + np.random.default_rng(0).standard_normal(y.shape) * np.array(instruments.sd)[:, None, None]
     columns = {
         "run_id": np.array([f"start{k}" for k in range(len(c.U))]), "configuration": np.where(c.wheeled > 0.5, "4W2T", "6T2A"),
@@ -56,7 +56,7 @@ def sliding():
     slippery = {
         f"{c}.ground.friction.{k}": 0.08 * f for c in ("6T2A", "4W2T") for k, f in (("static", 1.0), ("dynamic", 0.8))
     }
-    return started(g.CLIMBING | slippery)
+    return started(settled.CLIMBING | slippery)
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def written(path, runs):
 
 def test_histories_that_grip_have_nothing_said(histories):
     assert conduct(histories, CLIMBING) == []
-    assert conduct(table(g.case(seed=3)), CLIMBING) == []
+    assert conduct(table(tables.narrow(seed=3)), CLIMBING) == []
 
 
 def test_histories_that_never_grip_are_said(sliding, histories):
@@ -121,7 +121,7 @@ def made(case, histories):
         columns["configuration"][np.flatnonzero(columns["run_id"] == "start0")[20:]] = "4W2T"
         return Runs("runs.csv", columns)
     if case == "every reading equal":
-        columns = dict(g.case(seed=3).table)
+        columns = dict(tables.narrow(seed=3).table)
     for name, value in {"total_current_A": 2.5, "motor_speed_rpm": 5000.0, "speed_mm_s": 400.0}.items():
         columns[name] = np.full(len(columns["configuration"]), value)
     return Runs("runs.csv", columns)
@@ -150,7 +150,7 @@ def tenth(case):
 
 @pytest.mark.slow
 def test_calibrate_says_that_sds_are_ten_times_too_small():
-    runs = tenth(g.case(seed=3, free=g.FRICTION))
+    runs = tenth(tables.narrow(seed=3, free=settled.FRICTION))
     found = calibrate(runs, CLIMBING, starts=2, profiles=False, blocks=())
     (off,) = [n for n in found.remarks if isinstance(n, NoiseOff)]
     assert 9.0 < off.factor < 11.0 and off.channel == "" and off.source == "stated"
@@ -159,7 +159,7 @@ def test_calibrate_says_that_sds_are_ten_times_too_small():
 
 @pytest.mark.slow
 def test_loop_says_that_sds_are_ten_times_too_small():
-    found = SETTLED.discover(tenth(g.case(seed=3)))
+    found = SETTLED.discover(tenth(tables.narrow(seed=3)))
     off = found.remarks[0]
     assert off == NoiseOff("", off.factor, "stated") and 9.0 < off.factor < 11.0
-    assert not any(isinstance(n, NoiseOff) for n in SETTLED.discover(table(g.case(seed=3))).remarks)
+    assert not any(isinstance(n, NoiseOff) for n in SETTLED.discover(table(tables.narrow(seed=3))).remarks)

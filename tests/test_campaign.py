@@ -2,17 +2,15 @@
 
 import json
 import os
-import sys
 from types import SimpleNamespace
 
 import campaign
-import generator as g
-import generator_wide as gw
 import loop
 import loop_findings
 import loop_scores as scores
 import numpy as np
 import pytest
+from worlds import foreign, laws, tables
 
 
 def line(verdict="none", classes=(), where=None, truth=(), **more):
@@ -91,8 +89,8 @@ def test_a_line_that_was_cut_off_is_done_again(tmp_path):
 
 
 def test_what_a_result_holds_is_written_as_json():
-    held = {"a": np.float64(1.0), "b": (np.arange(2), SimpleNamespace(x=1)), "c": gw.PAPER.instruments}
-    assert json.loads(json.dumps(campaign.plain(held)))["b"][0] == [0, 1]
+    held = {"a": np.float64(1.0), "b": (np.arange(2), SimpleNamespace(x=1)), "c": tables.PAPER.instruments}
+    assert json.loads(json.dumps(loop_findings.plain(held)))["b"][0] == [0, 1]
 
 
 @pytest.mark.parametrize("kind", [k for k in loop.KINDS if k != "blind"])
@@ -110,11 +108,12 @@ def test_cases_of_every_kind(kind):
 
 
 def test_blind_cases_come_from_the_foreign_laws(monkeypatch):
-    law = g.Form("", "electrical", lambda s, q: s.I * np.sin(s.w / q["at"]), 0.2, {"at": (100.0, 200.0)})
-    monkeypatch.setitem(sys.modules, "foreign_laws", SimpleNamespace(FOREIGN={"odd": law}))
+    law = laws.Law("", "electrical", lambda s, q: s.I * np.sin(s.w / q["at"]), 0.2, {"at": (100.0, 200.0)})
+    monkeypatch.setattr(foreign, "FOREIGN", {"odd": law})
+    monkeypatch.setitem(tables.EVERY, "odd", law)
     made = next(m for m in (loop.attempt("blind", s) for s in range(8)) if not isinstance(m, str))
     assert made.label["kind"] == "foreign" and made.label["effects"][0]["name"] == "odd"
-    assert loop.oracle(made)[0]["best_other"] > 1.0
+    assert tables.oracle(made)[0]["best_other"] > 1.0
 
 
 def test_workers_keep_to_the_programs_that_they_have_compiled():

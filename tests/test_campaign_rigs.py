@@ -1,5 +1,6 @@
 """The campaign on rigs: cases of every kind, and what its summary says of lines."""
 
+import campaign
 import pytest
 import rigs
 
@@ -16,7 +17,7 @@ def test_cases_are_of_their_kind_and_strong_enough(kind):
         assert case.label["kind"] == kind and case.label["rows_lost"] == 0
         assert case.toml == rigs.attempt(kind, seed).toml
         for effect in case.label["effects"]:
-            assert effect["sizes"] < rigs.SIZES
+            assert effect["sizes"] < campaign.SIZES
             assert effect["sigmas"] > 0.9 * rigs.SIGMAS[kind][0]
             assert (effect["class"] == "") == (kind == "outside")
 

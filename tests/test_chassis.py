@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-import reference
+from worlds import paper
 
 from mmrjax import balances, chassis, params
 from mmrjax.conditions import Conditions
@@ -15,15 +15,15 @@ def test_chassis_inertias_match_reference():
     for _ in range(100):
         m, r, J_d, i, eta, J_w = RNG.uniform((2, 0.02, 0, 5, 0.3, 0), (20, 0.2, 1e-5, 100, 1, 1e-2))
         rotating = chassis.inertia_reduced(J_d, i, eta, J_w)
-        np.testing.assert_allclose(rotating, reference.rotating_inertia(J_d, i, eta, J_w), rtol=1e-9)
-        equivalent = reference.equivalent_inertia(m, r, J_d, i, eta, J_w)
+        np.testing.assert_allclose(rotating, paper.rotating_inertia(J_d, i, eta, J_w), rtol=1e-9)
+        equivalent = paper.equivalent_inertia(m, r, J_d, i, eta, J_w)
         np.testing.assert_allclose(chassis.inertia_equivalent(m, r, rotating), equivalent, rtol=1e-9)
 
 
 def test_normal_load_matches_reference():
     for mass, alpha in RNG.uniform((5, -0.7), (40, 0.7), (50, 2)):
-        expected = reference.rolling_force(mass / 2, alpha, 1.0)
-        np.testing.assert_allclose(chassis.normal_load(mass, alpha, reference.G, 2), expected, rtol=1e-9)
+        expected = paper.rolling_force(mass / 2, alpha, 1.0)
+        np.testing.assert_allclose(chassis.normal_load(mass, alpha, paper.G, 2), expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("wheeled", [0.0, 1.0])
@@ -45,7 +45,7 @@ def test_mass_factor_is_that_of_acceleration_without_sliding(robot, wheeled):
     drive = (s.torque_motor - s.torque_idle) * robot.gearbox.ratio * eta / body.radius
     free = drive - s.torque_track_loss / body.radius - s.demand
     rotating = chassis.inertia_reduced(robot.motor.inertia, robot.gearbox.ratio, eta, body.inertia)
-    delta = reference.mass_factor(m, body.radius, chassis.inertia_equivalent(m, body.radius, rotating))
+    delta = paper.mass_factor(m, body.radius, chassis.inertia_equivalent(m, body.radius, rotating))
     assert float(delta) > 1.3  # 48 : 1 makes the rotor count
     np.testing.assert_allclose(s.acceleration, free / (m * delta), rtol=1e-9)
 

@@ -2,11 +2,11 @@
 
 import dataclasses
 
-import generator_rigs as gr
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from worlds import rigs
 
 from calibration.data import robot_file
 from calibration.data import runs as records
@@ -24,7 +24,7 @@ from mmrjax.rig import Instrument, Rig
 
 def space_of(world, folder):
     """The space of candidates of a clean case, as the loop makes it."""
-    gr.case(world).write(folder)
+    rigs.case(world).write(folder)
     robot = robot_file.read(folder / "rig.toml")
     runs = records.read(folder / "table.csv", robot=robot)
     observer = observers.kind(runs)
@@ -37,8 +37,8 @@ def space_of(world, folder):
 @pytest.mark.parametrize("kind", ["wheeled", "bench", "linear"])
 def test_two_rigs_of_one_structure_share_their_programs(tmp_path, kind):
     rng = np.random.default_rng([5, len(kind)])
-    one = gr.world(rng, kind, rows=(33, 48))
-    other = gr.world(rng, like=one.rig, rows=(33, 48))
+    one = rigs.world(rng, kind, rows=(33, 48))
+    other = rigs.world(rng, like=one.rig, rows=(33, 48))
     spaces = [space_of(w, tmp_path / str(k)) for k, w in enumerate((one, other))]
     assert spaces[0].bare.base.rig != spaces[1].bare.base.rig  # priors, at least
     seen = [for_equations((s.equipped, s.bare, s.library.scored)) for s in spaces]

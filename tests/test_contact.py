@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import reference
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from worlds import paper
 
 from mmrjax import contact
 from mmrjax.contact import Friction
@@ -20,7 +20,7 @@ quick = settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.floats(-1, 1), st.floats(0.05, 1.5), st.floats(0.3, 1.0), st.floats(1e-3, 0.1), st.floats(1.5, 20))
 def test_friction_coefficient_matches_reference(speed, mu_s, ratio, V_s, spread):
     law = Friction(static=mu_s, dynamic=ratio * mu_s, speed_static=V_s, speed_dynamic=spread * V_s)
-    expected = reference.friction(speed, mu_s, ratio * mu_s, V_s, spread * V_s)
+    expected = paper.friction(speed, mu_s, ratio * mu_s, V_s, spread * V_s)
     np.testing.assert_allclose(law.coefficient(speed), expected, rtol=1e-9, atol=1e-15)
 
 
@@ -28,7 +28,7 @@ def test_friction_coefficient_matches_reference(speed, mu_s, ratio, V_s, spread)
 @given(st.floats(-0.999, 0.999), st.floats(0.05, 1.5), st.floats(1e-3, 0.1))
 def test_friction_speed_creep_matches_reference(share, mu_s, V_s):
     law = Friction(static=mu_s, dynamic=0.8 * mu_s, speed_static=V_s, speed_dynamic=10 * V_s)
-    expected = reference.friction_speed(share * mu_s, mu_s, V_s)
+    expected = paper.friction_speed(share * mu_s, mu_s, V_s)
     np.testing.assert_allclose(law.speed_creep(share * mu_s), expected, rtol=1e-9, atol=1e-300)
 
 
@@ -64,13 +64,13 @@ def test_friction_speed_creep_beyond_adhesion_is_flat_and_finite():
 @quick
 @given(st.floats(-2, 3), st.floats(-1, 0), st.floats(0.1, 2), st.floats(-5, 5), st.floats(-5, 5))
 def test_step_matches_reference(x, x0, width, y0, y1):
-    expected = reference.cubic_step(x, x0, y0, x0 + width, y1)
+    expected = paper.cubic_step(x, x0, y0, x0 + width, y1)
     np.testing.assert_allclose(contact.step(x, x0, y0, x0 + width, y1), expected, rtol=1e-9, atol=1e-9)
 
 
 def test_direction_is_smooth_sign():
     speeds = np.array([-5.0, -0.002, -0.001, 0.0, 0.0005, 0.002, 7.0])
-    expected = [reference.soft_sign(v, 0.002) for v in speeds]
+    expected = [paper.soft_sign(v, 0.002) for v in speeds]
     np.testing.assert_allclose(contact.direction(speeds, 0.002), expected, rtol=1e-12)
     assert np.isfinite(jax.vmap(jax.grad(lambda v: contact.direction(v, 0.002)))(jnp.asarray(speeds))).all()
 
@@ -81,7 +81,7 @@ def test_force_contact_matches_reference(exponent):
         q, rate, r1, r2 = RNG.uniform((0.0, -1, 0.001, 0.001), (0.02, 1, 0.01, 0.01))
         c, b, d = RNG.uniform((1e3, 0, 1e-4), (1e5, 100, 2e-3))
         got = contact.force_contact(q, rate, r1 + r2, c, exponent, b, d)
-        expected = reference.contact_force(q, rate, r1, r2, c, exponent, b, d)
+        expected = paper.contact_force(q, rate, r1, r2, c, exponent, b, d)
         np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-9)
 
 

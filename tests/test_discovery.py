@@ -6,13 +6,13 @@ import dataclasses
 from types import SimpleNamespace
 
 import equinox as eqx
-import generator as g
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
 from synthetic import FEW, SETTLED, known, parts, small, table
+from worlds import settled, tables
 
 from calibration.data.runs import Runs
 from calibration.data.runs import read as read_runs
@@ -35,20 +35,20 @@ def looks(request):
     """Who looks, at which runs, and for which effects signatures are compared."""
     if request.param == "few":
         return SimpleNamespace(analyst=FEW, grid=small, library=FEW.library)
-    return SimpleNamespace(analyst=SETTLED, grid=g.table8, library=BY_NAME)
+    return SimpleNamespace(analyst=SETTLED, grid=settled.table8, library=BY_NAME)
 
 
 @pytest.fixture(scope="module")
 def clean(looks):
     """A table in which nothing is missing, through the stages of the loop."""
-    runs = table(g.case(seed=2, grid=looks.grid))
+    runs = table(tables.narrow(seed=2, grid=looks.grid))
     return parts(runs, looks.analyst.trace(runs))
 
 
 @pytest.fixture(scope="module")
 def churning(looks):
     """Ten sigmas of churning, through the stages of the loop."""
-    case = g.case(["churning"], 10.0, seed=4, grid=looks.grid)
+    case = tables.narrow(["churning"], 10.0, seed=4, grid=looks.grid)
     runs = table(case)
     return SimpleNamespace(**vars(parts(runs, looks.analyst.trace(runs))), label=case.label)
 
@@ -122,7 +122,7 @@ def test_churning_is_found_with_its_amplitude(churning, looks):
 
 @pytest.mark.slow
 def test_brush_drop_is_found():
-    found = SETTLED.trace(table(g.case(["brush_drop"], 10.0, seed=1)))
+    found = SETTLED.trace(table(tables.narrow(["brush_drop"], 10.0, seed=1)))
     (members,) = classes(found)
     assert "brush_drop" in members and found.verdict == ("named" if len(members) == 1 else "class")
 
@@ -132,7 +132,7 @@ OUTSIDE = ["supply_hunting"], 12.0, 2
 
 @pytest.mark.slow
 def test_effect_outside_the_library_gets_no_name():
-    found = SETTLED.trace(table(g.case(*OUTSIDE)))
+    found = SETTLED.trace(table(tables.narrow(*OUTSIDE)))
     where = found.where
     assert found.verdict == "unnamed" and found.members == () and found.left.test.rejected
     assert found.searched is not None and not found.standing.stands and found.standing.why
@@ -142,7 +142,7 @@ def test_effect_outside_the_library_gets_no_name():
 
 @pytest.mark.slow
 def test_effect_outside_the_library_is_a_curve_in_the_result():
-    found = SETTLED.discover(table(g.case(*OUTSIDE)))
+    found = SETTLED.discover(table(tables.narrow(*OUTSIDE)))
     assert found.verdict == "unnamed" and found.effects == () and found.after.adequate
     where = found.unnamed
     assert where.balance == "electrical" and {"electrical", "supply"} <= set(where.balances_alike)
@@ -152,7 +152,9 @@ def test_effect_outside_the_library_is_a_curve_in_the_result():
 
 
 def test_two_effects_are_both_found(looks):
-    found = looks.analyst.trace(table(g.case(["series_resistance", "mass_offset"], 12.0, seed=3, grid=looks.grid)))
+    found = looks.analyst.trace(
+        table(tables.narrow(["series_resistance", "mass_offset"], 12.0, seed=3, grid=looks.grid))
+    )
     both = classes(found)
     assert len(both) == 2
     resistance = next(c for c in both if "series_resistance" in c)

@@ -4,13 +4,13 @@ import dataclasses
 import itertools
 from types import SimpleNamespace
 
-import generator_series as gs
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
 from synthetic import STATED, Analyst, known, parts, table
+from worlds import histories
 
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
@@ -41,9 +41,9 @@ ANALYST = Analyst(
 
 def case(*names, sigmas=12.0, seed=1):
     """Four of six starts: both configurations at the least and at the highest voltage."""
-    made, label = gs.case(names, sigmas, seed, duration=0.8, every=0.02)
+    made = histories.narrow(names, sigmas, seed, duration=0.8, every=0.02)
     runs = table(made)
-    return runs.where(np.isin(runs["run_id"], ["start0", "start2", "start3", "start5"])), label
+    return runs.where(np.isin(runs["run_id"], ["start0", "start2", "start3", "start5"])), made.label
 
 
 @pytest.fixture(scope="module")

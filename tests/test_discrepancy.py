@@ -6,13 +6,13 @@ import dataclasses
 from types import SimpleNamespace
 
 import equinox as eqx
-import generator as g
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from synthetic import SETTLED, table
 from test_implausible import unnamed
+from worlds import settled, tables
 
 from calibration.data import robot_file
 from calibration.discovery import discover, formula
@@ -34,7 +34,7 @@ CASES = {"commutation_step": ("electrical", "voltage"), "guide_binding": ("track
 @pytest.fixture(scope="module", params=[pytest.param(c, marks=pytest.mark.slow) for c in CASES])
 def found(request):
     """A case of 12 sigmas, its base fit, and the discrepancy that is fitted to what that leaves."""
-    case = g.case([request.param], 12.0, seed=1)
+    case = tables.narrow([request.param], 12.0, seed=1)
     runs = table(case)
     fitted = SETTLED.base(runs)
     space, base = fitted.space, fitted.candidate
@@ -42,9 +42,9 @@ def found(request):
     seen = diagnosed(bare, jnp.asarray(base.z), space.library.scored, discover.bases_at(runs, fitted))
     linear = jax.device_get(seen[0])
     what = fit_discrepancy(space, base, linear, *CASES[request.param])
-    truth, sound = g.readings(case.conditions, case.constants, case.terms)
-    x, _ = g.solve(case.conditions, case.constants, case.terms)
-    term = case.terms[0].of(g._instant(x, case.conditions, case.constants, case.terms))
+    truth, sound = settled.readings(case.conditions, case.constants, case.terms)
+    s, _ = settled.solve(case.conditions, case.constants, case.terms)
+    term = case.terms[0].of(s)
     return SimpleNamespace(
         case=case,
         runs=runs,

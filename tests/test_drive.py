@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import reference
 from scipy.integrate import cumulative_simpson
+from worlds import paper
 
 from mmrjax import balances, params
 from mmrjax.conditions import Conditions
@@ -46,7 +46,7 @@ def test_rates_match_reference_at_random_states(robot, grid):
     s = moving(robot, runs, State(*jnp.asarray(states.T), distance=jnp.zeros(n)))
     inductance, ratio = 0.000119, 48.0
     for k in range(n):
-        side = reference.Side(rows[k, 3], slopes[k], rows[k, 2], bool(rows[k, 0]), bool(on_battery[k]))
+        side = paper.Side(rows[k, 3], slopes[k], rows[k, 2], bool(rows[k, 0]), bool(on_battery[k]))
         current, w, speed, charge = states[k]
         expected = side.rates(0.0, [current, w, speed, 0.0, charge])
         volts = abs(float(s.voltage[k])) + abs(0.611 * current) + abs(0.0259 * w)
@@ -62,8 +62,8 @@ INSTANTS = np.concatenate([[0.0], np.geomspace(1e-4, 2.0, 40)])
 
 @pytest.fixture(scope="module")
 def expected_runs(grid):
-    runs = [reference.Side(v, np.radians(s), p, bool(w)).drive(INSTANTS) for w, s, p, v in grid[list(ROWS)]]
-    runs.append(reference.Side(0.0, 0.05, 2.0, battery=True, discharge=1000.0).drive(INSTANTS))
+    runs = [paper.Side(v, np.radians(s), p, bool(w)).drive(INSTANTS) for w, s, p, v in grid[list(ROWS)]]
+    runs.append(paper.Side(0.0, 0.05, 2.0, battery=True, discharge=1000.0).drive(INSTANTS))
     return np.stack(runs)
 
 

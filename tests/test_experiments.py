@@ -3,13 +3,13 @@
 import dataclasses
 
 import equinox as eqx
-import generator as g
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from loop_experiments import supported
 from synthetic import SETTLED, table
-from test_generator import SHAPES
+from test_worlds_tables import SHAPES
+from worlds import laws, settled, tables
 
 from calibration.data import robot_file
 from calibration.data.errors import BadConfiguration
@@ -35,12 +35,12 @@ PAIRS = {
 
 def conditions(made):
     """Conditions of a table of the generator, for the simulator."""
-    c = made.conditions if isinstance(made, g.Case) else made
+    c = made.conditions if isinstance(made, tables.Case) else made
     return Conditions(c.wheeled.astype(int), c.U, np.degrees(c.slope), c.payload, total_mass=c.mass)
 
 
-CLIMBING = params.replace(robots.nominal(), g.CLIMBING)
-REACH = reach(CLIMBING, conditions(g.table8()), channels.USUAL)
+CLIMBING = params.replace(robots.nominal(), settled.CLIMBING)
+REACH = reach(CLIMBING, conditions(settled.table8()), channels.USUAL)
 MENU = menu.menu(REACH)
 SPANS, BY = predicted.spans(MENU), {e.name: e for e in MENU}
 SETTINGS = SETTLED.settings
@@ -56,7 +56,7 @@ def foreseen(robot, batch):
 @pytest.fixture(scope="module")
 def shown():
     """Readings of the whole menu, and which exist, for constants and a term of the generator."""
-    full = dataclasses.replace(CLIMBING, effects=tuple(BY_NAME[name]() for name in g.LIBRARY))
+    full = dataclasses.replace(CLIMBING, effects=tuple(BY_NAME[name]() for name in laws.LIBRARY))
     read, batch = eqx.filter_jit(foreseen), predicted.batch(MENU, channels.USUAL)
 
     def of(p, term=None):
@@ -71,28 +71,28 @@ def shown():
     return of
 
 
-@pytest.mark.parametrize("name", [None, *g.LIBRARY])
+@pytest.mark.parametrize("name", [None, *laws.LIBRARY])
 def test_menu_agrees_with_the_generators_own_physics(name, shown):
-    p, term = g.perturbed(np.random.default_rng(5), scale=0.5), None
+    p, term = settled.perturbed(np.random.default_rng(5), scale=0.5), None
     if name is not None:
-        term = g.draw(name, np.random.default_rng(1))
-        term = dataclasses.replace(term, amplitude=term.amplitude * term.form.size)
+        term = laws.draw(name, np.random.default_rng(1))
+        term = dataclasses.replace(term, amplitude=term.amplitude * term.law.size)
     value, there = shown(p, term)
     for experiment_name, at in SPANS.items():
-        theirs, sound = g.carried_out(BY[experiment_name], p, [] if term is None else [term])
+        theirs, sound = settled.carried_out(BY[experiment_name], p, [] if term is None else [term])
         np.testing.assert_array_equal(there[at], sound, err_msg=experiment_name)
         np.testing.assert_allclose(value[at][sound], theirs[sound], rtol=1e-6, atol=1e-9, err_msg=experiment_name)
 
 
 def test_agreement_can_fail(shown):
-    value, _ = shown(g.CLIMBING)
-    theirs, _ = g.carried_out(BY["bare motor"], g.CLIMBING | {"motor.resistance": 0.6117})
+    value, _ = shown(settled.CLIMBING)
+    theirs, _ = settled.carried_out(BY["bare motor"], settled.CLIMBING | {"motor.resistance": 0.6117})
     with pytest.raises(AssertionError):
         np.testing.assert_allclose(value[SPANS["bare motor"]], theirs, rtol=1e-6)
 
 
 def test_menu_and_generator_have_the_same_instruments():
-    case = g.Case({}, {}, g.conditions(0, 1, 0, 0), g.CLIMBING, (), g.Instruments())
+    case = tables.Case({}, {}, settled.conditions(0, 1, 0, 0), settled.CLIMBING, (), settled.Instruments())
     sd = predicted.sds(
         MENU, dict(zip(channels.USUAL, case.instruments.stated * [1.0, np.pi / 30, 1e-3], strict=True))
     )
@@ -102,7 +102,7 @@ def test_menu_and_generator_have_the_same_instruments():
 
 def test_reverse_travel_turns_the_sign_of_a_biased_slope_alone(shown):
     at = SPANS
-    plain, biased = (shown(g.CLIMBING, g.Term("slope_bias", a))[0] for a in (0.0, 0.02))
+    plain, biased = (shown(settled.CLIMBING, laws.Term("slope_bias", a))[0] for a in (0.0, 0.02))
     change = biased - plain
     assert change[at["reverse, 6T2A"]][0] < 0 < change[at["downhill, 6T2A"]][0]  # of the current
 
@@ -115,7 +115,7 @@ def seen():
     """For each pair: a synthetic case of its first, and what both foresee once fitted to its table."""
     answers = {}
     for pair in PAIRS:
-        case = g.case([pair[0]], 12.0, seed=3)
+        case = tables.narrow([pair[0]], 12.0, seed=3)
         space = SETTLED.space(table(case))
         start = np.zeros(len(space.coordinates))
         fitted = fit_candidates(space, [(filled([name], SETTINGS), start) for name in pair], SETTINGS)
@@ -347,7 +347,7 @@ def test_menu_stays_within_the_reach_of_a_small_robot(rover):
 
 
 def test_configurations_without_rows_are_not_on_the_menu():
-    wheels_alone = g.table8(configurations=(1,))
+    wheels_alone = settled.table8(configurations=(1,))
     made = menu.menu(reach(CLIMBING, conditions(wheels_alone), channels.USUAL))
     assert not any("6T2A" in e.name for e in made) and {r.where for r in runs_of(made)} == {"", "4W2T"}
     assert {r.configuration for r in runs_of(made) if "4W2T" in r.kinds} == {1}
@@ -394,7 +394,7 @@ def test_robot_with_one_motor_is_not_told_to_disconnect_the_other(rover):
 
 def test_voltages_without_load_stay_below_the_permissible_speed():
     slow = robot_file.change(CLIMBING, {"motor.speed_limit": 900.0, "gearbox.speed_limit": 500.0}, where="test")
-    within = reach(slow, conditions(g.table8(voltages=(12.0,))), channels.USUAL)
+    within = reach(slow, conditions(settled.table8(voltages=(12.0,))), channels.USUAL)
     runs = {r.name: r for r in runs_of(menu.menu(within))}
     seen = within.motor_speed  # the table went there itself
     assert max(runs["bare motor"].voltage) <= 0.0259 * 900.0

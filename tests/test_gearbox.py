@@ -2,7 +2,7 @@
 
 import jax
 import numpy as np
-import reference
+from worlds import paper
 
 from mmrjax.gearbox import Gearbox
 
@@ -13,15 +13,15 @@ def test_gearbox_laws_match_reference():
     for _ in range(100):
         i, eta, M0, K, torque, w = RNG.uniform((5, 0.3, 0, 0, 0.002, 0), (100, 1, 1e-3, 1e-6, 0.1, 1300))
         gear = Gearbox(ratio=i, efficiency_load=eta, friction_coulomb=M0, friction_viscous=K)
-        idle = reference.gear_idle(w, M0, K, 1.0)
-        eta_r = reference.gear_efficiency(torque, idle, eta)
-        loss = reference.gear_loss(torque, i, eta_r)
-        np.testing.assert_allclose(loss, reference.gear_loss_split(torque, idle, i, eta), rtol=1e-9)  # (21) = (22)
+        idle = paper.gear_idle(w, M0, K, 1.0)
+        eta_r = paper.gear_efficiency(torque, idle, eta)
+        loss = paper.gear_loss(torque, i, eta_r)
+        np.testing.assert_allclose(loss, paper.gear_loss_split(torque, idle, i, eta), rtol=1e-9)  # (21) = (22)
         np.testing.assert_allclose(gear.torque_idle(w, 1.0), idle, rtol=1e-9)
         np.testing.assert_allclose(gear.efficiency(torque, w), eta_r, rtol=1e-9)
         np.testing.assert_allclose(gear.torque_loss(torque, w), loss, rtol=1e-9)
         np.testing.assert_allclose(
-            gear.torque_output(torque - idle, 1.0), reference.gear_output(torque, loss, i), rtol=1e-9
+            gear.torque_output(torque - idle, 1.0), paper.gear_output(torque, loss, i), rtol=1e-9
         )
 
 

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-import reference
+from worlds import paper
 
 from mmrjax import chassis, ground, robots
 from mmrjax.contact import Friction
@@ -18,24 +18,22 @@ def test_ground_forces_match_reference():
         f, mu, m, alpha, v, ratio = RNG.uniform((0, 0.1, 2, -0.5, -0.5, 0.3), (0.2, 1, 20, 0.5, 0.5, 2))
         surface = Ground(Friction(static=mu, dynamic=0.8 * mu), rolling_resistance=f)
         normal = chassis.normal_load(2 * m, alpha, G, 2)
+        np.testing.assert_allclose(surface.force_resistance(normal, 1.0), paper.rolling_force(m, alpha, f), rtol=1e-9)
         np.testing.assert_allclose(
-            surface.force_resistance(normal, 1.0), reference.rolling_force(m, alpha, f), rtol=1e-9
+            surface.force_adhesion(normal, ratio), paper.adhesion_force(m, alpha, ratio * mu), rtol=1e-9
         )
-        np.testing.assert_allclose(
-            surface.force_adhesion(normal, ratio), reference.adhesion_force(m, alpha, ratio * mu), rtol=1e-9
-        )
-        expected = reference.friction(v, mu, 0.8 * mu, 0.02, 0.2) * ratio * m * G * np.cos(alpha)
+        expected = paper.friction(v, mu, 0.8 * mu, 0.02, 0.2) * ratio * m * G * np.cos(alpha)
         np.testing.assert_allclose(surface.traction(v, normal, ratio), expected, rtol=1e-9)
         demand = RNG.uniform(-0.99, 0.99) * ratio * mu * normal
-        expected = reference.friction_speed(demand / normal / ratio, mu, 0.02)
+        expected = paper.friction_speed(demand / normal / ratio, mu, 0.02)
         np.testing.assert_allclose(surface.speed_creep(demand, normal, ratio), expected, rtol=1e-9)
         np.testing.assert_allclose(ground.force_gravity(m, alpha, G), m * G * np.sin(alpha), rtol=1e-9)
 
 
 def test_slip_matches_reference():
     for V, w, r in RNG.uniform((0.1, 1, 0.01), (1, 20, 0.1), (50, 3)):
-        theoretical = reference.theoretical_speed(w, r)
-        np.testing.assert_allclose(ground.slip(V, theoretical), reference.slip(V, theoretical), rtol=1e-9, atol=1e-12)
+        theoretical = paper.theoretical_speed(w, r)
+        np.testing.assert_allclose(ground.slip(V, theoretical), paper.slip(V, theoretical), rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize(("speed", "theoretical", "slip"), [(0.0, 0.0, 0.0), (0.0, 1.0, 1.0), (1.0, 1.0, 0.0)])

@@ -3,10 +3,10 @@
 import dataclasses
 import functools
 
-import generator as g
 import numpy as np
 import pytest
 from synthetic import FEW, SETTLED, small, table
+from worlds import laws, settled, tables
 
 from calibration.discovery import discover, findings
 from calibration.discovery.candidates import Candidate
@@ -17,17 +17,17 @@ from mmrjax.effects import BY_NAME
 LARGEST = amplitude_of(BY_NAME["winding_heating"]()).spec.bounds[1]
 
 
-def heated(times, grid=g.table8):
+def heated(times, grid=settled.table8):
     """A table of the nominal robot whose windings heat so many times as much as is plausible."""
-    p = dict(g.CLIMBING)
+    p = dict(settled.CLIMBING)
     c = grid(p)
-    readings = g.readings(c, p, (g.Term("winding_heating", times * LARGEST),))
-    return table(g._table(c, *readings, g.Instruments(), np.random.default_rng(1)))
+    readings = settled.readings(c, p, (laws.Term("winding_heating", times * LARGEST),))
+    return table(tables.table_of(c, *readings, settled.Instruments(), np.random.default_rng(1)))
 
 
 def steep(p):
     """24 runs, half of them up a slope that loads the motors."""
-    return g.table8(p, payloads=(0.0, 8.0), slopes=(0.0, 20.0))
+    return settled.table8(p, payloads=(0.0, 8.0), slopes=(0.0, 20.0))
 
 
 pytestmark = pytest.mark.slow
@@ -48,7 +48,7 @@ def unnamed():
 
 
 #: Who looks, and at which runs.
-LOOKS = {"few": (FEW, small), "many": (SETTLED, g.table8)}
+LOOKS = {"few": (FEW, small), "many": (SETTLED, settled.table8)}
 
 
 @pytest.fixture(scope="module", params=["few", "many"])
@@ -143,7 +143,7 @@ def test_named_effects_are_of_a_sign_and_a_strength_of_their_own(names, sigmas):
     """Whatever stands beside a strong effect: none gives power, none is at a bound, each has a p of its own."""
     seen = 0
     for seed in range(4):
-        found = SETTLED.trace(table(g.case(names, sigmas, seed)))
+        found = SETTLED.trace(table(tables.narrow(names, sigmas, seed)))
         if found.alike is None:
             continue
         space, base = found.screened.base.space, found.screened.base.candidate
@@ -162,7 +162,7 @@ def test_named_effects_are_of_a_sign_and_a_strength_of_their_own(names, sigmas):
 def test_an_effect_without_a_p_of_its_own_is_not_proposed(looks):
     """The same search, once as it is and once where noise explains as much in every table of the bootstrap."""
     analyst, grid = looks
-    runs = table(g.case(["churning"], 10.0, seed=4, grid=grid))
+    runs = table(tables.narrow(["churning"], 10.0, seed=4, grid=grid))
     found = analyst.trace(runs)
     assert "churning" in found.members[0]
     space, base, left = found.screened.base.space, found.screened.base.candidate, found.left

@@ -3,12 +3,12 @@ tell."""
 
 import dataclasses
 
-import generator as g
 import numpy as np
 import pytest
 from scipy import stats
 from synthetic import table
 from test_loop_command import mmrjax, written
+from worlds import settled, tables
 
 from calibration.data.runs import Runs
 from calibration.inference import lack_of_fit
@@ -20,7 +20,7 @@ from calibration.inference.observers import SettledRuns
 from mmrjax import params, robots
 
 SIGMA = np.array([0.02, 0.5, 3e-3])
-GRID = g.table8()
+GRID = settled.table8()
 
 
 def toy(rng, noise=1.0, missing=0.0, parameters=8, repeats=1):
@@ -136,14 +136,14 @@ def test_right_sds_and_residuals_with_structure_say_nothing_of_sds():
 
 @pytest.mark.slow
 def test_calibration_says_whether_it_is_adequate():
-    climbing = params.replace(robots.nominal(), g.CLIMBING)
+    climbing = params.replace(robots.nominal(), settled.CLIMBING)
     few = {"starts": 2, "profiles": False, "blocks": ()}
-    clean = g.case(seed=3, free=g.FRICTION)
+    clean = tables.narrow(seed=3, free=settled.FRICTION)
     assert calibrate(table(clean), climbing, **few).adequacy.adequate
     bare = {k: v for k, v in clean.table.items() if "_sd_" not in k}
     guessed = calibrate(table(bare), climbing, **few).adequacy
     assert guessed.adequate and not guessed.noise_known
-    lacking = g.case(["churning"], 12.0, seed=3, free=g.FRICTION)
+    lacking = tables.narrow(["churning"], 12.0, seed=3, free=settled.FRICTION)
     for made in (lacking.table, {k: v for k, v in lacking.table.items() if "_sd_" not in k}):
         found = calibrate(table(made), climbing, **few).adequacy
         assert found.adequate is False and "mmrjax loop" in found.statement
@@ -151,7 +151,7 @@ def test_calibration_says_whether_it_is_adequate():
 
 @pytest.mark.slow
 def test_command_opens_with_it(tmp_path):
-    written(tmp_path / "runs.csv", g.case(["churning"], 12.0, seed=3, free=g.FRICTION).table)
+    written(tmp_path / "runs.csv", tables.narrow(["churning"], 12.0, seed=3, free=settled.FRICTION).table)
     answer = mmrjax(
         tmp_path, "calibrate", "runs.csv", "--out", "x", "--starts", "4", "--no-profiles", "--no-hold-out",
         *(a for c in ("6T2A", "4W2T") for a in ("--prior", f"{c}.ground.friction.static=0.6±0.09")),

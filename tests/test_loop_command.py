@@ -14,12 +14,11 @@ import tomllib
 from pathlib import Path
 from types import SimpleNamespace
 
-import generator as g
-import generator_series as gs
 import jsonschema
 import numpy as np
 import pytest
 from synthetic import FEW, small
+from worlds import histories, settled, tables
 
 from calibration.data import effect_file, robot_file
 from calibration.inference import bases as curves
@@ -76,7 +75,7 @@ def written(path, table) -> None:
 
 
 def loaded(p):
-    return g.table8(p, payloads=(0.0, 3.0, 5.0, 8.0), slopes=(0.0, 10.0), voltages=(24.0, 33.0))
+    return settled.table8(p, payloads=(0.0, 3.0, 5.0, 8.0), slopes=(0.0, 10.0), voltages=(24.0, 33.0))
 
 
 @functools.cache
@@ -87,7 +86,7 @@ def commanded(every=False) -> SimpleNamespace:
     """
     room_for_it = tempfile.TemporaryDirectory()  # which is there as long as the answer
     folder, kept = Path(room_for_it.name), []
-    case = g.case(["churning"], 15.0, seed=3, grid=small)
+    case = tables.narrow(["churning"], 15.0, seed=3, grid=small)
     written(folder / "runs.csv", {k: np.append(v, v[4]) for k, v in case.table.items()})
 
     def discover(*arguments, **options):
@@ -239,7 +238,7 @@ def test_report_tells_the_story_in_order(done):
 
 @pytest.mark.slow
 def test_users_effect_is_scored_and_named(quick, tmp_path):
-    written(tmp_path / "runs.csv", g.case(["guide_binding"], 12.0, seed=5, grid=loaded).table)
+    written(tmp_path / "runs.csv", tables.narrow(["guide_binding"], 12.0, seed=5, grid=loaded).table)
     (tmp_path / "mine.py").write_text(MINE)
     run = ["loop", "runs.csv", "--no-report", "--replicates", 250, "--out", "x", *PRIORS]
     answer = mmrjax(tmp_path, *run, "--effects", "mine.py")
@@ -252,7 +251,7 @@ def test_users_effect_is_scored_and_named(quick, tmp_path):
 
 @pytest.mark.slow
 def test_one_voltage_gives_a_verdict(quick, tmp_path):
-    table = g.case(seed=1).table
+    table = tables.narrow(seed=1).table
     written(tmp_path / "runs.csv", {k: v[table["supply_voltage_V"] == 24] for k, v in table.items()})
     (tmp_path / "mine.py").write_text(MINE)
     run = ["loop", "runs.csv", "--no-report", "--replicates", 250, "--out", "x", "--effects", "mine.py", *PRIORS]
@@ -373,11 +372,11 @@ def test_interrupt_leaves_nothing(tmp_path, monkeypatch):
 
 def starts_churning(folder) -> SimpleNamespace:
     """The whole command on six starts of a robot whose tracks churn, one sample given twice."""
-    table, label = gs.case(["churning"], 14.0, seed=5, duration=0.8)
-    written(folder / "starts.csv", {k: np.append(v, v[40]) for k, v in table.items()})
+    made = histories.narrow(["churning"], 14.0, seed=5, duration=0.8)
+    written(folder / "starts.csv", {k: np.append(v, v[40]) for k, v in made.table.items()})
     priors = [*PRIORS, *(a.replace("static=0.6±0.09", "dynamic=0.48±0.08") for a in PRIORS)]
     answer = mmrjax(folder, "loop", "starts.csv", "--replicates", 250, "--out", "found", *priors)
-    return SimpleNamespace(folder=folder, label=label["effects"][0], answer=answer)
+    return SimpleNamespace(folder=folder, label=made.label["effects"][0], answer=answer)
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import concurrent.futures
 from types import SimpleNamespace
 
-import generator_rigs as gr
 import numpy as np
 import pytest
+from worlds import rigs
 
 from calibration.data import robot_file
 from calibration.data import runs as records
@@ -57,8 +57,8 @@ def test_a_budget_of_no_time_is_refused():
 @pytest.fixture
 def rig(tmp_path):
     """A folder with a bench's file and its table."""
-    world = gr.world(np.random.default_rng(3), "bench", "voltage", rows=(16, 20))
-    gr.case(world).write(tmp_path)
+    world = rigs.world(np.random.default_rng(3), "bench", "voltage", rows=(16, 20))
+    rigs.case(world).write(tmp_path)
     return ["loop", "table.csv", "--robot", "rig.toml", "--no-report", "--out", "found"]
 
 
@@ -96,8 +96,8 @@ def test_time_that_is_out_before_the_verdict_ends_at_the_next_stage(rig, mmrjax,
 
 @pytest.mark.slow
 def test_a_loop_of_kept_stages_finds_what_it_found(tmp_path):
-    world = gr.world(np.random.default_rng(3), "bench", "voltage", rows=(16, 20))
-    gr.case(world, "iron_loss", 12.0).write(tmp_path)
+    world = rigs.world(np.random.default_rng(3), "bench", "voltage", rows=(16, 20))
+    rigs.case(world, "iron_loss", 12.0).write(tmp_path)
     text = (tmp_path / "table.csv").read_text().splitlines()
     header = text[0].split(",")
     shown = [

@@ -6,7 +6,6 @@ import re
 from pathlib import Path
 from types import SimpleNamespace
 
-import generator as g
 import jsonschema
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from synthetic import SETTLED, table
 from test_implausible import heated, unnamed
 from test_loop_command import commanded
 from test_stated_values import made as leads
+from worlds import settled, tables
 
 from calibration.data.writing import finite
 from calibration.discovery.clusters import Cluster
@@ -31,9 +31,9 @@ SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "loop.sche
 
 def happening():
     """A clean table in random order, with the speed shown 12 mm/s too low in fifteen runs that were made one after another."""
-    p = dict(g.CLIMBING)
-    c = g.table8(p)
-    columns = g._table(c, *g.readings(c, p), g.Instruments(), np.random.default_rng(1))
+    p = dict(settled.CLIMBING)
+    c = settled.table8(p)
+    columns = tables.table_of(c, *settled.readings(c, p), settled.Instruments(), np.random.default_rng(1))
     columns["order"] = np.random.default_rng(5).permutation(len(columns["slope_deg"])) + 1.0
     off = (columns["order"] >= 30) & (columns["order"] <= 44)
     columns["speed_mm_s"] = columns["speed_mm_s"] - 12.0 * off

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import reference
 from scipy.integrate import solve_ivp
+from worlds import paper
 
 from mmrjax import energy, params, robots
 from mmrjax.conditions import Conditions
@@ -75,8 +75,8 @@ MANY = (
 
 def expected(voltages, times, slope, tolerance=1e-10):
     """SciPy's Radau on the plain rates of `reference`, with heat and energy, a voltage for each stretch of time."""
-    side = reference.Side(voltages[0], np.radians(slope))
-    p = reference.NOMINAL
+    side = paper.Side(voltages[0], np.radians(slope))
+    p = paper.NOMINAL
     R_wh, R_ha = p["motor.resistance_thermal_winding"], p["motor.resistance_thermal_housing"]
     C_w, C_h, cold = 16.3 / R_wh, 593.0 / R_ha, side.R
 

@@ -3,8 +3,8 @@
 import jax
 import numpy as np
 import pytest
-import reference
 from scipy.integrate import solve_ivp
+from worlds import paper
 
 from mmrjax.motor import ALPHA, Motor
 
@@ -18,14 +18,14 @@ def test_motor_laws_match_reference(sign):
         current, size = RNG.uniform((-10, 0), (10, 1300))
         w = sign * size
         motor = Motor(resistance=R, inductance=L, torque_constant=C, friction_coulomb=M0, friction_viscous=K)
-        loss = reference.motor_loss(w, M0, K, sign)
+        loss = paper.motor_loss(w, M0, K, sign)
         np.testing.assert_allclose(motor.torque_loss(w, sign), loss, rtol=1e-9)
-        np.testing.assert_allclose(motor.voltage_back(w), reference.motor_back(w, C), rtol=1e-9)
+        np.testing.assert_allclose(motor.voltage_back(w), paper.motor_back(w, C), rtol=1e-9)
         torque = motor.torque_electromagnetic(current) - motor.torque_loss(w, sign)
-        expected = reference.motor_torque(current, w, C, M0, K, sign)
+        expected = paper.motor_torque(current, w, C, M0, K, sign)
         np.testing.assert_allclose(torque, expected, rtol=1e-9, atol=1e-12)
         rate = (24.0 - motor.voltage_back(w) - motor.voltage_winding(current)) / motor.inductance
-        expected = reference.motor_current_rate(24.0, current, w, R, L, C)
+        expected = paper.motor_current_rate(24.0, current, w, R, L, C)
         np.testing.assert_allclose(rate, expected, rtol=1e-9, atol=1e-6)
 
 

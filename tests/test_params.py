@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import reference
+from worlds import paper
 
 from mmrjax import params, robots
 from mmrjax.params import parameter
@@ -19,8 +19,8 @@ def test_nominal_values_are_those_of_the_reference(robot):
     # The track model has a reference of its own, C MuJoCo; what of its running gear the paper prints is checked below.
     own = ("running_gear.", "6T2A.turning.", "4W2T.turning.")  # of turns see test_turning.py
     values = {p.name: float(p.value) for p in params.walk(robot) if not p.name.startswith(own)}
-    assert set(values) == set(reference.NOMINAL)
-    for name, expected in reference.NOMINAL.items():
+    assert set(values) == set(paper.NOMINAL)
+    for name, expected in paper.NOMINAL.items():
         assert values[name] == pytest.approx(expected, rel=1e-12), name
 
 

@@ -232,13 +232,13 @@ def test_saved_calibration_has_its_posterior(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(("names", "verdict"), [(["churning"], "named"), ([], "none")])
 def test_posterior_of_the_loop_has_what_it_found(names, verdict):
-    import generator as g
     from synthetic import SETTLED, table
+    from worlds import tables
 
     from calibration.discovery.discover import assemble_result
     from mmrjax.effects import BY_NAME
 
-    runs = table(g.case(names, 10.0, seed=4) if names else g.case(seed=2))
+    runs = table(tables.narrow(names, 10.0, seed=4) if names else tables.narrow(seed=2))
     traced = SETTLED.trace(runs)
     found = assemble_result(traced, runs, None, SETTLED.settings, BY_NAME, lambda text: None)
     assert (found.verdict == "none") == (verdict == "none")

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import reference
+from worlds import paper
 
 from mmrjax.power import Battery, curve_remark, voltage_source
 
@@ -20,7 +20,7 @@ def test_battery_voltage_matches_reference():
             curvature=A, slope=B, voltage_full=U0, resistance=R, current_other=I_p,
             capacity=capacity, capacity_curve=float(of_curve),
         )  # fmt: skip
-        expected = reference.battery_voltage(current, discharge, A, B, U0, R, I_p, capacity, of_curve)
+        expected = paper.battery_voltage(current, discharge, A, B, U0, R, I_p, capacity, of_curve)
         np.testing.assert_allclose(battery.voltage(current, discharge), expected, rtol=1e-9)
 
 
@@ -82,7 +82,7 @@ def test_battery_current_includes_other_consumers():
 def test_voltage_source_selects_as_reference(mode, on_battery):
     battery = Battery()
     own = float(battery.voltage(2.0, 100.0))
-    assert float(voltage_source(battery, 24.0, on_battery, 2.0, 100.0)) == reference.source_voltage(mode, 24.0, own)
+    assert float(voltage_source(battery, 24.0, on_battery, 2.0, 100.0)) == paper.source_voltage(mode, 24.0, own)
 
 
 def test_voltage_source_external_has_no_battery_gradient():

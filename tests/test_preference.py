@@ -4,12 +4,12 @@ import dataclasses
 import json
 from pathlib import Path
 
-import generator as g
 import jsonschema
 import numpy as np
 import pytest
 from pages import Tables
 from synthetic import SETTLED, known, table
+from worlds import tables
 
 from calibration.data.errors import BadConfiguration
 from calibration.data.writing import finite
@@ -101,7 +101,7 @@ def test_another_preference_lists_the_choices():
         settings_for(SettledRuns, prefer="heldout")
 
 
-RUNS = table(g.case(["series_resistance", "tension_friction"], 12.0, seed=3))
+RUNS = table(tables.narrow(["series_resistance", "tension_friction"], 12.0, seed=3))
 SETTINGS = dataclasses.replace(SETTLED.settings, prefer=HELD_OUT)
 
 

@@ -2,12 +2,12 @@
 
 import csv
 
-import generator as g
-import generator_series as gs
 import numpy as np
 import pytest
+import worlds.histories
 from synthetic import table
 from test_loop_command import mmrjax
+from worlds import tables
 
 from calibration.data import runs as records
 from calibration.data.errors import BadData
@@ -31,12 +31,12 @@ WRONG = {
 
 @pytest.fixture(scope="module")
 def runs():
-    return table(g.case(seed=4))
+    return table(tables.narrow(seed=4))
 
 
 @pytest.fixture(scope="module")
 def histories():
-    return table(gs.case((), 0.0, 3, duration=0.8, every=0.02)[0])
+    return table(worlds.histories.narrow((), 0.0, 3, duration=0.8, every=0.02))
 
 
 def scaled(runs, column, factor):

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import reference
+from worlds import paper
 
 from mmrjax import params, robots
 from mmrjax.conditions import Conditions
@@ -27,8 +27,8 @@ EFFECTS = {"directional_friction": 0.06, "backdriving_loss": 0.3, "nonlinear_sli
 def draw(count, seed):
     """Parameters of random robots by name, and a run of each: both movers, both signs, many that hardly move."""
     rng = np.random.default_rng(seed)
-    names = [n for n in reference.NOMINAL if n.startswith(LOST) and not any(h in n for h in HEAT)]
-    values = {n: reference.NOMINAL[n] * np.exp(rng.uniform(-0.4, 0.4, count)) for n in names}
+    names = [n for n in paper.NOMINAL if n.startswith(LOST) and not any(h in n for h in HEAT)]
+    values = {n: paper.NOMINAL[n] * np.exp(rng.uniform(-0.4, 0.4, count)) for n in names}
     values["gearbox.efficiency_load"] = rng.uniform(0.5, 0.95, count)
     for kind in KINDS:
         static = values[f"{kind}.ground.friction.static"]
@@ -48,7 +48,7 @@ def asked(values, runs):
     """Weight on the ground, pull of gravity, rolling resistance, and the demand of travel as the shafts would go [N]."""
     mass = (of_kind(values, runs, "mass") + np.asarray(runs.payload)) / 2
     slope = np.radians(np.asarray(runs.slope_deg))
-    normal, pull = mass * reference.G * np.cos(slope), mass * reference.G * np.sin(slope)
+    normal, pull = mass * paper.G * np.cos(slope), mass * paper.G * np.sin(slope)
     rolling = of_kind(values, runs, "ground.rolling_resistance") * normal
     stall = values["motor.torque_constant"] * np.asarray(runs.voltage) / values["motor.resistance"]
     sense = np.where(values["gearbox.ratio"] * stall >= pull * of_kind(values, runs, "radius"), 1, -1)
@@ -102,7 +102,7 @@ def test_a_robot_that_its_drive_and_the_ground_hold_stands():
     used = np.asarray(found.adhesion_used)
     assert (used[:4] <= 1).all() and (used[4:] > 1).all()  # the ground carries no more than it can
     np.testing.assert_allclose(found.total_current[1], 2 * 0.5 / 0.611, rtol=1e-9)
-    limit = 0.32 * 13.1 / 2 * reference.G * np.cos(np.radians(17.0))
+    limit = 0.32 * 13.1 / 2 * paper.G * np.cos(np.radians(17.0))
     np.testing.assert_allclose(found.traction[1], 2 * limit, rtol=1e-9)
 
 

@@ -6,10 +6,10 @@ import dataclasses
 import pickle
 
 import equinox as eqx
-import generator_rigs as gr
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from worlds import rigs
 
 from calibration.data import robot_file
 from calibration.data import runs as records
@@ -25,8 +25,8 @@ RIGS = [("bench", "voltage"), ("linear", "motor_speed"), ("wheeled", "voltage")]
 
 def rig(kind, imposed, folder):
     """A rig's robot, its table, and the library at its size."""
-    world = gr.world(np.random.default_rng([27, len(kind)]), kind, imposed, rows=(16, 40))
-    gr.case(world).write(folder)
+    world = rigs.world(np.random.default_rng([27, len(kind)]), kind, imposed, rows=(16, 40))
+    rigs.case(world).write(folder)
     robot = robot_file.read(folder / "rig.toml")
     runs = records.read(folder / "table.csv", robot=robot)
     return robot, runs, scales.library_for(robot, runs.conditions(robot), effects.BY_NAME)

@@ -6,10 +6,9 @@ import csv
 import json
 import time
 
-import generator_logs as gl
-import generator_rigs as gr
 import numpy as np
 import pytest
+from worlds import rigs
 
 from calibration.data import robot_file, settling
 from calibration.data import runs as records
@@ -21,9 +20,9 @@ from sweeps.commands.settle import rolling
 def made(tmp_path, seed=1, kind="bench", imposed="voltage", **options):
     """A log of a random rig, written beside its file: the log, its world, the robot."""
     rng = np.random.default_rng([27, seed])
-    world = gr.world(rng, kind, imposed, rows=(16, 60))
-    gr.case(world).write(tmp_path)
-    log = gl.log(world, rng, **options)
+    world = rigs.world(rng, kind, imposed, rows=(16, 60))
+    rigs.case(world).write(tmp_path)
+    log = rigs.log(world, rng, **options)
     log.write(tmp_path / "log.csv")
     return log, world, robot_file.read(tmp_path / "rig.toml")
 
@@ -73,9 +72,9 @@ def test_sds_hold_over_random_logs(tmp_path):
     z, levels, kept = [], 0, 0
     for seed in range(16):
         rng = np.random.default_rng([77, seed])
-        world = gr.world(rng, rows=(16, 60))
-        gr.case(world).write(tmp_path)
-        log = gl.log(
+        world = rigs.world(rng, rows=(16, 60))
+        rigs.case(world).write(tmp_path)
+        log = rigs.log(
             world, rng, hold=rng.uniform(1, 4), rate=rng.choice([50, 100, 250]), lag=rng.uniform(0.02, 0.4),
             noise=rng.uniform(0.5, 6), jitter=rng.uniform(0, 0.3), delay=rng.choice([0, 0, 0.05]),
             step=rng.choice([0, 0, 1, 3]),

@@ -2,12 +2,11 @@
 
 import dataclasses
 
-import generator as g
-import generator_series as gs
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from synthetic import Analyst, table
+from worlds import histories, settled
 
 from calibration.discovery.candidates import fit_base
 from calibration.discovery.settings import settings_for
@@ -18,18 +17,18 @@ from mmrjax.effects import BY_NAME
 ANALYST = Analyst(
     dataclasses.replace(settings_for(Histories, 300), slots=1), {"churning": BY_NAME["churning"]}, stated={}
 )
-INSTRUMENTS = g.Instruments(sd=(0.02, 9.5, 2.0))
+INSTRUMENTS = settled.Instruments(sd=(0.02, 9.5, 2.0))
 
 
 def on_ground(monkeypatch, adhesion, creep, seed=3):
     """Six clean starts of the nominal robot on a ground of this adhesion (of tracks, of wheels) and V_s [m/s], and
     its constants."""
-    p = dict(g.CLIMBING)
+    p = dict(settled.CLIMBING)
     for c, mu in zip(("6T2A", "4W2T"), adhesion, strict=True):
         p |= {f"{c}.ground.friction.static": mu, f"{c}.ground.friction.dynamic": 0.8 * mu}
         p |= {f"{c}.ground.friction.speed_static": creep, f"{c}.ground.friction.speed_dynamic": 10 * creep}
-    monkeypatch.setattr(g, "perturbed", lambda rng, free: p)
-    made, _ = gs.case(seed=seed, duration=1.5, every=0.05, instruments=INSTRUMENTS)
+    monkeypatch.setattr(histories, "perturbed", lambda rng, free: p)
+    made = histories.narrow(seed=seed, duration=1.5, every=0.05, instruments=INSTRUMENTS)
     return table(made), p
 
 
@@ -79,7 +78,7 @@ def ends_of(runs, p):
     """The ends of six starts on a ground, which of them slide, and what settled travel of the true robot shows."""
     problem = ANALYST.space(runs).bare
     ends = settled_ends.settled_ends(problem)
-    truth, sound = g.readings(gs.starts(p), p)
+    truth, sound = settled.readings(histories.starts(p), p)
     return ends, settled_ends._sliding(problem, ends), truth.T, sound
 
 

@@ -5,13 +5,12 @@ import itertools
 import math
 from types import SimpleNamespace
 
-import generator as g
-import generator_series as gs
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.polynomial import legendre
 from synthetic import SETTLED, STATED, Analyst, table
+from worlds import histories, laws, settled, tables
 
 from calibration.discovery import discover
 from calibration.discovery.candidates import Candidate, filled, fit_candidates, start
@@ -303,17 +302,17 @@ def test_a_class_stands_whoever_leads_it():
 # --- settled runs ---------------------------------------------------------------------------------------
 
 #: V_s of both configurations grows with speed, twofold at 0.4 m/s: creep (Fig. 7) times the speed.
-V_S = g.CLIMBING["6T2A.ground.friction.speed_static"]
-GROWING = g.Form(
+V_S = settled.CLIMBING["6T2A.ground.friction.speed_static"]
+GROWING = laws.Law(
     "", "slip", lambda s, q: 2 * V_S * np.sin(np.arcsin(np.clip(s.D / s.D_max, -1, 1)) / 3) * s.V, 1.0
 )  # fmt: skip
 
 
 def growing(monkeypatch, sigmas, seed):
     """A table of a robot whose sliding speed V_s grows with its speed."""
-    for forms in (g.FORMS, g.OUTSIDE):
+    for forms in (laws.FORMS, laws.OUTSIDE):
         monkeypatch.setitem(forms, "sliding_speed_grows", GROWING)
-    return table(g.case(["sliding_speed_grows"], sigmas, seed))
+    return table(tables.narrow(["sliding_speed_grows"], sigmas, seed))
 
 
 def stood(analyst, runs, effects):
@@ -332,7 +331,7 @@ def stood(analyst, runs, effects):
 def test_two_slips_do_not_stand_for_a_law_that_the_library_lacks(monkeypatch):
     got, best, _ = stood(SETTLED, growing(monkeypatch, 20.0, 1), ("rolling_radius", "load_slip"))
     assert not got.stands and got.why
-    true, same, after = stood(SETTLED, table(g.case(["rolling_radius", "load_slip"], 15.0, 1)), best.effects)
+    true, same, after = stood(SETTLED, table(tables.narrow(["rolling_radius", "load_slip"], 15.0, 1)), best.effects)
     assert true.stands and true.why == "beside" and same.key == best.key and not after.test.rejected_with_margin
 
 
@@ -368,7 +367,7 @@ def test_three_slips_do_not_stand_for_a_sliding_speed_that_grows(monkeypatch):
 )
 def test_true_pairs_of_one_balance_keep_their_names(pair):
     """Each at its ordinary strength, and the fit with both adequate."""
-    found = SETTLED.trace(table(g.case(pair, 15.0, 1)))
+    found = SETTLED.trace(table(tables.narrow(pair, 15.0, 1)))
     assert found.verdict in ("named", "class") and found.standing.stands and len(found.members) == 2
     assert all(any(name in members for members in found.members) for name in pair)
     assert not found.ends.test.rejected_with_margin
@@ -380,10 +379,10 @@ def test_true_pairs_of_one_balance_keep_their_names(pair):
 @pytest.mark.slow
 def test_supply_that_sags_over_time_gets_no_name(monkeypatch):
     """By one volt in 1.5 s, in six starts; it was called a brush drop and an eccentric pulley."""
-    sag = gs.Moving("supply", lambda s, q: np.full_like(s.w, s.time / 1.5), 1.0 / gs.LARGEST)
-    monkeypatch.setitem(gs.FORMS, "sag_over_time", sag)
-    made, label = gs.case(["sag_over_time"], 1e6, 1)
-    assert label["effects"][0]["amplitude"] == pytest.approx(1.0)
+    sag = laws.Law("", "supply", lambda s, q: np.full_like(s.w, s.time / 1.5), 1.0 / histories.LARGEST)
+    monkeypatch.setitem(histories.EVERY, "sag_over_time", sag)
+    made = histories.narrow(["sag_over_time"], 1e6, 1)
+    assert made.label["effects"][0]["amplitude"] == pytest.approx(1.0)
     names = ("brush_drop", "pulley_eccentricity", "series_resistance", "supply_sag", "churning", "rotating_inertia")
     dynamic = {f"{c}.ground.friction.dynamic": (0.48, 0.08) for c in ("6T2A", "4W2T")}
     analyst = Analyst(

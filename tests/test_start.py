@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jsonschema
 import numpy as np
 import pytest
-import reference
+from worlds import paper
 
 from mmrjax import robots, stages
 from mmrjax.channels import MM
@@ -48,7 +48,7 @@ def written(mmrjax, tmp_path):
 def by_hand():
     """Stages and slip of the start, of an integration and sums that share nothing with the package."""
     t = np.concatenate([np.linspace(0, 0.04, 4001), np.linspace(0.04, 0.8, 4001)[1:]])
-    side = reference.Side(VOLTAGE)
+    side = paper.Side(VOLTAGE)
     state = side.drive(t, rtol=1e-6, atol=1e-7)
     rolled, gone = (np.append(x, x[-1]) for x in (side.r * state[:, 1] / side.i, state[:, 2]))
     t = np.append(t, 5.0)  # nothing changes any more

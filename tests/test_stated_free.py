@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-import generator_rigs as gr
 import numpy as np
 import pytest
+from worlds import rigs
 
 from calibration.data import robot_file
 from calibration.data import runs as records
@@ -58,8 +58,8 @@ def test_everything_stated_with_a_width_is_freed_that_the_data_show(tmp_path):
 
 
 def test_a_calibration_frees_what_its_rig_states(tmp_path, monkeypatch):
-    world = gr.world(np.random.default_rng(4), "bench", "voltage", rows=(16, 24))
-    gr.case(world).write(tmp_path)
+    world = rigs.world(np.random.default_rng(4), "bench", "voltage", rows=(16, 24))
+    rigs.case(world).write(tmp_path)
     robot = robot_file.read(tmp_path / "rig.toml")
     runs = records.read(tmp_path / "table.csv", robot=robot)
     asked = []

@@ -2,17 +2,17 @@
 
 from types import SimpleNamespace
 
-import generator as g
 import numpy as np
 import pytest
 from synthetic import FEW, SETTLED, small, table
+from worlds import laws, settled, tables
 
 from calibration.discovery import discover, findings
 from calibration.discovery.notes import FreedValue
 from calibration.discovery.stated_values import scores, shifts
 from calibration.words import loop as words
 
-NOMINAL = g.CLIMBING["motor.resistance"]
+NOMINAL = settled.CLIMBING["motor.resistance"]
 #: χ² that a shift has to explain to be tried.
 NEEDED = 25.0
 
@@ -61,18 +61,18 @@ def test_a_coordinate_that_nothing_shows_cannot_be_the_wrong_one(toy):
 # --- a robot whose sheet is wrong -----------------------------------------------------------------------
 
 
-def made(resistance=NOMINAL, lead=0.0, grid=g.table8):
+def made(resistance=NOMINAL, lead=0.0, grid=settled.table8):
     """A table of a robot with this winding, and leads beside it, all else at its sheets."""
-    p = dict(g.CLIMBING) | {"motor.resistance": resistance}
-    terms = (g.Term("series_resistance", lead),) * (lead > 0)
-    c, instruments = grid(p), g.Instruments()
-    return table(g._table(c, *g.readings(c, p, terms), instruments, np.random.default_rng(1)))
+    p = dict(settled.CLIMBING) | {"motor.resistance": resistance}
+    terms = (laws.Term("series_resistance", lead),) * (lead > 0)
+    c, instruments = grid(p), settled.Instruments()
+    return table(tables.table_of(c, *settled.readings(c, p, terms), instruments, np.random.default_rng(1)))
 
 
 @pytest.fixture(scope="module", params=["few", pytest.param("many", marks=pytest.mark.slow)])
 def looks(request):
     """Who looks, and at which runs."""
-    return {"few": (FEW, small), "many": (SETTLED, g.table8)}[request.param]
+    return {"few": (FEW, small), "many": (SETTLED, settled.table8)}[request.param]
 
 
 @pytest.mark.parametrize(

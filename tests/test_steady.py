@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import reference
+from worlds import paper
 
 from mmrjax import params
 from mmrjax.conditions import Conditions
@@ -23,7 +23,7 @@ def readings(answer):
 
 def expected_readings(side):
     current, w, speed = side.steady()
-    return np.array([reference.SIDES * current, w, speed])
+    return np.array([paper.SIDES * current, w, speed])
 
 
 def names(answer):
@@ -34,7 +34,7 @@ def test_steady_matches_reference_root_over_table8(grid, steady_table8):
     got = readings(steady_table8)
     compared = 0
     for k, (wheeled, slope, payload, voltage) in enumerate(grid):
-        side = reference.Side(voltage, np.radians(slope), payload, bool(wheeled))
+        side = paper.Side(voltage, np.radians(slope), payload, bool(wheeled))
         if side.steady() is None:
             assert names(steady_table8)[k] == "slides" and np.isnan(got[k]).all()
             continue
@@ -54,7 +54,7 @@ def test_steady_matches_reference_root_on_battery(robot, grid):
         answer = steady_batch(robot, runs)
         got = readings(answer)
         for k, (w, s, p, _) in enumerate(rows):
-            side = reference.Side(0.0, np.radians(s), p, bool(w), battery=True, discharge=charge)
+            side = paper.Side(0.0, np.radians(s), p, bool(w), battery=True, discharge=charge)
             if side.steady() is not None:
                 np.testing.assert_allclose(got[k], expected_readings(side), rtol=1e-9)
             else:
@@ -65,9 +65,9 @@ def test_steady_matches_reference_root_for_random_robots(robot):
     """Every parameter off its nominal value by up to 20 %, uphill, level and downhill."""
     rng = np.random.default_rng(3)
     for _ in range(40):
-        values = {n: v * rng.uniform(0.8, 1.2) for n, v in reference.NOMINAL.items()}
+        values = {n: v * rng.uniform(0.8, 1.2) for n, v in paper.NOMINAL.items()}
         slope, payload, wheeled = rng.uniform(-0.25, 0.12), rng.uniform(0, 8), rng.integers(2)
-        side = reference.Side(24.0, slope, payload, bool(wheeled), p=values)
+        side = paper.Side(24.0, slope, payload, bool(wheeled), p=values)
         other = params.replace(robot, values)
         runs = Conditions(voltage=[24.0], slope_deg=np.degrees(slope), payload=payload, configuration=int(wheeled))
         answer = steady_batch(other, runs)
@@ -76,8 +76,8 @@ def test_steady_matches_reference_root_for_random_robots(robot):
 
 
 def test_comparison_with_reference_can_fail(robot, grid, steady_table8):
-    wrong = dict(reference.NOMINAL) | {"motor.resistance": 0.6111}
-    side = reference.Side(15.0, p=wrong)
+    wrong = dict(paper.NOMINAL) | {"motor.resistance": 0.6111}
+    side = paper.Side(15.0, p=wrong)
     with pytest.raises(AssertionError):
         np.testing.assert_allclose(readings(steady_table8)[0], expected_readings(side), rtol=1e-9)
 
@@ -180,8 +180,8 @@ def test_steady_stall_current_is_voltage_over_resistance(robot):
 
 def test_steady_stalls_exactly_below_the_voltage_that_breaks_away(robot):
     """Break-away torque from the tables by hand, 6T2A on 5 degrees."""
-    m, alpha, r = 13.1 / 2, np.radians(5.0), reference.PULLEY
-    load = 0.350 + r * m * reference.G * (0.2 * 0.3 * np.cos(alpha) + 0.06 * np.cos(alpha) + np.sin(alpha))
+    m, alpha, r = 13.1 / 2, np.radians(5.0), paper.PULLEY
+    load = 0.350 + r * m * paper.G * (0.2 * 0.3 * np.cos(alpha) + 0.06 * np.cos(alpha) + np.sin(alpha))
     voltage = 0.611 * (load / (48 * 0.74) + 0.0027 + 0.0003) / 0.0259
     below, above = (one(robot, voltage=[voltage * k], slope_deg=5.0) for k in (0.9999, 1.0001))
     assert float(below.motor_speed) == 0.0 < float(above.motor_speed)

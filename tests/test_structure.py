@@ -662,15 +662,8 @@ def test_campaigns_and_notebooks_take_the_way_of_users():
         if name not in own.get(file.stem, ())
     }
     assert found == set(CALLED)
-    way, shared = "calibration.discovery.discover.prepared", "campaign.rig_input"  # which takes that way
-    ways = {
-        "campaign": way,
-        "loop": way,
-        "loop_series": way,
-        "loop_baselines": way,
-        "rigs": shared,
-        "rig_logs": shared,
-    }
+    shared = dict.fromkeys(("loop", "loop_series", "rigs", "rig_logs"), "campaign.looped")  # which takes the one way
+    ways = shared | {"loop_baselines": "campaign.begun", "campaign": "calibration.discovery.discover.prepared"}
     for campaign, name in ways.items():
         tree = ast.parse((ROOT / f"benchmarks/{campaign}.py").read_text(encoding="utf-8"))
         assert name in {imported for imported, _ in names_imported(tree, "")}, campaign
@@ -770,8 +763,3 @@ def test_toml_is_read_in_one_place():
         if "tomllib" in (text := path.read_text(encoding="utf-8")) and "tomllib" in dict(imports(ast.parse(text), ""))
     }
     assert found == {"calibration/data/errors.py", "calibration/data/profiles.py"}
-
-
-def test_reference_implementation_imports_nothing_of_ours():
-    tree = ast.parse((ROOT / "tests" / "reference.py").read_text(encoding="utf-8"))
-    assert not {name.partition(".")[0] for name, _ in imports(tree, "tests")} & {*LAYERS, "jax"}

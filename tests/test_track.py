@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-import reference
+from worlds import paper
 
 from mmrjax.track import Track
 
@@ -15,8 +15,8 @@ def test_track_laws_match_reference(sign):
         M0, K, mu, share, size, normal = RNG.uniform((0, 0, 0, 0, 0, 10), (1, 0.1, 1, 1, 30, 200))
         track = Track(loss_coulomb=M0, loss_viscous=K, guide_friction=mu, guide_share=share)
         w = sign * size
-        np.testing.assert_allclose(track.torque_loss(w, sign), reference.track_loss(w, M0, K, sign), rtol=1e-9)
-        expected = reference.guide_force(share * normal, mu, sign)
+        np.testing.assert_allclose(track.torque_loss(w, sign), paper.track_loss(w, M0, K, sign), rtol=1e-9)
+        expected = paper.guide_force(share * normal, mu, sign)
         np.testing.assert_allclose(track.force_guide(normal, sign), expected, rtol=1e-9)
 
 

@@ -4,11 +4,11 @@ import dataclasses
 import json
 
 import equinox as eqx
-import generator_turns as planted
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from worlds import turns as planted
 
 import mmrjax as mm
 from calibration.data import runs as records

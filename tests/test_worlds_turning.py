@@ -5,9 +5,8 @@ import math
 
 import numpy as np
 import pytest
-import reference
 from scipy.optimize import brentq
-from worlds import turning
+from worlds import paper, turning
 from worlds.turning import LENGTH, REACH, STATES, SURFACES, WIDTH, Inputs, circling, paper_robot, simulate, straight
 
 
@@ -25,7 +24,7 @@ def ideal(wheeled=False, surface="wood", coulomb=False, **changes):
 
 def spot_ratio(robot, omega):
     """v_w/(ω B/2) at which the ground's yaw moment vanishes on the spot."""
-    edge, W = omega * robot.width / 2, robot.mass * reference.G
+    edge, W = omega * robot.width / 2, robot.mass * paper.G
 
     def moment(ratio):
         return turning.ground(robot, 0.0, 0.0, omega, (-ratio * edge, ratio * edge), W).moment
@@ -50,7 +49,7 @@ def test_spot_turn_figures_of_the_issue():
     assert turning.spot_creep(LENGTH, WIDTH, 1.0, False) == pytest.approx(1.51, abs=0.005)
     assert turning.spot_creep(LENGTH, WIDTH, 1.0, True) == pytest.approx(2.52, abs=0.005)
     assert turning.spot_coulomb(LENGTH, WIDTH) == pytest.approx(1.336, abs=5e-4)
-    assert turning.moment_lateral(13.1 * reference.G, LENGTH, 0.38, False) == pytest.approx(3.66, abs=0.005)
+    assert turning.moment_lateral(13.1 * paper.G, LENGTH, 0.38, False) == pytest.approx(3.66, abs=0.005)
 
 
 @pytest.mark.parametrize("payload", [0.0, 8.0])
@@ -84,7 +83,7 @@ def test_flush_levers_turn_by_spinning_faster():
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5])
 def test_lateral_sliding_has_the_moment_of_its_closed_form(share):
     robot = ideal(coulomb=True, scheme="uniform", nodes=1000)
-    W, phi_y, omega = robot.mass * reference.G, robot.sides[0].mu_s * robot.ratio, 1.0
+    W, phi_y, omega = robot.mass * paper.G, robot.sides[0].mu_s * robot.ratio, 1.0
     ahead = share * LENGTH / 2  # L a_y / (2 g φ_y)
     rolled = -omega * robot.y  # no sliding along
     on = turning.ground(robot, 0.0, -omega * ahead, omega, rolled, W)
@@ -119,7 +118,7 @@ def test_side_slope_creeps_below_and_slides_above_its_lateral_adhesion(wheeled):
 @pytest.mark.parametrize(("voltage", "slope"), [(15.0, 0.0), (33.0, 0.1), (33.0, -0.05)])
 def test_equal_voltages_travel_straight(wheeled, voltage, slope):
     robot = paper_robot(wheeled)
-    current, w, speed = reference.Side(voltage, slope, 0.0, wheeled).steady()
+    current, w, speed = paper.Side(voltage, slope, 0.0, wheeled).steady()
     found = straight(robot, voltage, slope, 0.0)
     assert found.steer == pytest.approx(0.0, abs=1e-9)
     assert found.v_y == pytest.approx(0.0, abs=1e-12)
@@ -131,7 +130,7 @@ def test_equal_voltages_travel_straight(wheeled, voltage, slope):
 def test_run_of_equal_voltages_is_the_half_robots():
     times = np.linspace(0.0, 0.3, 4)
     history = simulate(paper_robot(True), Inputs(15.0, 15.0, slope=0.05), times, rtol=1e-8, atol=1e-10)
-    half = reference.Side(15.0, 0.05, 0.0, True).drive(times, rtol=1e-8, atol=1e-10)
+    half = paper.Side(15.0, 0.05, 0.0, True).drive(times, rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(history["I_left"][1:], half[1:, 0], rtol=1e-5)
     np.testing.assert_allclose(history["w_right"][1:], half[1:, 1], rtol=1e-5)
     np.testing.assert_allclose(history["x"][1:], half[1:, 3], rtol=1e-5)
@@ -197,7 +196,7 @@ def test_force_is_on_the_ellipse_and_takes_power(rule):
     assert np.all(F_x * u[0] + F_y * u[1] > 0)
     along = turning.friction_share(robot, u[0], 0 * u[1])[0]
     expected = [
-        [reference.friction(v, s.mu_s, s.mu_d, s.V_s, s.V_d) for v in row]
+        [paper.friction(v, s.mu_s, s.mu_d, s.V_s, s.V_d) for v in row]
         for s, row in zip(robot.sides, u[0], strict=True)
     ]
     np.testing.assert_allclose(along, expected, rtol=1e-12)
@@ -219,7 +218,7 @@ def test_loads_have_their_sum_and_centre(wheeled, x_p):
 
 def test_loads_balance_the_forces():
     robot = paper_robot(surface="concrete", payload=8.0)
-    W = robot.mass * reference.G
+    W = robot.mass * paper.G
     on = turning.ground(robot, 0.3, 0.1, 2.0, (0.9, -0.2), W)
     assert on.N.sum() == pytest.approx(W, rel=1e-12)
     assert (on.N[1] - on.N[0]) * robot.width / 2 == pytest.approx(robot.height * on.F_y.sum(), rel=1e-12)
@@ -231,7 +230,7 @@ def test_loads_balance_the_forces():
 
 def test_slope_drives_where_the_heading_says():
     robot = paper_robot()
-    pull = robot.mass * reference.G * math.sin(0.1)
+    pull = robot.mass * paper.G * math.sin(0.1)
     for heading, (along, across) in (
         (0.0, (-1, 0)),
         (math.pi / 2, (0, 1)),

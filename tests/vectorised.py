@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from reference import NOMINAL, SIDES, G
+from worlds.paper import NOMINAL, SIDES, G
 
 ALPHA = 0.00393  # IEC 60028 [1/K]
 LIMIT = 125.0  # of the winding [°C]

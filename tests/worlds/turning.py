@@ -1,7 +1,7 @@
 # ruff: noqa: E741 (symbols as in the paper)
 """A robot of two sides that turns, a second implementation in NumPy and SciPy: nothing here comes from mmrjax.
 
-Constants and the laws of one side are those of `reference` (the paper's); what is new is what two sides do together.
+Constants and the laws of one side are those of `paper` (the paper's); what is new is what two sides do together.
 SI throughout. What is assumed:
 
 Axes.  Robot's frame at the middle of the wheelbase, on the ground below the centre of mass: x forward, y to the LEFT,
@@ -15,7 +15,7 @@ J_ψ ω̇ = Σ(x F_y - y F_x) + Σ y_s R_s. J_ψ is the whole robot's about its 
 the middle). The centre of mass is in the middle of the wheelbase and of the track. m is the mass of everything.
 
 Rolling resistance  R_s = f N_s σ(v_s), against the motion of the chassis over that side, v_s = v_x - ω y_s (not of
-the mover, as in straight travel); σ is `reference.soft_sign` within V_s/10. It acts at y_s, so it has a yaw moment
+the mover, as in straight travel); σ is `paper.soft_sign` within V_s/10. It acts at y_s, so it has a yaw moment
 (on the spot: against the turn). It does not act sideways, and does not count toward the ellipse of friction.
 
 Contact.  A contact at (x, y_s) slides over the ground by the reverse of u, u = (r ω_k,s - v_x + ω y_s, -v_y - ω x); the force
@@ -33,7 +33,7 @@ Track of length L: p = (N_s/L)(1 + 12 x_p x/L²) while |x_p| ≤ L/6, beyond tha
 Wheels: two points at ±L/2 with N_s (1/2 ± x_p/L), each at least 0. Nodes: `gauss` (Gauss-Legendre) or `uniform`
 (middles of equal lengths, e.g. one a grouser).
 
-Drive of a side.  Motor, gearbox and mover exactly as `reference.Side.rates`: σ_s of losses by r ω_k,s within V_s/10,
+Drive of a side.  Motor, gearbox and mover exactly as `paper.Side.rates`: σ_s of losses by r ω_k,s within V_s/10,
 load efficiency by the direction of the torque that reaches the teeth, guide friction r μ_t s N_s σ_s with the side's own
 load N_s. The shaft bears r ΣF_x of its own contacts; R_s acts on the chassis.
 A side is driven by `voltage` [V, signed], `duty` (of one supply, -1 to 1: U_s = D_s U_e), `speed` (r ω_k,s imposed [m/s];
@@ -58,9 +58,9 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from reference import NOMINAL, G, Side, soft_sign
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, root
+from worlds.paper import NOMINAL, G, Side, soft_sign
 
 LENGTH = 0.300  # wheelbase, and of the track on the ground [m], Table 6
 WIDTH = 0.243  # between the middles of the movers: half of B_b 208 and B_T 278 mm [m], Table 6
@@ -87,7 +87,7 @@ class Robot:
     """Two sides under one chassis.
 
     Attributes:
-        sides: left and right, each with its own constants (`reference.Side`; its voltage and slope are not used).
+        sides: left and right, each with its own constants (`paper.Side`; its voltage and slope are not used).
         ratio: φ_y/φ_x; rule: a of the direction rule.
         width: B [m]; length: L [m]; height: h [m]; inertia: J_ψ [kg·m²].
         wheels: points at ±L/2, else a track over L; nodes, scheme: of its quadrature.
@@ -309,7 +309,7 @@ def instant(robot: Robot, inputs: Inputs, t: float, state: Sequence[float]) -> I
     total = sum(value[k] * I[k] for k in range(2) if kinds[k] == "duty")
     U_e = inputs.supply
     if first.battery:
-        # reference.Side.supply counts 2 I of alike sides: hand it half of the sum.
+        # paper.Side.supply counts 2 I of alike sides: hand it half of the sum.
         U_e = first.supply(total / 2, charge)
     U, dI, dw, teeth = np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(2)
     for k, side in enumerate(robot.sides):
@@ -406,7 +406,7 @@ def simulate(
 
 
 def alone(side: Side, voltage: float, slope: float = 0.0, heading: float = 0.0) -> tuple[float, float, float]:
-    """I [A], w [rad/s], V [m/s] of a side in straight travel, by `reference`: where searches begin."""
+    """I [A], w [rad/s], V [m/s] of a side in straight travel, by `paper`: where searches begin."""
     own = copy.copy(side)
     own.U, own.battery = abs(voltage), False
     own.N, own.roll = side.m * G * math.cos(slope), side.f * side.m * G * math.cos(slope)

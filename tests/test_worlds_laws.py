@@ -5,32 +5,31 @@ from __future__ import annotations
 import itertools
 from types import SimpleNamespace
 
-import foreign_laws as f
-import generator as g
-import generator_series as gs
 import numpy as np
 import pytest
+from worlds import foreign as f
+from worlds import histories, laws, settled
 
 LAWS = f.FOREIGN | f.FOREIGN_SERIES
-KNOWN = g.LIBRARY | g.VARIANTS | g.OUTSIDE
-TABLE = g.table8()
-INSTRUMENTS = g.Instruments()
+KNOWN = laws.LIBRARY | laws.VARIANTS | laws.OUTSIDE
+TABLE = settled.table8()
+INSTRUMENTS = settled.Instruments()
 
 
 @pytest.fixture(autouse=True)
 def _registered(monkeypatch):
-    """`generator.Term` finds its form by name."""
+    """`laws.Term` finds its form by name."""
     for name, form in f.FOREIGN.items():
-        monkeypatch.setitem(g.FORMS, name, form)
+        monkeypatch.setitem(laws.FORMS, name, form)
 
 
-def shapes(law: g.Form | gs.Moving, values: int) -> list[dict[str, float]]:
+def shapes(law: laws.Law, values: int) -> list[dict[str, float]]:
     """Every shape on a grid over its bounds."""
     axes = [np.linspace(*bounds, values) for bounds in law.shapes.values()]
     return [dict(zip(law.shapes, map(float, point), strict=True)) for point in itertools.product(*axes)]
 
 
-def middle(law: g.Form | gs.Moving) -> dict[str, float]:
+def middle(law: laws.Law) -> dict[str, float]:
     return {k: (low + high) / 2 for k, (low, high) in law.shapes.items()}
 
 
@@ -43,23 +42,23 @@ def experiments() -> list[SimpleNamespace]:
             voltage=voltages.get(how, (15.0, 24.0, 33.0)), payload=np.zeros(len(voltages.get(how, (0, 0, 0)))),
             slope=np.array((-10.0, 0.0, 10.0))[: len(voltages.get(how, (0, 0, 0)))],
         )
-        for setup, how in g.HOW.items()
+        for setup, how in settled.HOW.items()
         for wheeled in (0, 1)
     ]  # fmt: skip
 
 
-def signature(name: str, law: g.Form, q: dict[str, float], share: float = 1e-3) -> np.ndarray:
-    term = g.Term(name, share * law.size, q)
-    return g.signature(TABLE, g.CLIMBING, [term], INSTRUMENTS) / share
+def signature(name: str, law: laws.Law, q: dict[str, float], share: float = 1e-3) -> np.ndarray:
+    term = laws.Term(name, share * law.size, q)
+    return settled.signature(TABLE, settled.CLIMBING, [term], INSTRUMENTS) / share
 
 
 def test_count_and_names():
     assert len(f.FOREIGN) == 20
     assert len(f.FOREIGN_SERIES) == 10
-    assert not set(LAWS) & (set(g.FORMS) - set(f.FOREIGN) | set(gs.FORMS))
+    assert not set(LAWS) & (set(laws.FORMS) - set(f.FOREIGN) | set(laws.SERIES))
     assert all(law.cls == "" and law.size > 0 for law in LAWS.values())
-    settled = {law.balance for law in f.FOREIGN.values()}
-    assert settled >= {"supply", "electrical", "motor", "gearbox", "track", "ground", "slip"}
+    balances = {law.balance for law in f.FOREIGN.values()}
+    assert balances >= {"supply", "electrical", "motor", "gearbox", "track", "ground", "slip"}
     assert set(f.DISSIPATIVE) <= set(f.FOREIGN)
     assert set(f.DISSIPATIVE_SERIES) <= set(f.FOREIGN_SERIES)
 
@@ -70,12 +69,12 @@ def test_finite(name):
     law = f.FOREIGN[name]
     for q in shapes(law, 3):
         for share in (1e-3, 1.0):
-            y, sound = g.readings(TABLE, g.CLIMBING, [g.Term(name, share * law.size, q)])
+            y, sound = settled.readings(TABLE, settled.CLIMBING, [laws.Term(name, share * law.size, q)])
             assert np.isfinite(y).all() and sound.all()
-    term = g.Term(name, 1e-3 * law.size, middle(law))
+    term = laws.Term(name, 1e-3 * law.size, middle(law))
     for run in experiments():
-        before, well = g.carried_out(run, g.CLIMBING)
-        after, sound = g.carried_out(run, g.CLIMBING, [term])
+        before, well = settled.carried_out(run, settled.CLIMBING)
+        after, sound = settled.carried_out(run, settled.CLIMBING, [term])
         assert np.isfinite(after[sound]).all()
         np.testing.assert_array_equal(sound, well)
         assert np.abs(after - before)[sound].max(initial=0) < 1.0
@@ -94,9 +93,8 @@ def test_linear_in_its_amplitude(name):
 def test_losses_take(name):
     """Climbing, level and downhill: what is lost has the sign of a loss wherever the motor drives."""
     law = f.FOREIGN[name]
-    for c in (TABLE, g.table8(slopes=(-10.0, -5.0, -2.0))):
-        x, sound = g.solve(c, g.CLIMBING)
-        s = g._instant(x, c, g.CLIMBING, ())
+    for c in (TABLE, settled.table8(slopes=(-10.0, -5.0, -2.0))):
+        s, sound = settled.solve(c, settled.CLIMBING)
         driving = sound & (s.I > 0)
         assert driving.sum() > 20
         for q in shapes(law, 5):
@@ -110,7 +108,7 @@ def test_like_no_known_law():
     known = [
         (name, signature(name, law, q))
         for name, law in KNOWN.items()
-        for q in shapes(law, 7 if name in g.OUTSIDE else 4)
+        for q in shapes(law, 7 if name in laws.OUTSIDE else 4)
     ]
     known = [(name, unit(v)) for name, v in known if np.linalg.norm(v) > 0]
     for name, law in f.FOREIGN.items():
@@ -135,7 +133,7 @@ def test_series_losses_take():
     w = rng.uniform(-300, 1300, n)
     s = SimpleNamespace(
         I=rng.uniform(-3, 50, n), w=w, w_k=w / 48, V=0.038 * w / 48, V_teor=0.038 * w / 48, r=0.038, i=48.0, R=0.6,
-        sign=np.sign(w), theta=rng.uniform(-50, 2000, n), T=rng.uniform(0, 20, n), q=rng.uniform(0, 2, n),
+        d=np.sign(w), theta=rng.uniform(-50, 2000, n), T=rng.uniform(0, 20, n), q=rng.uniform(0, 2, n),
         time=rng.uniform(0, 3, n), wheeled=rng.integers(0, 2, n), C_b=0.0 * w, z=0.0 * w, battery=0.0 * w,
     )  # fmt: skip
     for name in f.DISSIPATIVE_SERIES:
@@ -155,22 +153,25 @@ def test_a_seam_gives_back_what_it_takes():
 @pytest.mark.slow
 def test_histories():
     """All laws, known ones too, as one batch of starts, each alone in its six runs at ordinary size: finite and new."""
-    laws = f.FOREIGN_SERIES | gs.FORMS
-    six, members = gs.starts(g.CLIMBING), 1 + len(laws)
-    wide = g.Conditions(
+    every = f.FOREIGN_SERIES | laws.SERIES
+    six, members = histories.starts(settled.CLIMBING), 1 + len(every)
+    wide = settled.Conditions(
         *(np.tile(getattr(six, k), members) for k in ("wheeled", "U", "slope", "payload", "mass", "row"))
     )
     owner = np.arange(6 * members) // 6
-    terms = [(law, np.where(owner == k, law.size, 0.0), middle(law)) for k, law in enumerate(laws.values(), 1)]
-    times, y = gs.histories(wide, 0.9, 0.02, g.CLIMBING, terms)
+    terms = [
+        laws.Term("", np.where(owner == k, law.size, 0.0), middle(law), law)
+        for k, law in enumerate(every.values(), 1)
+    ]
+    times, y = histories.histories(wide, 0.9, 0.02, settled.CLIMBING, terms)
     assert y.shape == (3, 6 * members, len(times))
     assert np.isfinite(y).all()
     assert (y[1, :, -1] > 0).all()  # every robot still drives
-    white = (y * g._SHOWN[:, :, None] / INSTRUMENTS.stated[:, None, None]).reshape(3, members, -1)
+    white = (y * settled.SHOWN[:, :, None] / INSTRUMENTS.stated[:, None, None]).reshape(3, members, -1)
     change = np.moveaxis(white[:, 1:] - white[:, :1], 1, 0).reshape(members - 1, -1)
     left = np.linalg.norm(change, axis=1)
     mine = len(f.FOREIGN_SERIES)
-    assert (left[:mine] > 3).all(), dict(zip(laws, left, strict=True))  # each shows
+    assert (left[:mine] > 3).all(), dict(zip(every, left, strict=True))  # each shows
     units = change / np.maximum(left, 1e-9)[:, None]  # `battery_sag` does not show off the battery
-    cos = np.abs(units[:mine] @ units.T) - np.eye(mine, len(laws))
-    assert cos.max() < 0.99, [list(laws)[k] for k in np.unravel_index(cos.argmax(), cos.shape)]
+    cos = np.abs(units[:mine] @ units.T) - np.eye(mine, len(every))
+    assert cos.max() < 0.99, [list(every)[k] for k in np.unravel_index(cos.argmax(), cos.shape)]

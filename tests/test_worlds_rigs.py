@@ -1,17 +1,15 @@
 """The generator of rigs: its balances against mmrjax's, what its files and tables hold, tolerances, sizes of effects."""
 
-import ast
 import csv
 import dataclasses
 import json
 from pathlib import Path
 
-import generator_rigs as gr
-import generator_rigs_laws as laws
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from worlds import laws, rigs
 
 from mmrjax import params, robots
 from mmrjax.chassis import Chassis
@@ -33,9 +31,9 @@ ROWS = 64  # of all tables once padded, so that few programs are compiled
 def worlds():
     """Twelve rigs of every kind with everything imposed."""
     return [
-        gr.world(np.random.default_rng([3, seed]), kind, imposed)
-        for kind in gr.KINDS
-        for imposed in gr.IMPOSED
+        rigs.world(np.random.default_rng([3, seed]), kind, imposed)
+        for kind in rigs.KINDS
+        for imposed in rigs.IMPOSED
         for seed in range(12)
     ]
 
@@ -71,23 +69,15 @@ def steady(w):
     return np.stack([np.asarray(found.reading[n])[: len(c)] for n in w.rig.channels]), names
 
 
-def test_generator_imports_nothing_of_the_package():
-    for name in ("generator_rigs", "generator_rigs_laws"):
-        tree = ast.parse((HERE / f"{name}.py").read_text(encoding="utf-8"))
-        found = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
-        found |= {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
-        assert not [m for m in found if m.partition(".")[0] in ("mmrjax", "calibration", "sweeps", "jax")]
-
-
-@pytest.mark.parametrize("kind", [k if k == "bench" else pytest.param(k, marks=pytest.mark.slow) for k in gr.KINDS])
+@pytest.mark.parametrize("kind", [k if k == "bench" else pytest.param(k, marks=pytest.mark.slow) for k in rigs.KINDS])
 def test_readings_are_those_of_the_simulator(worlds, kind):
     """Rigs of every kind: voltage, duty or speed imposed, forward and backward, loads that drive the motor."""
     mine = [w for w in worlds if w.rig.kind == kind]
-    assert len(mine) == 12 * len(gr.IMPOSED)
+    assert len(mine) == 12 * len(rigs.IMPOSED)
     with jax.enable_x64(True):
         for w in mine:
             found, names = steady(w)
-            s, sound = gr.solve(w.rig, w.conditions, w.constants)
+            s, sound = rigs.solve(w.rig, w.conditions, w.constants)
             assert sound.all()
             assert set(names) <= {"converged", "reverses", "rolls_back"}, (w.rig, names)
             size = np.abs(s.shown).max(1, keepdims=True)
@@ -98,15 +88,15 @@ def test_comparison_with_the_simulator_can_fail(worlds):
     w = next(w for w in worlds if w.rig.kind == "winch" and w._driven())
     with jax.enable_x64(True):
         found, _ = steady(dataclasses.replace(w, constants=dict(w.constants) | {"torque_constant": 0.0}))
-    s, _ = gr.solve(w.rig, w.conditions, w.constants)
+    s, _ = rigs.solve(w.rig, w.conditions, w.constants)
     assert (np.abs(found - s.shown).max(1) > 1e-3 * np.abs(s.shown).max(1)).any()
 
 
 def test_rigs_span_what_they_should(worlds):
     assert {w.rig.sides for w in worlds} == set(range(1, 7))
-    assert {w.rig.supply for w in worlds} == set(gr.SUPPLIES)
+    assert {w.rig.supply for w in worlds} == set(rigs.SUPPLIES)
     assert {len(w.rig.channels) for w in worlds} == {1, 2, 3}
-    assert {n for w in worlds for n in w.rig.channels} == set(gr.CHANNELS)
+    assert {n for w in worlds for n in w.rig.channels} == set(rigs.CHANNELS)
     assert all(16 <= len(w.conditions) <= 60 for w in worlds)
     for part in (lambda r: r.reverse, lambda r: r.quantum, lambda r: not all(r.signed.values())):
         assert 0.1 < np.mean([bool(part(w.rig)) for w in worlds]) < 0.75
@@ -117,7 +107,7 @@ def test_rigs_span_what_they_should(worlds):
 def test_rigs_are_as_makers_build_them(worlds):
     for w in worlds:
         p, r = w.rig.stated, w.rig
-        assert 3000 * 0.999 < r.no_load / gr.RPM < 10_000 * 1.01
+        assert 3000 * 0.999 < r.no_load / rigs.RPM < 10_000 * 1.01
         assert 5 <= p["gearbox.ratio"] <= 200 and 0.5 < p["gearbox.efficiency_load"] < 0.96
         stall = r.supply / p["motor.resistance"]
         assert 0.04 * r.supply * stall < 200 / 0.8 and r.supply * stall / 6 > 5 * 0.9
@@ -130,7 +120,7 @@ def test_file_states_what_was_drawn_around(worlds, tmp_path):
     import tomllib
 
     for w in worlds[::5]:
-        c = gr.case(w)
+        c = rigs.case(w)
         c.write(tmp_path / "rig")
         content = tomllib.loads((tmp_path / "rig" / "rig.toml").read_text(encoding="utf-8"))
         assert content["base"] == "none" and content["channels"] == list(w.rig.channels)
@@ -152,17 +142,19 @@ def test_file_states_what_was_drawn_around(worlds, tmp_path):
         assert len(rows) == len(w.conditions)
         assert ("slope_deg" in header) == w.rig.vehicle
         assert ("supply_voltage_V" in header) == (w.rig.imposed != "motor_speed")
-        assert all(gr.CHANNELS[n][0] in header for n in w.rig.channels)
+        assert all(rigs.CHANNELS[n][0] in header for n in w.rig.channels)
         assert not [h for h in header if "configuration" in h or "mass" in h]
 
 
 def test_truth_is_as_far_off_as_the_file_says(worlds):
     """The stated tolerances hold: standard normal in the logarithm, or in the value where that may be negative."""
-    z = np.array([x for seed in range(200) for x in gr.truth(np.random.default_rng(seed), worlds[0].rig)[1].values()])
+    z = np.array(
+        [x for seed in range(200) for x in rigs.truth(np.random.default_rng(seed), worlds[0].rig)[1].values()]
+    )
     assert abs(z.mean()) < 0.1 and 0.9 < z.std() < 1.05 and np.abs(z).max() <= 2.5
     for w in worlds:
         for name, share in w.rig.tolerances.items():
-            if name in gr.NORMAL or name == "gearbox.efficiency_load":
+            if name in rigs.NORMAL or name == "gearbox.efficiency_load":
                 continue
             off = np.log(w.constants[name] / w.rig.stated[name])
             assert off == pytest.approx(w.z[name] * np.sqrt(np.log1p(share**2)), abs=1e-9)
@@ -175,11 +167,11 @@ def test_truth_is_as_far_off_as_the_file_says(worlds):
 def test_noise_is_as_the_table_says():
     pulls = []
     for seed in range(120):
-        w = gr.world(np.random.default_rng([8, seed]))
-        c = gr.case(w, seed=seed)
+        w = rigs.world(np.random.default_rng([8, seed]))
+        c = rigs.case(w, seed=seed)
         y, _ = w.readings()
         for k, name in enumerate(w.rig.channels):
-            column = gr.CHANNELS[name][0]
+            column = rigs.CHANNELS[name][0]
             sd = next(v[0] for n, v in c.table.items() if n.startswith(column.rpartition("_")[0][:6]) and "_sd_" in n)
             assert sd > 0
             shown = c.table[column]
@@ -201,10 +193,10 @@ def test_slopes_are_derivatives_of_the_readings(worlds):
                 share = w.rig.tolerances[name]
                 by = z * (
                     share * w.rig.stated[name] / w.constants[name]
-                    if name in gr.NORMAL
+                    if name in rigs.NORMAL
                     else np.sqrt(np.log1p(share**2))
                 )
-                value = w.constants[name] * (1 + by if name in gr.NORMAL else np.exp(by))
+                value = w.constants[name] * (1 + by if name in rigs.NORMAL else np.exp(by))
                 ends.append(w.readings(p=dict(w.constants) | {name: value})[0])
             np.testing.assert_allclose(
                 ((ends[1] - ends[0]) / 2e-2 / w.stated).ravel(), slopes[:, k], atol=2e-3 * (1 + np.abs(slopes[:, k]).max())
@@ -222,20 +214,20 @@ def test_posterior_of_what_nothing_shows_is_its_prior(worlds):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("names", [laws.LIBRARY, laws.OUTSIDE], ids=["library", "outside"])
+@pytest.mark.parametrize("names", [laws.RIGS, laws.OUTSIDE_RIGS], ids=["library", "outside"])
 def test_effects_leave_the_sigmas_that_are_asked_for(names, worlds):
     """By another optimiser, and from another start, than those by which amplitudes are sized."""
     rng = np.random.default_rng(4)
     seen = set()
     for name in names:
-        fits = [w for w in worlds if name in w.applicable(laws.FORMS)]
+        fits = [w for w in worlds if name in w.applicable(rigs.FORMS)]
         assert fits, name
         for k in rng.permutation(len(fits))[:12]:
-            c = gr.case(fits[k], name, 8.0, seed=int(k))
+            c = rigs.case(fits[k], name, 8.0, seed=int(k))
             effect = c.label["effects"][0]
             if effect["sizes"] < 3 and abs(effect["sigmas"] - 8.0) < 0.5 and not c.label["rows_lost"]:
                 seen.add(name)
-                assert effect["class"] == ("" if names is laws.OUTSIDE else name)
+                assert effect["class"] == ("" if names is laws.OUTSIDE_RIGS else name)
                 y, _ = fits[k].readings(c.terms)
                 start = 0.3 * rng.standard_normal(len(fits[k].rig.tolerances))
                 assert _refitted(fits[k], y, start) == pytest.approx(effect["sigmas"], rel=0.03), name
@@ -253,8 +245,8 @@ def _refitted(w, y, start):
         p = dict(w.constants)
         for name, x in zip(names, z, strict=True):
             share = w.rig.tolerances[name]
-            by = share * w.rig.stated[name] / p[name] * x if name in gr.NORMAL else np.sqrt(np.log1p(share**2)) * x
-            p[name] = gr.moved(name, p[name], by)
+            by = share * w.rig.stated[name] / p[name] * x if name in rigs.NORMAL else np.sqrt(np.log1p(share**2)) * x
+            p[name] = rigs.moved(name, p[name], by)
         return np.nan_to_num(np.concatenate([((y - w.readings(p=p)[0]) / w.stated).ravel(), -z]), nan=1e3)
 
     return float(np.sqrt(2 * least_squares(left, start, diff_step=1e-4, max_nfev=60).cost))
@@ -263,14 +255,14 @@ def _refitted(w, y, start):
 def test_library_is_of_effects_that_mmrjax_has():
     from mmrjax.effects import BY_NAME
 
-    for name, form in laws.LIBRARY.items():
+    for name, form in laws.RIGS.items():
         effect = BY_NAME[name]
         assert form.cls == name
         assert form.balance == (effect.channel if effect.balance == "sensor" else effect.balance)
 
 
 @pytest.mark.parametrize(
-    "names", [("churning",), pytest.param(tuple(laws.LIBRARY), marks=pytest.mark.slow)], ids=["one", "every"]
+    "names", [("churning",), pytest.param(tuple(laws.RIGS), marks=pytest.mark.slow)], ids=["one", "every"]
 )
 def test_laws_are_those_of_the_library(worlds, names):
     """A library law in mmrjax shows what the generator shows, to a thousandth of a rig's largest reading."""
@@ -279,10 +271,11 @@ def test_laws_are_those_of_the_library(worlds, names):
     rng = np.random.default_rng(7)
     with jax.enable_x64(True):
         for name in names:
-            form = laws.LIBRARY[name]
-            fits = [w for w in worlds if name in w.applicable(laws.LIBRARY)]
+            form = laws.RIGS[name]
+            fits = [w for w in worlds if name in w.applicable(laws.RIGS)]
             w = next((w for w in fits if not w.rig.wide), fits[0])
-            term = dataclasses.replace(laws.draw(name, rng, w.scale()), amplitude=0.2 * form.size(w.scale()))
+            law = form.at(w.scale())
+            term = dataclasses.replace(laws.draw(name, rng, law), amplitude=0.2 * law.size)
             effect = BY_NAME[name]()
             mine = [p.name for p in params.walk(effect) if p.name != "amplitude"]
             shapes = dict(zip(mine, term.shapes.values(), strict=False))
@@ -295,9 +288,9 @@ def test_laws_are_those_of_the_library(worlds, names):
                 0, padded(c.supply), np.degrees(padded(c.slope)), padded(c.payload), duty=padded(c.duty), **imposed
             )
             found = steady_batch(changed, asked).reading
-            s, sound = gr.solve(w.rig, c, w.constants, [term])
+            s, sound = rigs.solve(w.rig, c, w.constants, [term])
             for k, channel in enumerate(w.rig.channels):
-                if channel == "output_torque" and term.form.balance == "gearbox":
+                if channel == "output_torque" and term.law.balance == "gearbox":
                     continue  # what a torque meter at the output shows is without the gear's own loss
                 got = np.asarray(found[channel])[: len(c)][sound]
                 size = np.abs(s.shown[k]).max()

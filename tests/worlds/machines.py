@@ -10,9 +10,11 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
 
-import generator as g
 import numpy as np
-from reference import NOMINAL, PULLEY, SIDES, G
+from worlds import settled
+from worlds.laws import Law
+from worlds.paper import NOMINAL, PULLEY, SIDES, G
+from worlds.settled import SUPPLIES, TOLERANCES, Conditions, Instruments, between, conditions, typed
 
 TRACKS, WHEELS = "6T2A", "4W2T"
 ROLES = (TRACKS, WHEELS)
@@ -21,7 +23,6 @@ NAMES = {TRACKS: "crawler", WHEELS: "rover"}
 STEEPEST = 20.0  # [deg]
 #: Speeds at full voltage between which a robot is believable [m/s]; current of both motors at most load [A].
 FASTEST, SLOWEST, CURRENT = 3.0, 0.3, (0.5, 60.0)
-SUPPLIES = (6.0, 7.4, 12.0, 18.0, 24.0, 36.0, 48.0)  # [V]
 #: Largest share of the adhesion that a run demands: it must not slide.
 DEMAND = 0.8
 
@@ -41,7 +42,7 @@ class Machine:
     names: Mapping[str, str]
     supply: float
     payload: float
-    instruments: g.Instruments
+    instruments: Instruments
     toml: str | None = None
 
     @property
@@ -53,7 +54,7 @@ class Machine:
     def free(self) -> tuple[str, ...]:
         """Constants that its analyst knows within tolerances."""
         lost = [role for role in ROLES if role not in self.names]
-        return tuple(n for n in g.TOLERANCES if n.split(".")[0] not in lost)
+        return tuple(n for n in TOLERANCES if n.split(".")[0] not in lost)
 
     def public(self, name: str) -> str:
         """A constant as the robot's file calls it."""
@@ -69,18 +70,16 @@ class Machine:
             "supply": self.supply,
         }  # fmt: skip
 
+    def label(self, p: Mapping[str, float]) -> dict[str, dict]:
+        """What labels say of it and of the surface of true constants."""
+        surface = {
+            name: {"adhesion": p[f"{role}.ground.friction.static"], "V_s": p[f"{role}.ground.friction.speed_static"]}
+            for role, name in self.names.items()
+        }
+        return {"surface": surface, "robot": self.size}
 
-PAPER = Machine(NOMINAL, {TRACKS: TRACKS, WHEELS: WHEELS}, 33.0, 8.0, g.Instruments())
 
-
-def _spread(rng: np.random.Generator, low: float, high: float) -> float:
-    """A number between two, uniform in its logarithm."""
-    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
-
-
-def _typed(x: float, digits: int = 3) -> float:
-    """A number as a person types it."""
-    return float(f"{x:.{digits}g}")
+PAPER = Machine(NOMINAL, {TRACKS: TRACKS, WHEELS: WHEELS}, 33.0, 8.0, Instruments())
 
 
 def _chassis(rng: np.random.Generator, role: str, mass: float, radius: float, speed_wheel: float) -> dict[str, float]:
@@ -98,8 +97,8 @@ def _chassis(rng: np.random.Generator, role: str, mass: float, radius: float, sp
         "ground.rolling_resistance": rng.uniform(*((0.03, 0.08) if tracks else (0.015, 0.05))),
         "ground.friction.static": rng.uniform(0.35, 0.7),
     }
-    found = {name: _typed(value) for name, value in found.items()}
-    found["ground.friction.dynamic"] = _typed(0.8 * found["ground.friction.static"])
+    found = {name: typed(value) for name, value in found.items()}
+    found["ground.friction.dynamic"] = typed(0.8 * found["ground.friction.static"])
     found |= {
         f"ground.friction.{n}": NOMINAL[f"{role}.ground.friction.{n}"] for n in ("speed_static", "speed_dynamic")
     }
@@ -108,15 +107,15 @@ def _chassis(rng: np.random.Generator, role: str, mass: float, radius: float, sp
 
 def _drawn(rng: np.random.Generator, roles: Sequence[str]) -> tuple[dict[str, float], float, float] | None:
     """Constants, supply and payload of a robot; None where they make no robot."""
-    mass, ratio, radius = _spread(rng, 2, 60), _spread(rng, 10, 120), _spread(rng, 0.02, 0.15)
-    supply, no_load = float(rng.choice(SUPPLIES)), _spread(rng, 300, 1250)
+    mass, ratio, radius = between(rng, 2, 60), between(rng, 10, 120), between(rng, 0.02, 0.15)
+    supply, no_load = float(rng.choice(SUPPLIES)), between(rng, 300, 1250)
     if not SLOWEST < radius * no_load / ratio < FASTEST:
         return None
     p = dict(NOMINAL) | {"6T2A.radius": PULLEY}
     for role in roles:
         p |= _chassis(rng, role, mass, radius, no_load / ratio)
         mass, radius = mass * rng.uniform(0.85, 1.0), min(radius * rng.uniform(1.0, 1.4), 0.15)
-    payload = _typed(0.6 * p[f"{roles[0]}.mass"], 2)
+    payload = typed(0.6 * p[f"{roles[0]}.mass"], 2)
     efficiency = rng.uniform(0.6, 0.88)
     demand = max(_torque(p, role, payload, no_load / ratio) for role in roles) / (ratio * efficiency)
     C = supply / no_load
@@ -135,7 +134,7 @@ def _drawn(rng: np.random.Generator, roles: Sequence[str]) -> tuple[dict[str, fl
         "gearbox.friction_coulomb": dry * rng.uniform(0.05, 0.2),
         "gearbox.friction_viscous": dry * rng.uniform(0.4, 0.9) / no_load,
     }
-    p = {n: _typed(v) if n.startswith(("motor.", "gearbox.")) else v for n, v in p.items()}
+    p = {n: typed(v) if n.startswith(("motor.", "gearbox.")) else v for n, v in p.items()}
     whole = (
         0.02 < R < 15 and CURRENT[0] < SIDES * demand / C < CURRENT[1] and p["motor.inertia"] < 8e-4 and dry < 0.08
     )
@@ -158,14 +157,14 @@ def machine(rng: np.random.Generator, roles: Sequence[str]) -> Machine:
         made = _drawn(rng, roles)
     p, supply, payload = made
     names = {role: NAMES[role] for role in roles}
-    bare = Machine(p, names, supply, payload, g.Instruments())
+    bare = Machine(p, names, supply, payload, Instruments())
     reference = reference_run(bare)
     sd = [
-        _typed(x, 2)
+        typed(x, 2)
         for x in (0.0067 * SIDES * reference.I[0], 0.0008 * reference.w[0] * 30 / np.pi, 4.6 * reference.V[0])
     ]
-    step = (_typed(sd[0] / 2, 1), _typed(sd[1] / 5, 1), _typed(sd[2] / 3, 1))
-    return dataclasses.replace(bare, instruments=g.Instruments(tuple(sd), step), toml=toml(p, names))
+    step = (typed(sd[0] / 2, 1), typed(sd[1] / 5, 1), typed(sd[2] / 3, 1))
+    return dataclasses.replace(bare, instruments=Instruments(tuple(sd), step), toml=toml(p, names))
 
 
 def toml(p: Mapping[str, float], names: Mapping[str, str]) -> str:
@@ -202,7 +201,7 @@ def steepest(p: Mapping[str, float], role: str) -> float:
     return min(STEEPEST, float(np.floor(10 * np.degrees(np.arctan(hold))) / 10))
 
 
-def grid(m: Machine, p: Mapping[str, float], payloads: int = 3) -> g.Conditions:
+def grid(m: Machine, p: Mapping[str, float], payloads: int = 3) -> Conditions:
     """A grid like Table 8, in what the robot can do: three voltages, five slopes, so many payloads."""
     rows = []
     for wheeled in m.roles:
@@ -212,13 +211,32 @@ def grid(m: Machine, p: Mapping[str, float], payloads: int = 3) -> g.Conditions:
         axes = np.meshgrid(slopes, heavy, voltages, indexing="ij")
         rows.append(np.stack([np.full(axes[0].size, wheeled), *(a.ravel() for a in axes)]))
     w, s, load, u = np.concatenate(rows, 1)
-    return g.conditions(w, u, s, load, p)
+    return conditions(w, u, s, load, p)
 
 
 # --- laws of another robot's size ---------------------------------------------------------------------
 
 #: Signals by whose ratio a law is fitted to another robot's size, and the one that gives the unit of a balance.
-SCALED = ("I", "w", "V", "w_k", "V_teor", "B", "P", "D", "N", "D_max", "M", "U", "R", "C", "r", "M_t0", "M_own")
+SCALED = (
+    "I",
+    "line",
+    "w",
+    "V",
+    "w_k",
+    "V_teor",
+    "B",
+    "P",
+    "D",
+    "N",
+    "D_max",
+    "M",
+    "U",
+    "R",
+    "C",
+    "r",
+    "M_t0",
+    "M_own",
+)
 UNITS = {
     "mass": "M", "supply": "U", "electrical": "U", "motor": "torque", "gearbox": "B", "track": "B", "ground": "N",
     "slip": "V", "total_current": "I", "motor_speed": "w", "speed": "V",
@@ -230,16 +248,15 @@ def reference_run(m: Machine) -> SimpleNamespace:
     p = dict(m.constants)
     for role in m.names:
         p[f"{role}.ground.friction.static"] = 0.6
-    c = g.conditions([m.roles[0]], m.supply, 5.0, 0.5 * m.payload, p)
-    x, sound = g.solve(c, p)
+    c = conditions([m.roles[0]], m.supply, 5.0, 0.5 * m.payload, p)
+    s, sound = settled.solve(c, p)
     if not sound.all():
         raise ValueError("the robot does not move")
-    s = g._instant(x, c, p, ())
     s.torque = s.C * s.I
     return s
 
 
-def fitted_to(form: g.Form, m: Machine) -> g.Form:
+def fitted_to(form: Law, m: Machine) -> Law:
     """A law of the paper's robot at another robot's size: signals in units of their ordinary values."""
     if m is PAPER:
         return form

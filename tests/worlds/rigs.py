@@ -9,25 +9,23 @@ that it leaves the wanted number of sigmas after a refit of the constants, read 
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import generator_rigs_laws as laws
 import numpy as np
-from generator_rigs_laws import Term
+from worlds import laws
+from worlds.laws import Law, Term
+from worlds.paper import G
+from worlds.settled import SUPPLIES, Sealed, between, instant, newton, remainder, typed, write_table
+from worlds.tables import told_apart
 
-G = 9.80665
 RPM = np.pi / 30
 
 KINDS = ("wheeled", "tracked", "bench", "winch", "linear")
 VEHICLES = ("wheeled", "tracked")
 IMPOSED = ("voltage", "duty", "motor_speed")
-SUPPLIES = (6.0, 7.4, 12.0, 18.0, 24.0, 36.0, 48.0)  # [V]
 POWER, NO_LOAD, RATIO = (5.0, 200.0), (3000.0, 10_000.0), (5.0, 200.0)  # [W], [rpm], [-]
 MOST_MOTORS = 6
 ROWS = (16, 60)
@@ -118,20 +116,10 @@ class Rig:
         return name if name.startswith(("motor.", "gearbox.")) else f"{self.name}.{name}"
 
 
-def _log(rng: np.random.Generator, low: float, high: float) -> float:
-    """A number between two, uniform in its logarithm."""
-    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
-
-
-def _typed(x: float, digits: int = 3) -> float:
-    """A number as a person types it."""
-    return float(f"{x:.{digits}g}")
-
-
 def _drive(rng: np.random.Generator, supply: float) -> dict[str, float]:
     """Motor and gearbox as makers' series have them: stall power 6 to 20 times, no-load current 2 to 6 % of nominal,
     two to five per cent lost in each stage of a planetary gear."""
-    power, no_load, ratio = _log(rng, *POWER), _log(rng, *NO_LOAD) * RPM, _log(rng, *RATIO)
+    power, no_load, ratio = between(rng, *POWER), between(rng, *NO_LOAD) * RPM, between(rng, *RATIO)
     current = power / (0.8 * supply)  # nominal
     resistance = supply / (current * rng.uniform(6, 20))
     constant = supply / no_load
@@ -168,12 +156,12 @@ def _load(rng: np.random.Generator, kind: str, p: Mapping[str, float], supply: f
         return _vehicle(rng, kind, torque, speed, sides)
     dry = torque * rng.uniform(0.1, 0.4)
     viscous = torque * rng.uniform(0.1, 0.5) / speed * bool(rng.random() < 0.8)
-    inertia = p["motor.inertia"] * p["gearbox.ratio"] ** 2 * _log(rng, 0.1, 3.0)
+    inertia = p["motor.inertia"] * p["gearbox.ratio"] ** 2 * between(rng, 0.1, 3.0)
     found = {"inertia": inertia, "loss_coulomb": dry, "loss_viscous": viscous}
     if kind == "bench":
         return found
     # travel per radian at 0.03 to 1 m/s without load: a drum's radius, a screw's or a belt's lead / 2π
-    radius = _log(rng, 0.03, 1.0) / speed
+    radius = between(rng, 0.03, 1.0) / speed
     if kind == "winch":
         found |= {"loss_coulomb": 0.4 * dry, "torque_constant": torque * rng.uniform(0.3, 0.8)}
     return found | {"radius": radius}
@@ -181,7 +169,7 @@ def _load(rng: np.random.Generator, kind: str, p: Mapping[str, float], supply: f
 
 def _vehicle(rng: np.random.Generator, kind: str, torque: float, speed: float, sides: int) -> dict[str, float]:
     tracks = kind == "tracked"
-    radius = float(np.clip(_log(rng, 0.2, 2.0) / speed, 0.015, 0.25))
+    radius = float(np.clip(between(rng, 0.2, 2.0) / speed, 0.015, 0.25))
     rolling = rng.uniform(*((0.03, 0.08) if tracks else (0.015, 0.05)))
     share = rng.uniform(0.15, 0.5) if tracks else 0.0
     low, high = (0.06, 0.18) if tracks else (0.015, 0.04)
@@ -250,14 +238,14 @@ def _any_rig(rng: np.random.Generator, kind: str | None, imposed: str | None) ->
         p |= _load(rng, kind, p, supply, sides)
         if not vehicle or (0.3 < p["mass"] < 200 and p["radius"] * _nominal(p, supply)[2] < 4):
             break
-    p = {n: _typed(v) for n, v in p.items()}
+    p = {n: typed(v) for n, v in p.items()}
     written = {}
     if kind == "linear":
-        written = {key: _typed(p[n] * _linear(p["radius"], power)) for n, (key, power) in LINEAR.items()}
+        written = {key: typed(p[n] * _linear(p["radius"], power)) for n, (key, power) in LINEAR.items()}
         radius = written["lead_mm"] / (2e3 * np.pi)
         p |= {n: written[key] / _linear(radius, power) for n, (key, power) in LINEAR.items()}
     if vehicle:
-        p["ground.friction.dynamic"] = _typed(0.8 * p["ground.friction.static"], 9)
+        p["ground.friction.dynamic"] = typed(0.8 * p["ground.friction.static"], 9)
     ends = {n: t for n, t in TOLERANCES.items() if p.get(n, 0.0) > 0}
     if not vehicle:
         ends.pop("radius", None)  # of a screw or a drum it is known, and so it is beside the speed alone
@@ -330,7 +318,7 @@ def conditions(rng: np.random.Generator, r: Rig, p: Mapping[str, float]) -> Cond
         hold = DEMAND * p["ground.friction.static"] - p["ground.rolling_resistance"]
         steep = min(STEEPEST, float(np.degrees(np.arctan(max(hold, 0.02)))))
         slopes = np.floor(10 * steep * np.linspace(-1.0 if r.downhill else 0.0, 1.0, int(rng.integers(2, 5)))) / 10
-        heavy = _typed(0.4 * r.stated["mass"], 2)
+        heavy = typed(0.4 * r.stated["mass"], 2)
         payloads = np.unique(np.round(np.linspace(0, heavy, int(rng.integers(1, 4))), 2))
     others = len(slopes) * len(payloads) * len(directions)
     levels = int(np.clip(rng.integers(4, 11), 2, max(ROWS[1] // others, 2)))
@@ -353,56 +341,6 @@ def conditions(rng: np.random.Generator, r: Rig, p: Mapping[str, float]) -> Cond
 # --- the balances -----------------------------------------------------------------------------------
 
 
-def _instant(x: np.ndarray, r: Rig, c: Conditions, p: Mapping[str, float], terms: Sequence[Term]) -> SimpleNamespace:
-    """Every quantity of settled motion at x = (I [A], ω [rad/s], V [m/s]), shape (3, rows)."""
-
-    def extra(balance: str) -> Any:
-        return sum((t.of(s) for t in terms if t.form.balance == balance), 0.0)
-
-    s = SimpleNamespace(I=x[0], w=x[1], V=x[2], d=c.direction, slope=c.slope, payload=c.payload, order=c.order)
-    s.sides, s.ratio, s.R, s.C = r.sides, p["gearbox.ratio"], p["motor.resistance"], p["motor.torque_constant"]
-    s.duty = np.ones(len(c)) if r.wide else c.duty
-    s.w_k = s.w / s.ratio
-    s.r = p.get("radius", 1.0)
-    s.V_teor = s.r * s.w_k
-    s.line = r.sides * s.I * s.duty  # of all motors, from the supply (10)
-    drop = s.R * s.I + extra("electrical")  # (15)
-    s.U = s.C * s.w + drop if r.wide else s.duty * (c.supply - extra("supply"))
-    s.volts_left = s.w - c.motor_speed if r.wide else s.U - s.C * s.w - drop
-    if r.vehicle:
-        s.M_own, s.M = p["mass"], p["mass"] + c.payload
-        s.M = s.M + extra("mass")
-        m = s.M / r.sides
-        s.N = m * G * np.cos(c.slope)
-        s.D = s.d * p["ground.rolling_resistance"] * s.N + extra("ground") + m * G * np.sin(c.slope)  # (1), (5)
-        s.D_max = p["ground.friction.static"] * s.N  # (6)
-        share = s.D / s.D_max
-        s.slides = np.abs(share) >= 1
-        creep = 2 * p["ground.friction.speed_static"] * np.sin(np.arcsin(np.clip(share, -1, 1)) / 3)  # Fig. 7
-        s.M_t0 = p["track.loss_coulomb"]
-        guide = s.r * p["track.guide_friction"] * p["track.guide_share"] * s.N  # (26)
-        friction = s.d * (s.M_t0 + guide) + p["track.loss_viscous"] * s.w_k  # (24)
-        s.pull = s.r * s.D
-    else:
-        s.slides = np.zeros(len(c), bool)
-        creep = 0.0
-        friction = s.d * p["loss_coulomb"] + p["loss_viscous"] * s.w_k
-        s.pull = p.get("torque_constant", 0.0) * np.ones(len(c))
-    s.speed_left = s.V_teor - s.V - creep - extra("slip")
-    s.B = friction + extra("track") + s.pull
-    load = s.B + extra("gearbox")
-    loss = s.d * p["motor.friction_coulomb"] + p["motor.friction_viscous"] * s.w + extra("motor")  # (14)
-    idle = s.d * p["gearbox.friction_coulomb"] + p["gearbox.friction_viscous"] * s.w  # (20)
-    eta = p["gearbox.efficiency_load"]
-    s.torque_left = s.ratio * np.where(load * s.d >= 0, eta, 1 / eta) * (s.C * s.I - loss - idle) - load  # (19)-(23)
-    s.true = {
-        "total_current": s.line, "motor_speed": s.w, "speed": s.V, "motor_current": s.I, "output_speed": s.w_k,
-        "motor_voltage": s.U, "output_torque": s.B,
-    }  # fmt: skip
-    s.shown = np.stack([s.true[n] + extra(n) + 0 * s.I for n in r.channels])
-    return s
-
-
 def _scales(r: Rig, p: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
     """Orders of size of the unknowns and of what is left in their balances, shape (3, 1) each."""
     torque, no_load, speed = _nominal(p, r.supply)
@@ -417,37 +355,59 @@ def solve(
     """Every quantity of all rows at their operating points, by Newton's method; and which rows are sound: they move as
     they are driven, do not slide and travel more than a third of what they roll."""
     size, left = _scales(r, p)
+    given = SimpleNamespace(
+        sides=r.sides, supply=None if r.wide else c.supply, duty=np.ones(len(c)) if r.wide else c.duty, d=c.direction,
+        motor_speed=c.motor_speed if r.wide else None, slope=c.slope, payload=c.payload, order=c.order,
+        mass=p["mass"] + c.payload if r.vehicle else None,
+    )  # fmt: skip
+
+    def at(x: np.ndarray) -> SimpleNamespace:
+        return instant(x, given, p, terms, r.channels)
 
     def residual(x: np.ndarray) -> np.ndarray:
-        s = _instant(x, r, c, p, terms)
+        s = at(x)
         return np.stack([s.volts_left, s.torque_left, s.speed_left]) / left
 
     speed = c.motor_speed if r.wide else 0.9 * c.duty * c.supply / p["motor.torque_constant"]
     x = np.stack([size[0] * c.direction, speed, p.get("radius", 1.0) * speed / p["gearbox.ratio"]])
+    x = newton(residual, x, size, 40, 3.0, 1e-13)
     with np.errstate(all="ignore"):
-        for _ in range(40):
-            f = residual(x)
-            columns = []
-            for k in range(3):
-                step = x.copy()
-                step[k] += 1e-6 * size[k]
-                columns.append((residual(step) - f) / 1e-6)
-            slope = np.stack(columns, 1).transpose(2, 0, 1)
-            try:
-                move = np.linalg.solve(np.nan_to_num(slope), np.nan_to_num(f.T)[..., None])[..., 0].T
-            except np.linalg.LinAlgError:
-                break
-            move = np.clip(np.nan_to_num(move), -3, 3)
-            x = x - move * size
-            if np.abs(move).max() < 1e-13:
-                break
-        s, f = _instant(x, r, c, p, terms), residual(x)
+        s, f = at(x), residual(x)
     sound = np.isfinite(f).all(0) & (np.abs(f).max(0) < 1e-9) & ~s.slides & np.isfinite(s.shown).all(0)
     sound &= (s.w * c.direction > 0.02 * r.no_load) & (s.V * c.direction > 0.3 * np.abs(s.V_teor))
     return s, sound
 
 
 # --- signatures -------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class About:
+    """What of a rig decides which effects it can have and show: whether it is a vehicle; what is imposed, its channels;
+    whether it has rows backward, and at least three rows whose load drives the motor; how many slopes and payloads."""
+
+    vehicle: bool
+    imposed: str
+    channels: tuple[str, ...]
+    reverse: bool
+    driven: bool
+    slopes: int
+    payloads: int
+
+    def has(self, *names: str) -> bool:
+        """Whether it has any of these channels."""
+        return bool(set(names) & set(self.channels))
+
+    @property
+    def electric(self) -> bool:
+        """Whether anything shows the electrical balance: a voltage imposed or read, and beside it two more readings of
+        three unknowns would leave its equation closed only by its constants."""
+        return self.imposed != "motor_speed" or self.has("motor_voltage")
+
+    @property
+    def slips(self) -> bool:
+        """Whether ground speed stands beside the speed of the shafts."""
+        return self.vehicle and self.has("speed") and (self.imposed == "motor_speed" or self.has("motor_speed"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -517,25 +477,17 @@ class World:
         covariance = np.linalg.inv(slopes.T @ slopes + np.eye(slopes.shape[1]))
         return dict(zip(self.rig.tolerances, np.sqrt(np.diag(covariance)).tolist(), strict=True))
 
-    def applicable(self, forms: Mapping[str, laws.Form]) -> tuple[str, ...]:
+    def applicable(self, forms: Mapping[str, Law]) -> tuple[str, ...]:
         """Names of those forms that this rig can have."""
-        about = laws.About(
-            self.rig.vehicle, self.rig.kind == "tracked", self.rig.imposed, self.rig.channels, self.rig.reverse,
-            self._driven(), len(np.unique(self.conditions.slope)), len(np.unique(self.conditions.payload)),
+        about = About(
+            self.rig.vehicle, self.rig.imposed, self.rig.channels, self.rig.reverse, self._driven(),
+            len(np.unique(self.conditions.slope)), len(np.unique(self.conditions.payload)),
         )  # fmt: skip
         return tuple(n for n, form in forms.items() if form.needs(about))
 
     def _driven(self) -> bool:
         s, _ = solve(self.rig, self.conditions, self.constants)
         return bool((s.B * self.conditions.direction < 0).sum() >= 3)
-
-
-def remainder(signature: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """What of a whitened signature is left after a refit of the constants with their tolerances as priors."""
-    n = slopes.shape[1]
-    wide = np.concatenate([slopes, np.eye(n)])
-    long = np.concatenate([signature, np.zeros(n)])
-    return long - wide @ np.linalg.lstsq(wide, long, rcond=None)[0]
 
 
 def world(
@@ -565,9 +517,9 @@ def world(
         )
         for name, most in zip(r.channels, largest, strict=True):
             column_unit, share = CHANNELS[name][1], rng.uniform(*CHANNELS[name][2])
-            sd[name] = _typed(share * most / column_unit, 2)
+            sd[name] = typed(share * most / column_unit, 2)
             if coarse and rng.random() < 0.7:
-                quantum[name] = _typed(sd[name] * rng.uniform(1.0, COARSE[repeated]), 2)
+                quantum[name] = typed(sd[name] * rng.uniform(1.0, COARSE[repeated]), 2)
         return World(dataclasses.replace(r, quantum=quantum), p, z, c, sd)
     raise ValueError("no such rig whose rows are all sound")
 
@@ -608,7 +560,7 @@ def sized(w: World, term: Term, sigmas: float, slopes: np.ndarray) -> tuple[Term
     Secant steps from a hundredth of its ordinary size, at first by the linear remainder; fewer sigmas come back where
     rows would be lost.
     """
-    amplitude = 0.01 * term.size * np.sign(term.amplitude)
+    amplitude = 0.01 * term.law.size * np.sign(term.amplitude)
     best = (dataclasses.replace(term, amplitude=amplitude), 0.0)
     exact = False
     for _ in range(12):
@@ -619,7 +571,7 @@ def sized(w: World, term: Term, sigmas: float, slopes: np.ndarray) -> tuple[Term
             continue
         left = left_over(w, [now], slopes) if exact else float(np.linalg.norm(remainder(sign, slopes)))
         best = (now, left) if left > 0 else best
-        if left < 1e-9 or abs(amplitude) > 10 * term.size or (exact and abs(left - sigmas) < 0.03 * sigmas):
+        if left < 1e-9 or abs(amplitude) > 10 * term.law.size or (exact and abs(left - sigmas) < 0.03 * sigmas):
             break
         if abs(left - sigmas) < 0.03 * sigmas:
             exact = True
@@ -632,59 +584,39 @@ def oracle(w: World, term: Term, slopes: np.ndarray) -> dict[str, Any]:
     """Library effects that noise-free data could not tell from a term, and what the best other one would leave [σ]."""
     left = remainder(np.nan_to_num(w.signature([term])), slopes)
     size, scale, apart = float(np.linalg.norm(left)), w.scale(), {}
-    for name in w.applicable(laws.LIBRARY):
-        form = laws.LIBRARY[name]
+    for name in w.applicable(laws.RIGS):
+        law = laws.RIGS[name].at(scale)
         found = []
-        for shapes in form.grid(scale):
-            trial = Term(name, 0.02 * form.size(scale), shapes, form, scale)
-            unit = remainder(np.nan_to_num(w.signature([trial])), slopes)
+        for shapes in law.grid():
+            unit = remainder(np.nan_to_num(w.signature([Term(name, 0.02 * law.size, shapes, law)])), slopes)
             norm = float(np.linalg.norm(unit))
             along = float(left @ unit) / norm if norm > 1e-9 else 0.0
-            if form.either or along > 0:
+            if law.either or along > 0:
                 found.append(float(np.sqrt(max(size**2 - along**2, 0.0))))
         apart[name] = min(found, default=size)
-    others = {n: d for n, d in apart.items() if n != term.form.cls}
-    return {
-        "class_oracle": [n for n, d in apart.items() if d < max(2.0, np.sqrt(1 - 0.95**2) * size)],
-        "best_other": min(others.values(), default=size),
-        "mimic": min(others, key=others.__getitem__, default=""),
-    }
+    return told_apart(apart, size, term.law.cls)
+
+
+#: Effects that a rig may have.
+FORMS = laws.RIGS | laws.OUTSIDE_RIGS
 
 
 # --- cases ------------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
-class Case:
-    """A rig with its table and its label.
+class Case(Sealed):
+    """A rig with its table and its label, and what it was made from."""
 
-    Attributes:
-        toml: the rig's file; table: columns of a CSV; label: truth, for the scorer alone.
-        world, terms: what it was made from.
-    """
-
-    toml: str
-    table: dict[str, np.ndarray]
-    label: dict[str, Any]
     world: World
     terms: tuple[Term, ...]
-
-    def write(self, folder: Path) -> None:
-        """`rig.toml`, `table.csv` and `label.json` in a folder, which is made."""
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "rig.toml").write_text(self.toml, encoding="utf-8")
-        with (folder / "table.csv").open("w", newline="", encoding="utf-8") as file:
-            out = csv.writer(file)
-            out.writerow(self.table)
-            out.writerows(zip(*self.table.values(), strict=True))
-        (folder / "label.json").write_text(json.dumps(self.label, indent=1), encoding="utf-8")
 
 
 def case(w: World, name: str = "", sigmas: float = 8.0, seed: int = 0) -> Case:
     """A case of a world.
 
     Args:
-        name: of an effect of `laws.FORMS` that the rig's file does not state; empty makes a clean table.
+        name: of an effect of FORMS that the rig's file does not state; empty makes a clean table.
         sigmas: that it leaves after a refit of the constants with their tolerances.
         seed: of shapes, sign and noise.
     """
@@ -694,48 +626,46 @@ def case(w: World, name: str = "", sigmas: float = 8.0, seed: int = 0) -> Case:
     if name:
         with np.errstate(all="ignore"):
             slopes = w.slopes()
-            term, left = sized(w, laws.draw(name, rng, w.scale()), sigmas, slopes)
+            term, left = sized(w, laws.draw(name, rng, FORMS[name].at(w.scale())), sigmas, slopes)
             alike = oracle(w, term, slopes)
         terms = (term,)
-        sensor = term.form.balance in CHANNELS
-        effects.append({
-            "name": name, "class": term.form.cls, "balance": "sensor" if sensor else term.form.balance,
-            "channel": term.form.balance if sensor else "", "amplitude": term.amplitude,
-            "sizes": abs(term.amplitude) / term.size, "shapes": dict(term.shapes), "sigmas": left, **alike,
-        })  # fmt: skip
+        effects.append(term.label | {"sigmas": left, **alike})
     y, sound = w.readings(terms)
     r = w.rig
     label = {
         "schema": "mmrjax.sealed-rig/1",
         "seed": seed,
-        "kind": "clean" if not name else "library" if name in laws.LIBRARY else "outside",
-        "load": r.kind, "imposed": r.imposed, "channels": list(r.channels), "sides": r.sides, "supply": r.supply,
+        "kind": "clean" if not name else "library" if name in laws.RIGS else "outside",
+        "stratum": r.kind, "load": r.kind, "imposed": r.imposed, "channels": list(r.channels), "sides": r.sides, "supply": r.supply,
         "reverse": r.reverse, "unsigned": [n for n, s in r.signed.items() if not s], "quantum": dict(r.quantum),
         "rows": len(w.conditions), "rows_lost": int((~sound).sum()), "effects": effects,
         "constants": {r.public(n): w.constants[n] for n in r.tolerances},
         "z": {r.public(n): z for n, z in w.z.items()},
         "sd_over_prior": {r.public(n): x for n, x in w.posterior().items()},
     }  # fmt: skip
-    return Case(toml(r), _table(w, y, sound, rng), label, w, terms)
+    return Case(_table(w, y, sound, rng), label, toml(r), w, terms)
 
 
-def _table(w: World, y: np.ndarray, sound: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    r, c = w.rig, w.conditions
-    kept: dict[str, np.ndarray] = {}
-    if r.imposed == "motor_speed":
-        kept["motor_speed_rpm"] = np.round(c.motor_speed / RPM, 6)
-    else:
-        kept["supply_voltage_V"] = c.supply
+def settings(r: Rig, c: Conditions) -> dict[str, np.ndarray]:
+    """Columns of what is imposed."""
+    speed = {"motor_speed_rpm": np.round(c.motor_speed / RPM, 6)}
+    kept = speed if r.wide else {"supply_voltage_V": c.supply}
     if r.imposed == "duty":
         kept["duty"] = c.duty
     if r.vehicle:
         kept |= {"slope_deg": np.round(np.degrees(c.slope), 6), "payload_kg": c.payload}
+    return kept
+
+
+def _table(w: World, y: np.ndarray, sound: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    r, c = w.rig, w.conditions
+    kept = settings(r, c)
     noise = rng.standard_normal(y.shape)
     for k, name in enumerate(r.channels):
         shown = y[k] + w.sd[name] * noise[k]
         if step := r.quantum.get(name, 0.0):
             shown = np.round(shown / step) * step
-        kept[CHANNELS[name][0]] = np.array([_typed(x, 9) for x in (shown if r.signed[name] else np.abs(shown))])
+        kept[CHANNELS[name][0]] = np.array([typed(x, 9) for x in (shown if r.signed[name] else np.abs(shown))])
     for name in r.channels:
         column, _, unit = CHANNELS[name][0].rpartition("_") if name != "speed" else ("speed", "", "mm_s")
         kept[f"{column}_sd_{unit}"] = np.full(len(c), w.sd[name])
@@ -770,3 +700,75 @@ def toml(r: Rig) -> str:
     for head, table in tables.items():
         lines += ["", f"[{head}]", *(f"{k} = {v}" for k, v in table.items())]
     return "\n".join(lines) + "\n"
+
+
+# --- logs ---------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Log:
+    """A log.
+
+    Attributes:
+        table: its columns; level: index of the level of each row; settled: readings of each level without noise [unit],
+            shape (levels, channels); channels: names; sd: noise of a sample [unit], by channel.
+    """
+
+    table: dict[str, np.ndarray]
+    level: np.ndarray
+    settled: np.ndarray
+    channels: tuple[str, ...]
+    sd: dict[str, float]
+
+    def write(self, path):
+        """The log as a CSV file."""
+        write_table({n: [f"{x:.9g}" for x in column] for n, column in self.table.items()}, path)
+
+
+def log(
+    w: World,
+    rng: np.random.Generator,
+    *,
+    hold: float = 2.0,
+    rate: float = 100.0,
+    lag: float = 0.15,
+    noise: float = 1.0,
+    jitter: float = 0.1,
+    delay: float = 0.0,
+    step: float = 0.0,
+    terms: tuple[Term, ...] = (),
+) -> Log:
+    """A log that goes through the rows of a world's table.
+
+    Args:
+        hold: of each level [s]; rate: samples a second; lag: time constant of the transitions [s].
+        noise: of a sample, over the sd that the world has of settled readings; jitter: sd of the clock, over a step.
+        terms: effects that the rig's file does not state (`case`).
+        delay: of the readings against what is imposed [s]; step: of the instruments, over the sd of a sample.
+    """
+    shown, sound = w.readings(terms)
+    assert sound.all()
+    per = round(hold * rate)
+    rows = per * len(w.conditions)
+    level = np.repeat(np.arange(len(w.conditions)), per)
+    time = np.arange(rows) / rate
+    time[1:] += np.clip(jitter * rng.standard_normal(rows - 1), -0.4, 0.4) / rate
+    c, r = w.conditions, w.rig
+    table = {"time_s": np.round(time, 6)} | {n: column[level] for n, column in settings(r, c).items()}
+    sds = {}
+    late = round(delay * rate)
+    settled = np.stack([s if w.rig.signed[n] else np.abs(s) for n, s in zip(r.channels, shown, strict=True)], 1)
+    decay = np.exp(-1 / (rate * lag))
+    for k, name in enumerate(r.channels):
+        target = settled[level, k]
+        target = np.concatenate([np.full(late, target[0]), target[: rows - late]])
+        x, at = np.empty(rows), target[0]
+        for i in range(rows):
+            at = target[i] + (at - target[i]) * decay
+            x[i] = at
+        sds[name] = noise * w.sd[name]
+        x = x + sds[name] * rng.standard_normal(rows)
+        if step:
+            x = np.round(x / (step * sds[name])) * step * sds[name]
+        table[CHANNELS[name][0]] = x
+    return Log(table, level, settled, r.channels, sds)

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from reference import NOMINAL
 from worlds import turning as world
+from worlds.paper import NOMINAL
 
 from mmrjax import channels
 

@@ -6,21 +6,22 @@ perturbed rigs go through the classical Runge-Kutta method at once, with steps o
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import json
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from worlds import laws
+from worlds.histories import runge_kutta, soft_sign, teeth
+from worlds.laws import Term, shaped
+from worlds.rigs import RPM
+from worlds.settled import Sealed, between, remainder, typed
 
 IMPOSED = ("voltage", "motor_current", "motor_speed")
 RUNS, ROWS = 4, 200
 EVERY = (0.005, 0.01, 0.02)  # [s]
 STEP = 2.5e-4  # [s]; the winding's time constant is 2e-4 s, and the method is stable to 2.7 of them
-RPM = np.pi / 30
 REST = 0.01  # of the output, within which friction is smoothed [rad/s]
 RELATIVE = {
     "resistance": 0.05, "torque_constant": 0.03, "friction": 0.3, "viscous": 0.3, "efficiency": 0.04,
@@ -40,41 +41,9 @@ CHANNELS = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class Law:
-    """One effect: balance, term per unit of amplitude, ordinary size, on which rigs, shapes to draw from."""
-
-    balance: str
-    of: Callable[[SimpleNamespace, Mapping[str, float]], Any]
-    size: Callable[[SimpleNamespace], float]
-    cls: str = ""
-    imposed: tuple[str, ...] = IMPOSED
-    shapes: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
-
-
-_PHASE = {"phase": (-3.0, 3.0)}
-LIBRARY: dict[str, Law] = {
-    "series_resistance": Law("electrical", lambda s, q: s.I, lambda r: 0.15 * r.resistance, "series_resistance", ("voltage",)),
-    "torque_constant_saturation": Law("motor", lambda s, q: s.C * s.I**3, lambda r: 0.15 / r.rated**2, "torque_constant_saturation"),
-    "gear_quadratic_loss": Law("gearbox", lambda s, q: s.B**2 * s.sign, lambda r: 0.1 / r.torque, "gear_quadratic_loss"),
-    "churning": Law("track", lambda s, q: s.w_k**2 * s.sign, lambda r: 0.1 * r.torque / r.w_k**2, "churning"),
-    "stribeck_track": Law("track", lambda s, q: np.exp(-abs(s.w_k) / (q["fade"] * s.fast)) * s.sign, lambda r: 0.1 * r.torque, "stribeck_track", shapes={"fade": (0.1, 0.3)}),
-    "directional_friction": Law("track", lambda s, q: s.sign**2, lambda r: 0.07 * r.torque, "directional_friction"),
-    "directional_viscous": Law("track", lambda s, q: s.w_k * s.sign, lambda r: 0.07 * r.torque / r.w_k, "directional_viscous"),
-    "presliding": Law("track", lambda s, q: s.z - s.sign, lambda r: 0.1 * r.torque, "presliding"),
-    "angle_friction": Law("track", lambda s, q: np.sin(s.theta + q["phase"]) * s.sign, lambda r: 0.07 * r.torque, "angle_friction", shapes=_PHASE),
-}  # fmt: skip
-OUTSIDE: dict[str, Law] = {
-    # a bent shaft, a seal that lets go at a speed, grease that warms with the way travelled, cable drag by the angle
-    "order_two": Law("track", lambda s, q: np.sin(2 * s.theta + q["phase"]), lambda r: 0.07 * r.torque, shapes=_PHASE),
-    "friction_step": Law("track", lambda s, q: 0.5 * (1 + np.tanh((abs(s.w_k) / s.fast - q["at"]) / 0.03)) * s.sign, lambda r: 0.1 * r.torque, shapes={"at": (0.3, 0.6)}),
-    "warming": Law("track", lambda s, q: np.exp(-s.time / 0.5) * s.sign, lambda r: 0.1 * r.torque),
-    "supply_recovery": Law("electrical", lambda s, q: np.exp(-s.time / 0.3) * np.sign(s.I), lambda r: 0.05 * r.supply, imposed=("voltage",)),
-}  # fmt: skip
-LAWS = {**LIBRARY, **OUTSIDE}
+LAWS = laws.LOGS | laws.OUTSIDE_LOGS
 #: Turn over which the contacts of `presliding` yield [rad], the library's own.
 YIELDS = 0.02
-Term = tuple[Law, float, Mapping[str, float]]
 #: Of a sum of squares, what one more step of one's own least squares may still gain.
 CONVERGED = 0.1
 
@@ -125,10 +94,7 @@ def rig(rng: np.random.Generator, imposed: str, every: float | None = None) -> R
         every: sampling step [s]; None: a random one.
     """
     supply, fast = float(rng.choice([6.0, 12.0, 24.0, 48.0])), rng.uniform(300.0, 800.0)
-    stall, ratio = (
-        np.exp(rng.uniform(np.log(3), np.log(30))),
-        float(np.round(np.exp(rng.uniform(np.log(15), np.log(60))))),
-    )
+    stall, ratio = between(rng, 3, 30), float(np.round(between(rng, 15, 60)))
     C, R, eta = supply / fast, supply / stall, rng.uniform(0.7, 0.92)
     rated = 0.3 * stall
     torque, w_k = ratio * eta * C * rated, fast / ratio
@@ -141,7 +107,7 @@ def rig(rng: np.random.Generator, imposed: str, every: float | None = None) -> R
         "inertia": (1 - share) * whole, "dry": torque * rng.uniform(0.1, 0.3),
         "damping": torque * rng.uniform(*((0.5, 1.0) if slow else (0.1, 0.3))) / w_k,
     }  # fmt: skip
-    stated = {n: float(f"{x * np.exp(RELATIVE[n] * rng.standard_normal()):.4g}") for n, x in p.items()}
+    stated = {n: typed(x * np.exp(RELATIVE[n] * rng.standard_normal()), 4) for n, x in p.items()}
     stated["efficiency"] = min(stated["efficiency"], 0.97)
     drawn = float(rng.choice(EVERY))
     every = drawn if every is None else every
@@ -151,7 +117,7 @@ def rig(rng: np.random.Generator, imposed: str, every: float | None = None) -> R
     delay = every * (round(late) if imposed == "motor_speed" else late)
     made = Rig(imposed, p, stated, ratio, supply, rated, torque, w_k, every, inputs, delay, {})
     shown = histories(made, [p])[0]
-    sd = {n: float(f"{CHANNELS[n][2] * np.sqrt(np.mean(shown[n] ** 2)):.2g}") for n in made.channels}
+    sd = {n: typed(CHANNELS[n][2] * np.sqrt(np.mean(shown[n] ** 2)), 2) for n in made.channels}
     return dataclasses.replace(made, sd=sd)
 
 
@@ -178,37 +144,38 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
     count, per = len(members), round(r.every / STEP)
     p = {n: np.repeat([m[n] for m in members], RUNS) for n in r.p}
     inputs = np.tile(r.inputs, (count, 1))
-    laws: list[tuple[Law, np.ndarray, Mapping[str, float]]] = []
-    for k, own in enumerate(terms or [()] * count):
-        laws += [(law, np.where(np.arange(count * RUNS) // RUNS == k, a, 0.0), q) for law, a, q in own]
+    every = [
+        dataclasses.replace(t, amplitude=np.where(np.arange(count * RUNS) // RUNS == k, t.amplitude, 0.0))
+        for k, own in enumerate(terms or ())
+        for t in own
+    ]
     J_w, J_d, C, R, i = p["inertia"], p["rotor"], p["torque_constant"], p["resistance"], r.ratio
 
     def signals(time, y, given, slope):
-        s = SimpleNamespace(time=time, C=C, fast=r.w_k, I=y[0], w=y[1], theta=y[2], z=y[3])
+        s = SimpleNamespace(time=time, C=C, fast=r.w_k, I=y[0], w=y[1], turn=y[2], b=y[3])
         if r.imposed == "motor_speed":
             s.w = given
         s.w_k = s.w / i
-        x = np.clip(s.w_k / REST, -1, 1)
-        s.sign = 0.5 * x * (3 - x * x)
+        s.d = soft_sign(s.w_k, REST)
 
         def extra(balance):
-            return sum((a * law.of(s, q) for law, a, q in laws if law.balance == balance), 0.0)
+            return laws.total(every, balance, s)
 
-        load = p["dry"] * s.sign + p["damping"] * s.w_k + extra("track")
+        load = p["dry"] * s.d + p["damping"] * s.w_k + extra("track")
         s.B = load
         s.B = load + extra("gearbox")
-        idle = p["friction"] * s.sign + p["viscous"] * s.w
+        idle = p["friction"] * s.d + p["viscous"] * s.w
         if r.imposed == "motor_speed":
             turn = slope / i
             for _ in range(6):  # the current by which the motors accelerate so
                 A = C * s.I - idle - extra("motor")
-                eta = _efficiency(A * J_w + i * J_d * s.B, s.sign, p["efficiency"])
+                eta = teeth(A * J_w + i * J_d * s.B, s.d, p["efficiency"])
                 s.I = ((turn * (J_w + J_d * i**2 * eta) + s.B) / (i * eta) + idle + extra("motor")) / C
-            s.turn = turn
+            s.rate = turn
         else:
             A = C * s.I - idle - extra("motor")
-            eta = _efficiency(A * J_w + i * J_d * s.B, s.sign, p["efficiency"])
-            s.turn = (i * eta * A - s.B) / (J_w + J_d * i**2 * eta)
+            eta = teeth(A * J_w + i * J_d * s.B, s.d, p["efficiency"])
+            s.rate = (i * eta * A - s.B) / (J_w + J_d * i**2 * eta)
         if r.imposed == "voltage":
             s.dI = (given - C * s.w - R * s.I - extra("electrical")) / (2e-4 * R)
         else:
@@ -217,10 +184,10 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
 
     def rates(time, y, given, slope):
         s = signals(time, y, given, slope)
-        z = (s.w_k - s.w_k * s.sign * s.z) / YIELDS
+        b = (s.w_k - s.w_k * s.d * s.b) / YIELDS
         if r.imposed == "motor_speed":
-            return np.stack([0 * s.w, 0 * s.w, s.w_k, z])
-        return np.stack([s.dI, i * s.turn, s.w_k, z])
+            return np.stack([0 * s.w, 0 * s.w, s.w_k, b])
+        return np.stack([s.dI, i * s.rate, s.w_k, b])
 
     y = np.zeros((4, count * RUNS))
     lines = r.imposed == "motor_speed"
@@ -231,23 +198,19 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
         now = inputs[:, row]
         slope = (inputs[:, min(row + 1, ROWS - 1)] - now) / r.every if lines else 0.0
         for n in range(per):
-            t, given = (row + n / per) * r.every, [now + slope * (n + x) * h for x in (0.0, 0.5, 1.0)]
+            t = (row + n / per) * r.every
+
+            def at(x: float, y: np.ndarray, what: Any = rates) -> Any:
+                return what(t + x * h, y, now + slope * (n + x) * h, slope)  # noqa: B023
+
             if row * per + n in wanted:
-                s = signals(t, y, given[0], slope) if lines else SimpleNamespace(I=y[0], w=y[1])
+                s = at(0.0, y, signals) if lines else SimpleNamespace(I=y[0], w=y[1])
                 kept[row * per + n] = [s.I, s.w, y[2]]
-            a = rates(t, y, given[0], slope)
-            b = rates(t + h / 2, y + h / 2 * a, given[1], slope)
-            d = rates(t + h / 2, y + h / 2 * b, given[1], slope)
-            e = rates(t + h, y + h * d, given[2], slope)
-            y = y + h / 6 * (a + 2 * b + 2 * d + e)
+            y = runge_kutta(at, y, h)
     rows = np.array([kept[max(row * per - late, 0)] for row in range(ROWS)])  # (rows, 3, columns)
     shown = np.moveaxis(rows, 0, -1).reshape(3, count, RUNS, ROWS)
     order = {"total_current": 0, "motor_speed": 1, "output_angle": 2}
     return [{n: shown[order[n], k] / CHANNELS[n][1] for n in r.channels} for k in range(count)]
-
-
-def _efficiency(flow, sign, eta):
-    return 1 + np.abs(sign) * (np.where(flow * sign >= 0, eta, 1 / eta) - 1)
 
 
 def whitened(r: Rig, shown: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -261,23 +224,11 @@ def moved(p: Mapping[str, float], name: str, z: float) -> dict[str, float]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Case:
-    """A rig, its log and its label."""
+class Case(Sealed):
+    """A log with its label, its rig, and its whitened readings, shape (runs, readings)."""
 
     rig: Rig
-    measured: np.ndarray  # whitened, shape (runs, readings)
-    table: dict[str, np.ndarray]
-    label: dict[str, Any]
-
-    def write(self, folder: Path) -> None:
-        """`rig.toml`, `table.csv` and `label.json`."""
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "rig.toml").write_text(toml(self.rig), encoding="utf-8")
-        with (folder / "table.csv").open("w", newline="", encoding="utf-8") as file:
-            out = csv.writer(file)
-            out.writerow(self.table)
-            out.writerows(zip(*self.table.values(), strict=True))
-        (folder / "label.json").write_text(json.dumps(self.label, indent=1), encoding="utf-8")
+    measured: np.ndarray
 
 
 def slopes(r: Rig, p: Mapping[str, float], terms: Sequence[Term], also: Sequence[Sequence[Term]] = ()):
@@ -297,21 +248,18 @@ def case(r: Rig, name: str, sigmas: float, seed: int) -> Case:
     terms: tuple[Term, ...] = ()
     effects = []
     if name:
-        law = LAWS[name]
-        shapes = {k: float(rng.uniform(*b)) for k, b in law.shapes.items()}
-        amplitude = 0.05 * law.size(r.scale)
-        y, base, (change,) = slopes(r, r.p, (), [[(law, amplitude, shapes)]])
+        term = shaped(name, rng, LAWS[name].at(r.scale))
+        term = dataclasses.replace(term, amplitude=0.05 * term.law.size)
+        y, base, (change,) = slopes(r, r.p, (), [[term]])
         columns = np.stack([b.ravel() for b in base], 1)
-        left = _left(change.ravel(), columns)
+        left = float(np.linalg.norm(remainder(change.ravel(), columns)))
         for _ in range(4):  # what is left does not quite grow as the amplitude
-            amplitude *= float(np.clip(sigmas / max(left, 1e-9), 0.1, 30.0))
-            change = whitened(r, histories(r, [r.p], [[(law, amplitude, shapes)]])[0]) - y
-            left = _left(np.nan_to_num(change, nan=1e3).ravel(), columns)
-        terms = ((law, amplitude, shapes),)
-        effects.append({
-            "name": name, "class": law.cls, "balance": law.balance, "channel": "", "amplitude": amplitude,
-            "sizes": amplitude / law.size(r.scale), "shapes": shapes, "sigmas": left,
-        })  # fmt: skip
+            larger = float(np.clip(sigmas / max(left, 1e-9), 0.1, 30.0))
+            term = dataclasses.replace(term, amplitude=term.amplitude * larger)
+            change = whitened(r, histories(r, [r.p], [[term]])[0]) - y
+            left = float(np.linalg.norm(remainder(np.nan_to_num(change, nan=1e3).ravel(), columns)))
+        terms = (term,)
+        effects.append(term.label | {"sigmas": left})
     shown = histories(r, [r.p], [terms])[0]
     measured = {n: x + r.sd[n] * rng.standard_normal(x.shape) for n, x in shown.items()}
     column = {"voltage": "supply_voltage_V", "motor_current": "motor_current_A", "motor_speed": "motor_speed_rpm"}
@@ -323,20 +271,14 @@ def case(r: Rig, name: str, sigmas: float, seed: int) -> Case:
     }
     for n in r.channels:
         head, _, unit = CHANNELS[n][0].rpartition("_")
-        table[CHANNELS[n][0]] = np.array([float(f"{x:.9g}") for x in measured[n].ravel()])
+        table[CHANNELS[n][0]] = np.array([typed(x, 9) for x in measured[n].ravel()])
         table[f"{head}_sd_{unit}"] = np.full(RUNS * ROWS, r.sd[n])
     label = {
-        "kind": "clean" if not name else "library" if LAWS[name].cls else "outside", "seed": seed, "imposed": r.imposed,
+        "kind": "clean" if not name else "library" if LAWS[name].cls else "outside", "seed": seed, "stratum": r.imposed, "imposed": r.imposed,
         "every": r.every, "delay": r.delay, "effects": effects, "constants": r.p,
-        "finite": bool(all(np.isfinite(x).all() for x in shown.values())),
+        "sound": bool(all(np.isfinite(x).all() for x in shown.values())),
     }  # fmt: skip
-    return Case(r, whitened(r, measured), table, label)
-
-
-def _left(change: np.ndarray, columns: np.ndarray) -> float:
-    wide = np.concatenate([columns, np.eye(columns.shape[1])])
-    long = np.concatenate([change, np.zeros(columns.shape[1])])
-    return float(np.linalg.norm(long - wide @ np.linalg.lstsq(wide, long, rcond=None)[0]))
+    return Case(table, label, toml(r), r, whitened(r, measured))
 
 
 def least_squares(c: Case, steps: int = 12) -> tuple[float, float]:
@@ -345,8 +287,7 @@ def least_squares(c: Case, steps: int = 12) -> tuple[float, float]:
     are priors. The delay is known to it. All fits go through the simulation together.
     """
     r, effect = c.rig, c.label["effects"]
-    law, shapes = (LAWS[effect[0]["name"]], effect[0]["shapes"]) if effect else (None, {})
-    unit = 0.1 * law.size(r.scale) if law is not None else 0.0
+    law = LAWS[effect[0]["name"]].at(r.scale) if effect else None
     count = len(r.names)
     jobs = [(out, with_term) for with_term in ((False, True) if law is not None else (False,)) for out in range(RUNS)]
 
@@ -357,7 +298,7 @@ def least_squares(c: Case, steps: int = 12) -> tuple[float, float]:
         return {**p, "efficiency": min(p["efficiency"], 1.0)}
 
     def terms(size: float, with_term: bool) -> tuple[Term, ...]:
-        return ((law, unit * size, shapes),) if with_term and law is not None else ()
+        return (Term("", 0.1 * law.size * size, effect[0]["shapes"], law),) if with_term and law is not None else ()
 
     # Of each fit: unknowns (constants in their sds, the term in a tenth of its size), the best of them with what is left
     # there, its derivatives and its error held out, and the damping.
