@@ -36,6 +36,7 @@ def words_of_others(*texts):
         bare = re.sub(r"data:image/[^\"]*", "", text)
         bare = re.sub(r'"sweeps/paper/[^"]*"', "", bare)  # a file of the code, in a store's digests
         bare = re.sub(r"<style>.*?</style>", "", bare, flags=re.DOTALL)
+        bare = re.sub(r"\dT\d\d:\d\d:\d\d", "", bare)  # a time of day, which may read as a ratio of gears
         for word in FORBIDDEN:
             at = bare.find(word)
             if at >= 0:
