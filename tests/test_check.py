@@ -23,6 +23,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.requirements import CUT_OFF, QUANTITIES, Point, evaluate, packed, ratings
 from mmrjax.signals import CONVERGED, SLIDES, STALLED, STATUSES
+from sweeps.pages import posture_figures
 from tests.commands import command
 from tests.pages import Tables, drawn, outside
 
@@ -287,7 +288,7 @@ def test_external_supply_and_another_configuration(tmp_path):
 def test_report_shows_the_sheet(folder, result):
     page = (folder / "report.html").read_text()
     tables = Tables(page)
-    posed = {"postures"} if any(r["name"].startswith("step_") for r in result["requirements"]) else set()
+    posed = {"postures"} if any(r["name"] in posture_figures.ASKED for r in result["requirements"]) else set()
     assert drawn(page) == {"margins"} | posed and outside(folder) == []
     rows = tables.tables["requirements"][1:]
     assert [r[0] for r in rows] == ["met" if r["met"] else "missed" for r in result["requirements"]]
