@@ -31,37 +31,6 @@ PAIRS = (("duty_left", "duty_right"), ("voltage_left", "voltage_right"))
 APART = (*PAIRS[0], *PAIRS[1], "yaw_rate")
 
 
-class Instant(eqx.Module):
-    """What a profile asks at one instant; fields as in `Profile`, None where it states nothing."""
-
-    mode: Int[Array, ""]
-    demand: Scalar
-    voltage: Scalar | None
-    duty: Scalar | None
-    duty_left: Scalar | None
-    duty_right: Scalar | None
-    slope_deg: Scalar | None
-    payload: Scalar | None
-    adhesion: Scalar | None
-    adhesion_lateral: Scalar | None
-    voltage_left: Scalar | None
-    voltage_right: Scalar | None
-    yaw_rate: Scalar | None
-    current_other: Scalar | None
-
-    def conditions(self, otherwise: Conditions) -> Conditions:
-        """The conditions of this instant; `otherwise` where the profile states nothing."""
-        stated = {name: getattr(self, name) for name in CONDITIONS if getattr(self, name) is not None}
-        if "payload" in stated and otherwise.total_mass is not None:
-            stated["total_mass"] = otherwise.total_mass + stated["payload"] - otherwise.payload
-        held = (self.mode == BRAKE) | (self.mode == COAST)
-        for name in ("duty", "duty_left", "duty_right"):
-            duty = stated.get(name, getattr(otherwise, name))
-            stated[name] = None if duty is None else jnp.where(held, 0.0, duty)
-        coasts = jnp.where(self.mode == COAST, 1.0, otherwise.open)
-        return dataclasses.replace(otherwise, **stated, open=coasts)
-
-
 class Profile(eqx.Module):
     """A mission as rows in time; between two rows lies a segment. All numbers differentiable and batchable.
 
@@ -122,16 +91,29 @@ class Profile(eqx.Module):
         """The rows `k` and `k + 1`: one segment as a profile of its own."""
         return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, k, 2), self)
 
-    def at(self, elapsed: Scalar) -> Instant:
-        """What is asked `elapsed` seconds after the first of two rows."""
+    def at(self, elapsed: Scalar) -> Profile:
+        """What is asked `elapsed` seconds after the first of two rows: its fields are scalars."""
         share = elapsed / (self.time[1] - self.time[0]) if self.linear else 0.0
 
-        def value(x: Array) -> Scalar:
+        def value(x: Array) -> Array:
             return x[0] + (x[1] - x[0]) * share if self.linear else x[0]
 
-        given = {name: getattr(self, name) for name in (*CONDITIONS, *FURTHER)}
-        stated = {name: None if x is None else value(x) for name, x in given.items()}
-        return Instant(mode=self.mode[0], demand=value(self.demand), **stated)
+        still: dict[str, Any] = {"time": self.time[0], "mode": self.mode[0]}
+        nothing: dict[str, Any] = dict.fromkeys(still)
+        values = jax.tree.map(value, dataclasses.replace(self, **nothing))
+        return dataclasses.replace(values, **still)
+
+    def conditions(self, otherwise: Conditions) -> Conditions:
+        """The conditions of an instant, see `at`; `otherwise` where the profile states nothing."""
+        stated = {name: getattr(self, name) for name in CONDITIONS if getattr(self, name) is not None}
+        if "payload" in stated and otherwise.total_mass is not None:
+            stated["total_mass"] = otherwise.total_mass + stated["payload"] - otherwise.payload
+        held = (self.mode == BRAKE) | (self.mode == COAST)
+        for name in ("duty", "duty_left", "duty_right"):
+            duty = stated.get(name, getattr(otherwise, name))
+            stated[name] = None if duty is None else jnp.where(held, 0.0, duty)
+        coasts = jnp.where(self.mode == COAST, 1.0, otherwise.open)
+        return dataclasses.replace(otherwise, **stated, open=coasts)
 
 
 Index = Int[Array, ""] | int

@@ -13,6 +13,8 @@ loads are those of a rigid robot in balance at every instant.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -242,6 +244,19 @@ def _moments_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     return found, change
 
 
+class _Given(NamedTuple):
+    """What `grip` is of."""
+
+    stance: Stance
+    friction: Friction
+    adhesion: Scalar
+    load: Scalar
+    sliding: Array
+    lateral_speed: Scalar
+    yaw_rate: Scalar
+    resistance: Array
+
+
 def grip(
     stance: Stance,
     friction: Friction,
@@ -265,13 +280,12 @@ def grip(
         resistance: rolling resistance over the normal load, with its sign, of each side [-].
         loads: T [N] and x_p [m] where a search that holds more unknowns finds them too; None: found here.
     """
-
-    given = stance, friction, adhesion, load, sliding, lateral_speed, yaw_rate, resistance
+    given = _Given(stance, friction, adhesion, load, sliding, lateral_speed, yaw_rate, resistance)
     if loads is not None:
-        return _at_loads(loads, None, *given)
+        return _at_loads(loads, None, given)
     held = jax.lax.stop_gradient(given)
-    at = _loads(*held)
-    found, rise = _at_loads(at, None, *given), jax.jacfwd(lambda x: _at_loads(x, None, *held))(at)
+    at = _loads(held)
+    found, rise = _at_loads(at, None, given), jax.jacfwd(lambda x: _at_loads(x, None, held))(at)
     # The last step alone carries the derivatives, which are the implicit ones; it is so small that lines will do.
     change = _step(found.lacking, rise.lacking)
     return jax.tree.map(lambda x, slope: x - slope @ change, found, rise)
@@ -284,71 +298,50 @@ def _step(lacking: Float[Array, " 2"], slope: Float[Array, "2 2"]) -> Float[Arra
     return jnp.stack([d * first - b * second, a * second - c * first]) / (a * d - b * c)
 
 
-def _loads(
-    stance: Stance,
-    friction: Friction,
-    adhesion: Scalar,
-    load: Scalar,
-    sliding: Array,
-    lateral_speed: Scalar,
-    yaw_rate: Scalar,
-    resistance: Array,
-) -> Float[Array, " 2"]:
-    """The load that has moved [N] and the centre of pressure [m], without derivatives; arguments of `_at_loads`.
+def _loads(given: _Given) -> Float[Array, " 2"]:
+    """The load that has moved [N] and the centre of pressure [m], without derivatives.
 
     As long as all of the contact bears, the moments of its law do not depend on them.
     """
-    given = stance, friction, adhesion, load, sliding, lateral_speed, yaw_rate, resistance
+    stance, load = given.stance, given.load
 
-    def steps(loads: Array, given: tuple, even: Array | None) -> Array:
+    def steps(loads: Array, given: _Given, even: Array | None) -> Array:
         def step(_: int, loads: Array) -> Array:
             def lacking(x: Array) -> tuple[Array, Array]:
-                return (_at_loads(x, even, *given).lacking,) * 2
+                return (_at_loads(x, even, given).lacking,) * 2
 
             slope, left = jax.jacfwd(lacking, has_aux=True)(loads)
             return loads - _step(left, slope)
 
         return jax.lax.fori_loop(0, LOAD_STEPS, step, loads, unroll=even is not None)
 
-    nothing = load * sliding[0]
+    nothing = load * given.sliding[0]
     begun = jnp.stack([jnp.zeros_like(nothing), stance.ahead * jnp.ones_like(nothing)])
-    even = moments(*_along(begun[1], stance, friction, sliding, lateral_speed, yaw_rate))
+    even = moments(*_along(begun[1], given))
     found = steps(begun, given, even)
     lifts = (stance.on_tracks > 0.5) & (jnp.maximum(jnp.abs(begun[1]), jnp.abs(found[1])) > stance.length / 6)
     return rarely(lifts, lambda at, given: steps(at, given, None), (begun, given), found)
 
 
-def _along(
-    centre: Scalar, stance: Stance, friction: Friction, sliding: Array, lateral_speed: Scalar, yaw_rate: Scalar
-) -> tuple[Law, Array, Scalar, Scalar]:
+def _along(centre: Scalar, given: _Given) -> tuple[Law, Array, Scalar, Scalar]:
     """Arguments of `moments` where the centre of pressure is there."""
+    stance, yaw = given.stance, given.yaw_rate
     place, half, _ = footprint(stance, centre)
-    law = Law(friction, stance.lateral ** (2 * stance.rule - 2), stance.on_tracks, stance.nodes)
-    return law, sliding, -lateral_speed - yaw_rate * (place - stance.ahead), -yaw_rate * half
+    law = Law(given.friction, stance.lateral ** (2 * stance.rule - 2), stance.on_tracks, stance.nodes)
+    return law, given.sliding, -given.lateral_speed - yaw * (place - stance.ahead), -yaw * half
 
 
-def _at_loads(
-    loads: Array,
-    even: Array | None,
-    stance: Stance,
-    friction: Friction,
-    adhesion: Scalar,
-    load: Scalar,
-    sliding: Array,
-    lateral_speed: Scalar,
-    yaw_rate: Scalar,
-    resistance: Array,
-) -> Grip:
+def _at_loads(loads: Array, even: Array | None, given: _Given) -> Grip:
     """What the ground does where so much load has moved, and the centre of pressure is there.
 
     The lateral speed of a contact is linear along it, and so is the load that it bears: its forces and moments are
     sums of four moments of the law over an even load; `even` are these, where they are known.
     """
-    moved, centre = loads
+    (moved, centre), stance, adhesion, load = loads, given.stance, given.adhesion, given.load
     normal = jnp.maximum(load / 2 - 2 * SIDES * moved, 0.0)
     place, half, tilt = footprint(stance, centre)
     arm = place - stance.ahead
-    law, _, middle, end = _along(centre, stance, friction, sliding, lateral_speed, yaw_rate)
+    law, sliding, middle, end = _along(centre, given)
     even = moments(law, sliding, middle, end) if even is None else even
     zeroth, first, second = (even[:, k] + tilt * even[:, k + 1] for k in range(3))
     held, across = adhesion * normal, adhesion * normal * stance.lateral**stance.rule
@@ -357,7 +350,7 @@ def _at_loads(
     ahead = held * zeroth * sliding
     outward = stance.height * total(aside) / stance.width
     # Nothing presses on a vertical ground.
-    behind = stance.height * total(ahead - resistance * normal) / jnp.maximum(load, 1e-9)
+    behind = stance.height * total(ahead - given.resistance * normal) / jnp.maximum(load, 1e-9)
     return Grip(
         normal=normal,
         ahead=ahead,

@@ -26,8 +26,8 @@ SHORT = 0.03  # [s]
 
 
 def short(fidelity: Fidelity) -> dict[str, float]:
-    has = {option.name for option in fidelity.options}
-    return fidelity.resolved(**({"duration": SHORT} if "duration" in has else {}))
+    has = {option.name for option in fidelity.facts.options}
+    return fidelity.facts.resolved(**({"duration": SHORT} if "duration" in has else {}))
 
 
 # --- the contract -----------------------------------------------------------------------------------
@@ -42,7 +42,7 @@ def knows_itself(fidelity: Fidelity, robot) -> None:
         and facts.effort.starts >= 1
     )
     assert all(0 < option.default <= option.most and option.meaning and option.unit for option in facts.options)
-    assert fidelity.resolved() == {option.name: option.default for option in facts.options}
+    assert fidelity.facts.resolved() == {option.name: option.default for option in facts.options}
     assert (fidelity.histories is not None) == facts.histories
     parameters = {p.name for p in params.walk(robot.configurations.members[0])}
     assert set(facts.computes) <= parameters
@@ -181,7 +181,7 @@ def test_new_fidelity_is_a_file_and_a_line(toy, robot):
     fidelity = fidelities.get(toy)
     for law in CONTRACT:
         law(fidelity, robot)
-    assert fidelity.run(robot, RUNS, fidelity.resolved(patience=4)).columns["patience"].tolist() == [4.0, 4.0]
+    assert fidelity.run(robot, RUNS, fidelity.facts.resolved(patience=4)).columns["patience"].tolist() == [4.0, 4.0]
 
 
 # --- before anything is imported ----------------------------------------------------------------------
@@ -239,6 +239,6 @@ def test_check_refuses_a_step_that_a_run_cannot_bear(robot):
     track = fidelities.get("track")
     stiff = params.replace(robot, {"running_gear.contact_stiffness": jnp.asarray(3e9)})
     with pytest.raises(ValueError, match=r"the largest stable step is .* \(run \d of 2\)"):
-        track.check(stiff, RUNS, track.resolved(step=1e-3))
+        track.check(stiff, RUNS, track.facts.resolved(step=1e-3))
     with pytest.raises(ValueError, match=r"duration: got 0\.00055 s; expected a whole number of samples"):
-        track.check(robot, RUNS, track.resolved(duration=5.5e-4))
+        track.check(robot, RUNS, track.facts.resolved(duration=5.5e-4))

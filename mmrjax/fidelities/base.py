@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from mmrjax import balances, channels, fidelities
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities import Effort, Facts, Option
+from mmrjax.fidelities import Facts
 from mmrjax.params import Scalar
 from mmrjax.rig import Rig
 from mmrjax.robot import Robot
@@ -176,27 +176,3 @@ class Fidelity:
     def facts(self) -> Facts:
         """What was known of it before it was imported."""
         return fidelities.facts(self.name)
-
-    @property
-    def description(self) -> str:
-        """One line."""
-        return self.facts.description
-
-    @property
-    def options(self) -> tuple[Option, ...]:
-        """Options that it has."""
-        return self.facts.options
-
-    @property
-    def effort(self) -> Effort:
-        """What a calibration through it does where nobody states it."""
-        return self.facts.effort
-
-    @property
-    def rollout(self) -> bool:
-        """Whether it integrates over time."""
-        return self.facts.rollout
-
-    def resolved(self, **given: float | None) -> dict[str, float]:
-        """See `Facts.resolved`."""
-        return self.facts.resolved(**given)

@@ -27,7 +27,7 @@ from mmrjax.fidelities import elimination, half_robot, turning
 from mmrjax.fidelities.half_robot import Average, Motion, Steady, System
 from mmrjax.mjcf import mjx
 from mmrjax.params import Scalar
-from mmrjax.signals import CONVERGED, FAILED, NOT_SETTLED, TIPS, PlaneMotion, Result, Signals
+from mmrjax.signals import CONVERGED, NOT_SETTLED, PlaneMotion, Result, Signals
 from mmrjax.trigonometry import cosine, sine
 from mmrjax.turning import SIDES, Grip, Law
 from mmrjax.undercarriage import Pull, Reactions, Touch
@@ -357,12 +357,8 @@ def status(run: System, averages: Steady, end: Motion) -> Array:
     keeps = dataclasses.replace(plane_motion(run, end), **over)
     status = turning.status_keeping(run.robot, run.conditions, travel, keeps)
     status = jnp.where((averages.change > half_robot.SETTLED) & (status == CONVERGED), NOT_SETTLED, status)
-    q, height = end.q, half_robot.axle_height(run)
-    tilt = jnp.maximum(jnp.abs(q[PITCH]), jnp.abs(q[ROLL]))
-    status = jnp.where((tilt > half_robot.OVER) & (tilt < 2 * jnp.pi), TIPS, status)
-    finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(end.v)) & jnp.isfinite(signals.total_current)
-    grounded = (jnp.abs(q[HEIGHT] - height) < 0.5 * height) | (status == TIPS)
-    return jnp.where(finite & grounded, status, FAILED)
+    tilt = jnp.maximum(jnp.abs(end.q[PITCH]), jnp.abs(end.q[ROLL]))
+    return half_robot.unless_lost(run, status, end, end.q[HEIGHT], tilt, signals.total_current)
 
 
 def result_of(run: System, averages: Steady, status: Array) -> Result:

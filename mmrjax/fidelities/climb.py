@@ -21,7 +21,7 @@ from mmrjax import balances, contact, footing
 from mmrjax.chassis import Chassis
 from mmrjax.compiling import SMALL, compiled
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.half_robot import current_after
+from mmrjax.fidelities.half_robot import contacts_resist, current_after
 from mmrjax.fidelities.linear import factorise, substitute
 from mmrjax.footing import COORDINATES, FRONT, PITCH, REAR, SHAFT, Footing, Shape
 from mmrjax.lever_drives import LeverDrive, Swing, lever_drive, swing
@@ -356,10 +356,8 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
     rises = jnp.maximum(
         run.chassis.ground.traction_rise(_sliding(at, motion.v, signals), at.force, signals.adhesion), 0
     )
-    coefficient = pulled.force / jnp.maximum(at.force, 1e-9)
-    pushes = coefficient[:, None] * at.along + at.off
     shaft = _shaft_loss(run, motion, signals, at)
-    damping = (at.along.T * rises) @ at.along + (pushes.T * at.damped) @ at.off
+    damping = contacts_resist(at.along, at.off, pulled.force, at.force, rises, at.damped)
     damping = damping.at[SHAFT, SHAFT].add(shaft) + (_ON_BELTS.T * stiffens) @ _ON_BELTS
     whole = matrix.at[SHAFT, SHAFT].add(armature) + step * damping
     # of wheels, whose levers weigh nothing
@@ -388,7 +386,7 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
     geared = (pair.constant * swung.current - pair.inertia * led / step - swung.torque) @ middle[LED]
     off, along = at.off @ gained, at.along @ gained
     normal = at.force - at.damped * off
-    friction = pulled.force - rises * along - coefficient * at.damped * off
+    friction = pulled.force - rises * along - pulled.force / jnp.maximum(at.force, 1e-9) * at.damped * off
     motor = ratio * middle[SHAFT]
     drive = signals.torque_motor - signals.torque_idle
     mesh = drive - rotor * ratio * gained[SHAFT] / step

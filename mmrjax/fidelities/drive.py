@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 
 import diffrax
@@ -10,7 +11,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from mmrjax import balances
@@ -20,7 +20,7 @@ from mmrjax.fidelities import turning
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
 from mmrjax.fidelities.rest import holds, status_moving, voltage_at_rest
 from mmrjax.fidelities.result import result, withhold
-from mmrjax.fidelities.rosenbrock import Rodas4
+from mmrjax.fidelities.rosenbrock import Rodas4, norm, step_longest
 from mmrjax.fidelities.steady import operating_signals
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
@@ -103,15 +103,7 @@ def rates(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) ->
     return jnp.stack(rates) / jnp.asarray(units(robot), y.dtype)
 
 
-def _norm(error: Float[Array, " unknowns"]) -> Scalar:
-    """Root mean square of the drive's own unknowns; memories add to it and never dilute it."""
-    return optx.rms_norm(error) * (error.shape[0] / len(_UNITS)) ** 0.5
-
-
-def _step_longest(robot: Robot, conditions: Conditions) -> Scalar | None:
-    """The longest step that still resolves every effect with a memory [s]; None where none has one."""
-    limits = [jnp.asarray(effect.step_longest(robot, conditions)) for effect in robot.remembering]
-    return jax.lax.stop_gradient(jnp.min(jnp.stack(limits))) if limits else None
+_norm = functools.partial(norm, own=len(_UNITS))
 
 
 def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[Array, " unknowns"]:
@@ -194,7 +186,9 @@ def drive(
     imposed = conditions.motor_speed is not None
     parked = jnp.asarray(False) if rolling or imposed else holds(robot, conditions)
     moves = jnp.where(parked, jnp.zeros_like(y0).at[jnp.asarray([0, 4])].set(1.0), 1.0)
-    ys, went = _integrated(rates, _norm, robot, conditions, moves, y0, times, tolerance, max_steps)
+    ys, went = _integrated(
+        rates, functools.partial(norm, own=len(_UNITS)), robot, conditions, moves, y0, times, tolerance, max_steps
+    )
     signals = jax.vmap(lambda y: balances.moving(robot, conditions, state_of(robot, y)))(ys)
     # Friction at rest carries what gravity and the motors ask of a robot that it holds.
     still = jnp.zeros_like(signals.acceleration)
@@ -208,18 +202,28 @@ def drive(
     )
     end = jax.tree.map(lambda x: x[-1], signals)
     status = _status(robot, conditions, end, parked, went)
-    # The battery's parabola goes on past empty, the run does not: a clear end, and no numbers after it.
-    going = (conditions.battery < 0.5) | ~robot.battery.empty(signals.discharge)
-    signals, distance = jax.tree.map(lambda x: jnp.where(going, x, jnp.nan), (signals, ys[:, 3] * _UNITS[3]))
-    time_end = jnp.max(jnp.where(going, times, times[0]))
-    there = (status != BATTERY_EMPTY) & (status != FAILED)
-    answer = withhold(result(robot, end, status), there, status != FAILED)
-    return Trajectory(times, distance, signals, time_end, answer)
+    return _kept(
+        robot, conditions, times, ys[:, 3] * _UNITS[3], signals, signals.discharge, result(robot, end, status)
+    )
+
+
+def _kept(
+    robot: Robot, conditions: Conditions, times: Array, away: Array, signals: Signals, discharge: Scalar, end: Result
+) -> Trajectory:
+    """What is kept of a run: the battery's parabola goes on past empty, the run does not: a clear end, and no numbers
+    after it."""
+    going = jnp.asarray((conditions.battery < 0.5) | ~robot.battery.empty(discharge))
+    signals, away = jax.tree.map(
+        lambda x: jnp.where(going.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan), (signals, away)
+    )
+    there = (end.status != BATTERY_EMPTY) & (end.status != FAILED)
+    answer = withhold(end, there, end.status != FAILED)
+    return Trajectory(times, away, signals, jnp.max(jnp.where(going, times, times[0])), answer)
 
 
 def _integrated(
     law: Callable[[Robot, Conditions, Array], Array],
-    norm: Callable[[Array], Scalar],
+    size: Callable[[Array], Scalar],
     robot: Robot,
     conditions: Conditions,
     moves: Array | float,
@@ -231,7 +235,7 @@ def _integrated(
     """The unknowns at those times, and whether the integrator got to the last of them.
 
     Args:
-        law: rates of the unknowns; norm: of an error of them; moves: 0 for those that stand, else 1.
+        law: rates of the unknowns; size: of an error of them; moves: 0 for those that stand, else 1.
     """
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda _, y, run: law(run[0], run[1], y) * run[2]),
@@ -245,7 +249,7 @@ def _integrated(
         max_steps=max_steps,
         throw=False,
         stepsize_controller=diffrax.PIDController(
-            rtol=tolerance, atol=tolerance, norm=norm, dtmax=_step_longest(robot, conditions)
+            rtol=tolerance, atol=tolerance, norm=size, dtmax=step_longest(robot, conditions)
         ),
         adjoint=diffrax.ForwardMode(),
     )
@@ -266,12 +270,8 @@ def _turning(
     end = jax.tree.map(lambda x: x[-1], (travel, motion))
     status = jnp.where(parked, STALLED, turning.status_moving(robot, conditions, *end))
     status = jnp.where(went, status, FAILED)
-    going = (conditions.battery < 0.5) | ~robot.battery.empty(motion.discharge)
-    signals = jax.tree.map(lambda x: jnp.where(going.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan), travel.signals)
-    away = jnp.where(going, jnp.hypot(motion.place_x, motion.place_y), jnp.nan)
-    there = (status != BATTERY_EMPTY) & (status != FAILED)
-    answer = withhold(turning.result_of(robot, end[0], status), there, status != FAILED)
-    return Trajectory(times, away, signals, jnp.max(jnp.where(going, times, times[0])), answer)
+    away, answer = jnp.hypot(motion.place_x, motion.place_y), turning.result_of(robot, end[0], status)
+    return _kept(robot, conditions, times, away, travel.signals, motion.discharge, answer)
 
 
 def _status(robot: Robot, conditions: Conditions, end: Signals, parked: Array, done: Array) -> Array:

@@ -211,11 +211,19 @@ def resistance(run: System, motion: Motion, signals: Signals, at: Touch, pulled:
     one, none = jnp.ones_like(rises), jnp.zeros_like(rises)
     along = jnp.stack([one, none, at.lever_z, at.rate_x * front, at.rate_x * rear], axis=1)
     off = jnp.stack([none, one, -at.lever_x, at.rate_z * front, at.rate_z * rear], axis=1)
-    share = pulled.force / jnp.maximum(at.force, 1e-9)
-    pushes = share[:, None] * along + off
-    contacts = (along.T * rises) @ along + (pushes.T * at.damped) @ off
     none = jnp.zeros_like(losses[0])
-    return contacts + jnp.diag(jnp.stack([losses[0], none, none, losses[1], none]))
+    own = jnp.diag(jnp.stack([losses[0], none, none, losses[1], none]))
+    return contacts_resist(along, off, pulled.force, at.force, rises, at.damped) + own
+
+
+def contacts_resist(
+    along: Float[Array, "contacts n"], off: Float[Array, "contacts n"], pulled: Array, force: Array, rises: Array,
+    damped: Array,
+) -> Float[Array, "n n"]:  # fmt: skip
+    """K of the contacts, see `resistance`: they move `along` the ground and `off` it with v, pulled by friction [N]
+    under a normal force [N]."""
+    pushes = (pulled / jnp.maximum(force, 1e-9))[:, None] * along + off
+    return (along.T * rises) @ along + (pushes.T * damped) @ off
 
 
 def _pushed(
@@ -487,13 +495,22 @@ def status(run: System, averages: Steady, end: Motion) -> Array:
     empty = (conditions.battery > 0.5) & robot.battery.empty(end.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
     status = jnp.where(margin(run) < 0, TIPS, status)
-    finite = jnp.all(jnp.isfinite(end.q)) & jnp.all(jnp.isfinite(end.v)) & jnp.isfinite(signals.total_current)
-    # A run that has left the ground, sunk through it or turned over has numbers that mean nothing.
-    turned = (jnp.abs(end.q[2]) > OVER) & (jnp.abs(end.q[2]) < 2 * jnp.pi)
-    status = jnp.where(turned & (jnp.abs(end.q[1]) < HIGH * axle_height(run)), TIPS, status)
-    grounded = (jnp.abs(end.q[1] - axle_height(run)) < 0.5 * axle_height(run)) & (jnp.abs(end.q[2]) < OVER)
-    sane = grounded | (status == TIPS)
-    return jnp.where(finite & sane, status, FAILED)
+    return unless_lost(run, status, end, end.q[1], jnp.abs(end.q[2]), signals.total_current)
+
+
+def unless_lost(run: System, status: Array, end: Motion, height: Array, tilt: Array, current: Scalar) -> Array:
+    """The status of a run; of one that has left the ground, sunk through it or turned over, whose numbers mean
+    nothing, `tips` or `failed`.
+
+    Args:
+        end: its last motion, with the `height` of the middle of the wheelbase [m] and its `tilt`, 0 or more [rad].
+    """
+    level = axle_height(run)
+    finite = jnp.all(jnp.isfinite(end.q)) & jnp.all(jnp.isfinite(end.v)) & jnp.isfinite(current)
+    turned = (tilt > OVER) & (tilt < 2 * jnp.pi)
+    status = jnp.where(turned & (jnp.abs(height) < HIGH * level), TIPS, status)
+    grounded = (jnp.abs(height - level) < 0.5 * level) & (tilt < OVER)
+    return jnp.where(finite & (grounded | (status == TIPS)), status, FAILED)
 
 
 def result_of(run: System, averages: Steady, status: Array) -> Result:

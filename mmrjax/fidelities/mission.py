@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mmrjax import energy
+from mmrjax import balances, energy
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import mission_straight, mission_turning
 from mmrjax.fidelities.mission_steps import EVENTS, FIRST, Asked, Carry, Law, follow
@@ -149,11 +149,26 @@ def law_of(conditions: Conditions, profile: Profile) -> Law:
     return mission_turning if profile.turns or conditions.turns else mission_straight
 
 
+def begun(law: Law, robot: Robot, conditions: Conditions, start: Start) -> Float[Array, " unknowns"]:
+    """The unknowns at the beginning, headed as the conditions say, else uphill; in SI."""
+    ambient, heading = robot.motor.temperature_ambient, conditions.heading_deg
+    winding, housing = (ambient if t is None else t for t in (start.temperature_winding, start.temperature_housing))
+    shafts = start.speed / robot.chassis(conditions.configuration).radius * robot.gearbox.ratio
+    y = jnp.zeros_like(law.units(robot))
+    for at, value in (
+        (law.CURRENT, start.current), (law.MOTOR, shafts), (law.WINDING, winding), (law.HOUSING, housing),
+        (law.GROUND, start.speed), (law.HEADING, 0.0 if heading is None else jnp.radians(heading)),
+        (law.DISCHARGE, conditions.discharge),
+    ):  # fmt: skip
+        y = y.at[at].set(value)
+    return y
+
+
 def _ends(
     law: Law, robot: Robot, otherwise: Conditions, segment: Profile, found: Any, asked: Asked, stands: Array
 ) -> tuple[Array, Array]:
     """Status of a segment at its end, and whether the robot has missed what was demanded."""
-    mode, signals = segment.mode[0], law.signals_of(found)
+    mode, signals = segment.mode[0], balances.signals_of(found)
     driven = jnp.max(jnp.abs(jnp.asarray(signals.duty * signals.voltage_source)))
     status = jnp.where(stands, STALLED, law.status(robot, asked.conditions, found))
     slow = [jnp.max(jnp.abs(jnp.asarray(x))) < 1.0 for x in (signals.direction, signals.direction_travel)]
@@ -206,7 +221,7 @@ def mission(
     begin, law = Start() if start is None else start, law_of(conditions, profile)
     names, highest = list(law.TOTALS), len(law.PEAKS)
     dtype = jnp.result_type(conditions.voltage, profile.time)
-    y0 = law.begin(robot, conditions, begin).astype(dtype) / law.units(robot).astype(dtype)
+    y0 = begun(law, robot, conditions, begin).astype(dtype) / law.units(robot).astype(dtype)
     q0 = jnp.zeros(len(names), dtype)
     whole, false = jnp.asarray(0), jnp.asarray(False)
     buffer = None
@@ -254,7 +269,7 @@ def mission(
     outcome = jnp.where(jnp.any(bad), status[first], CONVERGED)
     outcome = jnp.where(c.ended, _ending(c), outcome)
     end = jax.tree.map(lambda x: x[-1], found)
-    answer = withhold(law.result_of(robot, end, outcome), outcome != FAILED, outcome != FAILED)
+    answer = withhold(law.RESULT(robot, end, outcome), outcome != FAILED, outcome != FAILED)
     answer = dataclasses.replace(answer, flags=c.flags)
 
     def named(x: Array) -> dict[str, Array]:
@@ -296,7 +311,7 @@ def _course(
     }
 
     def signals(y: Array, stands: Array, k: Array) -> Signals:
-        return law.signals_of(law.instant(robot, conditions, profile.row(k % profile.segments), y, stands)[0])
+        return balances.signals_of(law.instant(robot, conditions, profile.row(k % profile.segments), y, stands)[0])
 
     every = law.at_places(jax.vmap(signals)(ys, stood, of), so_far)
     winding, housing = _temperatures(law, ys)

@@ -14,12 +14,12 @@ from jaxtyping import Array, Float
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.rest import least
 from mmrjax.fidelities.result import mask
-from mmrjax.fidelities.rosenbrock import stages
+from mmrjax.fidelities.rosenbrock import stages, step_longest
 from mmrjax.params import Scalar
 from mmrjax.profile import Profile
 from mmrjax.rarely import rarely
 from mmrjax.robot import Robot
-from mmrjax.signals import Result, Signals
+from mmrjax.signals import Signals
 
 #: The first step of a segment [s], and the shortest.
 FIRST, SHORTEST = 1e-4, 1e-9
@@ -60,6 +60,9 @@ class Law(Protocol):
         TOTALS: what is integrated, and its unit; PEAKS: largest values of any instant, and their unit.
         CLOCK, DISCHARGE, WINDING, HOUSING: places among the unknowns of the time in the segment [s], the charge taken
             [C], and the temperatures [°C], of a robot that turns those of both sides.
+        CURRENT, MOTOR, GROUND, HEADING: of currents, motor speeds, speed and heading.
+        STOPS: of what is 0 at rest; AT_REST: the room of standing robots of its kind (`rest`, `turning`).
+        RESULT: what there is of a run that ends so, of robot, instant and status.
         UNITS: of the unknowns before the memories of effects; LONG: whether an instant takes long to compile.
     """
 
@@ -69,6 +72,13 @@ class Law(Protocol):
     DISCHARGE: int
     WINDING: Any
     HOUSING: Any
+    CURRENT: Any
+    MOTOR: Any
+    GROUND: int
+    HEADING: Any
+    STOPS: tuple[Any, ...]
+    AT_REST: Any
+    RESULT: Any
     UNITS: tuple[float, ...]
     LONG: bool
 
@@ -76,8 +86,8 @@ class Law(Protocol):
         """What the unknowns are measured in."""
         ...
 
-    def begin(self, robot: Robot, conditions: Conditions, start: Any) -> Float[Array, " unknowns"]:
-        """The unknowns at the beginning of a mission."""
+    def state_of(self, robot: Robot, y: Array, stands: Array) -> Any:
+        """The state that the unknowns stand for."""
         ...
 
     def asked_at(self, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> Asked:
@@ -90,20 +100,8 @@ class Law(Protocol):
         """What there is of an instant, rates of the unknowns in their units, and of the totals [1/s]."""
         ...
 
-    def firmness(self, asked: Asked, y: Array, stands: Array) -> Scalar:
-        """How firmly friction would hold the robot [-], see `rest.firmness`."""
-        ...
-
-    def settled_at_rest(self, asked: Asked, y: Array, stands: Array) -> Array:
-        """The unknowns, the currents those that will flow once the robot stands."""
-        ...
-
     def slowness(self, asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
         """By how much shafts, and what slides, are slower than friction at rest is resolved [-]."""
-        ...
-
-    def at_rest(self, y: Array) -> Array:
-        """The unknowns of a robot that has come to rest."""
         ...
 
     def drawn(self, asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
@@ -138,16 +136,8 @@ class Law(Protocol):
         """Status of a robot that friction does not hold, by its last instant."""
         ...
 
-    def signals_of(self, found: Any) -> Signals:
-        """Signals of an instant; of a robot that turns of left and right side."""
-        ...
-
     def at_places(self, signals: Signals, so_far: dict[str, Array]) -> Signals:
         """Signals over time, with what follows from the totals so far."""
-        ...
-
-    def result_of(self, robot: Robot, found: Any, status: Array) -> Result:
-        """What there is of a run that ends so."""
         ...
 
 
@@ -158,9 +148,15 @@ def _firmly(
     less once there is no error."""
     asked = law.asked_at(robot, otherwise, segment, y, stands)
     at_rest = law.asked_at(robot, otherwise, segment, y, jnp.asarray(True))
-    settled = law.settled_at_rest(at_rest, y, stands)
-    firm = law.firmness(asked, y, stands)
-    return jnp.asarray(firm), least(firm, law.firmness(at_rest, settled, stands))
+    current = law.AT_REST.current_at_rest(at_rest.robot, at_rest.conditions, law.state_of(at_rest.robot, y, stands))
+    settled = y.at[law.CURRENT].set(current / law.UNITS[0])
+    firm = _firm(law, asked, y, stands)
+    return firm, least(firm, _firm(law, at_rest, settled, stands))
+
+
+def _firm(law: Law, asked: Asked, y: Array, stands: Array) -> Array:
+    """How firmly friction would hold the robot [-], see `rest.firmness`."""
+    return jnp.asarray(law.AT_REST.firmness(asked.robot, asked.conditions, law.state_of(asked.robot, y, stands)))
 
 
 class Carry(NamedTuple):
@@ -251,7 +247,9 @@ def _onto(
     back = back[which]
     y, q = y + back * dy, q + back * dq
     # To rest: what is left of the motion is lost where it slid.
-    rest = law.at_rest(y)
+    rest = y
+    for k in law.STOPS:
+        rest = rest.at[k].set(0.0)
     moved, parked = (law.instant(robot, otherwise, segment, x, stands)[0] for x in (y, rest))
     halts = which == STANDS
     lost = jnp.where(halts, law.stored(robot, moved) - law.stored(robot, parked), 0.0)
@@ -274,7 +272,8 @@ def follow(
     clock = law.CLOCK
     length = (segment.time[1] - segment.time[0]).astype(carry.y.dtype)
     first, nearly = carry.accepted + carry.rejected, length * (1 - 1e-12 if carry.y.dtype == float else 1 - 1e-6)
-    longest = _step_longest(robot, otherwise)
+    limit = step_longest(robot, otherwise)
+    longest = jnp.inf if limit is None else limit
 
     def rates(y: Array, stands: Array) -> tuple[Array, Array]:
         _, dy, dq, _ = law.instant(robot, otherwise, segment, y, stands)
@@ -348,7 +347,7 @@ def follow(
     # The segment's beginning may have taken away what held the robot.
     y = carry.y.at[clock].set(0.0)
     asked = law.asked_at(robot, otherwise, segment, y, carry.stands)
-    stands = carry.stands & (law.firmness(asked, y, carry.stands) >= 0)
+    stands = carry.stands & (_firm(law, asked, y, carry.stands) >= 0)
     # And it may have lifted the cells above their cut-off, or pressed them below.
     below = jnp.asarray(_cell_above(law, asked, y, stands) < 0)
     low = jnp.where(below & carry.below, carry.low, 0.0)
@@ -369,12 +368,6 @@ def _stayed_below(robot: Robot, below: Array, low: Array) -> Array:
     """Whether the cells have been below their cut-off for as long as they may."""
     rounding = 8 * jnp.finfo(low.dtype).eps
     return below & (low >= robot.battery.delay_cutoff * (1 - rounding))
-
-
-def _step_longest(robot: Robot, conditions: Conditions) -> Scalar:
-    """The longest step that still resolves every effect with a memory [s]."""
-    limits = [jnp.asarray(effect.step_longest(robot, conditions)) for effect in robot.remembering]
-    return jax.lax.stop_gradient(jnp.min(jnp.stack([*limits, jnp.asarray(jnp.inf)])))
 
 
 def _peaks_of(law: Law, robot: Robot, found: Any) -> Array:

@@ -3,30 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+import functools
 
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from mmrjax import balances, energy
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities import rest, result
+from mmrjax.fidelities import rest, result, rosenbrock
 from mmrjax.fidelities.mission_steps import Asked
-from mmrjax.fidelities.rest import current_at_rest
 from mmrjax.params import Scalar
-from mmrjax.profile import MOTOR_SPEED, SPEED, Instant, Profile
+from mmrjax.profile import MOTOR_SPEED, SPEED, Profile
 from mmrjax.robot import Robot
-from mmrjax.signals import Result, Signals, State
+from mmrjax.signals import Signals, State
 
 #: Of the unknowns current, motor speed, speed, discharge, temperatures of winding and housing, integral of the
 #: controller and time in the segment; all are then of the order of one. The memories of effects follow.
 UNITS = (10.0, 1000.0, 1.0, 100.0, 50.0, 50.0, 10.0, 1.0)
 CURRENT, MOTOR, GROUND, DISCHARGE, WINDING, HOUSING, INTEGRAL, CLOCK = range(len(UNITS))
 
-LONG = False
+#: Unknowns that are 0 at rest; where the heading is: nowhere.
+STOPS, HEADING = (MOTOR, GROUND), slice(0)
+LONG, AT_REST, RESULT = False, rest, result.result
 
 #: What is integrated beside them: name, and unit of a total.
 TOTALS: dict[str, str] = {
@@ -45,20 +45,6 @@ def units(robot: Robot) -> Float[Array, " unknowns"]:
     return jnp.asarray(UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering))
 
 
-def begin(robot: Robot, conditions: Conditions, start: Any) -> Float[Array, " unknowns"]:
-    """The unknowns at the beginning, see `mission.Start`; in SI."""
-    turning = start.speed / robot.chassis(conditions.configuration).radius * robot.gearbox.ratio
-    first = [start.current, turning, start.speed, conditions.discharge, *temperatures(robot, start), 0.0, 0.0]
-    return jnp.stack([jnp.asarray(x, float) for x in (*first, *(jnp.zeros(()) for _ in robot.remembering))])
-
-
-def temperatures(robot: Robot, start: Any) -> tuple[Scalar, Scalar]:
-    """Of winding and housing at the beginning [°C]."""
-    ambient = robot.motor.temperature_ambient
-    winding, housing = (ambient if t is None else t for t in (start.temperature_winding, start.temperature_housing))
-    return winding, housing
-
-
 def state_of(robot: Robot, y: Float[Array, " unknowns"], stands: Array) -> State:
     x = y * units(robot).astype(y.dtype)
     memory = {effect.name: x[len(UNITS) + k] for k, effect in enumerate(robot.remembering)}
@@ -66,7 +52,7 @@ def state_of(robot: Robot, y: Float[Array, " unknowns"], stands: Array) -> State
     return State(x[CURRENT], motor, speed, x[DISCHARGE], memory, x[WINDING])
 
 
-def with_consumers(robot: Robot, asked: Instant) -> Robot:
+def with_consumers(robot: Robot, asked: Profile) -> Robot:
     """The robot with what its other consumers draw at an instant."""
     if asked.current_other is None:
         return robot
@@ -159,23 +145,10 @@ def instant(
     )
 
 
-def firmness(asked: Asked, y: Array, stands: Array) -> Scalar:
-    return rest.firmness(asked.robot, asked.conditions, state_of(asked.robot, y, stands))
-
-
-def settled_at_rest(asked: Asked, y: Array, stands: Array) -> Array:
-    current = current_at_rest(asked.robot, asked.conditions, state_of(asked.robot, y, stands))
-    return y.at[CURRENT].set(current / UNITS[CURRENT])
-
-
 def slowness(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     load, state = asked.robot.chassis(asked.conditions.configuration), state_of(asked.robot, y, stands)
     rolling = load.radius * state.speed_motor / asked.robot.gearbox.ratio
     return 1 - jnp.abs(rolling) / load.speed_still, 1 - jnp.abs(rolling - state.speed) / load.speed_grip
-
-
-def at_rest(y: Array) -> Array:
-    return y.at[MOTOR].set(0.0).at[GROUND].set(0.0)
 
 
 def drawn(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
@@ -213,9 +186,7 @@ def over(robot: Robot, found: Signals) -> dict[str, Scalar]:
     return {**result.exceeded(robot, found), "too_hot": hot}
 
 
-def norm(error: Array) -> Scalar:
-    """Root mean square of the drive's own unknowns; memories add to it and never dilute it."""
-    return optx.rms_norm(error) * (error.shape[0] / len(UNITS)) ** 0.5
+norm = functools.partial(rosenbrock.norm, own=len(UNITS))
 
 
 def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
@@ -225,14 +196,6 @@ def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
 def status(robot: Robot, conditions: Conditions, found: Signals) -> Array:
     now = dataclasses.replace(conditions, discharge=jnp.asarray(found.discharge))
     return rest.status_moving(robot, now, found, found.duty * found.voltage_source)
-
-
-def signals_of(found: Signals) -> Signals:
-    return found
-
-
-def result_of(robot: Robot, found: Signals, status: Array) -> Result:
-    return result.result(robot, found, status)
 
 
 def at_places(signals: Signals, so_far: dict[str, jax.Array]) -> Signals:

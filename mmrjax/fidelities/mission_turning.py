@@ -10,23 +10,21 @@ import dataclasses
 import functools
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax import balances, energy
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import mission_straight as straight
-from mmrjax.fidelities import turning
+from mmrjax.fidelities import rosenbrock, turning
 from mmrjax.fidelities.mission_steps import Asked
 from mmrjax.fidelities.rest import least
 from mmrjax.params import Scalar
-from mmrjax.profile import SPEED, VOLTAGE, Instant, Profile
+from mmrjax.profile import SPEED, VOLTAGE, Profile
 from mmrjax.robot import Robot
-from mmrjax.signals import PlaneMotion, Result, Signals
+from mmrjax.signals import PlaneMotion, Signals
 from mmrjax.turning import SIDES, total
 
 #: Of the unknowns, of either side: current, motor speed, temperatures of winding and housing, integral of the
@@ -39,7 +37,8 @@ UNITS = (*(unit for unit in _EACH for _ in SIDES), 1.0, 1.0, 1.0, 1.0, straight.
 CURRENT, MOTOR, WINDING, HOUSING, INTEGRAL = (slice(2 * k, 2 * k + 2) for k in range(len(_EACH)))
 GROUND, LATERAL, YAW, HEADING, DISCHARGE, CLOCK = range(2 * len(_EACH), len(UNITS))
 
-LONG = True
+STOPS = (MOTOR, GROUND, LATERAL, YAW)
+LONG, AT_REST, RESULT = True, turning, turning.result_of
 
 #: What is integrated beside them: name, and unit of a total; of current and torque the mean over both sides.
 OF_SIDES = tuple(f"current_squared_{side}" for side in ("left", "right"))
@@ -54,10 +53,9 @@ PEAKS: dict[str, str] = {
 }  # fmt: skip
 
 
-class Found(eqx.Module):
+class Found(balances.Travel):
     """An instant: all that both sides do, and how the robot moves."""
 
-    travel: balances.Travel
     motion: PlaneMotion
 
 
@@ -66,19 +64,7 @@ def units(robot: Robot) -> Float[Array, " unknowns"]:
     return jnp.asarray((*UNITS, *(size for e in robot.remembering for size in (e.memory_size or 1.0,) * 2)))
 
 
-def begin(robot: Robot, conditions: Conditions, start: Any) -> Float[Array, " unknowns"]:
-    """The unknowns at the beginning, headed as the conditions say, else uphill; in SI."""
-    heading = 0.0 if conditions.heading_deg is None else jnp.radians(conditions.heading_deg)
-    shafts = start.speed / robot.chassis(conditions.configuration).radius * robot.gearbox.ratio
-    winding, housing = straight.temperatures(robot, start)
-    y = jnp.zeros(len(UNITS) + 2 * len(robot.remembering))
-    placed = ((CURRENT, start.current), (MOTOR, shafts), (WINDING, winding), (HOUSING, housing))
-    for at, value in (*placed, (GROUND, start.speed), (HEADING, heading), (DISCHARGE, conditions.discharge)):
-        y = y.at[at].set(value)
-    return y
-
-
-def motion_of(robot: Robot, y: Float[Array, " unknowns"], stands: Array) -> PlaneMotion:
+def state_of(robot: Robot, y: Float[Array, " unknowns"], stands: Array) -> PlaneMotion:
     x = y * units(robot).astype(y.dtype)
     memory = {e.name: x[len(UNITS) + 2 * k :][:2] for k, e in enumerate(robot.remembering)}
     motor, ahead, aside, yaw = (jnp.where(stands, 0.0, x[k]) for k in (MOTOR, GROUND, LATERAL, YAW))
@@ -86,7 +72,7 @@ def motion_of(robot: Robot, y: Float[Array, " unknowns"], stands: Array) -> Plan
     return PlaneMotion(x[CURRENT], motor, ahead, aside, yaw, x[HEADING], none, none, x[DISCHARGE], memory, x[WINDING])
 
 
-def demanded(robot: Robot, otherwise: Conditions, segment: Profile | Instant) -> Array:
+def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
     """What is demanded of either side, of each row [rad/s or m/s], shape (rows, 2)."""
     demand = jnp.stack([segment.demand, segment.demand], -1)
     if segment.yaw_rate is None:
@@ -99,7 +85,7 @@ def demanded(robot: Robot, otherwise: Conditions, segment: Profile | Instant) ->
 def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> Asked:
     asked = segment.at(y[CLOCK])
     robot, conditions = straight.with_consumers(robot, asked), asked.conditions(otherwise)
-    motion, own = motion_of(robot, y, stands), conditions.of_sides()
+    motion, own = state_of(robot, y, stands), conditions.of_sides()
     state = balances.states_of_sides(robot, conditions, motion)
     if asked.voltage_left is not None and asked.voltage_right is not None:
         volts = jnp.stack([asked.voltage_left, asked.voltage_right])
@@ -117,7 +103,7 @@ def instant(
 ) -> tuple[Found, Array, Array, Asked]:
     """All of an instant, rates of the unknowns in their units, and of the totals [1/s]."""
     asked = asked_at(robot, otherwise, segment, y, stands)
-    motion = motion_of(robot, y, stands)
+    motion = state_of(robot, y, stands)
     travel = balances.turning(asked.robot, asked.conditions, motion)
     signals = travel.signals
     winding, housing = (y[k] * _EACH[2] for k in (WINDING, HOUSING))
@@ -148,7 +134,7 @@ def instant(
         motion.yaw_rate, *current,
     ]  # fmt: skip
     return (
-        Found(travel, motion),
+        Found(**vars(travel), motion=motion),
         jnp.concatenate([jnp.atleast_1d(jnp.asarray(r, y.dtype)) for r in rates]) / units(robot).astype(y.dtype),
         jnp.stack([jnp.asarray(x, y.dtype) for x in totals]),
         asked,
@@ -161,18 +147,9 @@ def _size(motion: PlaneMotion) -> Scalar:
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
-def firmness(asked: Asked, y: Array, stands: Array) -> Scalar:
-    return turning.firmness(asked.robot, asked.conditions, motion_of(asked.robot, y, stands))
-
-
-def settled_at_rest(asked: Asked, y: Array, stands: Array) -> Array:
-    current = turning.current_at_rest(asked.robot, asked.conditions, motion_of(asked.robot, y, stands))
-    return y.at[CURRENT].set(current / _EACH[0])
-
-
 def slowness(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     robot, conditions = asked.robot, asked.conditions
-    load, motion = robot.chassis(conditions.configuration), motion_of(robot, y, stands)
+    load, motion = robot.chassis(conditions.configuration), state_of(robot, y, stands)
     rolling = load.radius * jnp.asarray(motion.speed_motor) / robot.gearbox.ratio
     along = jnp.abs(rolling - balances.states_of_sides(robot, conditions, motion).speed)
     across = jnp.abs(motion.speed_lateral) + jnp.abs(motion.yaw_rate) * robot.running_gear.wheelbase / 2
@@ -180,24 +157,18 @@ def slowness(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     return least(*slow), least(*grips, 1 - across / load.speed_grip)
 
 
-def at_rest(y: Array) -> Array:
-    for k in (MOTOR, GROUND, LATERAL, YAW):
-        y = y.at[k].set(0.0)
-    return y
-
-
 def drawn(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
-    robot, motion = asked.robot, motion_of(asked.robot, y, stands)
+    robot, motion = asked.robot, state_of(asked.robot, y, stands)
     duty = robot.driver.duty_limited(asked.conditions.of_sides().duty, motion.current)
     return robot.sides * total(jnp.asarray(motion.current * duty)) / 2, motion.discharge
 
 
 def stored(robot: Robot, found: Found) -> Scalar:
-    return energy.stored_turning(robot, found.travel, found.motion)
+    return energy.stored_turning(robot, found, found.motion)
 
 
 def peaks(robot: Robot, found: Found) -> dict[str, Scalar]:
-    each = jax.vmap(lambda s: straight.peaks(robot, s))(found.travel.signals)
+    each = jax.vmap(lambda s: straight.peaks(robot, s))(found.signals)
     most: dict[str, Scalar] = {name: jnp.max(jnp.asarray(x)) for name, x in each.items()}
     most |= {"current": total(jnp.asarray(each["current"])) / 2, "speed": _size(found.motion)}
     return {**most, "yaw_rate": jnp.abs(found.motion.yaw_rate), **_of_sides(robot, each)}
@@ -218,27 +189,15 @@ def _of_sides(robot: Robot, each: dict[str, Any]) -> dict[str, Scalar]:
 
 
 def over(robot: Robot, found: Found) -> dict[str, Scalar]:
-    each = jax.vmap(lambda s: straight.over(robot, s))(found.travel.signals)
+    each = jax.vmap(lambda s: straight.over(robot, s))(found.signals)
     return {name: jnp.any(x) for name, x in each.items()}
 
 
-def norm(error: Array) -> Scalar:
-    """That of straight travel, where sides are alike: both sides' errors count as one."""
-    weight = np.full(error.shape[0], 0.5)
-    weight[GROUND : CLOCK + 1] = 1.0
-    return jnp.sqrt(jnp.sum(weight * error**2) / len(straight.UNITS))
+norm = functools.partial(rosenbrock.norm_of_sides, whole=slice(GROUND, CLOCK + 1), own=len(straight.UNITS))
 
 
 def status(robot: Robot, conditions: Conditions, found: Found) -> Array:
-    return turning.status_moving(robot, conditions, found.travel, found.motion)
-
-
-def signals_of(found: Found) -> Signals:
-    return found.travel.signals
-
-
-def result_of(robot: Robot, found: Found, status: Array) -> Result:
-    return turning.result_of(robot, found.travel, status)
+    return turning.status_moving(robot, conditions, found, found.motion)
 
 
 def at_places(signals: Signals, so_far: dict[str, jax.Array]) -> Signals:

@@ -9,10 +9,14 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 from diffrax import RESULTS
 from jaxtyping import Array, Float
 
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.linear import factorise, substitute
+from mmrjax.params import Scalar
+from mmrjax.robot import Robot
 
 #: Unknowns up to which elimination is written out; beyond, its program takes too long to compile.
 _WRITTEN_OUT = 8
@@ -88,6 +92,25 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         c2, c3 = (sum(d * v for d, v in zip(row, u[:5], strict=True)) for row in _D)
         dense = {"y0": y0, "y1": y1, "c2": c2, "c3": c3}
         return y1, u[-1], dense, None, RESULTS.successful
+
+
+def norm(error: Float[Array, " unknowns"], own: int) -> Scalar:
+    """Root mean square of an error of the robot's `own` unknowns; memories add to it and never dilute it."""
+    return optx.rms_norm(error) * (error.shape[0] / own) ** 0.5
+
+
+def norm_of_sides(error: Float[Array, " unknowns"], whole: slice, own: int) -> Scalar:
+    """The same where both sides have unknowns but those of the `whole` robot: a pair counts as one, so that steps are
+    those of the `own` unknowns of straight travel where sides are alike."""
+    weight = np.full(error.shape[0], 0.5)
+    weight[whole] = 1.0
+    return jnp.sqrt(jnp.sum(weight * error**2) / own)
+
+
+def step_longest(robot: Robot, conditions: Conditions) -> Array | None:
+    """The longest step that still resolves every effect with a memory [s]; None where none has one."""
+    limits = [jnp.asarray(effect.step_longest(robot, conditions)) for effect in robot.remembering]
+    return jax.lax.stop_gradient(jnp.min(jnp.stack(limits))) if limits else None
 
 
 def stages(

@@ -7,6 +7,7 @@ Both are parts of the fidelities `steady` and `drive`, which come here where con
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import jax
@@ -15,13 +16,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mmrjax import balances, ground
+from mmrjax.chassis import Chassis
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.effects.base import Effect
 from mmrjax.fidelities import lanes, rest
 from mmrjax.fidelities.rest import SHARE, TIME, voltage_at_rest
 from mmrjax.fidelities.result import efficiency, result, withhold
-from mmrjax.fidelities.rosenbrock import inverse
+from mmrjax.fidelities.rosenbrock import inverse, norm_of_sides
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import (
@@ -259,13 +261,16 @@ def circling(robot: Robot, conditions: Conditions) -> tuple[balances.Travel, Pla
     return travel, motion, jnp.where(solved, status, NOT_SETTLED)
 
 
+def _size(chassis: Chassis, ahead: Scalar, aside: Scalar, yaw: Scalar) -> Array:
+    """Of a motion in the plane, or of its change, where the sides are [m/s], [m/s²]."""
+    return jnp.abs(ahead) + jnp.abs(aside) + jnp.abs(yaw) * chassis.turning.width / 2
+
+
 def status_keeping(robot: Robot, conditions: Conditions, travel: balances.Travel, motion: PlaneMotion) -> Array:
     """Status of a robot that keeps its motion."""
     chassis = robot.chassis(conditions.configuration)
     shafts = jnp.max(jnp.abs(travel.signals.speed_theoretical))
-    along = (
-        jnp.abs(motion.speed) + jnp.abs(motion.speed_lateral) + jnp.abs(motion.yaw_rate) * chassis.turning.width / 2
-    )
+    along = _size(chassis, motion.speed, motion.speed_lateral, motion.yaw_rate)
     status = jnp.where(jnp.minimum(shafts, along) < chassis.speed_still, STALLED, CONVERGED)
     status = jnp.where(tips(robot, travel), TIPS, status)
     empty = (conditions.battery > 0.5) & robot.battery.empty(motion.discharge)
@@ -275,11 +280,9 @@ def status_keeping(robot: Robot, conditions: Conditions, travel: balances.Travel
 def status_moving(robot: Robot, conditions: Conditions, travel: balances.Travel, motion: PlaneMotion) -> Array:
     """Status at the end of a run over time: `not_settled` while its motion in its own frame changes, else what it is
     of a robot that keeps it."""
-    arm = robot.chassis(conditions.configuration).turning.width / 2
-    size = jnp.abs(motion.speed) + jnp.abs(motion.speed_lateral) + arm * jnp.abs(motion.yaw_rate)
-    change = (
-        jnp.abs(travel.acceleration) + jnp.abs(travel.acceleration_lateral) + arm * jnp.abs(travel.acceleration_yaw)
-    )
+    chassis = robot.chassis(conditions.configuration)
+    size = _size(chassis, motion.speed, motion.speed_lateral, motion.yaw_rate)
+    change = _size(chassis, travel.acceleration, travel.acceleration_lateral, travel.acceleration_yaw)
     status = status_keeping(robot, conditions, travel, motion)
     return jnp.where((change * TIME > SHARE * size) & (status == CONVERGED), NOT_SETTLED, status)
 
@@ -289,11 +292,7 @@ def at_rest(y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
     return jnp.zeros_like(y).at[jnp.asarray([0, 1, 10])].set(1.0)
 
 
-def norm(error: Float[Array, " unknowns"]) -> Scalar:
-    """Root mean square of an error, both sides' as one: steps are those of straight travel where the sides are
-    alike."""
-    weight = jnp.ones(error.shape[0]).at[:4].set(0.5).at[len(_UNITS) :].set(0.5)
-    return jnp.sqrt(jnp.sum(weight * error**2) / OF_STRAIGHT)
+norm = functools.partial(norm_of_sides, whole=slice(4, len(_UNITS)), own=OF_STRAIGHT)
 
 
 def _of_sides(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> tuple[Conditions, State]:

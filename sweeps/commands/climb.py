@@ -29,7 +29,7 @@ from sweeps import config as configuration
 from sweeps.config_campaign import SIZE
 from sweeps.console import progress, say
 from sweeps.inputs import check_configurations, load_robot
-from sweeps.points import imposed
+from sweeps.points import imposed, scale
 from sweeps.points.climbs import NEAR, SLOW, SOUGHT, refused
 from sweeps.results.climb import VERDICTS, Along, ClimbResult
 from sweeps.skeleton import leave, page
@@ -73,7 +73,7 @@ def climb(config: configuration.Climb, out: Path | None, force: bool) -> int:
             with progress(1, quiet=False) as advance:
                 every = [_terrain(config, float(size) / 1000)[0] for size in sizes]
                 grounds = jax.tree.map(lambda *x: jnp.stack(x), *every)
-                told = _shares(advance)
+                told = scale.shares(advance, 1)
                 whole = [
                     jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(sizes)), c)
                     for c in (conditions, sequence)
@@ -105,7 +105,7 @@ def climb(config: configuration.Climb, out: Path | None, force: bool) -> int:
                     along.widths,
                     duration=config.duration_s,
                     step=config.time_step_s,
-                    progress=_shares(advance),
+                    progress=scale.shares(advance, 1),
                 )
             ended = derivatives.climb
             grounds = jax.tree.map(lambda x: x[None], along.given(along.values).terrain)
@@ -127,17 +127,6 @@ def climb(config: configuration.Climb, out: Path | None, force: bool) -> int:
         print_climb(found)
         manifest = {"seed": None, "verdict": found.verdict}
         return leave(folder, config, manifest, solved=found.verdict != "failed", page=page("climb", found, file))
-
-
-def _shares(advance: Callable[[float], None]) -> Callable[[float], None]:
-    done = 0.0
-
-    def told(share: float) -> None:
-        nonlocal done
-        advance(max(share - done, 0.0))
-        done = max(done, share)
-
-    return told
 
 
 def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, sequence: Sequence) -> Along | None:

@@ -107,9 +107,9 @@ class SettledRuns(Observer):
     def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> SettledRuns:
         chosen = fidelities.get(fidelity or "steady")
         conditions = runs.conditions(robot)
-        if not chosen.rollout:
+        if not chosen.facts.rollout:
             try:
-                chosen.check(robot, conditions, chosen.resolved())
+                chosen.check(robot, conditions, chosen.facts.resolved())
             except ValueError as error:
                 raise BadConfiguration(f"{runs.source}, settled runs: {error}") from error
         return cls(conditions, chosen.name, runs.layout.crosses_zero)
@@ -202,7 +202,7 @@ class SettledRuns(Observer):
 
     @property
     def long(self) -> bool:
-        return fidelities.get(self.fidelity).rollout
+        return fidelities.facts(self.fidelity).rollout
 
     @property
     def eased(self) -> bool:
