@@ -28,7 +28,7 @@ from measure import in_turn, machine, set_precision, yardstick_points
 
 set_precision(single=False)
 
-import vectorised
+from worlds import vectorised
 
 import mmrjax as mm
 from mmrjax.fidelities.steady import steady_batch, steady_outputs

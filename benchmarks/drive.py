@@ -10,7 +10,7 @@ import time
 
 import jax
 import numpy as np
-from measure import finish, limit_words, machine, over_batches, parser, row_words, set_precision
+from measure import finish, machine, parser, set_precision, time_batches
 
 options = parser(__doc__.splitlines()[0], "180")
 options.add_argument("--tolerance", type=float, default=1e-6, help="of a step of ours")
@@ -113,11 +113,7 @@ def main() -> None:
 
     record = {"benchmark": "drive", "machine": machine(), "simulated_s": 2.0, "tolerance": arguments.tolerance}
     print("      runs")
-    record["batches"] = over_batches([int(b) for b in arguments.batches.split(",")], prepare, arguments.repeats)
-    if record["batches"][-1].get("out_of_memory"):
-        print(row_words(record["batches"][-1]))
-    record["limit"] = limit_words(record["batches"])
-    print(f"limit: {record['limit']}")
+    time_batches(record, arguments, prepare)
     states, result = run(batch(180))
     assert not bool(jnp.any(result.status == FAILED))
 

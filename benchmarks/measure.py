@@ -164,3 +164,12 @@ def finish(record: dict[str, Any], path: Path | None) -> None:
     print(f"versions: Python {m['python']}, {versions}")
     if path:
         path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+def time_batches(record: dict[str, Any], arguments: argparse.Namespace, prepare: Callable[[int], Callable]) -> None:
+    """Time each batch of the options into the record, and say which limit the last meets."""
+    record["batches"] = over_batches([int(b) for b in arguments.batches.split(",")], prepare, arguments.repeats)
+    if record["batches"][-1].get("out_of_memory"):
+        print(row_words(record["batches"][-1]))
+    record["limit"] = limit_words(record["batches"])
+    print(f"limit: {record['limit']}")

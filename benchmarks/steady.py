@@ -10,7 +10,7 @@ import time
 
 import jax
 import numpy as np
-from measure import finish, limit_words, machine, over_batches, parser, row_words, set_precision
+from measure import finish, machine, parser, set_precision, time_batches
 
 options = parser(__doc__.splitlines()[0], "65536")
 options.add_argument("--baseline-points", type=int, default=4000, help="points that the loop of SciPy solves")
@@ -46,11 +46,7 @@ def main() -> None:
 
     record = {"benchmark": "steady", "machine": machine()}
     print("    points")
-    record["batches"] = over_batches([int(b) for b in arguments.batches.split(",")], prepare, arguments.repeats)
-    if record["batches"][-1].get("out_of_memory"):
-        print(row_words(record["batches"][-1]))
-    record["limit"] = limit_words(record["batches"])
-    print(f"limit: {record['limit']}")
+    time_batches(record, arguments, prepare)
 
     if not arguments.no_baseline:
         from worlds import paper

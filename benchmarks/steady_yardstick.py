@@ -42,7 +42,7 @@ from measure import in_turn, machine, set_precision, yardstick_points
 
 set_precision(single=False)
 
-import vectorised
+from worlds import vectorised
 
 from mmrjax import channels, outputs, params, robots
 from mmrjax.conditions import Conditions

@@ -20,29 +20,8 @@ CLIMBING = params.replace(robots.nominal(), settled.CLIMBING)
 
 
 def started(p=settled.CLIMBING, duration=0.8, every=0.02):
-    """Six starts without effects, as the generator follows them, and a little noise."""
-    c = worlds.histories.starts(p)
-    times, y = worlds.histories.histories(c, duration, every, p)
-    instruments = settled.Instruments(sd=(0.05, 15.0, 5.0))
-    shown = y * settled.SHOWN[:, :, None]
-    shown = shown + np.random.default_rng(0).standard_normal(y.shape) * np.array(instruments.sd)[:, None, None]
-    columns = {
-        "run_id": np.array([f"start{k}" for k in range(len(c.U))]), "configuration": np.where(c.wheeled > 0.5, "4W2T", "6T2A"),
-        "supply_voltage_V": c.U, "total_mass_kg": c.mass, "payload_kg": c.payload,
-        "slope_deg": np.round(np.degrees(c.slope), 6),
-    }  # fmt: skip
-    columns = {name: np.repeat(x, len(times)) for name, x in columns.items()}
-    columns["time_s"] = np.tile(np.round(times, 6), len(c.U))
-    for k, (name, sd) in enumerate(
-        {
-            "total_current_A": "total_current_sd_A",
-            "motor_speed_rpm": "motor_speed_sd_rpm",
-            "speed_mm_s": "speed_sd_mm_s",
-        }.items()
-    ):
-        columns[name] = np.round(shown[k].ravel(), 4)
-        columns[sd] = np.full(len(shown[k].ravel()), instruments.stated[k])
-    return Runs("runs.csv", columns)
+    """Six starts without effects, as the world follows them, and a little noise."""
+    return table(worlds.histories.narrow(seed=0, duration=duration, every=every, constants=p))
 
 
 @pytest.fixture(scope="module")

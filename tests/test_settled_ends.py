@@ -20,15 +20,14 @@ ANALYST = Analyst(
 INSTRUMENTS = settled.Instruments(sd=(0.02, 9.5, 2.0))
 
 
-def on_ground(monkeypatch, adhesion, creep, seed=3):
+def on_ground(adhesion, creep, seed=3):
     """Six clean starts of the nominal robot on a ground of this adhesion (of tracks, of wheels) and V_s [m/s], and
     its constants."""
     p = dict(settled.CLIMBING)
     for c, mu in zip(("6T2A", "4W2T"), adhesion, strict=True):
         p |= {f"{c}.ground.friction.static": mu, f"{c}.ground.friction.dynamic": 0.8 * mu}
         p |= {f"{c}.ground.friction.speed_static": creep, f"{c}.ground.friction.speed_dynamic": 10 * creep}
-    monkeypatch.setattr(histories, "perturbed", lambda rng, free: p)
-    made = histories.narrow(seed=seed, duration=1.5, every=0.05, instruments=INSTRUMENTS)
+    made = histories.narrow(seed=seed, duration=1.5, every=0.05, instruments=INSTRUMENTS, constants=p)
     return table(made), p
 
 
@@ -40,9 +39,9 @@ def at_truth(space, p):
     return (inside - np.asarray(c.location)) / np.asarray(c.spread)
 
 
-def is_global(monkeypatch, adhesion, creep, seed=3):
+def is_global(adhesion, creep, seed=3):
     """Whether the base fit is at least as good as the truth, and leaves what noise leaves."""
-    runs, p = on_ground(monkeypatch, adhesion, creep, seed)
+    runs, p = on_ground(adhesion, creep, seed)
     space = ANALYST.space(runs)
     z = jnp.asarray(at_truth(space, p))
     truth = 0.5 * float(jnp.sum(space.bare.misfit(z, space.bare.data) ** 2) + jnp.sum(z**2))
@@ -53,15 +52,15 @@ def is_global(monkeypatch, adhesion, creep, seed=3):
 
 
 @pytest.mark.slow
-def test_clean_starts_on_a_ground_that_is_not_nominal_are_fitted(monkeypatch):
-    is_global(monkeypatch, (0.55, 0.54), 0.012)
+def test_clean_starts_on_a_ground_that_is_not_nominal_are_fitted():
+    is_global((0.55, 0.54), 0.012)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("creep", [0.005, 0.02, 0.06])
 @pytest.mark.parametrize("adhesion", [(0.2, 0.25), (0.35, 0.9), (0.7, 0.6), (1.0, 1.0)])
-def test_base_fit_of_clean_starts_is_global_on_any_ground(monkeypatch, adhesion, creep):
-    is_global(monkeypatch, adhesion, creep)
+def test_base_fit_of_clean_starts_is_global_on_any_ground(adhesion, creep):
+    is_global(adhesion, creep)
 
 
 # --- what the ends show ---------------------------------------------------------------------------------
@@ -95,9 +94,9 @@ def test_ends_of_runs_that_grip_are_those_of_settled_travel(gripping):
 
 
 @pytest.mark.slow
-def test_a_run_that_slides_is_not_taken_for_settled(monkeypatch):
+def test_a_run_that_slides_is_not_taken_for_settled():
     """On a slope beyond its adhesion a robot spins its movers, and its steady state is none."""
-    _, slides, _, sound = ends_of(*on_ground(monkeypatch, (0.12, 0.6), 0.02))
+    _, slides, _, sound = ends_of(*on_ground((0.12, 0.6), 0.02))
     assert not sound.all() and sound[3:].all()
     np.testing.assert_array_equal(slides, ~sound)
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import vectorised
+from worlds import vectorised
 
 from mmrjax import channels, outputs, params
 from mmrjax.conditions import Conditions

@@ -54,7 +54,7 @@ def test_a_log_is_that_of_the_simulator_with_the_same_truth(tmp_path, imposed, n
     assert case.label["sound"]
     sizes = {e["name"]: e["amplitude"] for e in case.label["effects"]}
     ours = shown(tmp_path, case, **sizes)
-    clean = logs.whitened(case.rig, logs.histories(case.rig, [case.rig.p], [_terms(case)])[0])
+    clean = logs.whitened(case.rig, logs.histories(case.rig, [case.rig.p], [case.terms])[0])
     assert np.sqrt(np.mean((ours - clean) ** 2)) < ERROR
 
 
@@ -88,25 +88,17 @@ def test_logs_of_about_one_length_share_what_is_compiled():
     assert resolved[1] < resolved[0] and slow[0].columns.shape == fast[0].columns.shape
 
 
-def _terms(case):
-    return tuple(
-        laws.Term(e["name"], e["amplitude"], e["shapes"], logs.LAWS[e["name"]]) for e in case.label["effects"]
-    )
-
-
 @pytest.mark.slow
 def test_a_log_is_reproducible_and_its_effect_has_its_strength():
     rig = logs.rig(np.random.default_rng(7), "voltage", 0.005)
     clean, again = (logs.case(rig, "", 0.0, 4).table for _ in range(2))
     assert all((clean[n] == again[n]).all() for n in clean)
     one = logs.case(rig, "series_resistance", 9.0, 4)
-    assert (
-        one.label["effects"][0]["class"] == "series_resistance" and len(one.table["time_s"]) == logs.RUNS * logs.ROWS
-    )
-    y, base, (change,) = logs.slopes(rig, rig.p, (), [_terms(one)])
-    assert np.linalg.norm(remainder(change.ravel(), np.stack([b.ravel() for b in base], 1))) == pytest.approx(
-        9.0, rel=0.1
-    )
+    assert one.label["effects"][0]["class"] == "series_resistance"
+    assert len(one.table["time_s"]) == logs.RUNS * logs.ROWS
+    y, base, (change,) = logs.slopes(rig, rig.p, (), [one.terms])
+    left = remainder(change.ravel(), np.stack([b.ravel() for b in base], 1))
+    assert np.linalg.norm(left) == pytest.approx(9.0, rel=0.1)
     assert np.sqrt(np.mean((one.measured - y - change) ** 2)) == pytest.approx(1.0, abs=0.05)
 
 

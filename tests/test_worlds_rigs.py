@@ -1,9 +1,8 @@
-"""The generator of rigs: its balances against mmrjax's, what its files and tables hold, tolerances, sizes of effects."""
+"""Rigs: balances against mmrjax's, what their files and tables hold, tolerances, sizes of effects."""
 
 import csv
 import dataclasses
 import json
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +14,7 @@ from mmrjax import params, robots
 from mmrjax.chassis import Chassis
 from mmrjax.conditions import Conditions
 from mmrjax.contact import Friction
+from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.ground import Ground
 from mmrjax.rig import Rig
@@ -23,7 +23,6 @@ from mmrjax.shaft import Shaft
 from mmrjax.signals import STATUSES
 from mmrjax.track import Track
 
-HERE = Path(__file__).parent
 ROWS = 64  # of all tables once padded, so that few programs are compiled
 
 
@@ -57,14 +56,13 @@ def padded(x):
     return np.resize(np.asarray(x, float), ROWS)
 
 
-def steady(w):
+def steady(w, *effects):
     """mmrjax's readings of a world [SI], shape (channels, rows), and its statuses."""
     c = w.conditions
     imposed = {"motor_speed": padded(c.motor_speed)} if w.rig.wide else {}
-    asked = Conditions(
-        0, padded(c.supply), np.degrees(padded(c.slope)), padded(c.payload), duty=padded(c.duty), **imposed
-    )
-    found = steady_batch(robot(w), asked)
+    slope = np.degrees(padded(c.slope))
+    asked = Conditions(0, padded(c.supply), slope, padded(c.payload), duty=padded(c.duty), **imposed)
+    found = steady_batch(dataclasses.replace(robot(w), effects=effects), asked)
     names = [STATUSES[k] for k in np.asarray(found.status)[: len(c)]]
     return np.stack([np.asarray(found.reading[n])[: len(c)] for n in w.rig.channels]), names
 
@@ -148,9 +146,8 @@ def test_file_states_what_was_drawn_around(worlds, tmp_path):
 
 def test_truth_is_as_far_off_as_the_file_says(worlds):
     """The stated tolerances hold: standard normal in the logarithm, or in the value where that may be negative."""
-    z = np.array(
-        [x for seed in range(200) for x in rigs.truth(np.random.default_rng(seed), worlds[0].rig)[1].values()]
-    )
+    drawn = [rigs.truth(np.random.default_rng(seed), worlds[0].rig)[1] for seed in range(200)]
+    z = np.array([x for each in drawn for x in each.values()])
     assert abs(z.mean()) < 0.1 and 0.9 < z.std() < 1.05 and np.abs(z).max() <= 2.5
     for w in worlds:
         for name, share in w.rig.tolerances.items():
@@ -158,9 +155,8 @@ def test_truth_is_as_far_off_as_the_file_says(worlds):
                 continue
             off = np.log(w.constants[name] / w.rig.stated[name])
             assert off == pytest.approx(w.z[name] * np.sqrt(np.log1p(share**2)), abs=1e-9)
-        exact = (
-            set(w.constants) - set(w.rig.tolerances) - {"ground.friction.dynamic", "ground.friction.speed_dynamic"}
-        )
+        exact = set(w.constants) - set(w.rig.tolerances)
+        exact -= {"ground.friction.dynamic", "ground.friction.speed_dynamic"}
         assert all(w.constants[n] == w.rig.stated[n] for n in exact)
 
 
@@ -184,23 +180,22 @@ def test_noise_is_as_the_table_says():
     assert abs(pulls.mean()) < 0.05 and 0.95 < pulls.std() < 1.05
 
 
+def further(w, name, z):
+    """A true constant of a world, so many sds of its tolerance further."""
+    share, value = w.rig.tolerances[name], w.constants[name]
+    normal = name in rigs.NORMAL
+    return rigs.moved(
+        name, value, z * (share * w.rig.stated[name] / value if normal else np.sqrt(np.log1p(share**2)))
+    )
+
+
 def test_slopes_are_derivatives_of_the_readings(worlds):
     for w in worlds[::20]:
         slopes = w.slopes()
         for k, name in enumerate(w.rig.tolerances):
-            ends = []
-            for z in (-1e-2, 1e-2):
-                share = w.rig.tolerances[name]
-                by = z * (
-                    share * w.rig.stated[name] / w.constants[name]
-                    if name in rigs.NORMAL
-                    else np.sqrt(np.log1p(share**2))
-                )
-                value = w.constants[name] * (1 + by if name in rigs.NORMAL else np.exp(by))
-                ends.append(w.readings(p=dict(w.constants) | {name: value})[0])
-            np.testing.assert_allclose(
-                ((ends[1] - ends[0]) / 2e-2 / w.stated).ravel(), slopes[:, k], atol=2e-3 * (1 + np.abs(slopes[:, k]).max())
-            )  # fmt: skip
+            ends = [w.readings(p=dict(w.constants) | {name: further(w, name, z)})[0] for z in (-1e-2, 1e-2)]
+            found = ((ends[1] - ends[0]) / 2e-2 / w.stated).ravel()
+            np.testing.assert_allclose(found, slopes[:, k], atol=2e-3 * (1 + np.abs(slopes[:, k]).max()))
 
 
 @pytest.mark.slow
@@ -242,32 +237,17 @@ def _refitted(w, y, start):
     names = list(w.rig.tolerances)
 
     def left(z):
-        p = dict(w.constants)
-        for name, x in zip(names, z, strict=True):
-            share = w.rig.tolerances[name]
-            by = share * w.rig.stated[name] / p[name] * x if name in rigs.NORMAL else np.sqrt(np.log1p(share**2)) * x
-            p[name] = rigs.moved(name, p[name], by)
+        p = dict(w.constants) | {name: further(w, name, x) for name, x in zip(names, z, strict=True)}
         return np.nan_to_num(np.concatenate([((y - w.readings(p=p)[0]) / w.stated).ravel(), -z]), nan=1e3)
 
     return float(np.sqrt(2 * least_squares(left, start, diff_step=1e-4, max_nfev=60).cost))
-
-
-def test_library_is_of_effects_that_mmrjax_has():
-    from mmrjax.effects import BY_NAME
-
-    for name, form in laws.RIGS.items():
-        effect = BY_NAME[name]
-        assert form.cls == name
-        assert form.balance == (effect.channel if effect.balance == "sensor" else effect.balance)
 
 
 @pytest.mark.parametrize(
     "names", [("churning",), pytest.param(tuple(laws.RIGS), marks=pytest.mark.slow)], ids=["one", "every"]
 )
 def test_laws_are_those_of_the_library(worlds, names):
-    """A library law in mmrjax shows what the generator shows, to a thousandth of a rig's largest reading."""
-    from mmrjax.effects import BY_NAME
-
+    """A library law in mmrjax shows what the world shows, to a thousandth of a rig's largest reading."""
     rng = np.random.default_rng(7)
     with jax.enable_x64(True):
         for name in names:
@@ -277,21 +257,16 @@ def test_laws_are_those_of_the_library(worlds, names):
             law = form.at(w.scale())
             term = dataclasses.replace(laws.draw(name, rng, law), amplitude=0.2 * law.size)
             effect = BY_NAME[name]()
+            assert form.cls == name
+            assert form.balance == (effect.channel if effect.balance == "sensor" else effect.balance)
             mine = [p.name for p in params.walk(effect) if p.name != "amplitude"]
             shapes = dict(zip(mine, term.shapes.values(), strict=False))
             values = {"amplitude": term.amplitude, **shapes}
             effect = params.replace(effect, {k: jnp.asarray(v) for k, v in values.items()})
-            changed = dataclasses.replace(robot(w), effects=(effect,))
-            c = w.conditions
-            imposed = {"motor_speed": padded(c.motor_speed)} if w.rig.wide else {}
-            asked = Conditions(
-                0, padded(c.supply), np.degrees(padded(c.slope)), padded(c.payload), duty=padded(c.duty), **imposed
-            )
-            found = steady_batch(changed, asked).reading
-            s, sound = rigs.solve(w.rig, c, w.constants, [term])
+            found, _ = steady(w, effect)
+            s, sound = rigs.solve(w.rig, w.conditions, w.constants, [term])
             for k, channel in enumerate(w.rig.channels):
                 if channel == "output_torque" and term.law.balance == "gearbox":
                     continue  # what a torque meter at the output shows is without the gear's own loss
-                got = np.asarray(found[channel])[: len(c)][sound]
                 size = np.abs(s.shown[k]).max()
-                np.testing.assert_allclose(got / size, s.shown[k][sound] / size, atol=1e-6, err_msg=name)
+                np.testing.assert_allclose(found[k][sound] / size, s.shown[k][sound] / size, atol=1e-6, err_msg=name)

@@ -365,14 +365,15 @@ def narrow(
     free: Sequence[str] = FRICTION,
     instruments: Instruments | None = None,
     on_battery: bool = False,
+    constants: dict[str, float] | None = None,
 ) -> SeriesCase:
     """One sealed set of starts of the paper's robot on a surface that is known.
 
     As `tables.narrow`: constants within tolerances, effects each sized to leave `sigmas` after a refit of the `free`
-    constants alone.
+    constants alone. `constants`: true ones, in place of such.
     """
     rng = np.random.default_rng(seed)
-    p = perturbed(rng, free)
+    p = perturbed(rng, free) if constants is None else constants
     c = starts(p)
     w = SeriesWorld(
         "narrow", "", PAPER, p, c, ((duration, 1),) * len(c.U), instruments or Instruments(sd=(0.05, 15.0, 5.0)),
@@ -472,7 +473,7 @@ def signatures(w: SeriesWorld, terms: Sequence[Term], good: np.ndarray) -> tuple
     """
     p, c, free = w.constants, w.conditions, w.free
     runs, members = len(c.U), 1 + len(free) + len(terms)
-    wide = Conditions(*(np.tile(getattr(c, f.name), members) for f in dataclasses.fields(c)))
+    wide = c.at(np.tile(np.arange(runs), members))
 
     def only(k: int, value: float) -> np.ndarray:
         return np.where(np.arange(runs * members) // runs == k, value, 0.0)

@@ -16,7 +16,7 @@ from worlds import laws
 from worlds.histories import runge_kutta, soft_sign, teeth
 from worlds.laws import Term, shaped
 from worlds.rigs import RPM
-from worlds.settled import Sealed, between, remainder, typed
+from worlds.settled import Sealed, between, remainder, robot_toml, typed
 
 IMPOSED = ("voltage", "motor_current", "motor_speed")
 RUNS, ROWS = 4, 200
@@ -225,9 +225,10 @@ def moved(p: Mapping[str, float], name: str, z: float) -> dict[str, float]:
 
 @dataclasses.dataclass(frozen=True)
 class Case(Sealed):
-    """A log with its label, its rig, and its whitened readings, shape (runs, readings)."""
+    """A log with its label, its rig and effects, and its whitened readings, shape (runs, readings)."""
 
     rig: Rig
+    terms: tuple[Term, ...]
     measured: np.ndarray
 
 
@@ -278,7 +279,7 @@ def case(r: Rig, name: str, sigmas: float, seed: int) -> Case:
         "every": r.every, "delay": r.delay, "effects": effects, "constants": r.p,
         "sound": bool(all(np.isfinite(x).all() for x in shown.values())),
     }  # fmt: skip
-    return Case(table, label, toml(r), r, whitened(r, measured))
+    return Case(table, label, toml(r), r, terms, whitened(r, measured))
 
 
 def least_squares(c: Case, steps: int = 12) -> tuple[float, float]:
@@ -286,10 +287,8 @@ def least_squares(c: Case, steps: int = 12) -> tuple[float, float]:
     the true term, which then is one more unknown: Levenberg and Marquardt from what the file states, whose tolerances
     are priors. The delay is known to it. All fits go through the simulation together.
     """
-    r, effect = c.rig, c.label["effects"]
-    law = LAWS[effect[0]["name"]].at(r.scale) if effect else None
-    count = len(r.names)
-    jobs = [(out, with_term) for with_term in ((False, True) if law is not None else (False,)) for out in range(RUNS)]
+    r, count = c.rig, len(c.rig.names)
+    jobs = [(out, with_term) for with_term in ((False, True) if c.terms else (False,)) for out in range(RUNS)]
 
     def constants(at: np.ndarray) -> dict[str, float]:
         p = dict(r.stated)
@@ -298,7 +297,7 @@ def least_squares(c: Case, steps: int = 12) -> tuple[float, float]:
         return {**p, "efficiency": min(p["efficiency"], 1.0)}
 
     def terms(size: float, with_term: bool) -> tuple[Term, ...]:
-        return (Term("", 0.1 * law.size * size, effect[0]["shapes"], law),) if with_term and law is not None else ()
+        return tuple(dataclasses.replace(t, amplitude=0.1 * t.law.size * size) for t in c.terms if with_term)
 
     # Of each fit: unknowns (constants in their sds, the term in a tenth of its size), the best of them with what is left
     # there, its derivatives and its error held out, and the damping.
@@ -347,17 +346,13 @@ def least_squares(c: Case, steps: int = 12) -> tuple[float, float]:
 
 def toml(r: Rig) -> str:
     """The rig's file as its owner writes it."""
-    tables: dict[str, list[str]] = {"motor": [], "gearbox": [f'ratio = "{r.ratio} ± 0"'], "bench": ['load = "shaft"']}
+    top = {"schema": "mmrjax.robot/2", "base": "none", "imposed": r.imposed}
+    top |= {"start": "measured" if r.imposed == "motor_speed" else "rest", "channels": r.channels}
+    tables: dict[str, dict[str, Any]] = {
+        "": top, "motor": {}, "gearbox": {"ratio": f"{r.ratio} ± 0"}, "bench": {"load": "shaft"},
+    }  # fmt: skip
     for name in RELATIVE:
-        if name == "resistance" and r.imposed != "voltage":
-            continue
-        table, _, key = PUBLIC[name].partition(".")
-        tables[table].append(f'{key} = "{r.stated[name]!r} ± {100 * RELATIVE[name]:g} %"')
-    start = "measured" if r.imposed == "motor_speed" else "rest"
-    lines = [
-        'schema = "mmrjax.robot/2"', 'base = "none"', f'imposed = "{r.imposed}"', f'start = "{start}"',
-        "channels = [" + ", ".join(f'"{n}"' for n in r.channels) + "]",
-    ]  # fmt: skip
-    for head, rows in tables.items():
-        lines += ["", f"[{head}]", *rows]
-    return "\n".join(lines) + "\n"
+        if name != "resistance" or r.imposed == "voltage":
+            table, _, key = PUBLIC[name].partition(".")
+            tables[table][key] = f"{r.stated[name]!r} ± {100 * RELATIVE[name]:g} %"
+    return robot_toml(tables)

@@ -9,12 +9,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from worlds import settled
 from worlds.laws import Law
 from worlds.paper import NOMINAL, PULLEY, SIDES, G
-from worlds.settled import SUPPLIES, TOLERANCES, Conditions, Instruments, between, conditions, typed
+from worlds.settled import SUPPLIES, TOLERANCES, Conditions, Instruments, between, conditions, robot_toml, typed
 
 TRACKS, WHEELS = "6T2A", "4W2T"
 ROLES = (TRACKS, WHEELS)
@@ -169,10 +170,11 @@ def machine(rng: np.random.Generator, roles: Sequence[str]) -> Machine:
 
 def toml(p: Mapping[str, float], names: Mapping[str, str]) -> str:
     """The robot's file as its user writes it: every number that the maker states, V_s and V_d left at their defaults."""
-    tables: dict[str, dict[str, float | str]] = {"motor": {}, "gearbox": {}}
+    top = {"schema": "mmrjax.robot/2", "configurations": list(names.values())}
+    tables: dict[str, dict[str, Any]] = {"": top, "motor": {}, "gearbox": {}}
     for name, value in p.items():
         head, _, rest = name.partition(".")
-        if head in tables:
+        if head in ("motor", "gearbox"):
             tables[head][rest] = value
     for role, public in names.items():
         tables[public] = {"movers": "tracks" if role == TRACKS else "wheels"}
@@ -182,14 +184,7 @@ def toml(p: Mapping[str, float], names: Mapping[str, str]) -> str:
                 continue
             table, _, key = rest.rpartition(".")
             tables.setdefault(f"{public}.{table}" if table else public, {})[key] = value
-    lines = ['schema = "mmrjax.robot/2"', "configurations = [" + ", ".join(f'"{n}"' for n in names.values()) + "]"]
-    for head, table in tables.items():
-        lines += [
-            "",
-            f"[{head}]",
-            *(f"{k} = {v!r}" if isinstance(v, float) else f'{k} = "{v}"' for k, v in table.items()),
-        ]
-    return "\n".join(lines) + "\n"
+    return robot_toml(tables)
 
 
 # --- conditions -------------------------------------------------------------------------------------

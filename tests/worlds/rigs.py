@@ -18,7 +18,7 @@ import numpy as np
 from worlds import laws
 from worlds.laws import Law, Term
 from worlds.paper import G
-from worlds.settled import SUPPLIES, Sealed, between, instant, newton, remainder, typed, write_table
+from worlds.settled import SUPPLIES, Sealed, between, instant, newton, remainder, robot_toml, typed, write_table
 from worlds.tables import told_apart
 
 RPM = np.pi / 30
@@ -674,32 +674,27 @@ def _table(w: World, y: np.ndarray, sound: np.ndarray, rng: np.random.Generator)
 
 def toml(r: Rig) -> str:
     """The rig's file as its owner writes it: nothing of another robot, numbers with their tolerances."""
-    tables: dict[str, dict[str, str]] = {"motor": {}, "gearbox": {}}
-    tables[r.name] = {"load": '"vehicle"' if r.vehicle else '"linear"' if r.kind == "linear" else '"shaft"'}
+    load = {"load": "vehicle" if r.vehicle else "linear" if r.kind == "linear" else "shaft"}
     if r.vehicle:
-        tables[r.name]["movers"] = '"tracks"' if r.kind == "tracked" else '"wheels"'
+        load["movers"] = "tracks" if r.kind == "tracked" else "wheels"
+    top = {"schema": "mmrjax.robot/2", "base": "none", "sides": r.sides}
+    top |= {"imposed": "motor_speed" if r.wide else "voltage", "channels": r.channels, "configurations": [r.name]}
+    tables: dict[str, dict[str, Any]] = {"": top, "motor": {}, "gearbox": {}, r.name: load}
     for name, value in r.stated.items():
         table, _, key = r.public(name).rpartition(".")
         if r.written and table == r.name:
             key = LINEAR[name][0]
             value = r.written[key]
         share = r.tolerances.get(name, 0.0 if name == "radius" and not r.vehicle else None)
-        number = repr(float(value))
-        tables.setdefault(table, {})[key] = number if share is None else f'"{number} ± {100 * share:g} %"'
-    lines = [
-        'schema = "mmrjax.robot/2"', 'base = "none"', f"sides = {r.sides}",
-        f'imposed = "{"motor_speed" if r.wide else "voltage"}"',
-        "channels = [" + ", ".join(f'"{n}"' for n in r.channels) + "]", f'configurations = ["{r.name}"]',
-    ]  # fmt: skip
+        number = float(value)
+        tables.setdefault(table, {})[key] = number if share is None else f"{number!r} ± {100 * share:g} %"
     for name in r.channels:
-        known = {} if r.signed[name] else {"signed": "false"}
+        known = {} if r.signed[name] else {"signed": False}
         if name in r.quantum:
-            known["quantum"] = repr(r.quantum[name])
+            known["quantum"] = r.quantum[name]
         if known:
             tables[f"instruments.{name}"] = known
-    for head, table in tables.items():
-        lines += ["", f"[{head}]", *(f"{k} = {v}" for k, v in table.items())]
-    return "\n".join(lines) + "\n"
+    return robot_toml(tables)
 
 
 # --- logs ---------------------------------------------------------------------------------------------

@@ -45,6 +45,21 @@ def write_table(table: Mapping[str, np.ndarray], path: Path) -> Path:
     return path
 
 
+def robot_toml(tables: Mapping[str, Mapping[str, Any]]) -> str:
+    """A robot's file as its owner writes it: of each table keys and values; the first is of the top."""
+
+    def written(x: Any) -> str:
+        if isinstance(x, bool):
+            return str(x).lower()
+        if isinstance(x, list | tuple):
+            return f"[{', '.join(map(written, x))}]"
+        return f'"{x}"' if isinstance(x, str) else repr(x)
+
+    heads = [f"[{name}]\n" if name else "" for name in tables]
+    bodies = ["\n".join(f"{k} = {written(x)}" for k, x in table.items()) for table in tables.values()]
+    return "\n\n".join(head + body for head, body in zip(heads, bodies, strict=True)) + "\n"
+
+
 @dataclasses.dataclass(frozen=True)
 class Sealed:
     """A table, what an analyst gets of it, and its label.
