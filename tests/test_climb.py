@@ -97,6 +97,16 @@ def test_motors_of_levers_load_the_battery():
     assert 0.01 < share < 1 and float(end.drawn) == pytest.approx(share * float(passed.lever_current[0]))
 
 
+def test_a_positive_voltage_raises_either_lever():
+    """Angles are positive up; of the rear pair ψ falls then."""
+    volts = jnp.full(2, 6.0)
+    asked = Sequence(jnp.arange(2.0), volts, volts, over_time=True, begins=jnp.full(2, 0.5))
+    run = system(ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.flat(), asked)
+    swung = climb._swung(run, climb.stand(run), 0.5, 24.0, jnp.zeros(2), run.step * jnp.eye(2))
+    assert swung.rate[0] > 0 > swung.rate[1]
+    assert np.asarray(swung.voltage) == pytest.approx([6.0, -6.0])
+
+
 @pytest.mark.slow
 def test_verdicts_of_whole_climbs_and_their_energy_and_half_the_step():
     runs = [
