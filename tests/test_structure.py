@@ -149,6 +149,16 @@ def front_door_is_light(path: PurePosixPath, tree: ast.Module) -> Iterator[Breac
                 yield line, f"the front door loads {name}"
 
 
+def figures_wait_for_the_page(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
+    """A command imports figures and pages once it draws: they cost half a second before the answer."""
+    if path.parent.as_posix() == "sweeps/commands":
+        head = ast.Module([n for n in tree.body if isinstance(n, ast.Import | ast.ImportFrom)], [])
+        rooms = {(".".join(name.split(".")[:3]), line) for name, line in names_imported(head, "sweeps.commands")}
+        for name, line in rooms:
+            if name.startswith("sweeps.pages.") and not name.endswith("words"):
+                yield line, f"imports {name} at its head"
+
+
 OBSERVERS = {"Histories", "SettledRuns"}
 
 
@@ -441,6 +451,7 @@ RULES: tuple[Rule, ...] = (
     balances_alone_sum_terms,
     physics_reads_and_prints_nothing,
     front_door_is_light,
+    figures_wait_for_the_page,
     observers_alone_know_the_kind_of_data,
     channels_are_counted_in_one_place,
     configurations_are_data,
@@ -561,6 +572,7 @@ BAD = {
         "calibration/sensitivity/bad.py",
         "def f(x):\n    return g('one two three four five six')\ndef h(x):\n    raise BadData('no')",
     ),
+    "imports sweeps.pages.page at its head": ("sweeps/commands/bad.py", "from sweeps.pages.page import render"),
     "keeps state in threading.local": ("calibration/bad.py", "import threading\nX = threading.local()"),
 }
 #: What no rule may mind.
@@ -584,6 +596,7 @@ GOOD = {
     "sweeps/local.py": "import numpy as np\nX = {}\nX[1] = 2\ndef f(X, y):\n    X[1] = y\n    z = np.append(y, 1)\n    z[0] = 1\n",
     "sweeps/options.py": "X = option(help='6T2A or 4W2T')\nfrom calibration.discovery.discover import discover\n",
     "sweeps/paper/rows.py": "X = {'6T2A': ('total_current_A', 'speed_mm_s')}\n",
+    "sweeps/commands/late.py": "from sweeps.pages import words\ndef f():\n    from sweeps.pages import page\n",
     "sweeps/pages/words.py": "X = ['write 6T2A, or else 4W2T']\n",
 }
 

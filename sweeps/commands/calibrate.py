@@ -14,7 +14,6 @@ from sweeps import config as configuration
 from sweeps.console import pulse, say, tell
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
-from sweeps.pages.page import rms
 from sweeps.skeleton import leave, page
 from sweeps.store import open_folder
 
@@ -67,7 +66,7 @@ def print_calibration(found: CalibrationResult) -> None:
         errors.add_row(which, f"{max(e.rows for e in by.values())}/{len(found)}", *cells)
     say(errors)
     if Layout.of(found.robot).crosses_zero:
-        say(words.describe_rms(rms(found.rows(), found.channels, ("before", "after", "held_out"))))
+        say(words.describe_rms(words.rms(found.rows(), found.channels, ("before", "after", "held_out"))))
     say(found.starts.statement())
     for note in found.notes:
         say(f"- {note}")

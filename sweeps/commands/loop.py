@@ -24,7 +24,6 @@ from sweeps import config as configuration
 from sweeps.console import pulse, say, tell
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
-from sweeps.pages.page import rms
 from sweeps.skeleton import leave, page
 from sweeps.store import RunFolder, open_folder
 
@@ -86,10 +85,10 @@ def loop(
                 found, noise=config.noise or None, population=config.population, generations=config.generations,
                 members=members, seed=config.seed, tell=progress,
             ))  # fmt: skip
-        found.save(folder.partial, config.robot)
         print_discovery(found)
         if config.resolve and found.resolved is None:
             say("The track model was not asked: nothing remains in slip, track or ground that it has a say in.")
+        found.save(folder.partial, config.robot)
         if config.report:
             progress("writing the report")
         manifest = {"seed": config.seed, "verdict": found.verdict}
@@ -159,11 +158,8 @@ def print_discovery(found: DiscoveryResult) -> None:
         errors.add_row(text, f"{max(e['rows'] for e in by.values())}/{len(found.runs)}", *cells)
     say(errors)
     if Layout.of(found.robot).crosses_zero:
-        say(
-            words.describe_rms(
-                rms(found.rows_table(), found.channels, ("before", "after", "held_out_before", "held_out_after"))
-            )
-        )
+        moments = ("before", "after", "held_out_before", "held_out_after")
+        say(words.describe_rms(words.rms(found.rows_table(), found.channels, moments)))
     if found.sensitivity:
         say(f"{said_of.at_other_noise(found.sensitivity)}")
     for note in found.notes:

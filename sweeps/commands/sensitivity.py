@@ -29,7 +29,7 @@ from sweeps import config as configuration
 from sweeps.config import GridPart
 from sweeps.console import say, tell
 from sweeps.inputs import beside_robot, load_robot, read_runs
-from sweeps.pages.figure_style import short
+from sweeps.pages.words import short_name
 from sweeps.points import axes as axes_room
 from sweeps.points import grid as grid_room
 from sweeps.points import imposed
@@ -188,7 +188,7 @@ def print_sensitivity(found: SensitivityResult) -> None:
     for study in found.outputs.values():
         share = study.overall_share
         top = [k for k in np.argsort(-share)[:3] if share[k] >= NEGLIGIBLE]
-        shown.add_row(study.row.label, *(f"{short(found.names[k])} {100 * share[k]:.0f} %" for k in top))
+        shown.add_row(study.row.label, *(f"{short_name(found.names[k])} {100 * share[k]:.0f} %" for k in top))
     say(shown)
     idle = found.negligible
     if idle:

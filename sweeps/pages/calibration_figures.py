@@ -12,7 +12,8 @@ from calibration.inference import blocks
 from calibration.inference.identifiability import Z95
 from calibration.inference.result import CalibrationResult
 from mmrjax.channels import Channel
-from sweeps.pages.figure_style import BLUE, FAINT, INK, ORANGE, VERMILION, axis_label, figure, short
+from sweeps.pages.figure_style import BLUE, FAINT, INK, ORANGE, VERMILION, axis_label, figure
+from sweeps.pages.words import short_name
 
 #: Runs of which histories are drawn.
 HISTORIES = 6
@@ -30,7 +31,7 @@ def parameters(found: CalibrationResult) -> Figure:
         axes.plot(p.shift, row, "o", color=colour, ms=6)
         words = f"{p.value:.3g} {p.unit}".removesuffix(" -")
         axes.text(1.01, row, words, transform=axes.get_yaxis_transform(), va="center", fontsize=8.5, color=INK)
-    axes.set_yticks(range(len(found.parameters)), [short(n) for n in found.parameters])
+    axes.set_yticks(range(len(found.parameters)), [short_name(n) for n in found.parameters])
     axes.set(xlabel="shift from the prior [prior sds]")
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
@@ -52,7 +53,7 @@ def profiles(found: CalibrationResult) -> Figure:
         axes.plot(profile.value[near], profile.rise[near], "o-", ms=3, color=BLUE)
         axes.axvline(p.value, color=INK, lw=0.9)
         axes.plot(p.prior.median, 0.3, "^", color=VERMILION, ms=6, clip_on=False)
-        axes.set_title(short(name), fontsize=9)
+        axes.set_title(short_name(name), fontsize=9)
         axes.set_xlabel(f"[{p.unit}]")
         axes.set_ylim(0, 10)
         axes.locator_params(axis="x", nbins=4)
@@ -64,7 +65,7 @@ def profiles(found: CalibrationResult) -> Figure:
 
 def correlations(found: CalibrationResult) -> Figure:
     """Posterior correlation of every pair of parameters, and the singular values."""
-    names = [short(n) for n in found.identifiability.names]
+    names = [short_name(n) for n in found.identifiability.names]
     fig, grid = figure(1, 2, 1.6 + 0.36 * len(names), width_ratios=[1.7, 1.0])
     left, right = grid[0]
     c = found.identifiability.correlation

@@ -11,7 +11,8 @@ from matplotlib.axis import Axis
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
-from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, note, short
+from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, note
+from sweeps.pages.words import short_name
 
 #: Bins of a histogram, and along a name at most; at least, and points of each that more need.
 BARS, BINS = 40, 24
@@ -41,7 +42,7 @@ def spread(output: np.ndarray, label: str, varied: Mapping[str, Varied]) -> Figu
     histogram.set(xlabel=label, ylabel="points", title="how often")
     for axes, name in zip(others, names, strict=False):
         _band(axes, varied[name].values, output)
-        axes.set(xlabel=varied[name].label, ylabel=label, title=f"over {short(name)}")
+        axes.set(xlabel=varied[name].label, ylabel=label, title=f"over {short_name(name)}")
         _ticks(axes.xaxis, varied[name])
     if len(names) == 2:
         _map(fig, others[2], varied[names[0]], varied[names[1]], output, label)

@@ -181,8 +181,3 @@ def note(axes: Axes, words: str, x: float = 0.02, y: float = 0.97, **keywords: A
 def colours_of(configurations: np.ndarray) -> dict[str, str]:
     """A colour for each configuration of a table, in the order of their first rows."""
     return {name: colour for name, (colour, _) in looks(configurations).items()}
-
-
-def short(name: str) -> str:
-    """A parameter's name without the words that every such name has."""
-    return name.replace("ground.friction.", "").replace("ground.", "").replace("track.", "").replace("effects.", "")

@@ -24,9 +24,9 @@ from sweeps.pages.figure_style import (
     colours_of,
     figure,
     note,
-    short,
 )
 from sweeps.pages.sweep_figures import UNITS, imposed
+from sweeps.pages.words import short_name
 
 if TYPE_CHECKING:
     from sweeps.pages.loop import Change
@@ -321,7 +321,7 @@ def base_shift(found: DiscoveryResult) -> Figure:
         axes.plot([p.shift_before, p.shift_after], [row, row], color="#c9c9c9", lw=1.6, zorder=1)
         axes.plot(p.shift_before, row, "o", ms=6, mfc="white", color=ORANGE)
         axes.plot(p.shift_after, row, "o", ms=5, color=BLUE)
-    axes.set_yticks(range(len(shift)), [short(n) for n in shift])
+    axes.set_yticks(range(len(shift)), [short_name(n) for n in shift])
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
     axes.set(xlabel="shift from the prior [prior sds]")

@@ -137,18 +137,6 @@ def columns(shown: Iterable[Channel]) -> dict[str, str]:
     return {c.name: c.column for c in shown}
 
 
-def rms(table: dict[str, np.ndarray], shown: Sequence[Channel], whens: Iterable[str]) -> dict[str, dict[str, float]]:
-    """rms of simulated less measured in each channel's unit, by when (of columns `WHEN_COLUMN`) and channel."""
-    found: dict[str, dict[str, float]] = {}
-    for when in whens:
-        for c in shown:
-            if f"{when}_{c.column}" in table:
-                error = np.square(table[f"{when}_{c.column}"] - table[c.column])
-                there = error[np.isfinite(error)]
-                found.setdefault(when, {})[c.name] = float(np.sqrt(there.mean())) if there.size else math.nan
-    return found
-
-
 def first_rows(table: dict[str, np.ndarray]) -> list[dict[str, Any]]:
     """The rows of a table that a page has room for."""
     return [{k: v[i] for k, v in table.items()} for i in range(min(len(next(iter(table.values()))), ROWS))]

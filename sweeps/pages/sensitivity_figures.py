@@ -8,7 +8,8 @@ from matplotlib.figure import Figure
 
 from calibration.sensitivity.replicates import Estimate
 from calibration.sensitivity.result import NEGLIGIBLE, NextRuns, OutputStudy, SensitivityResult
-from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, VERMILION, figure, note, short
+from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, VERMILION, figure, note
+from sweeps.pages.words import short_name
 
 #: Inputs that a figure shows at most, and operating points of a tornado.
 SHOWN, TALLEST, PANELS = 8, 10, 4
@@ -30,7 +31,7 @@ def overview(found: SensitivityResult) -> Figure:
     fig, axes = figure(1, 1, 0.9 + 0.29 * len(rows))
     ax: Axes = axes[0, 0]
     _cells(ax, shares[rows], 12)
-    ax.set_yticks(range(len(rows)), [short(found.names[k]) for k in rows])
+    ax.set_yticks(range(len(rows)), [short_name(found.names[k]) for k in rows])
     ax.set_xticks(range(shares.shape[1]), [s.row.label for s in found.outputs.values()], rotation=18, ha="left")
     ax.xaxis.tick_top()
     return fig
@@ -88,7 +89,7 @@ def tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
         ax.tick_params(axis="x", labelsize=8)
         ax.locator_params(axis="x", nbins=4)
         ax.grid(axis="y", visible=False)
-    axes[0, 0].set_yticks([-p for p in range(len(top))], [short(found.names[i]) for i in top], fontsize=8.5)
+    axes[0, 0].set_yticks([-p for p in range(len(top))], [short_name(found.names[i]) for i in top], fontsize=8.5)
     axes[0, 0].set_xlabel(f"{study.row.label}{'' if unit == '-' else f' [{unit}]'}", fontsize=9)
     return fig
 
@@ -132,7 +133,7 @@ def _bars(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarra
         ends = np.stack([estimate.value - estimate.low, estimate.high - estimate.value])[:, top] / scale
         ax.barh(at, np.maximum(value, 0.0), color=colour, height=0.9 * height, label=words)
         ax.errorbar(value, at, xerr=np.maximum(ends, 0.0), fmt="none", ecolor=INK, elinewidth=0.9, capsize=1.5)
-    ax.set_yticks(-np.arange(len(top)), [short(found.names[k]) for k in top], fontsize=8.5)
+    ax.set_yticks(-np.arange(len(top)), [short_name(found.names[k]) for k in top], fontsize=8.5)
     ax.set_xlim(left=0)
     unit = "" if study.row.unit == "-" else f" [{study.row.unit}]"
     ax.set_xlabel(
@@ -191,7 +192,7 @@ def convergence(found: SensitivityResult) -> Figure:
                 "o-",
                 color=colour,
                 markersize=3,
-                label=short(found.names[k]),
+                label=short_name(found.names[k]),
             )
         ax.set_xscale("log")
         ax.set_xticks(counts, [f"{count / 1000:.0f}k" for count in counts])
@@ -216,7 +217,7 @@ def next_runs(runs: NextRuns, found: SensitivityResult) -> Figure:
         ax.barh(-place, 1.0, color="#e9ecef", height=0.66)
         ax.barh(-place, left[k], color=BLUE, height=0.66)
         ax.text(left[k] + 0.01, -place, f"{100 * left[k]:.0f} %", va="center", fontsize=8.5)
-    ax.set_yticks([-p for p in range(len(moving))], [short(found.names[k]) for k in moving])
+    ax.set_yticks([-p for p in range(len(moving))], [short_name(found.names[k]) for k in moving])
     ax.set_xlim(0, 1.02)
     ax.set_xlabel(f"standard deviation after these {len(runs.points)} runs, as a share of that before [-]")
     ax.grid(axis="y", visible=False)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
+
+import numpy as np
 
 from mmrjax import channels
 
@@ -179,6 +182,20 @@ _FITS = {
 }  # fmt: skip
 
 
+def rms(
+    table: dict[str, np.ndarray], shown: Sequence[channels.Channel], whens: Iterable[str]
+) -> dict[str, dict[str, float]]:
+    """rms of simulated less measured in each channel's unit, by when (of columns `WHEN_COLUMN`) and channel."""
+    found: dict[str, dict[str, float]] = {}
+    for when in whens:
+        for c in shown:
+            if f"{when}_{c.column}" in table:
+                error = np.square(table[f"{when}_{c.column}"] - table[c.column])
+                there = error[np.isfinite(error)]
+                found.setdefault(when, {})[c.name] = float(np.sqrt(there.mean())) if there.size else math.nan
+    return found
+
+
 def describe_rms(rms: Mapping[str, Mapping[str, float]]) -> str:
     """rms errors in the units of their channels, in a line; by fit and channel."""
     units = {c.name: (c.label, c.unit) for c in channels.EVERY}
@@ -187,3 +204,8 @@ def describe_rms(rms: Mapping[str, Mapping[str, float]]) -> str:
         for when, by in rms.items()
     ]
     return "rms error: " + "; ".join(parts)
+
+
+def short_name(name: str) -> str:
+    """A parameter's name without the words that every such name has."""
+    return name.replace("ground.friction.", "").replace("ground.", "").replace("track.", "").replace("effects.", "")
