@@ -23,12 +23,12 @@ QUICK := XLA_FLAGS="--xla_cpu_use_fusion_emitters=false --xla_backend_optimizati
 test: lint
 	PYTHONDONTWRITEBYTECODE= $(QUICK) $(PYTEST) -m "not slow"
 
-# Everything, compiled as users compile it: the tests that compile or run for long too, less than an hour on two cores.
+# Everything: the tests that compile or run for long too, some hours on two cores.
 test-all: lint
-	$(PYTEST)
+	PYTHONDONTWRITEBYTECODE= $(QUICK) $(PYTEST)
 
 slow: $(TOOLS)
-	$(PYTEST) -m slow
+	PYTHONDONTWRITEBYTECODE= $(QUICK) $(PYTEST) -m slow
 
 lint: $(TOOLS)
 	$(BIN)/ruff check .

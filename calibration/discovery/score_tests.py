@@ -263,6 +263,12 @@ def beside_columns(
     return found, deviate
 
 
+@functools.partial(compiled, options=SELDOM)
+def _keys(seed: Array, shape: tuple[int, int]) -> Array:
+    """Keys of a seed."""
+    return jax.random.key_data(jax.random.split(jax.random.key(seed), shape))
+
+
 def bootstrap(
     problem: Problem,
     z: np.ndarray,
@@ -284,9 +290,9 @@ def bootstrap(
             for all known. Each table is drawn with sds that such an estimate might have been of.
     """
     count = -(-replicates // CHUNK)
-    keys = jax.random.key_data(jax.random.split(jax.random.key(seed), (count, CHUNK)))
+    keys = np.asarray(_keys(jnp.asarray(seed), (count, CHUNK)))
     drawn = problem.observe.draws(
-        problem, jnp.asarray(z), linear, keys.reshape(count * CHUNK, -1)[:replicates],
+        problem, jnp.asarray(z), linear, jnp.asarray(keys.reshape(count * CHUNK, -1)[:replicates]),
         _factors(freedom, len(problem.channels), replicates, seed),
     )  # fmt: skip
     # To whole batches: those that are repeated are cut off.

@@ -114,7 +114,8 @@ class Coordinates(eqx.Module):
     @property
     def tied(self) -> tuple[tuple[str, int, float], ...]:
         """(Follower, index of its leader, ratio) of each parameter that follows a free one."""
-        return tuple((name, k, float(self.ratios[n])) for n, (name, k) in enumerate(self.followers))
+        ratios = np.asarray(self.ratios)
+        return tuple((name, k, float(ratios[n])) for n, (name, k) in enumerate(self.followers))
 
     def value(self, z: Float[Array | np.ndarray, "... parameters"]) -> Any:
         """Parameters θ [SI] at coordinates z; of NumPy where these are."""
@@ -132,7 +133,7 @@ class Coordinates(eqx.Module):
 
     def slope(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
         """dθ/dz [SI]."""
-        return jax.jvp(self.value, (jnp.asarray(z),), (jnp.ones_like(z),))[1]
+        return _slope(self, jnp.asarray(z))
 
     def robot(self, base: Robot, z: Float[Array, " parameters"]) -> Robot:
         """`base` with the free parameters, and those tied to them, at coordinates z."""
@@ -144,6 +145,11 @@ class Coordinates(eqx.Module):
         own = jax.tree.map(np.asarray, self)
         u = own.location + own.spread * z
         return np.where(u <= own.low, -1, np.where(u >= own.high, 1, 0))
+
+
+@functools.partial(compiled, options=SELDOM)
+def _slope(coordinates: Coordinates, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
+    return jax.jvp(coordinates.value, (z,), (jnp.ones_like(z),))[1]
 
 
 @functools.partial(compiled, options=SELDOM)

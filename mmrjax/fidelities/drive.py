@@ -6,7 +6,6 @@ import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -20,7 +19,7 @@ from mmrjax.fidelities import turning
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
 from mmrjax.fidelities.rest import holds, status_moving, voltage_at_rest
 from mmrjax.fidelities.result import result, withhold
-from mmrjax.fidelities.rosenbrock import Rodas4, norm, step_longest
+from mmrjax.fidelities.rosenbrock import norm, step_longest
 from mmrjax.fidelities.steady import operating_signals
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
@@ -237,6 +236,10 @@ def _integrated(
     Args:
         law: rates of the unknowns; size: of an error of them; moves: 0 for those that stand, else 1.
     """
+    import diffrax  # only now: it takes half a second
+
+    from mmrjax.fidelities.rodas import Rodas4
+
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda _, y, run: law(run[0], run[1], y) * run[2]),
         Rodas4(inverted=conditions.turns),
