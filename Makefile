@@ -23,7 +23,7 @@ QUICK := XLA_FLAGS="--xla_cpu_use_fusion_emitters=false --xla_backend_optimizati
 test: lint
 	PYTHONDONTWRITEBYTECODE= $(QUICK) $(PYTEST) -m "not slow"
 
-# Everything: the tests that compile or run for long too, some hours on two cores.
+# Everything: the tests that compile or run for long too, some two hours on two cores.
 test-all: lint
 	PYTHONDONTWRITEBYTECODE= $(QUICK) $(PYTEST)
 
