@@ -92,7 +92,7 @@ def test_agreement_can_fail(shown):
 
 
 def test_menu_and_generator_have_the_same_instruments():
-    case = tables.Case({}, {}, settled.conditions(0, 1, 0, 0), settled.CLIMBING, (), settled.Instruments())
+    case = tables.Case({}, {}, None, settled.conditions(0, 1, 0, 0), settled.CLIMBING, (), settled.Instruments())
     sd = predicted.sds(
         MENU, dict(zip(channels.USUAL, case.instruments.stated * [1.0, np.pi / 30, 1e-3], strict=True))
     )
