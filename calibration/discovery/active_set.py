@@ -7,6 +7,7 @@ import functools
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -76,7 +77,8 @@ class ActiveSet(eqx.Module):
 
     def with_effects(self, active: Sequence[int] | Array) -> ActiveSet:
         """The same with these effects in the slots."""
-        return dataclasses.replace(self, active=jnp.asarray(active, int))
+        slots = active if isinstance(active, jax.Array) else np.asarray(active, int)  # else a conversion is compiled
+        return dataclasses.replace(self, active=jnp.asarray(slots, int))
 
 
 @functools.partial(compiled, options=SELDOM)
