@@ -81,6 +81,8 @@ def _command(
 
         @functools.wraps(function)
         def run(**given: Any) -> int:
+            from sweeps.console import working
+
             no_cache, file = given.pop("no_cache"), given.pop("config_file")
             given.pop("help_all", None)
             plan = given.pop("plan", None)
@@ -92,7 +94,8 @@ def _command(
             if beside is not None:
                 further = config.resolve_beside(beside, file, made.taken(beside, given))
             found = config.resolve(kind, file, stated, beside) if resolve is None else resolve(file, stated)
-            return function(Told(_prepared(found, no_cache), further, file), **given)
+            with working(function.__name__.replace("_", " ")):
+                return function(Told(_prepared(found, no_cache), further, file), **given)
 
         own = list(inspect.signature(function, eval_str=True).parameters.values())[1:]
         own = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own]

@@ -25,8 +25,8 @@ from rich.text import Text
 
 #: Widest line of text on a terminal.
 COLUMNS = 80
-#: Longest silence of a long computation [s].
-SILENCE = 10.0
+#: Longest silence of a long computation, and of a command that begins [s].
+SILENCE, FIRST = 10.0, 1.0
 _WIDTH = None if sys.stdout.isatty() else 120  # a file has no width of its own
 _out = Console(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
 _err = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
@@ -51,6 +51,18 @@ def wrapped(text: str) -> str:
         )
         for line in text.split("\n")
     )  # fmt: skip
+
+
+@contextmanager
+def working(name: str) -> Iterator[None]:
+    """Say that a command works where it has not ended soon: what it imports and compiles can take longer."""
+    soon = threading.Timer(FIRST, tell, [f"{name}: working"])
+    soon.daemon = True
+    soon.start()
+    try:
+        yield
+    finally:
+        soon.cancel()
 
 
 @contextmanager

@@ -31,7 +31,9 @@ from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.drive import drive, drive_batch
 from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.signals import Result
-from sweeps import cli
+from sweeps import cli, console
+
+console.FIRST = 1e6  # that a command works depends on the time it takes: tests of what is said don't hear it
 
 #: Memory mappings of a process from which its compiled programs are dropped; Linux allows 65530, and the
 #: compiler crashes or hangs beyond. A program takes some dozens.

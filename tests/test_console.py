@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from calibration.words.steps import still
+from sweeps import console
 from sweeps.console import pulse
 
 
@@ -34,3 +35,12 @@ def test_what_goes_on_is_said_with_what_was_compiled():
     assert still("fitting", 41.6, 0) == "still fitting (42 s)"
     assert still("fitting", 41.6, 1) == "still fitting (42 s, 1 program compiled)"
     assert still("fitting", 9.6, 12) == "still fitting (10 s, 12 programs compiled)"
+
+
+def test_a_command_says_soon_that_it_works(monkeypatch, capsys):
+    monkeypatch.setattr(console, "FIRST", 0.2)
+    with console.working("rig check"):
+        pass
+    with console.working("size"):
+        time.sleep(0.4)
+    assert capsys.readouterr().err == "size: working\n"
