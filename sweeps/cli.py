@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import os
+import re
 import signal
 import sys
 import threading
@@ -546,7 +547,7 @@ def main() -> None:
         code = _fail(f"{place}: {error.strerror}; no run folder was left, only its .partial beside it", 2)
     except Exception as error:
         if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of the option parser
-            code = _fail(error.format_message(), error.exit_code)
+            code = _fail(_no_number(error) or error.format_message(), error.exit_code)
         else:
             import traceback
 
@@ -560,6 +561,15 @@ def main() -> None:
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _no_number(error: Any) -> str:
+    """What to say of a text where an option takes a number, which most often has its unit."""
+    option = getattr(error, "param", None)
+    if option is None or not re.search(r"valid (number|float|integer)", str(getattr(error, "message", ""))):
+        return ""
+    told = " ".join(str(option.help or "").replace("\\[", "[").split())
+    return f"{option.opts[0]}: got no number; expected one without its unit. {told}"
 
 
 def _fail(message: str, code: int) -> int:

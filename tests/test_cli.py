@@ -114,6 +114,10 @@ def test_compare_own_mass_takes_the_robots(mmrjax, tmp_path):
 
 
 USAGE = {
+    "a unit": (
+        ["simulate", "--voltage", "24V"],
+        r"--voltage: got no number; expected one without its unit. Supply.* \(V\)",
+    ),
     "misspelt option": (["sweep", "--slope", "5"], r"No such option: --slope"),
     "unknown command": (["swep"], r"No such command"),
     "slope of 95": (["sweep", "--slopes", "0,95"], r"option slopes_deg\.1: got 95\.0; expected -45 to 45"),
