@@ -264,9 +264,10 @@ def beside_columns(
 
 
 @functools.partial(compiled, options=SELDOM)
-def _keys(seed: Array, shape: tuple[int, int]) -> Array:
-    """Keys of a seed."""
-    return jax.random.key_data(jax.random.split(jax.random.key(seed), shape))
+def _keys(seed: Array, batches: int, replicates: int) -> Array:
+    """A key for each replicate, shape (replicates, 2)."""
+    keys = jax.random.key_data(jax.random.split(jax.random.key(seed), (batches, CHUNK)))
+    return keys.reshape(batches * CHUNK, -1)[:replicates]
 
 
 def bootstrap(
@@ -290,9 +291,8 @@ def bootstrap(
             for all known. Each table is drawn with sds that such an estimate might have been of.
     """
     count = -(-replicates // CHUNK)
-    keys = np.asarray(_keys(jnp.asarray(seed), (count, CHUNK)))
     drawn = problem.observe.draws(
-        problem, jnp.asarray(z), linear, jnp.asarray(keys.reshape(count * CHUNK, -1)[:replicates]),
+        problem, jnp.asarray(z), linear, _keys(jnp.asarray(seed), count, replicates),
         _factors(freedom, len(problem.channels), replicates, seed),
     )  # fmt: skip
     # To whole batches: those that are repeated are cut off.

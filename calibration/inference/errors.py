@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -35,6 +35,12 @@ def percent_error(simulated: np.ndarray, measured: np.ndarray, *, crosses_zero: 
         return (sized_error if crosses_zero else relative_error)(simulated, measured)
 
 
+def root_mean_square(errors: np.ndarray) -> float:
+    """Of those that there are; NaN where there is none."""
+    there = errors[np.isfinite(errors)]
+    return float(np.sqrt(np.mean(there**2))) if there.size else float("nan")
+
+
 def summary(errors: np.ndarray) -> dict[str, float | int]:
     """Root mean square and worst of the errors (35) [%] over the rows that have one, and their count."""
     there = errors[np.isfinite(errors)]
@@ -42,7 +48,7 @@ def summary(errors: np.ndarray) -> dict[str, float | int]:
         return {"rows": 0, "rms_percent": float("nan"), "max_percent": float("nan")}
     return {
         "rows": int(there.size),
-        "rms_percent": float(np.sqrt(np.mean(there**2))),
+        "rms_percent": root_mean_square(there),
         "max_percent": float(np.abs(there).max()),
     }
 
@@ -80,7 +86,18 @@ def channel_errors(
     sigma = (simulated - measured) / sd
     answer = {}
     for k, channel in enumerate(shown):
-        there = sigma[np.isfinite(sigma[:, k]), k]
-        rms = float(np.sqrt(np.mean(there**2))) if there.size else float("nan")
-        answer[channel.name] = {**summary(percent[:, k]), "rms_sigma": rms}
+        answer[channel.name] = {**summary(percent[:, k]), "rms_sigma": root_mean_square(sigma[:, k])}
     return answer
+
+
+def rms_by_fit(
+    table: Mapping[str, np.ndarray], shown: Sequence[Channel], fits: Iterable[str]
+) -> dict[str, dict[str, float]]:
+    """rms of simulated less measured in each channel's unit, by fit (of columns `FIT_COLUMN`) and channel."""
+    found: dict[str, dict[str, float]] = {}
+    for fit in fits:
+        for c in shown:
+            if f"{fit}_{c.column}" in table:
+                error = table[f"{fit}_{c.column}"] - table[c.column]
+                found.setdefault(fit, {})[c.name] = root_mean_square(error)
+    return found

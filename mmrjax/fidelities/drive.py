@@ -185,9 +185,7 @@ def drive(
     imposed = conditions.motor_speed is not None
     parked = jnp.asarray(False) if rolling or imposed else holds(robot, conditions)
     moves = jnp.where(parked, jnp.zeros_like(y0).at[jnp.asarray([0, 4])].set(1.0), 1.0)
-    ys, went = _integrated(
-        rates, functools.partial(norm, own=len(_UNITS)), robot, conditions, moves, y0, times, tolerance, max_steps
-    )
+    ys, went = _integrated(rates, _norm, robot, conditions, moves, y0, times, tolerance, max_steps)
     signals = jax.vmap(lambda y: balances.moving(robot, conditions, state_of(robot, y)))(ys)
     # Friction at rest carries what gravity and the motors ask of a robot that it holds.
     still = jnp.zeros_like(signals.acceleration)

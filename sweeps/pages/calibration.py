@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from calibration.data.columns import Layout
+from calibration.inference.errors import rms_by_fit
 from calibration.inference.identifiability import HELD
 from calibration.inference.result import CalibrationResult
 from sweeps.pages import calibration_figures, cluster_figures, comparison_figures
 from sweeps.pages.page import Album, columns, conditions, curves, first_rows, render, words_shown
-from sweeps.pages.words import rms
 
 
 def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
@@ -51,7 +51,7 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
         columns=columns(found.channels),
         sized=sized,
         has_ground=found.robot.has_ground,
-        rms=rms(table, found.channels, ("before", "after", "held_out")),
+        rms=rms_by_fit(table, found.channels, ("before", "after", "held_out")),
         held=HELD,
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",
     )

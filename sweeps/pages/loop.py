@@ -14,6 +14,7 @@ from calibration.data.columns import Layout
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference import blocks
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
+from calibration.inference.errors import rms_by_fit
 from calibration.inference.notes import FarFromPrior
 from calibration.words import loop as words
 from calibration.words.notes import sentence
@@ -23,7 +24,7 @@ from mmrjax.effects import BY_NAME
 from mmrjax.robot import Robot
 from sweeps.pages import cluster_figures, loop_figures
 from sweeps.pages.page import Album, columns, conditions, curves, first_rows, render, words_shown
-from sweeps.pages.words import GLOSSARY, rms
+from sweeps.pages.words import GLOSSARY
 
 #: Change of an rms error that is marked [%].
 NOTABLE = 0.05
@@ -242,6 +243,6 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         sized=sized,
         has_ground=found.robot.has_ground,
         closed=loop_figures.closed(table) if sized and isinstance(found.detail, EquationDefects) else [],
-        rms=rms(table, found.channels, ("before", "after", "held_out_before", "held_out_after")),
+        rms=rms_by_fit(table, found.channels, ("before", "after", "held_out_before", "held_out_after")),
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",
     )

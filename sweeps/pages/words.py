@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
-
-import numpy as np
 
 from mmrjax import channels
 
@@ -180,20 +177,6 @@ _FITS = {
     "before": "before", "after": "after", "held_out": "held out", "held_out_before": "before, held out",
     "held_out_after": "after, held out",
 }  # fmt: skip
-
-
-def rms(
-    table: dict[str, np.ndarray], shown: Sequence[channels.Channel], whens: Iterable[str]
-) -> dict[str, dict[str, float]]:
-    """rms of simulated less measured in each channel's unit, by when (of columns `WHEN_COLUMN`) and channel."""
-    found: dict[str, dict[str, float]] = {}
-    for when in whens:
-        for c in shown:
-            if f"{when}_{c.column}" in table:
-                error = np.square(table[f"{when}_{c.column}"] - table[c.column])
-                there = error[np.isfinite(error)]
-                found.setdefault(when, {})[c.name] = float(np.sqrt(there.mean())) if there.size else math.nan
-    return found
 
 
 def describe_rms(rms: Mapping[str, Mapping[str, float]]) -> str:

@@ -57,16 +57,11 @@ def attributes(of: Obstacle) -> dict[str, dict[str, Any]]:
     """Outputs that a point has, by name, with their attributes in a store."""
     names = (VERDICT, LARGEST) if of.find else tuple(name for name in OUTPUTS if name != LARGEST)
     found: dict[str, dict[str, Any]] = {
-        name: {"units": unit_of(OUTPUTS[name][0]), "long_name": OUTPUTS[name][1]} for name in names
+        name: {"units": OUTPUTS[name][0], "long_name": OUTPUTS[name][1]} for name in names
     }
     del found[VERDICT]["units"]
     found[VERDICT] |= {"flag_values": [*range(len(NAMES))], "flag_meanings": " ".join(NAMES)}
     return found
-
-
-def unit_of(unit: str) -> str:
-    """A unit as a store has it."""
-    return "1" if unit in ("-", "") else unit
 
 
 def terrains_of(of: Obstacle, sizes: np.ndarray) -> Terrain:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Collection
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from mmrjax.signals import STATUSES
 from mmrjax.variation import STATUS, Variation
 from sweeps.config_campaign import Campaign
 from sweeps.console import tell
-from sweeps.points import axes, climbs, scale
+from sweeps.points import axes, scale
 from sweeps.points.design import Blocks
 from sweeps.points.tasks import Task, task_of
 from sweeps.points.zarr_store import ABSENT, Layout, Variable
@@ -113,16 +114,20 @@ def _bearable(variation: Variation, task: Task, plan: axes.Plan) -> None:
 def laid_out(config: Campaign, job: scale.Job) -> Layout:
     """Arrays of the store of a job, with units and long names."""
     variables = [
-        Variable(name, scale.KINDS.get(name, config.storage), job.task.attributes[name]) for name in job.outputs
+        Variable(name, scale.KINDS.get(name, config.storage), _in_store(job.task.attributes[name]))
+        for name in job.outputs
     ]
     meanings = {"flag_values": [*range(len(STATUSES)), ABSENT], "flag_meanings": " ".join((*STATUSES, "absent"))}
     variables.append(Variable(STATUS, scale.KINDS[STATUS], {"long_name": "how the run ended", **meanings}))
     known = job.plan.axes
-    coordinates = {
-        name: {"units": climbs.unit_of(axis.unit), "long_name": axis.meaning} for name, axis in known.items()
-    }
+    coordinates = {n: _in_store({"units": axis.unit, "long_name": axis.meaning}) for n, axis in known.items()}
     for name in {axes.CONFIGURATION} & set(coordinates):
         del coordinates[name]["units"]
     labels = {axes.CONFIGURATION: job.robot.configurations.names}
     about = {"title": "sweep of a robot", "source": f"mmrjax {__version__}, {job.task.model}"}
     return Layout(job.plan.design, job.blocks, tuple(variables), coordinates, labels, about, config.compression)
+
+
+def _in_store(about: dict[str, Any]) -> dict[str, Any]:
+    """Attributes as a store has them, where the unit of what has none is 1."""
+    return {**about, "units": "1"} if about.get("units") in ("-", "") else about

@@ -70,7 +70,7 @@ def of_fidelity(
         every = (*missions.OUTPUTS, *(missions.OF_TURNS if turns else ()))
         rows, usual = {r.column: (r.unit, r.label) for r in every}, missions.USUAL
     flags = {"flag_masks": [1 << k for k in range(len(LIMITS))], "flag_meanings": " ".join(LIMITS)}
-    known: Attributes = {n: {"units": climbs.unit_of(unit), "long_name": label} for n, (unit, label) in rows.items()}
+    known: Attributes = {n: {"units": unit, "long_name": label} for n, (unit, label) in rows.items()}
     known[FLAGS] = {"long_name": "limits exceeded", **flags}
     at_once = facts.at_once(False), facts.at_once(True)
     return Task(model, options, known, usual, facts.slow and not profiled, at_once)
