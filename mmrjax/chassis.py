@@ -74,11 +74,6 @@ def inertia_reduced(inertia_motor: Scalar, ratio: Scalar, efficiency: Scalar, in
     return inertia_motor * ratio**2 * efficiency + inertia_wheel
 
 
-def inertia_equivalent(mass_side: Scalar, radius: Scalar, inertia_rotating: Scalar) -> Scalar:
-    """J'_eq = m_i r_k² + J [kg·m²], eq. (3)."""
-    return mass_side * radius**2 + inertia_rotating
-
-
 def normal_load(mass: Scalar, slope: Scalar, gravity: float, sides: Scalar) -> Scalar:
     """Normal load of one side m_i g cos α [N], eq. (5)."""
     return mass * (gravity / sides) * cosine(slope)

@@ -38,7 +38,6 @@ class Output:
     Attributes:
         name: noun; column: in tables, with the unit in the name; unit: of the column; factor: the SI value of one.
         label: words of tables and reports; resolution: digits after the point that a person wants to see [unit].
-        of_segments: whether a segment has it too.
     """
 
     name: str
@@ -47,7 +46,6 @@ class Output:
     factor: float
     label: str
     resolution: int
-    of_segments: bool = True
 
 
 def _wh(name: str, label: str) -> Output:
@@ -73,10 +71,10 @@ OUTPUTS: tuple[Output, ...] = (
     Output("winding_peak", "winding_peak_C", "°C", 1.0, "hottest winding", 1),
     Output("cell_low", "cell_low_V", "V", 1.0, "lowest cell voltage", 3),
     Output("state_of_charge", "state_of_charge", "-", 1.0, "state of charge at the end", 4),
-    Output("winding_end", "winding_end_C", "°C", 1.0, "winding at the end", 1, of_segments=False),
-    Output("housing_end", "housing_end_C", "°C", 1.0, "housing at the end", 1, of_segments=False),
-    Output("endurance", "endurance_s", "s", 1.0, "endurance at this duty", 0, of_segments=False),
-    Output("range", "range_m", "m", 1.0, "range at this duty", 0, of_segments=False),
+    Output("winding_end", "winding_end_C", "°C", 1.0, "winding at the end", 1),
+    Output("housing_end", "housing_end_C", "°C", 1.0, "housing at the end", 1),
+    Output("endurance", "endurance_s", "s", 1.0, "endurance at this duty", 0),
+    Output("range", "range_m", "m", 1.0, "range at this duty", 0),
     *(_wh(f"energy_to_{name}", f"energy to: {meaning}") for name, meaning in energy.SINKS.items()),
     _wh("energy_stored", "rise of the energy in motion"),
     Output("unaccounted_share", "unaccounted_share", "-", 1.0, "energy unaccounted for, of that turned over", 9),

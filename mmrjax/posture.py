@@ -16,7 +16,7 @@ import itertools
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from mmrjax import masses
 from mmrjax.conditions import Conditions
@@ -125,7 +125,6 @@ class Posture(eqx.Module):
             end of the contact; negative where the robot tips [m].
         tips_back, tips_forward: slopes on which it would, uphill and downhill [rad].
         inertia: in pitch about the centre of mass [kg·m²].
-        carries: whether each circle bears, within `TOUCH`.
     """
 
     pitch: Scalar
@@ -140,7 +139,6 @@ class Posture(eqx.Module):
     tips_back: Scalar
     tips_forward: Scalar
     inertia: Scalar
-    carries: Bool[Array, " 4"]
 
     @property
     def length(self) -> Scalar:
@@ -212,5 +210,4 @@ def rest(side: Outline, slope: Scalar, inertia: Scalar) -> Posture:
         tips_back=jnp.arctan2(centre - rear, high)[best],
         tips_forward=jnp.arctan2(front - centre, high)[best],
         inertia=inertia,
-        carries=touching,
     )

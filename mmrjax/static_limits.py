@@ -46,7 +46,7 @@ class Limits(eqx.Module):
     """Static limits of a robot with its levers as they stand.
 
     Attributes:
-        step: the highest, driven onto nose first [m]; step_pitch: nose up, where it stands on it [rad].
+        step: the highest, driven onto nose first [m].
         gap: the widest, that its contact bridges on both sides of its centre of mass [m]; 0 where no belt bears.
         contact: length of the contact on level ground [m].
         tip_front, tip_rear: tops of the levers' rollers above level ground [m]; on wheels those of the wheels.
@@ -55,7 +55,6 @@ class Limits(eqx.Module):
     """
 
     step: Scalar
-    step_pitch: Scalar
     gap: Scalar
     contact: Scalar
     tip_front: Scalar
@@ -223,7 +222,6 @@ def limits(robot: Robot, conditions: Conditions) -> Limits:
     width = robot.chassis(conditions.configuration).turning.width
     return Limits(
         step=highest.height,
-        step_pitch=highest.pitch,
         gap=jnp.maximum(bridged, 0.0) * rests.line,
         contact=rests.length,
         tip_front=jnp.where(tracked, tops[FRONT_ROLLER], jnp.max(tops)),

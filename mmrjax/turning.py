@@ -146,15 +146,6 @@ def footprint(stance: Stance, centre: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     return jnp.sign(centre) * (length - borne) / 2, borne / 2, tilt
 
 
-def pressure(stance: Stance, centre: Scalar) -> tuple[Array, Array]:
-    """Nodes of a contact [m], from its middle, and the share of the load that each bears [-]: see `footprint`."""
-    tracks = stance.on_tracks > 0.5
-    middle, half, tilt = footprint(stance, centre)
-    line, share, ends = _nodes(stance.nodes)
-    place = jnp.where(tracks, line, np.sign(line))
-    return middle + place * half, jnp.where(tracks, share, ends) * (1 + tilt * place)
-
-
 class Law(eqx.Module):
     """What of a contact's law nodes share.
 

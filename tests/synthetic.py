@@ -71,7 +71,7 @@ class Analyst:
 
     def discover(self, runs: Runs) -> DiscoveryResult:
         """The whole loop."""
-        return discover.discover_at(runs, robots.nominal(), known(runs), self.settings, self.stated, self.library)
+        return discover.assemble_result(self.trace(runs), runs, None, self.settings, self.library, lambda note: None)
 
 
 def parts(runs: Runs, traced: LoopStages) -> SimpleNamespace:

@@ -299,7 +299,7 @@ def test_report_shows_the_sheet(folder, result):
 
 
 def test_paper_file_states_where_each_aim_comes_from():
-    asked = requirements.paper()
+    asked = requirements.load(None)
     assert all("Section" in r.source or "Table" in r.source or "sheet" in r.source for r in asked.each)
     assert {r.name for r in asked.each} >= {"speed_m_s", "slope_deg", "payload_kg", "endurance_min", "mass_kg"}
     assert set(STATUSES) >= {"cut_off", "slides"} and len({q.name for q in QUANTITIES.values()}) == len(QUANTITIES)

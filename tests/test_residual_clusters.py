@@ -8,13 +8,12 @@ import jsonschema
 import numpy as np
 import pytest
 from pages import Tables
-from synthetic import SETTLED, known
+from synthetic import SETTLED
 from test_lack_of_fit import SIGMA, toy
 from test_loop_command import commanded
 
 from calibration.data import runs as records
 from calibration.data.runs import Runs
-from calibration.discovery import discover
 from calibration.inference.calibrate import calibrate
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.observers import Histories
@@ -277,7 +276,7 @@ def test_clean_table_says_nothing_of_columns_without_a_role(tmp_path):
 @pytest.mark.slow
 def test_the_loop_says_what_its_last_fit_leaves_clustered():
     runs = measured_table(0, 8.0)
-    found = discover.discover_at(runs, robots.nominal(), known(runs), SETTLED.settings, {}, SETTLED.library)
+    found = SETTLED.discover(runs)
     document = found.to_json()
     assert [(c.column, c.channel) for c in found.residual_clusters] == [("idle_wheel", "speed")]
     assert [n for n in found.remarks if n is found.residual_clusters[0]]

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import jsonschema
 import numpy as np
 import pytest
+from test_sensitivity_methods import shapley_of_linear
 
 from calibration.data import posterior as posteriors
 from calibration.data import robot_file
 from calibration.inference import priors
 from calibration.inference.posterior import of_coordinates
 from calibration.sensitivity import inputs as room
-from calibration.sensitivity import shapley
 from calibration.sensitivity.analyse import analyse
 from calibration.sensitivity.local import inert, local
 from calibration.sensitivity.methods import correlated, shapley_effects
@@ -126,7 +126,7 @@ def test_shapley_effects_of_a_posterior_are_those_of_its_linear_model(robot, stu
     found = analyse(one, "shapley", 20_000)
     assert sum(found.sampled["steady"].values()) == found.evaluations > 0
     z_slopes = local(one).by_score["total_current"][0] @ np.linalg.inv(inputs.parameters.root)
-    truth = shapley.linear(z_slopes, covariance)
+    truth = shapley_of_linear(z_slopes, covariance)
     estimate = found.outputs["total_current"].overall["shapley"]
     half = (estimate.high - estimate.low) / 2
     assert np.all(np.abs(estimate.value - truth) <= 1.5 * half + 0.01) and half.max() < 0.1
@@ -146,7 +146,7 @@ def test_shapley_effects_of_inputs_that_do_nothing_are_those_of_their_correlatio
     at = found.outputs["speed"].at_points["shapley"]
     assert abs(slopes[0, 1]) < 1e-9 and np.all(np.abs(slopes[:, 2]) < 1e-9)
     for k in range(2):
-        truth, half = shapley.linear(slopes[k], covariance), (at.high[k] - at.low[k]) / 2
+        truth, half = shapley_of_linear(slopes[k], covariance), (at.high[k] - at.low[k]) / 2
         assert np.all(np.abs(at.value[k] - truth) <= 1.5 * half + 0.01) and half.max() < 0.1
     assert at.value[0, 1] > 0.05 and at.value[0, 2] > 0.01
     assert found.inputs["motor.inductance"].inert and "motor.inductance" not in found.negligible

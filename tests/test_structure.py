@@ -299,7 +299,6 @@ KEPT = {
     ("calibration/data/parts.py", "motors"): "a packaged table",
     ("calibration/data/parts.py", "gearboxes"): "a packaged table",
     ("calibration/data/parts.py", "cells"): "a packaged table",
-    ("calibration/data/requirements.py", "paper"): "a packaged file",
     ("calibration/discovery/scales.py", "_nominal"): "pure: signals of the nominal robot",
     ("sweeps/cli.py", "os.environ"): "set for jax, before it is imported",
     ("sweeps/cli.py", "jax.config"): "a switch of jax, once a process",
@@ -642,7 +641,7 @@ def test_front_door_loads_nothing_heavy():
 INNER = {
     "with_inferred_instruments", "with_surface_configurations", "of_surfaces", "with_table_mass",
     "with_initial_states", "with_begins", "check_start", "inferred", "library_for", "settings_for", "without_copies",
-    "pose", "fit_base", "trace", "discover_at",
+    "pose", "fit_base", "trace",
 }  # fmt: skip
 #: Campaigns and notebooks that call a part of that all the same, and why.
 CALLED: dict[tuple[str, str], str] = {

@@ -13,7 +13,7 @@ from mmrjax import turning as room
 from mmrjax.contact import Friction
 from mmrjax.fidelities import drive, turning
 from mmrjax.signals import STATUSES
-from mmrjax.turning import SIDES, Stance, pressure
+from mmrjax.turning import SIDES, Stance
 
 grip = jax.jit(room.grip)
 CONFIGURATIONS = ("6T2A", "4W2T")
@@ -313,6 +313,14 @@ def test_forces_and_their_derivatives_are_those_of_loads_in_balance(height, lift
             difference = (getattr(ahead, name) - getattr(behind, name)) / (2 * step)
             scale = 1e-6 * (1 + float(jnp.abs(difference).max()))
             np.testing.assert_allclose(getattr(exact, name)[..., k], difference, rtol=1e-6, atol=scale, err_msg=name)
+
+
+def pressure(stance, centre):
+    """Nodes of a contact [m], from its middle, and the share of the load that each bears."""
+    middle, half, tilt = room.footprint(stance, centre)
+    line, weight = np.polynomial.legendre.leggauss(stance.nodes)
+    place, share = (line, weight / 2) if stance.on_tracks else (np.array([-1, 1]), 0.5)
+    return middle + place * half, share * (1 + tilt * place)
 
 
 @pytest.mark.parametrize("centre", [0.0, 0.03, -0.05, 0.08, -0.12])

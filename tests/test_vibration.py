@@ -7,14 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import vibration
 
 from calibration.data.runs import Runs
 from calibration.discovery.discover import discover
-from mmrjax import channels, params, robots, vibration
+from mmrjax import channels, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.contact import Friction
 from mmrjax.effects.slip import VibrationSlip
-from mmrjax.fidelities.track import track, track_batch
+from mmrjax.fidelities.track import track_batch
 from mmrjax.signals import CONVERGED, NOT_SETTLED, Signals
 
 LAW = Friction(static=0.6, dynamic=0.5, speed_static=0.01, speed_dynamic=0.1)
@@ -99,25 +100,7 @@ GEARS = {
 def shaken():
     """Slip [%] of runs, and what follows from their ripple; gears that the law was not derived from."""
 
-    @jax.jit
-    def runs(robot):
-        def one(voltage, slope, payload):
-            conditions = Conditions(0, voltage=voltage, slope_deg=slope, payload=payload)
-            run = track(robot, conditions, duration=1.5, sample=2e-4, rolling=True)
-            seen, signals = vibration.ripple(robot, conditions, run), run.steady.signals
-            friction = robot.chassis(0).ground.friction
-            percent = 100 / signals.speed_theoretical
-            slip = 100 * (1 - signals.speed / signals.speed_theoretical)
-            return (
-                slip,
-                percent * (vibration.speed_sliding(friction, seen.demanded, seen.swing) - seen.lead),
-                percent * friction.speed_creep(seen.demanded),
-                seen.normal,
-            )
-
-        rows = (jnp.repeat(jnp.asarray([15.0, 33.0]), 3), jnp.tile(jnp.asarray([0.0, 6.0, 12.0]), 2), jnp.zeros(6))
-        return jax.vmap(one)(*rows)
-
+    rows = (jnp.repeat(jnp.asarray([15.0, 33.0]), 3), jnp.tile(jnp.asarray([0.0, 6.0, 12.0]), 2), jnp.zeros(6))
     found = {}
     for name, (gear, (static, dynamic, speed)) in GEARS.items():
         values = {f"running_gear.{k}": v for k, v in gear.items()} | {
@@ -126,7 +109,8 @@ def shaken():
             "6T2A.track.guide_friction": 0.06,
         }  # fmt: skip
         robot = params.replace(robots.nominal(), {k: jnp.asarray(v) for k, v in values.items()})
-        found[name] = [np.asarray(x) for x in runs(robot)]
+        seen = vibration.compared(robot, *rows)
+        found[name] = [np.asarray(seen[x]) for x in ("slip", "law", "without ripple", "normal")]
     return found
 
 

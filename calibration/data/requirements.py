@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Iterable, Mapping
 from importlib import resources
 from itertools import combinations
@@ -335,9 +334,3 @@ def _contradictions(each: list[Requirement], envelope: Envelope, where: str) -> 
                 f"{where}: winding_C of at most {r.limit:g} contradicts the envelope, whose ambient_C goes up to "
                 f"{r.envelope.ambient_C[1]:g}"
             )
-
-
-@functools.cache
-def paper() -> Requirements:
-    """The paper's aims."""
-    return load(None)

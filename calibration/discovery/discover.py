@@ -241,26 +241,6 @@ def prepared(
     )
 
 
-def discover_at(
-    runs: Runs,
-    robot: Robot,
-    noise: Noise,
-    settings: Settings,
-    stated: Mapping[str, tuple[float, float]] | None = None,
-    library: Library = effects.BY_NAME,
-    numbers: np.ndarray | None = None,
-    progress: Tell = lambda note: None,
-) -> DiscoveryResult:
-    """One pass of the loop over a table whose noise is known; the arguments as of `discover`.
-
-    Args:
-        numbers: of the rows, as messages call them; None counts from 1.
-        progress: is given notes, not sentences.
-    """
-    traced = trace(runs, robot, noise, settings, stated, library, progress)
-    return assemble_result(traced, runs, numbers, settings, library, progress)
-
-
 @dataclasses.dataclass(frozen=True)
 class Sds:
     """The noise that a verdict is with.
@@ -371,7 +351,7 @@ def trace(
     later: Callable[[BaseFit], None] = lambda base: None,
     keep: Keep = kept.nothing,
 ) -> LoopStages:
-    """The stages of the loop up to a verdict, in order; the arguments as of `discover_at`. `later` is told the base
+    """The stages of the loop up to a verdict, in order; the noise is known. `later` is told the base
     fit as soon as something is missing. What is kept of a stage holds what those before it found, which is one whole.
 
     What replicates of a bootstrap show in units of their own sds hardly depends on these: where the stages `of` the

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from math import factorial
 
 import numpy as np
 from scipy.special import ndtri
@@ -146,23 +145,3 @@ def effects(terms: Terms) -> Estimate:
     """Shapley effects [-], shape (inputs,)."""
     kept = terms.parts[np.isfinite(terms.parts).all(1)]
     return ratio(kept, np.full(len(kept), terms.variance))
-
-
-def linear(mean_slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Exact effects of y = βᵀz with jointly normal z, over all subsets; for a dozen inputs at most (Owen and Prieur,
-    SIAM/ASA J. Uncertain. Quantif. 5 (2017))."""
-    size = len(mean_slope)
-    total = float(mean_slope @ covariance @ mean_slope)
-    cost = np.zeros(2**size)
-    for code in range(1, 2**size):
-        drawn = np.flatnonzero([code >> k & 1 for k in range(size)])
-        half = _conditional(covariance, drawn)[1] if len(drawn) < size else None
-        cost[code] = total if half is None else float(np.sum((mean_slope[drawn] @ half) ** 2))
-    share = np.zeros(size)
-    for code in range(2**size):
-        count = code.bit_count()
-        for k in range(size):
-            if not code >> k & 1:
-                weight = factorial(count) * factorial(size - count - 1) / factorial(size)
-                share[k] += weight * (cost[code | 1 << k] - cost[code])
-    return share / total

@@ -58,18 +58,6 @@ def names() -> tuple[str, ...]:
     return tuple(d.name for d in TABLE)
 
 
-def get(name: str) -> Derived:
-    """A derived output by its name.
-
-    Raises:
-        KeyError: no such output; the message lists those that there are.
-    """
-    for derived in TABLE:
-        if derived.name == name:
-            return derived
-    raise KeyError(f"no derived output {name}; there are {', '.join(names())}")
-
-
 def compute(module: str) -> Callable[..., dict[str, Any]]:
     """The function of a module that computes derived outputs of one run."""
     return importlib.import_module(module).compute

@@ -54,14 +54,12 @@ class Trajectory(eqx.Module):
         time: [s], shape (times,).
         distance: travelled along the slope; of a robot that turns from where it started [m], shape (times,).
         signals: every signal at those times; each field has shape (times,).
-        time_end: last of those times before the battery is empty, else of the run [s].
         result: the state at the end, with the run's status.
     """
 
     time: Float[Array, " times"]
     distance: Float[Array, " times"]
     signals: Signals
-    time_end: Float[Array, ""]
     result: Result
 
 
@@ -176,7 +174,7 @@ def drive(
         standstill exactly at rest where friction holds it; `slides`
         when the movers slide beyond V_s and the robot loses speed or stands (one that holds its speed has
         `converged`, flagged `slips`); `battery_empty` when the charge has
-        run out: signals after `time_end` and the result's numbers are NaN; `failed` when
+        run out: signals after that and the result's numbers are NaN; `failed` when
         the integrator gave up, its numbers NaN too. Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
     """
     if conditions.turns:
@@ -215,7 +213,7 @@ def _kept(
     )
     there = (end.status != BATTERY_EMPTY) & (end.status != FAILED)
     answer = withhold(end, there, end.status != FAILED)
-    return Trajectory(times, away, signals, jnp.max(jnp.where(going, times, times[0])), answer)
+    return Trajectory(times, away, signals, answer)
 
 
 def _integrated(
