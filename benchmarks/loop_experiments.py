@@ -57,7 +57,7 @@ def supported(seen: experiments.PredictedReadings, carried_out: Mapping[str, Map
     value, sd = (
         np.concatenate([np.asarray(r[what], float) for r in carried_out.values()]) for what in ("value", "sd")
     )
-    read = seen.there[at] & np.isfinite(value)
+    read = seen.exists[at] & np.isfinite(value)
     at, value, sd = at[read], value[read], sd[read]
     chi2 = {}
     for k, name in enumerate(seen.names):

@@ -123,8 +123,8 @@ class Conditions(eqx.Module):
             shape = np.broadcast_shapes(*shapes)
         except ValueError:
             names = [f.name for f in dataclasses.fields(type(self)) if f.name not in (*others, "begin")]
-            of = dict(zip([*names, *optional], shapes, strict=True))
-            said = ", ".join(f"{name} {s}" for name, s in of.items() if s)
+            by_name = dict(zip([*names, *optional], shapes, strict=True))
+            said = ", ".join(f"{name} {s}" for name, s in by_name.items() if s)
             raise ValueError(f"Conditions: shapes do not broadcast to one another: {said}") from None
         self.configuration = np.broadcast_to(which, shape) if which.dtype.kind == "U" else _broadcast(which, shape)
         # the same number for all is one array: most fields of a large batch are 0 or 1

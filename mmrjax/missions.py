@@ -105,8 +105,8 @@ USUAL = (
 
 def _quotient(part: Scalar, whole: Scalar) -> Array:
     """part / whole; NaN with a finite derivative where `whole` is not above 0."""
-    there = whole > 0
-    return jnp.where(there, part / jnp.where(there, whole, 1.0), jnp.nan)
+    positive = whole > 0
+    return jnp.where(positive, part / jnp.where(positive, whole, 1.0), jnp.nan)
 
 
 def _root(x: Scalar) -> Array:
@@ -118,36 +118,38 @@ def totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array]:
 
     A segment that was not reached has NaN.
     """
-    of, ran = found.of, found.time > 0
-    turned = of["drawn"] + of["returned"] + sum(jnp.abs(of[name]) for name in energy.SINKS)
-    still = of["path"] <= 1e-6  # m
+    by_segment, ran = found.of, found.time > 0
+    turned = by_segment["drawn"] + by_segment["returned"] + sum(jnp.abs(by_segment[name]) for name in energy.SINKS)
+    still = by_segment["path"] <= 1e-6  # m
     numbers = {
         "duration": found.time,
-        "distance": of["path"],
-        "displacement": of["distance"],
+        "distance": by_segment["path"],
+        "displacement": by_segment["distance"],
         "energy": found.energy,
-        "energy_per_metre": jnp.where(still, jnp.nan, _quotient(found.energy, jnp.where(still, 1.0, of["path"]))),
-        "energy_drawn": of["drawn"],
-        "energy_returned": of["returned"],
-        "rms_current": _root(_quotient(of["current_squared"], found.time)),
+        "energy_per_metre": jnp.where(
+            still, jnp.nan, _quotient(found.energy, jnp.where(still, 1.0, by_segment["path"]))
+        ),
+        "energy_drawn": by_segment["drawn"],
+        "energy_returned": by_segment["returned"],
+        "rms_current": _root(_quotient(by_segment["current_squared"], found.time)),
         "peak_current": peaks["current"],
-        "rms_torque": _root(_quotient(of["torque_squared"], found.time)),
+        "rms_torque": _root(_quotient(by_segment["torque_squared"], found.time)),
         "peak_torque": peaks["torque"],
         "peak_speed": peaks["speed"],
         "peak_motor_speed": peaks["motor_speed"],
         "winding_peak": peaks["temperature"],
         "cell_low": jnp.where(jnp.isfinite(peaks["cell_low"]), peaks["cell_low"], jnp.nan),
-        **{f"energy_to_{name}": of[name] for name in energy.SINKS},
+        **{f"energy_to_{name}": by_segment[name] for name in energy.SINKS},
         "energy_stored": found.stored,
         "unaccounted_share": _quotient(found.unaccounted, turned),
     }
-    if "turned" in of:
-        numbers |= {name: of[name] for name in ("turned", "place_x", "place_y")} | {
+    if "turned" in by_segment:
+        numbers |= {name: by_segment[name] for name in ("turned", "place_x", "place_y")} | {
             "peak_yaw_rate": peaks["yaw_rate"]
         }
         for side in _SIDES:
             numbers |= {
-                f"rms_current_{side}": _root(_quotient(of[f"current_squared_{side}"], found.time)),
+                f"rms_current_{side}": _root(_quotient(by_segment[f"current_squared_{side}"], found.time)),
                 f"peak_current_{side}": peaks[f"current_{side}"],
                 f"winding_peak_{side}": peaks[f"temperature_{side}"],
             }

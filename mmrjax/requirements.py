@@ -154,11 +154,11 @@ def packed(robot: Robot, cells: Scalar) -> Robot:
     return dataclasses.replace(robot, battery=battery)
 
 
-def _at(robot: Robot, point: Point, of: Ratings) -> tuple[Robot, Conditions]:
+def _at(robot: Robot, point: Point, rated: Ratings) -> tuple[Robot, Conditions]:
     """The robot with its winding at ambient temperature, as a run begins, and the conditions of a point."""
     copper = 1 + ALPHA * (point.ambient - TEMPERATURE_REFERENCE)
     motor = dataclasses.replace(robot.motor, resistance=robot.motor.resistance * copper)
-    robot = packed(dataclasses.replace(robot, motor=motor), of.cells)
+    robot = packed(dataclasses.replace(robot, motor=motor), rated.cells)
     return robot, Conditions(
         configuration=jnp.asarray(point.configuration),
         voltage=jnp.where(point.battery > 0.5, 1.0, point.charge),
@@ -187,18 +187,18 @@ def heat_left(robot: Robot, point: Point, current: Scalar, limit: Scalar) -> Sca
     return 1 - current**2 * motor.resistance_thermal * hot / jnp.maximum(limit - point.ambient, 1.0)
 
 
-def _cell(of: Ratings, signals: Signals, point: Point) -> Scalar:
+def _cell(rated: Ratings, signals: Signals, point: Point) -> Scalar:
     """By how much a cell is above its cut-off voltage [V]; inf on an external supply."""
-    return jnp.where(point.battery > 0.5, signals.voltage_source / of.cells - of.voltage_cutoff, jnp.inf)
+    return jnp.where(point.battery > 0.5, signals.voltage_source / rated.cells - rated.voltage_cutoff, jnp.inf)
 
 
-def travel(robot: Robot, point: Point, of: Ratings) -> tuple[dict[str, Array], Array]:
+def travel(robot: Robot, point: Point, rated: Ratings) -> tuple[dict[str, Array], Array]:
     """Steady travel: every quantity of group `travel` by name [SI], and the outcome; beside them the
     `current` of one motor and of the `battery` [A], what is `left` of traction and speed, of `adhesion` alone [-],
     and by how much a `cell` is above its cut-off [V]."""
-    here, conditions = _at(robot, point, of)
+    here, conditions = _at(robot, point, rated)
     signals, status, _ = operating(here, conditions)
-    outcome = jnp.where((status == CONVERGED) & (_cell(of, signals, point) < 0), CUT_OFF, status)
+    outcome = jnp.where((status == CONVERGED) & (_cell(rated, signals, point) < 0), CUT_OFF, status)
     moving = jnp.where(jnp.abs(signals.speed) > 1e-6, signals.speed, 1e-6)
     turns = jnp.abs(signals.speed_motor)
     found = {
@@ -214,18 +214,18 @@ def travel(robot: Robot, point: Point, of: Ratings) -> tuple[dict[str, Array], A
         "battery": here.battery.current(signals.total_current),
         "adhesion": 1 - signals.demand / signals.adhesion_limit,
         "left": steepest_slope.travel_margin(here, signals),
-        "cell": _cell(of, signals, point),
+        "cell": _cell(rated, signals, point),
     }
     return {name: jnp.asarray(x) for name, x in found.items()}, outcome
 
 
-def _travel(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
-    values, outcome = travel(robot, point, of)
+def _travel(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
+    values, outcome = travel(robot, point, rated)
     return Found(values[name], outcome)
 
 
-def _slope(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
-    here, conditions = _at(robot, point, of)
+def _slope(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
+    here, conditions = _at(robot, point, rated)
     answer = steepest_slope.compute(here, conditions)
     held = jnp.isfinite(answer["steepest_slope"])
     return Found(jnp.where(held, answer["steepest_slope"], 0.0), answer["status"])
@@ -235,24 +235,24 @@ def _slope(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
 HALVINGS = 26
 
 
-def _payload(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
+def _payload(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
     """The largest payload that is carried for long: the robot travels, its winding settles within what is permitted,
     its gearboxes carry the torque (where their limit is stated) and its cells stay above their cut-off."""
     most = CONDITION_LIMITS["payload"][1]
 
     def left(robot: Robot, payload: Scalar) -> Scalar:
         at = dataclasses.replace(point, payload=payload)
-        here, conditions = _at(robot, at, of)
+        here, conditions = _at(robot, at, rated)
         signals, _, _ = operating(here, conditions)
-        hot = heat_left(robot, at, signals.current, of.temperature)
-        torque = 1 - jnp.abs(signals.torque_gear) / of.torque
-        each = [steepest_slope.travel_margin(here, signals), hot, torque, _cell(of, signals, point)]
+        hot = heat_left(robot, at, signals.current, rated.temperature)
+        torque = 1 - jnp.abs(signals.torque_gear) / rated.torque
+        each = [steepest_slope.travel_margin(here, signals), hot, torque, _cell(rated, signals, point)]
         return functools.reduce(jnp.minimum, each)
 
     found, holds = _edge(left, robot, jnp.zeros(()), jnp.asarray(most))
-    here, conditions = _at(robot, dataclasses.replace(point, payload=jnp.zeros(())), of)
+    here, conditions = _at(robot, dataclasses.replace(point, payload=jnp.zeros(())), rated)
     signals, status, _ = operating(here, conditions)
-    outcome = jnp.where((status == CONVERGED) & (_cell(of, signals, point) < 0), CUT_OFF, status)
+    outcome = jnp.where((status == CONVERGED) & (_cell(rated, signals, point) < 0), CUT_OFF, status)
     return Found(jnp.where(holds, found, 0.0), outcome)
 
 
@@ -283,7 +283,7 @@ def _edge(left, robot: Robot, low: Array, high: Array) -> tuple[Array, Array]:  
 NODES = 8
 
 
-def _endurance(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
+def _endurance(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
     """How long the battery lasts [s]: t = ∫ dC / (s I_Σ(C) + I_p) over the charge that is used, Gauss-Legendre.
 
     It drives at full voltage for a share s of the time, else it stands; it ends where a cell meets its cut-off.
@@ -292,12 +292,12 @@ def _endurance(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
 
     def drawn(robot: Robot, discharge: Scalar) -> tuple[Scalar, Scalar, Array]:
         """Mean current of the battery [A], what is left of the cut-off [V], status."""
-        here, conditions = _at(robot, point, of)
+        here, conditions = _at(robot, point, rated)
         conditions = dataclasses.replace(conditions, discharge=jnp.asarray(discharge))
         signals, status, _ = operating(here, conditions)
         stands = point.share <= 0
         motors = jnp.where(stands, 0.0, signals.total_current)
-        cell = here.battery.voltage(motors, discharge) / of.cells - of.voltage_cutoff
+        cell = here.battery.voltage(motors, discharge) / rated.cells - rated.voltage_cutoff
         current = here.battery.current(point.share * motors)
         return current, cell, jnp.where(stands, CONVERGED, status)
 
@@ -312,7 +312,7 @@ def _endurance(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
     return Found(time, outcome)
 
 
-def _mass(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
+def _mass(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
     mass = jnp.asarray(robot.chassis(point.configuration).mass)
     return Found(mass, jnp.full(mass.shape, CONVERGED))
 
@@ -321,27 +321,27 @@ def _mass(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
 DUTY_LEFT = {"turn_in_place_rad_s": -1.0, "turning_radius_mm": 0.0}
 
 
-def _turn(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
+def _turn(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
     """A settled turn on level ground, at full voltage: both sides apart on the spot, or beside a side that brakes."""
-    here, conditions = _at(robot, point, of)
+    here, conditions = _at(robot, point, rated)
     conditions = dataclasses.replace(
         conditions, slope_deg=jnp.zeros(()), adhesion_lateral=jnp.asarray(point.adhesion_lateral),
         duty_left=jnp.asarray(DUTY_LEFT[name]), duty_right=jnp.asarray(1.0),
     )  # fmt: skip
     found, motion, status = circling(here, conditions)
-    low = jnp.any(jnp.asarray(_cell(of, found.signals, point)) < 0)
+    low = jnp.any(jnp.asarray(_cell(rated, found.signals, point)) < 0)
     turns = jnp.where(jnp.abs(motion.yaw_rate) > 1e-6, motion.yaw_rate, 1e-6)
     value = motion.yaw_rate if name == "turn_in_place_rad_s" else jnp.abs(motion.speed / turns)
     return Found(jnp.asarray(value), jnp.where((status == CONVERGED) & low, CUT_OFF, status))
 
 
-def _across(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
+def _across(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
     """The side slope [deg] from which a robot that travels across slides, or tips.
 
     Rolling resistance takes a share f/φ_x of the friction ellipse: tan α = φ_y √(1 - (f/φ_x)²). It tips at
     tan α = B / (2 h). Of a rigid robot whose load has not moved.
     """
-    here, conditions = _at(robot, point, of)
+    here, conditions = _at(robot, point, rated)
     conditions = dataclasses.replace(conditions, adhesion_lateral=jnp.asarray(point.adhesion_lateral))
     chassis = here.chassis(conditions.configuration)
     stands = balances.stance(here, conditions, chassis, chassis.mass + point.payload)
@@ -353,7 +353,7 @@ def _across(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
     return Found(jnp.degrees(jnp.arctan(jnp.minimum(slides, tips))), jnp.asarray(CONVERGED))
 
 
-def _posture(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
+def _posture(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
     """What geometry allows a robot on level ground, see `static_limits`: the highest step in any posture of its
     levers, stairs and gaps with its levers flush, its size with them folded."""
     conditions = Conditions(configuration=jnp.asarray(point.configuration), payload=point.payload)
@@ -374,11 +374,11 @@ GROUPS = {"travel": _travel, "slope": _slope, "payload": _payload, "endurance": 
           "turn": _turn, "across": _across, "posture": _posture}  # fmt: skip
 
 
-def evaluate(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
+def evaluate(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
     """One quantity at one point.
 
     Args:
-        robot: any; its parameters may be tracers; point: scalars; of: the robot's `ratings`, or others.
+        robot: any; its parameters may be tracers; point: scalars; rated: the robot's `ratings`, or others.
         name: of `QUANTITIES`.
     """
-    return GROUPS[QUANTITIES[name].group](robot, point, of, name)
+    return GROUPS[QUANTITIES[name].group](robot, point, rated, name)

@@ -132,10 +132,10 @@ class Results:
         Over a profile the outcomes are the mission's numbers; conditions that the profile states are NaN.
         """
         conditions, nan = self.conditions, np.full(self.shape, np.nan)
-        of = {"voltage": "supply_voltage_V", "payload": "payload_kg", "slope_deg": "slope_deg"}
-        columns = {column: np.asarray(getattr(conditions, name)) for name, column in of.items()}
+        as_table = {"voltage": "supply_voltage_V", "payload": "payload_kg", "slope_deg": "slope_deg"}
+        columns = {column: np.asarray(getattr(conditions, name)) for name, column in as_table.items()}
         columns["supply_voltage_V"] = np.where(np.asarray(conditions.battery) > 0.5, np.nan, conditions.voltage)
-        columns |= {of[name]: nan for name in self.stated if name in of}
+        columns |= {as_table[name]: nan for name in self.stated if name in as_table}
         found = outputs.columns(self.result, self.channels, self.further)
         if self.mission is not None:
             found = {name: found[name] for name in (*missions.names("turned" in self.mission.total.of), *CODES)}

@@ -131,9 +131,9 @@ def step(side: Outline, pitch: Scalar | None = None) -> Step:
     rises = jax.vmap(lambda pitch: jax.jvp(lambda x: step_at(still, x), (pitch,), (jnp.ones_like(pitch),))[1])(beside)
     share = jnp.clip(-rises[1] / jnp.maximum(rises[0] - rises[1], 1e-12), 0.0, 1.0)
     moved = jnp.asarray(jax.vmap(lambda pitch: step_at(side, pitch) - step_at(still, pitch))(beside))
-    there = side.pitched(best)
+    pitched = side.pitched(best)
     height = step_at(still, best) + share * moved[0] + (1 - share) * moved[1]
-    return Step(height, best, there, -lowest(there)[0])
+    return Step(height, best, pitched, -lowest(pitched)[0])
 
 
 def with_levers(conditions: Conditions, front: Scalar, rear: Scalar) -> Conditions:
@@ -174,10 +174,10 @@ def best_step(robot: Robot, conditions: Conditions) -> tuple[Step, Scalar, Scala
     nothing: as its tail leaves the lower ground, the centre of mass has to be over the step, and what is under it is
     no higher than in the best posture. The pitch alone is searched for, the levers' angles follow (`best_levers`).
     """
-    still, there = jax.lax.stop_gradient((robot, conditions))
+    still, run = jax.lax.stop_gradient((robot, conditions))
 
     def height(pitch: Scalar) -> Scalar:
-        return step_at(posture.outline(still, with_levers(there, *best_levers(still, there, pitch))), pitch)
+        return step_at(posture.outline(still, with_levers(run, *best_levers(still, run, pitch))), pitch)
 
     best, apart = _highest(height, *_POSTURES)
     for _ in range(2):  # smooth there: the tops of parabolas
@@ -188,7 +188,7 @@ def best_step(robot: Robot, conditions: Conditions) -> tuple[Step, Scalar, Scala
             + jnp.where(bend > 0, jnp.clip((high - low) / (2 * jnp.where(bend > 0, bend, 1.0)), -1, 1), 0.0) * apart
         )
         apart = apart / 16
-    front, rear = best_levers(still, there, best)
+    front, rear = best_levers(still, run, best)
     return step(posture.outline(robot, with_levers(conditions, front, rear)), best), front, rear
 
 

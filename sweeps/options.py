@@ -73,12 +73,12 @@ def described(name: str, fact: Mapping[str, Any]) -> str:
 
 
 def _bounds(fact: Mapping[str, Any]) -> str:
-    of = {**fact.get("items", {}), **fact}
-    ends = [f"{of[key]:.10g}" if key in of else "" for key in ("minimum", "maximum")]
+    limits = {**fact.get("items", {}), **fact}
+    ends = [f"{limits[key]:.10g}" if key in limits else "" for key in ("minimum", "maximum")]
     if all(ends):
         return " to ".join(ends)
     words = {"minimum": "at least", "exclusiveMinimum": "above", "maximum": "at most", "exclusiveMaximum": "below"}
-    return ", ".join(f"{word} {of[key]:.10g}" for key, word in words.items() if key in of)
+    return ", ".join(f"{word} {limits[key]:.10g}" for key, word in words.items() if key in limits)
 
 
 def _default(name: str, fact: Mapping[str, Any]) -> str:

@@ -16,12 +16,12 @@ from sweeps.store import DONE, SOLVER_FAILED, Folder
 Page = Callable[[Path], Any]
 
 
-def page(name: str, *of: Any, **known: Any) -> Page:
+def page(name: str, *found: Any, **known: Any) -> Page:
     """The page of `sweeps/pages` by name, of what its `write` takes after the folder.
 
     It is imported when it is written: figures cost half a second, which --no-report saves.
     """
-    return lambda folder: importlib.import_module(f"sweeps.pages.{name}").write(folder, *of, **known)
+    return lambda folder: importlib.import_module(f"sweeps.pages.{name}").write(folder, *found, **known)
 
 
 def leave(

@@ -105,7 +105,7 @@ def test_replicates_tell_what_the_noise_is():
 def test_too_few_rows_cannot_be_tested_and_say_so():
     whole, few = toy(np.random.default_rng(6), parameters=2), np.arange(0, 90, 30)
     rows = (few[:, None] * 3 + np.arange(3)).ravel()
-    some = {name: getattr(whole, name)[few] for name in ("simulated", "whitened", "there")}
+    some = {name: getattr(whole, name)[few] for name in ("simulated", "whitened", "counts")}
     small = dataclasses.replace(whole, runs=whole.runs.where(few), jacobian=whole.jacobian[rows], **some)
     made = judged(small, estimated=True)
     assert made.adequate is None and made.p_value is None

@@ -190,11 +190,11 @@ def test_empty_cells_and_missing_readings_are_let_be():
     columns = extras(np.random.default_rng(8))
     columns["idle_wheel"][:9] = np.nan
     made = left(8, columns, lambda r, c: np.nan_to_num(by_wheel(3.0)(r, {"idle_wheel": np.nan_to_num(c["idle_wheel"], nan=1.0)})))  # fmt: skip
-    there = made.there & (np.arange(ROWS) % 7 > 0)[:, None]
-    found = residual_clusters(dataclasses.replace(made, there=there, whitened=np.where(there, made.whitened, 0.0)))
+    there = made.counts & (np.arange(ROWS) % 7 > 0)[:, None]
+    found = residual_clusters(dataclasses.replace(made, counts=there, whitened=np.where(there, made.whitened, 0.0)))
     assert found[0].column == "idle_wheel" and "not stated" in {m.level for m in found[0].levels}
     assert sum(m.rows for m in found[0].levels) == there[:, SPEED].sum()
-    nobody = dataclasses.replace(made, there=np.zeros_like(there), whitened=np.zeros_like(made.whitened))
+    nobody = dataclasses.replace(made, counts=np.zeros_like(there), whitened=np.zeros_like(made.whitened))
     assert residual_clusters(nobody) == ()
 
 

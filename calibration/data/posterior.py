@@ -65,24 +65,20 @@ class Posterior:
         return vectors * np.sqrt(np.maximum(values, 0.0))
 
     def at(self, z: Any) -> Any:
-        """Parameters [SI] in the order of `names` at coordinates z, shape (..., coordinates); traceable."""
+        """Parameters [SI] in the order of `names` at coordinates z, shape (..., coordinates): in NumPy of an array of
+        NumPy, which compiles nothing, else traceable."""
         import jax.numpy as jnp
 
         from calibration.inference.priors import held_within
 
-        u = jnp.asarray(self.location) + jnp.asarray(self.spread) * z
+        xp = np if isinstance(z, np.ndarray) else jnp
+        u = xp.asarray(self.location) + xp.asarray(self.spread) * z
         u = held_within(u, self.low, self.high, self.softness * self.spread)
         kinds = np.asarray(self.kinds)
-        theta = jnp.where(jnp.asarray(kinds == LOG), jnp.exp(jnp.where(kinds == LOG, u, 0.0)), u)
-        theta = jnp.where(jnp.asarray(kinds == ANGLE), jnp.remainder(u + jnp.pi, 2 * jnp.pi) - jnp.pi, theta)
+        theta = xp.where(xp.asarray(kinds == LOG), xp.exp(xp.where(kinds == LOG, u, 0.0)), u)
+        theta = xp.where(xp.asarray(kinds == ANGLE), xp.remainder(u + np.pi, 2 * np.pi) - np.pi, theta)
         followers = [ratio * theta[..., k] for _, k, ratio in self.tied]
-        return jnp.concatenate([theta, jnp.stack(followers, -1)], -1) if followers else theta
-
-    def numbers(self, z: np.ndarray) -> np.ndarray:
-        """The same of an array, in one program."""
-        import jax
-
-        return np.asarray(jax.jit(self.at)(z))
+        return xp.concatenate([theta, xp.stack(followers, -1)], -1) if followers else theta
 
     def values(self, normal_scores: Any) -> Any:
         """Parameters [SI] of draws.
@@ -97,8 +93,7 @@ class Posterior:
 
     def draw(self, draws: int, seed: int) -> np.ndarray:
         """Parameters [SI] of so many random draws, shape (draws, names)."""
-        scores = np.random.default_rng(seed).standard_normal((draws, len(self)))
-        return self.numbers(np.asarray(self.mean) + scores @ self.root.T)
+        return self.values(np.random.default_rng(seed).standard_normal((draws, len(self))))
 
     def check(self, robot: Robot, where: str) -> None:
         """Refuse a posterior that is not this robot's.
@@ -118,7 +113,8 @@ class Posterior:
                     f"{where}: a posterior of {name}, which this robot does not have, so it is of another robot; "
                     f"{choices(name, [n for n in known if n.rpartition('.')[2] == name.rpartition('.')[2]] or known)}"
                 )
-        at = self.numbers(np.asarray(self.mean))
+        with np.errstate(invalid="ignore"):  # of a file with NaN, refused below
+            at = self.at(np.asarray(self.mean))
         sd = np.asarray(self.sd)
         for name, value, width in zip(self.names, at, sd, strict=True):
             if not abs(known[name] - value) <= APART * width + 1e-6 * abs(value):  # also where one is NaN
@@ -149,7 +145,7 @@ def write(posterior: Posterior, path: Path | str) -> None:
         "low": (p.low, "least u"),
         "high": (p.high, "greatest u"),
         "softness": (p.softness, "width over which bounds are rounded off, as a share of the spread"),
-        "value": (p.numbers(p.mean)[: len(p)], "parameter at the mean [SI]"),
+        "value": (p.at(p.mean)[: len(p)], "parameter at the mean [SI]"),
         "sd": (p.sd[: len(p)], "standard deviation of the parameter, to first order [SI]"),
     }
     data: dict[str, Any] = {

@@ -137,8 +137,11 @@ class ProfileTable:
     @property
     def stated(self) -> tuple[str, ...]:
         """Columns of conditions that it states, as a table of runs names them."""
-        of = {"voltage": "supply_voltage_V", "slope_deg": "slope_deg", "payload": "payload_kg"}
-        return (*(column for name, column in of.items() if name in self.values), *([SURFACE] if self.surface else []))
+        names = {"voltage": "supply_voltage_V", "slope_deg": "slope_deg", "payload": "payload_kg"}
+        return (
+            *(column for name, column in names.items() if name in self.values),
+            *([SURFACE] if self.surface else []),
+        )
 
     def demanded(self, segment: np.ndarray, elapsed: np.ndarray, per_speed: float) -> np.ndarray:
         """Ground speed that is demanded [m/s], of a motor speed the one it rolls at; NaN where none is.
@@ -454,13 +457,13 @@ def _mode(cells: _Cells, row: int, before: str, filled: list[str]) -> str:
     stated = cells.text(MODE, row)
     if stated and stated not in MODES:
         cells.refuse(MODE, row, f"one of these; {choices(stated, MODES)}")
-    there = [cells.columns[field][0] for field in DEMANDS if cells.has(field)]
-    mode = stated or (DEMANDS[filled[0]] if filled else "" if there else MODES[VOLTAGE])
+    columns = [cells.columns[field][0] for field in DEMANDS if cells.has(field)]
+    mode = stated or (DEMANDS[filled[0]] if filled else "" if columns else MODES[VOLTAGE])
     if not mode and row == len(cells) - 1:
         mode = before
     if not mode:
         raise BadData(
-            f"{cells.source} row {row + 1}: got no demand; expected a value in one of {', '.join(there)}, or brake "
+            f"{cells.source} row {row + 1}: got no demand; expected a value in one of {', '.join(columns)}, or brake "
             "or coast in the column mode"
         )
     return mode

@@ -323,11 +323,11 @@ def _contradictions(each: list[Requirement], envelope: Envelope, where: str) -> 
     for r in each:
         if r.limit is None:
             continue
-        of = {"payload_kg": envelope.payload_kg, "slope_deg": envelope.slope_deg}.get(r.name)
-        if of is not None and r.least and r.limit < of[1]:
+        ends = {"payload_kg": envelope.payload_kg, "slope_deg": envelope.slope_deg}.get(r.name)
+        if ends is not None and r.least and r.limit < ends[1]:
             raise BadConfiguration(
                 f"{where}: {r.name} of at least {r.limit:g} contradicts the envelope, whose {r.name} goes up to "
-                f"{of[1]:g}"
+                f"{ends[1]:g}"
             )
         if r.name == "winding_C" and r.envelope.ambient_C is not None and r.limit < r.envelope.ambient_C[1]:
             raise BadConfiguration(

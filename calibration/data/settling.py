@@ -226,8 +226,8 @@ def shown(robot: Robot) -> tuple[Channel, ...]:
 
 def _in_order(runs: Runs) -> list[np.ndarray]:
     """Rows of each run, whose time increases from row to row."""
-    of, time = names(runs), runs["time_s"]
-    each = [np.flatnonzero(of == name) for name in dict.fromkeys(of.tolist())]
+    run, time = names(runs), runs["time_s"]
+    each = [np.flatnonzero(run == name) for name in dict.fromkeys(run.tolist())]
     for rows in each:
         steps = np.diff(time[rows])
         if (steps <= 0).any():
@@ -502,8 +502,8 @@ def _first_steady(signals: tuple[Signal, ...], rows: np.ndarray, parts: list[tup
 
 
 def _plain(x: np.ndarray) -> float:
-    there = x[np.isfinite(x)]
-    return float(np.mean(there)) if len(there) else math.nan
+    finite = x[np.isfinite(x)]
+    return float(np.mean(finite)) if len(finite) else math.nan
 
 
 def _noise_of_mean(signal: Signal, rows: np.ndarray, ends: list[tuple[int, int]]) -> float:
@@ -533,12 +533,12 @@ def _correlation_time(x: np.ndarray) -> float:
 def _mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[float, float, float]:
     """Mean of a channel over a stretch, sd of that mean, and its change from end to end by a straight line."""
     shown = signal.shown[rows]
-    there = np.isfinite(shown)
-    if there.sum() < max(FEWEST, 0.5 * len(rows)):
+    finite = np.isfinite(shown)
+    if finite.sum() < max(FEWEST, 0.5 * len(rows)):
         return math.nan, math.nan, math.nan
-    t, x = time[there] - time[there].mean(), shown[there]
+    t, x = time[finite] - time[finite].mean(), shown[finite]
     if len(signal.angle):
-        angle = signal.angle[rows][there]
+        angle = signal.angle[rows][finite]
         slope = float(t @ (angle - angle.mean()) / (t @ t))
         rest = angle - angle.mean() - slope * t
         sd = math.sqrt(float(np.mean(rest**2)) * _correlation_time(rest) / float(t @ t))
@@ -551,7 +551,7 @@ def _mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[float, fl
     sd = spread * math.sqrt(_correlation_time(rest) / len(x))
     if signal.step > 0:  # without noise readings round alike; with it their mean is off by less
         # Of two readings alone nobody knows how often noise carries one to the other.
-        within = max(spread**2 / signal.step**2 - 1 / 12, 0.0) if len(np.unique(shown[there])) > 2 else 0.0
+        within = max(spread**2 / signal.step**2 - 1 / 12, 0.0) if len(np.unique(shown[finite])) > 2 else 0.0
         rounding = min(1 / math.sqrt(12), math.exp(-2 * math.pi**2 * within) / (math.pi * math.sqrt(2)))
         sd = math.hypot(sd, rounding * signal.step)
     return mean, max(sd, 1e-6 * abs(mean), 1e-9 * signal.largest), slope * float(np.ptp(t))

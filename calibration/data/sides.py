@@ -59,7 +59,7 @@ def _refuse_against(
     if told.sum() < FEWEST or against.sum() <= MOSTLY * told.sum():
         return
     row = int(np.argmax(np.where(against, np.abs(drive), -1.0)))
-    got, driven = (" and ".join(number(float(f"{x[row]:.4g}")) for x in of) for of in (shown, runs.of_sides))
+    got, driven = (" and ".join(number(float(f"{x[row]:.4g}")) for x in sides) for sides in (shown, runs.of_sides))
     raise BadData(
         f"{runs.source} row {row + 1}, {column}: got {got} where {' and '.join(runs.layout.sides)} are {driven}, and "
         f"so in {against.sum()} of {told.sum()} rows; expected {expected}"

@@ -83,11 +83,11 @@ def with_surface_configurations(robot: Robot, runs: Runs) -> Robot:
     for configuration in dict.fromkeys(c for c, _ in pairs):
         mine = [label for c, label in pairs if c == configuration]
         own = [x for x in mine if x not in labelled or named(configuration, x) in members]
-        there = [named(configuration, x) for x in own if named(configuration, x) in members]
-        if not own or (len(mine) == 1 and not there) or (configuration not in members and not there):
+        present = [named(configuration, x) for x in own if named(configuration, x) in members]
+        if not own or (len(mine) == 1 and not present) or (configuration not in members and not present):
             continue
         stays = configuration in members and len(own) < len(mine)
-        pattern = members[configuration] if configuration in members else members[there[0]]
+        pattern = members[configuration] if configuration in members else members[present[0]]
         names = list(dict.fromkeys(named(configuration, x) for x in own))
         if configuration in members and not stays:  # in its place
             members = {

@@ -108,7 +108,7 @@ class Runs:
 
     def where(self, rows: np.ndarray) -> Runs:
         """The rows that a mask or an index selects."""
-        columns, extras = ({k: v[rows] for k, v in of.items()} for of in (self.columns, self.extras))
+        columns, extras = ({k: v[rows] for k, v in cells.items()} for cells in (self.columns, self.extras))
         return dataclasses.replace(self, columns=columns, extras=extras)
 
     def measured(self) -> np.ndarray:

@@ -137,8 +137,8 @@ class ScoredLibrary:
 def scored_library(effects: Sequence[Effect]) -> ScoredLibrary:
     """Every effect at every point of its shape's grid."""
     grids = tuple(scored(e) for e in effects)
-    of = np.repeat(np.arange(len(grids)), [len(s.at) for s in grids])
-    return ScoredLibrary(tuple(effects), grids, of, np.concatenate([s.at for s in grids]))
+    effect = np.repeat(np.arange(len(grids)), [len(s.at) for s in grids])
+    return ScoredLibrary(tuple(effects), grids, effect, np.concatenate([s.at for s in grids]))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -45,9 +45,9 @@ class Classes:
 
 def cosines(space: CandidateSpace, scores: ScoreTable) -> np.ndarray:
     """Largest |cos| between what a fit leaves of two effects' signatures, over their shapes; (effects, effects)."""
-    cosine, of, count = np.abs(np.asarray(scores.cosine)), space.library.of, len(space.library)
+    cosine, effect, count = np.abs(np.asarray(scores.cosine)), space.library.of, len(space.library)
     whole = np.zeros((count, count))
-    np.maximum.at(whole, (of[:, None], of[None, :]), cosine)
+    np.maximum.at(whole, (effect[:, None], effect[None, :]), cosine)
     return whole
 
 

@@ -776,11 +776,11 @@ def _residuals(
         linear: the fit at z, linearised; reading: what it says of every row [SI], shape (rows or more, channels).
     """
     rows, count = len(runs), len(runs.channels)
-    there = (space.weight[:rows] > 0) & np.isfinite(reading[:rows])
+    counts = (space.weight[:rows] > 0) & np.isfinite(reading[:rows])
     jacobian = np.asarray(linear.jacobian)[: rows * count, : len(z)]
-    whitened = np.where(there, np.asarray(linear.by_row())[:rows], 0.0)
+    whitened = np.where(counts, np.asarray(linear.by_row())[:rows], 0.0)
     return Residuals(
-        type(space.bare.observe), runs, reading[:rows], whitened, there, jacobian, z[: jacobian.shape[1]]
+        type(space.bare.observe), runs, reading[:rows], whitened, counts, jacobian, z[: jacobian.shape[1]]
     )
 
 

@@ -93,11 +93,11 @@ def alike_variables(
     names: Sequence[tuple[str, str]], deviate: np.ndarray, place: str, variable: str
 ) -> tuple[str, ...]:
     """Over what else a curve in a place is as improbable, the most improbable first."""
-    there = {names[j][1]: deviate[j] for j in np.argsort(-deviate) if names[j][0] == place}
-    there.pop(bases_room.CONDITIONS, None)
+    by_variable = {names[j][1]: deviate[j] for j in np.argsort(-deviate) if names[j][0] == place}
+    by_variable.pop(bases_room.CONDITIONS, None)
     found: dict[str, str] = {_axis(variable): variable}
-    for other, d in there.items():
-        if d > max(there.values()) - ALIKE:
+    for other, d in by_variable.items():
+        if d > max(by_variable.values()) - ALIKE:
             found.setdefault(_axis(other), other)
     return tuple(other for other in found.values() if other != variable)
 

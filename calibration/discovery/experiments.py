@@ -65,7 +65,7 @@ class PredictedReadings:
         value: readings [SI], shape (alternatives, readings); sd: of the instruments [SI], shape (readings,).
         half: J C^½, so that the covariance that the fit leaves is half halfᵀ; shape
             (alternatives, readings, coordinates).
-        there: readings that exist for every alternative, shape (readings,).
+        exists: which readings do for every alternative, shape (readings,).
         settings: from which separation an experiment counts.
     """
 
@@ -74,14 +74,14 @@ class PredictedReadings:
     value: np.ndarray
     half: np.ndarray
     sd: np.ndarray
-    there: np.ndarray
+    exists: np.ndarray
     settings: Settings
 
     def apart(self, a: int, b: int, *experiments: str) -> float:
         """Expected separation of two alternatives by experiments, all carried out [σ]."""
         where = predicted.spans(self.experiments)
         spans = [where[e] for e in experiments]
-        at = np.concatenate([np.flatnonzero(self.there[k]) + k.start for k in spans])
+        at = np.concatenate([np.flatnonzero(self.exists[k]) + k.start for k in spans])
         d = self.value[a, at] - self.value[b, at]
         squares = [d @ np.linalg.solve(_covariance(self.half[x, at], self.sd[at]), d) for x in (a, b)]
         return float(np.sqrt(max(min(squares), 0.0)))

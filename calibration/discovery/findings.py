@@ -393,7 +393,7 @@ def errors(
     sigma = (simulated - measured) / sd
     answer: Errors = {}
     for k, name in enumerate(channels.names(problem.channels)):
-        there = sigma[np.isfinite(sigma[:, k]), k]
-        rms = float(np.sqrt(np.mean(there**2))) if there.size else float("nan")
+        finite = sigma[np.isfinite(sigma[:, k]), k]
+        rms = float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")
         answer[name] = {**summary(percent[:, k]), "rms_sigma": rms}
     return answer

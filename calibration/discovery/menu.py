@@ -202,11 +202,11 @@ def _runs(
     """Runs under every combination of slopes and voltages."""
     each = list(itertools.product(dict.fromkeys(slopes), dict.fromkeys(voltages)))
     slope, voltage = (tuple(x) for x in zip(*each, strict=True))
-    of = (at.configuration,) if at is not None else ()
+    own = (at.configuration,) if at is not None else ()
     return Run(
-        ", ".join((name, *of)), (*(kinds or (name,)), *of), doing, setup, voltage, slope, (payload,) * len(each),
+        ", ".join((name, *own)), (*(kinds or (name,)), *own), doing, setup, voltage, slope, (payload,) * len(each),
         tuple(c for c in (read or reach.measured) if c in reach.measured), 0 if at is None else at.index, sides,
-        brake, math.inf if at is None else at.steepest, steepest, where=", ".join(of), motors=reach.motors,
+        brake, math.inf if at is None else at.steepest, steepest, where=", ".join(own), motors=reach.motors,
     )  # fmt: skip
 
 

@@ -70,8 +70,8 @@ def compared(space: CandidateSpace, runs: Runs, best: Candidate, alike: Classes)
     held = {kind: counts & np.any(list(by.values()), 0)[:, None] for kind, by in kinds.items()}
     common = {kind: np.all([np.isfinite(e[kind]) for e in errors], 0) for kind in kinds}
 
-    def rms(e: Mapping[str, np.ndarray], of: Sequence[str]) -> float:
-        squares = np.concatenate([e[kind][common[kind]] ** 2 for kind in of])
+    def rms(e: Mapping[str, np.ndarray], blocks: Sequence[str]) -> float:
+        squares = np.concatenate([e[kind][common[kind]] ** 2 for kind in blocks])
         return float(np.sqrt(squares.mean())) if squares.size else float("nan")
 
     return tuple(

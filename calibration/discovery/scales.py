@@ -178,8 +178,8 @@ def _sized(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple[Robot,
     factor *= SLIPPERY if kind.balance == "slip" and amplitude.spec.unit == "-" else UNKNOWN
     limits = factor
     if kind.balance != "sensor":
-        here, there = (_unit_share(grown, mine[0], s) for s in (mine[1], _rated(*mine)))
-        limits = factor * min(1.0, _ratio(here, there))
+        own, rated = (_unit_share(grown, mine[0], s) for s in (mine[1], _rated(*mine)))
+        limits = factor * min(1.0, _ratio(own, rated))
     else:
         low, high = amplitude_of(grown).spec.bounds
         limits = min(factor, MOST_OFF / (max(-low, high) * _unit_share(grown, *mine)))

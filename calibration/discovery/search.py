@@ -157,11 +157,11 @@ def _extend(
 
 def _pairs(space: CandidateSpace, scores: ScoreTable) -> list[tuple[str, str]]:
     """Pairs of effects by their joint score, the strongest first, a batch of them."""
-    of, names = space.library.of, space.library.names
+    effect, names = space.library.of, space.library.names
     pair = np.triu(np.asarray(scores.pair))
     found: list[tuple[str, str]] = []
     for flat in np.argsort(-pair, axis=None)[:PAIRS]:
-        i, j = sorted((int(of[flat // len(of)]), int(of[flat % len(of)])))
+        i, j = sorted((int(effect[flat // len(effect)]), int(effect[flat % len(effect)])))
         if i != j and (names[i], names[j]) not in found:
             found.append((names[i], names[j]))
         if len(found) == _batch(space):

@@ -114,12 +114,12 @@ def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarra
     for root, sigmas in itertools.product(roots, SIZES):
         scale = sigmas * size
         inner, pull = scale**2 * root.T @ a @ root, scale * root.T @ b
-        there = np.eye(len(root)) + inner
-        z = np.linalg.solve(there, pull)
-        evidence = 0.5 * pull @ z - 0.5 * np.linalg.slogdet(there)[1]
+        information = np.eye(len(root)) + inner
+        z = np.linalg.solve(information, pull)
+        evidence = 0.5 * pull @ z - 0.5 * np.linalg.slogdet(information)[1]
         if evidence > best[0]:
             explained = 2 * pull @ z - z @ inner @ z
-            taken = float(np.trace(np.linalg.solve(there, inner)))
+            taken = float(np.trace(np.linalg.solve(information, inner)))
             best = evidence, (scale, root, z, float(explained), taken, 2 * float(evidence))
     name = f"wave_{balance}" if variable in ORDERS else f"curve_{balance}_{axis}"
     return Smooth(name, variable, low, high, *best[1])
@@ -174,9 +174,9 @@ def surface(
     best = (-np.inf, 0.0, 0.0)
     for sigmas in SIZES:
         scale = sigmas * size
-        there = np.eye(len(b)) + scale**2 * a
-        z = np.linalg.solve(there, scale * b)
-        evidence = scale * b @ z - np.linalg.slogdet(there)[1]
+        information = np.eye(len(b)) + scale**2 * a
+        z = np.linalg.solve(information, scale * b)
+        evidence = scale * b @ z - np.linalg.slogdet(information)[1]
         if evidence > best[0]:
             best = float(evidence), scale, float(2 * scale * b @ z - scale**2 * z @ a @ z)
     return Surface(best[1] * columns, best[2], best[0])

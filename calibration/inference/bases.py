@@ -143,8 +143,8 @@ def signature(linear: Linearization, place: str, shapes: np.ndarray) -> np.ndarr
 
 def scaled(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """x mapped linearly so that the rows that count span -1 to 1; zeros where it does not vary."""
-    there = x[weight > 0]
-    low, high = there.min(), there.max()
+    counting = x[weight > 0]
+    low, high = counting.min(), counting.max()
     return np.clip((2 * x - low - high) / (high - low), -1, 1) if high - low > 1e-9 * max(abs(high), 1e-9) else 0 * x
 
 
@@ -321,20 +321,20 @@ def collinearity(columns: Mapping[str, np.ndarray], weight: np.ndarray, axes: Se
     Args:
         columns, weight: as of `families`; axes: columns of the conditions, None: of the packaged robot's.
     """
-    there = weight > 0
-    x = np.asarray(columns["order"], float)[there]
+    counts = weight > 0
+    x = np.asarray(columns["order"], float)[counts]
     if len(x) < 4 or np.ptp(x) == 0:
         return 1.0
-    _, which = np.unique(np.asarray(columns["configuration"])[there], return_inverse=True)
+    _, which = np.unique(np.asarray(columns["configuration"])[counts], return_inverse=True)
     conditions = axes_of(None) if axes is None else axes
     others = [c for c in conditions if c != VARIABLES["slope"]]
-    cells = np.stack([which, *(np.asarray(columns[c], float)[there] for c in others)], 1)
+    cells = np.stack([which, *(np.asarray(columns[c], float)[counts] for c in others)], 1)
     _, cell = np.unique(cells, axis=0, return_inverse=True)
     few = cell.max() + 1 <= FEW_CELLS * len(x)
     smooth = [VARIABLES["slope"]] * (VARIABLES["slope"] in conditions) if few else conditions
     terms = list(np.eye(len(x))[cell.ravel() if few else which.ravel()].T)
     for column in smooth:
-        terms += list(legendre.legvander(scaled(columns[column], weight)[there], DEGREE)[:, 1:].T)
+        terms += list(legendre.legvander(scaled(columns[column], weight)[counts], DEGREE)[:, 1:].T)
     matrix = np.stack(terms, 1).astype(float)
     left = x - matrix @ np.linalg.lstsq(matrix, x, rcond=None)[0]
     rank = int(np.linalg.matrix_rank(matrix))

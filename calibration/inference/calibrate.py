@@ -185,9 +185,9 @@ def calibrate(
 
     measured, sd = runs.measured(), np.asarray(posed.data.sd)
     seen, seen_before = _reached(posed, status, after.reading), _reached(posed, status_before, before.reading)
-    there = np.isfinite(measured) & np.isfinite(seen)
-    whitened = np.where(there, (seen - measured) / sd, 0.0)
-    left = lack_of_fit.Residuals(observe, runs, seen, whitened, there, about.jacobian, z)
+    finite = np.isfinite(measured) & np.isfinite(seen)
+    whitened = np.where(finite, (seen - measured) / sd, 0.0)
+    left = lack_of_fit.Residuals(observe, runs, seen, whitened, finite, about.jacobian, z)
     if not known.estimated.any():
         notes += noise_remarks(left)
     sources = {name: "product" for name in of_product} | {name: "stated" for name in stated}

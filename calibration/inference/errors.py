@@ -37,19 +37,19 @@ def percent_error(simulated: np.ndarray, measured: np.ndarray, *, crosses_zero: 
 
 def root_mean_square(errors: np.ndarray) -> float:
     """Of those that there are; NaN where there is none."""
-    there = errors[np.isfinite(errors)]
-    return float(np.sqrt(np.mean(there**2))) if there.size else float("nan")
+    finite = errors[np.isfinite(errors)]
+    return float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")
 
 
 def summary(errors: np.ndarray) -> dict[str, float | int]:
     """Root mean square and worst of the errors (35) [%] over the rows that have one, and their count."""
-    there = errors[np.isfinite(errors)]
-    if there.size == 0:
+    finite = errors[np.isfinite(errors)]
+    if finite.size == 0:
         return {"rows": 0, "rms_percent": float("nan"), "max_percent": float("nan")}
     return {
-        "rows": int(there.size),
-        "rms_percent": root_mean_square(there),
-        "max_percent": float(np.abs(there).max()),
+        "rows": int(finite.size),
+        "rms_percent": root_mean_square(finite),
+        "max_percent": float(np.abs(finite).max()),
     }
 
 

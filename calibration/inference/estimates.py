@@ -187,9 +187,9 @@ def chi_square(
     after: np.ndarray, measured: np.ndarray, sd: np.ndarray, about: Identifiability, known: Noise
 ) -> ChiSquare:
     """Misfit of the readings that are there, and the degrees of freedom that the fit leaves them."""
-    there = np.isfinite(measured)
-    misfit = np.where(there, (after - measured) / sd, 0.0)
-    freedom = float(there.sum() - about.leverage.sum())
+    finite = np.isfinite(measured)
+    misfit = np.where(finite, (after - measured) / sd, 0.0)
+    freedom = float(finite.sum() - about.leverage.sum())
     return ChiSquare(float(np.sum(misfit**2)), freedom, not bool(known.estimated.any()))
 
 

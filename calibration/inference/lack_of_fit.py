@@ -68,7 +68,7 @@ class Residuals:
     Attributes:
         observe: kind of the runs.
         simulated: fitted readings [SI]; whitened: simulated less measured, in sds, 0 where a reading does not count;
-            there: whether it does; shape (rows, channels).
+            counts: whether it does; shape (rows, channels).
         jacobian: of the whitened readings, row by row, shape (rows · channels, parameters).
         z: coordinates of the fit, shape (parameters,).
     """
@@ -77,7 +77,7 @@ class Residuals:
     runs: Runs
     simulated: np.ndarray
     whitened: np.ndarray
-    there: np.ndarray
+    counts: np.ndarray
     jacobian: np.ndarray
     z: np.ndarray
 
@@ -89,8 +89,8 @@ class Residuals:
     @property
     def freedom(self) -> np.ndarray:
         """Degrees of freedom that the fit leaves each channel, shape (channels,)."""
-        leverage = np.sum(self.taken[: self.there.size] ** 2, 1).reshape(self.there.shape)
-        return np.sum(np.where(self.there, 1.0 - leverage, 0.0), 0)
+        leverage = np.sum(self.taken[: self.counts.size] ** 2, 1).reshape(self.counts.shape)
+        return np.sum(np.where(self.counts, 1.0 - leverage, 0.0), 0)
 
     @property
     def chi2(self) -> np.ndarray:
@@ -100,9 +100,9 @@ class Residuals:
     def rescaled(self) -> Residuals:
         """The same with each channel's sds as its own misfit says."""
         factor = np.sqrt(np.maximum(self.chi2, 1e-300) / np.maximum(self.freedom, 1e-9))
-        factor = np.where(self.there.any(0) & (self.freedom > 0), factor, 1.0)
+        factor = np.where(self.counts.any(0) & (self.freedom > 0), factor, 1.0)
         whitened = self.whitened / factor
-        jacobian = (self.jacobian.reshape(*self.there.shape, -1) / factor[:, None]).reshape(self.jacobian.shape)
+        jacobian = (self.jacobian.reshape(*self.counts.shape, -1) / factor[:, None]).reshape(self.jacobian.shape)
         return dataclasses.replace(self, whitened=whitened, jacobian=jacobian)
 
 
@@ -155,7 +155,7 @@ def _p_value(fit: Residuals, columns: np.ndarray, known: bool) -> float | None:
 
 def _families(fit: Residuals) -> dict[Shown, np.ndarray]:
     """Columns over the readings by what they show: for each channel, curves over each variable, by configuration."""
-    observe, runs, simulated, there = fit.observe, fit.runs, fit.simulated, fit.there
+    observe, runs, simulated, counts = fit.observe, fit.runs, fit.simulated, fit.counts
     variables = {c: (runs[c], TERMS) for c in (*runs.axes, *DUTY) if runs.has(c)}
     if observe.axis:
         variables[observe.axis] = runs[observe.axis], OVER_TIME
@@ -164,27 +164,27 @@ def _families(fit: Residuals) -> dict[Shown, np.ndarray]:
     variables |= {
         f"the fitted {c.label}": (simulated[:, k], TERMS)
         for k, c in enumerate(fit.runs.channels)
-        if there[:, k].any()
+        if counts[:, k].any()
     }
     which = runs["configuration"]
     families = {}
     for k, channel in enumerate(fit.runs.channels):
-        rows = there[:, k]
+        rows = counts[:, k]
         for name, (x, terms) in variables.items():
             if rows.sum() < 2 or not np.isfinite(x[rows]).all() or np.ptp(x[rows]) == 0:
                 continue
             scaled = 2 * (x - x[rows].min()) / np.ptp(x[rows]) - 1
             curve = legendre.legvander(np.nan_to_num(scaled), min(terms, len(np.unique(x[rows])) - 1))
             own = [curve * ((which == c) & rows)[:, None] for c in np.unique(which)]
-            columns = np.zeros((*there.shape, sum(o.shape[1] for o in own)))
+            columns = np.zeros((*counts.shape, sum(o.shape[1] for o in own)))
             columns[:, k] = np.concatenate(own, 1)
-            families[Shown(channel.name, "follow", name)] = columns.reshape(there.size, -1)
+            families[Shown(channel.name, "follow", name)] = columns.reshape(counts.size, -1)
     return families
 
 
 def _memory(fit: Residuals) -> tuple[float, Shown] | None:
     """Whether residuals of a run resemble those of the sample before, where rows of a run follow one another."""
-    observe, runs, residual, there = fit.observe, fit.runs, fit.whitened, fit.there
+    observe, runs, residual, counts = fit.observe, fit.runs, fit.whitened, fit.counts
     if not observe.axis:
         return None
     run = runs["run_id"] if runs.has("run_id") else np.zeros(len(runs), str)
@@ -192,7 +192,7 @@ def _memory(fit: Residuals) -> tuple[float, Shown] | None:
     follows = run[order][1:] == run[order][:-1]
     found = []
     for k, channel in enumerate(fit.runs.channels):
-        e, ok = residual[order, k], there[order, k]
+        e, ok = residual[order, k], counts[order, k]
         both = follows & ok[1:] & ok[:-1]
         power = float(np.sum(e[ok] ** 2))
         if both.sum() >= 20 and power > 0:
@@ -206,7 +206,7 @@ def _memory(fit: Residuals) -> tuple[float, Shown] | None:
 
 def _replicates(fit: Residuals) -> tuple[float, Shown] | None:
     """Whether the residuals exceed the scatter of rows under the same conditions."""
-    observe, runs, residual, there = fit.observe, fit.runs, fit.whitened, fit.there
+    observe, runs, residual, counts = fit.observe, fit.runs, fit.whitened, fit.counts
     freedom, chi2 = float(fit.freedom.sum()), float(fit.chi2.sum())
     columns = [c for c in ("configuration", *observe.axes_of(runs), "surface") if runs.has(c)]
     groups: dict[tuple[str, ...], list[int]] = {}
@@ -215,8 +215,8 @@ def _replicates(fit: Residuals) -> tuple[float, Shown] | None:
         groups.setdefault(key, []).append(row)
     pure, own = 0.0, 0
     for rows in (g for g in groups.values() if len(g) > 1):
-        for k in range(there.shape[1]):
-            e = residual[rows, k][there[rows, k]]
+        for k in range(counts.shape[1]):
+            e = residual[rows, k][counts[rows, k]]
             pure += float(np.sum((e - e.mean()) ** 2)) if len(e) > 1 else 0.0
             own += max(len(e) - 1, 0)
     if own < REPLICATES or freedom - own < 1 or pure <= 0:

@@ -27,12 +27,12 @@ from mmrjax.signals import Signals
 PROBED = ("mass", "supply", "electrical", "motor", "gearbox", "track", "ground", "slip")
 
 
-def probe(of: str) -> Effect:
+def probe(whose: str) -> Effect:
     """An effect that adds its amplitude to a balance: of every side, or of each its own, shape (2,): left, right."""
 
     class Probe(Effect):
-        name: ClassVar[str] = f"probe_{of}"
-        balance: ClassVar[str] = of
+        name: ClassVar[str] = f"probe_{whose}"
+        balance: ClassVar[str] = whose
         dissipative: ClassVar[bool] = False
         amplitude: Scalar = parameter(
             0.0, unit="", meaning="defect", bounds=(-1e9, 1e9), sd=1.0, source="", amplitude=True

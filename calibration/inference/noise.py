@@ -113,20 +113,20 @@ def of(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
     measured, columns = runs.measured(), runs.deviations()
     sd, source = np.ones_like(measured), []
     for k, channel in enumerate(runs.channels):
-        there = np.isfinite(measured[:, k])
-        if not there.any():
+        finite = np.isfinite(measured[:, k])
+        if not finite.any():
             source.append("no readings")
             continue
         if k not in shares and runs.has(channel.sd_column):
-            sd[:, k] = np.where(there, columns[:, k], 1.0)
+            sd[:, k] = np.where(finite, columns[:, k], 1.0)
             source.append("columns")
             continue
         size, relative = shares.get(k, (START, True))
-        if relative and not np.any(measured[there, k] != 0):
+        if relative and not np.any(measured[finite, k] != 0):
             raise BadData(
                 f"{runs.source}: {channel.name} reads 0 in every row; state its sd, e.g. --noise in {channel.unit}"
             )
-        sd[:, k] = np.where(there, size * sizes[:, k] if relative else size, 1.0)
+        sd[:, k] = np.where(finite, size * sizes[:, k] if relative else size, 1.0)
         source.append("stated" if k in shares else "estimated")
     quantum = np.array([runs.layout.variance(name) for name in channels.names(runs.channels)])
     known = np.array([s in ("columns", "stated") for s in source])  # an estimate has it in it already

@@ -47,13 +47,13 @@ def common_factors(fit: Residuals) -> dict[str, float]:
     sds that are off everywhere alike.
     """
     factors = noise_factors(fit, BEYOND_DOUBT)
-    enough = bool(np.all(fit.freedom[fit.there.any(0)] >= FEWEST))
+    enough = bool(np.all(fit.freedom[fit.counts.any(0)] >= FEWEST))
     return factors if enough and _everywhere(fit, factors) else {}
 
 
 def _everywhere(fit: Residuals, factors: dict[str, float]) -> bool:
     """Whether every channel that is read has a factor, and they are the same."""
-    count = int(fit.there.any(0).sum())
+    count = int(fit.counts.any(0).sum())
     return len(factors) == count > 1 and max(factors.values()) < ALIKE**2 * min(factors.values())
 
 

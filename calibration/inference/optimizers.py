@@ -540,8 +540,8 @@ def _steps(
 
     def one(at: Progress, found: tuple[Array, Array, Any], weight: Array) -> tuple[Progress, Optimum]:
         new = step(at, found, held, TOLERANCE_LONG)
-        (r, jacobian, _), there = new.found, dataclasses.replace(data, weight=weight)
-        return new, _optimum(jacobian, r, new.y, there, no_pin(new.y.shape[0]), new.steps)
+        (r, jacobian, _), reweighted = new.found, dataclasses.replace(data, weight=weight)
+        return new, _optimum(jacobian, r, new.y, reweighted, no_pin(new.y.shape[0]), new.steps)
 
     return jax.vmap(one)(at, found, weights)
 
@@ -576,8 +576,8 @@ def searches_long(
         fresh, going = mine.fill(), np.flatnonzero(mine.taken)
         # A step judges what was found where the last one led; what is accepted becomes y.
         ahead = _put(ahead, fresh, starts[mine.holds[fresh]])
-        there = evaluate(ahead[going], mine.holds[going])
-        found = jax.tree.map(lambda x: _put(np.zeros((len(ahead), *x.shape[1:]), x.dtype), going, x), there)  # noqa: B023
+        evaluated = evaluate(ahead[going], mine.holds[going])
+        found = jax.tree.map(lambda x: _put(np.zeros((len(ahead), *x.shape[1:]), x.dtype), going, x), evaluated)  # noqa: B023
         if len(fresh):
             begun = jax.device_get(jax.vmap(begin_at)(jnp.asarray(ahead), jax.tree.map(np.zeros_like, found)))
             at = begun if at is None else jax.tree.map(lambda old, new: _put(old, fresh, new[fresh]), at, begun)  # noqa: B023

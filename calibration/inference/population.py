@@ -152,8 +152,8 @@ class Members:
 
     def _load(self, file: Path) -> None:
         try:
-            with file.open("rb") as bytes_, np.load(bytes_) as there:
-                own, arrays = str(there["identity"]), [there[k] for k in KEPT]
+            with file.open("rb") as bytes_, np.load(bytes_) as saved:
+                own, arrays = str(saved["identity"]), [saved[k] for k in KEPT]
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise BadConfiguration(f"--members {file}: no file of members; {error}") from None
         if own != self._own:
@@ -302,8 +302,8 @@ def regression(posed: Problem, found: Population, at: int) -> tuple[Float[np.nda
     Returns:
         The slope, shape (rows · channels, parameters), and the rms of what it leaves [σ].
     """
-    there = np.isfinite(found.cost)
-    z, reading = found.z[there], found.reading[there]
+    finite = np.isfinite(found.cost)
+    z, reading = found.z[finite], found.reading[finite]
     number = min(len(z), MEMBERS_EACH * (z.shape[1] + 1))
     spread = np.linalg.pinv(np.cov(z.T).reshape(z.shape[1], -1))
     apart = z - found.z[at]

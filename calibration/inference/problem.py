@@ -67,11 +67,11 @@ def data_of(measured: np.ndarray, sd: np.ndarray, parameters: int) -> Data:
         measured: [SI], NaN where a reading is missing; sd: of each, shapes (rows, channels).
         parameters: how many are free.
     """
-    there = np.isfinite(measured)
+    finite = np.isfinite(measured)
     return Data(
-        jnp.asarray(np.where(there, measured, 0.0)),
-        jnp.asarray(np.where(there, sd, 1.0)),
-        jnp.asarray(there, float),
+        jnp.asarray(np.where(finite, measured, 0.0)),
+        jnp.asarray(np.where(finite, sd, 1.0)),
+        jnp.asarray(finite, float),
         jnp.zeros(parameters),
         jnp.asarray(STIFFNESS),
     )

@@ -99,15 +99,15 @@ def _factor(measured: np.ndarray, possible: np.ndarray) -> float:
     Args:
         measured: shape (runs,); possible: of several robots, NaN where one does not move, shape (robots, runs).
     """
-    there = np.isfinite(measured) & np.isfinite(possible).any(0)
-    if not there.any():
+    finite = np.isfinite(measured) & np.isfinite(possible).any(0)
+    if not finite.any():
         return 1.0
-    size = np.abs(possible[:, there])
+    size = np.abs(possible[:, finite])
     low, high = np.nanmin(size, 0), np.nanmax(size, 0)
     tells = high > SMALL * np.nanmax(high)
     if not tells.any():  # a channel that steady travel does not show
         return 1.0
-    low, high, x = low[tells], high[tells], np.abs(measured[there][tells])
+    low, high, x = low[tells], high[tells], np.abs(measured[finite][tells])
     x = np.maximum(x, 1e-9 * high)
     return float(np.median(np.where(x > high, x / high, np.where(x < low, x / low, 1.0))))
 
@@ -180,12 +180,12 @@ def _slopes(runs: Runs, measured: np.ndarray, possible: np.ndarray, robot: Robot
     k = next((k for k, c in enumerate(robot.channels) if c.name in ("total_current", "motor_current")), None)
     if k is None or "slope_deg" not in runs.axes:
         return
-    slope, there = runs["slope_deg"], np.isfinite(measured[:, k]) & np.isfinite(possible[:, k])
+    slope, finite = runs["slope_deg"], np.isfinite(measured[:, k]) & np.isfinite(possible[:, k])
     columns = [
         c for c in ("configuration", runs.layout.imposed_column, "payload_kg", "surface", "duty") if runs.has(c)
     ]
     groups: dict[tuple[str, ...], list[int]] = {}
-    for row in np.flatnonzero(there):
+    for row in np.flatnonzero(finite):
         groups.setdefault(tuple(str(runs[c][row]) for c in columns), []).append(int(row))
     several = [g for g in groups.values() if np.ptp(slope[g]) > 0]
     if sum(len(g) - 1 for g in several) < 3:

@@ -120,9 +120,9 @@ def residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, .
     columns = _without_role(whole)
     if not columns:
         return ()
-    made = [(k, of) for k in range(fit.there.shape[1]) if (of := _channel(whole, k, columns)) is not None]
+    made = [(k, seen) for k in range(fit.counts.shape[1]) if (seen := _channel(whole, k, columns)) is not None]
     count = sum(len(tested.tests) for _, tested in made)
-    every = [(count * float(p[0]), k, test) for k, of in made for test, p in of.p_values(of.left[:, None])]
+    every = [(count * float(p[0]), k, test) for k, seen in made for test, p in seen.p_values(seen.left[:, None])]
     found = [one for one in every if one[0] < LEVEL]
     if not found:
         return ()
@@ -130,7 +130,9 @@ def residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, .
     floor = 1 / (1 + len(strongest))
     answer: list[ResidualCluster] = []
     for k, tested in made:
-        chances = [(p, test, floor * (1 + int(np.sum(strongest <= p / count)))) for p, of, test in found if of == k]
+        chances = [
+            (p, test, floor * (1 + int(np.sum(strongest <= p / count)))) for p, seen, test in found if seen == k
+        ]
         mine = sorted(((p if c <= floor else max(p, c)), test) for p, test, c in chances if c <= LEVEL)
         taken: list[tuple[float, _Comparison, list[str]]] = []
         for p, test in _coarse_first(mine, columns):
@@ -177,12 +179,12 @@ class _Units:
     """What is compared, a settled row or a run of a history each.
 
     Attributes:
-        runs: their table; there: whether a reading counts; whitened: residuals; jacobian: by the free parameters,
+        runs: their table; counts: whether a reading does; whitened: residuals; jacobian: by the free parameters,
             shape (units, channels, parameters); residual, simulated: [SI]; covariance: of z, (JᵀJ + 1)⁻¹.
     """
 
     runs: Runs
-    there: np.ndarray
+    counts: np.ndarray
     whitened: np.ndarray
     jacobian: np.ndarray
     residual: np.ndarray
@@ -191,20 +193,20 @@ class _Units:
 
 
 def _by_row(fit: Residuals) -> _Units:
-    jacobian = np.where(fit.there[..., None], fit.jacobian.reshape(*fit.there.shape, -1), 0.0)
-    flat = jacobian.reshape(fit.there.size, -1)
+    jacobian = np.where(fit.counts[..., None], fit.jacobian.reshape(*fit.counts.shape, -1), 0.0)
+    flat = jacobian.reshape(fit.counts.size, -1)
     covariance = np.linalg.inv(flat.T @ flat + np.eye(flat.shape[1]))
-    residual = np.where(fit.there, fit.simulated - fit.runs.measured(), np.nan)
-    return _Units(fit.runs, fit.there, fit.whitened, jacobian, residual, fit.simulated, covariance)
+    residual = np.where(fit.counts, fit.simulated - fit.runs.measured(), np.nan)
+    return _Units(fit.runs, fit.counts, fit.whitened, jacobian, residual, fit.simulated, covariance)
 
 
 def _by_run(fit: Residuals) -> _Units:
     """Means of each run; whitened ones times the root of how many samples they are of, so that noise has the sd 1."""
     rows = _by_row(fit)
     run = fit.runs["run_id"] if fit.runs.has("run_id") else np.zeros(len(fit.runs), str)
-    _, first, of = np.unique(run, return_index=True, return_inverse=True)
-    member = of[:, None] == np.arange(len(first))  # (samples, runs)
-    counts = member.T.astype(float) @ rows.there
+    _, first, run_of = np.unique(run, return_index=True, return_inverse=True)
+    member = run_of[:, None] == np.arange(len(first))  # (samples, runs)
+    counts = member.T.astype(float) @ rows.counts
     weight = np.sqrt(np.maximum(counts, 1.0))
 
     def total(x: np.ndarray) -> np.ndarray:
@@ -220,11 +222,11 @@ def _by_run(fit: Residuals) -> _Units:
     mean = np.maximum(counts, 1.0)
     return _Units(
         runs=dataclasses.replace(fit.runs, columns=columns, extras=one),
-        there=counts > 0,
+        counts=counts > 0,
         whitened=total(rows.whitened) / weight,
         jacobian=total(rows.jacobian) / weight[..., None],
         residual=np.where(counts > 0, total(rows.residual) / mean, np.nan),
-        simulated=np.where(counts > 0, total(np.where(rows.there, rows.simulated, 0.0)) / mean, np.nan),
+        simulated=np.where(counts > 0, total(np.where(rows.counts, rows.simulated, 0.0)) / mean, np.nan),
         covariance=rows.covariance,
     )
 
@@ -373,12 +375,12 @@ def _orthonormal(columns: np.ndarray, least: float = CLEAR) -> np.ndarray:
 
 def _channel(whole: _Units, k: int, columns: dict[str, np.ndarray]) -> _Channel | None:
     """A channel and its tests; None where too little is measured."""
-    there = whole.there[:, k]
-    if there.sum() < FEWEST:
+    counts = whole.counts[:, k]
+    if counts.sum() < FEWEST:
         return None
-    runs = whole.runs.where(there)
+    runs = whole.runs.where(counts)
     # The residuals' covariance is 1 - J (JᵀJ + 1)⁻¹ Jᵀ, of which only a few directions are not 1.
-    j = whole.jacobian[there, k]
+    j = whole.jacobian[counts, k]
     root = np.linalg.cholesky(whole.covariance)
     directions, size, _ = np.linalg.svd(j @ root, full_matrices=False)
     share = np.clip(size**2, 0.0, 1.0)
@@ -389,18 +391,18 @@ def _channel(whole: _Units, k: int, columns: dict[str, np.ndarray]) -> _Channel 
     def scaled(x: np.ndarray, by: np.ndarray) -> np.ndarray:
         return x + directions @ ((by - 1)[:, None] * (directions.T @ x))
 
-    travel = np.sign(whole.simulated[there, k])
+    travel = np.sign(whole.simulated[counts, k])
     both = min(np.sum(travel > 0), np.sum(travel < 0)) >= 2
-    smooth = _smooth(runs, whole.simulated[there], travel if both else None)
+    smooth = _smooth(runs, whole.simulated[counts], travel if both else None)
     taken = _orthonormal(np.concatenate([directions[:, ~open_], _unit(scaled(smooth, forth))], 1))
-    whitened = scaled(whole.whitened[there, k][:, None], back)[:, 0]
+    whitened = scaled(whole.whitened[counts, k][:, None], back)[:, 0]
     left = whitened - taken @ (taken.T @ whitened)
     freedom = len(left) - taken.shape[1]
     tests = []
     for name, cells in columns.items():
         for within in ("", *_labels(runs)):
             for reversing in (False, True)[: 1 + both]:
-                shape = _shape(cells[there], runs[within] if within else None)
+                shape = _shape(cells[counts], runs[within] if within else None)
                 basis = scaled(shape * travel[:, None] if reversing else shape, forth)
                 basis = _orthonormal(_unit(basis))
                 basis = _orthonormal(basis - taken @ (taken.T @ basis), OWN)
@@ -482,10 +484,10 @@ def _permuted(made: Sequence[tuple[int, _Channel]], seed: int) -> np.ndarray:
 
 def _reported(whole: _Units, k: int, test: _Comparison, p: float, alike: tuple[str, ...]) -> ResidualCluster:
     """A finding in the units of its channel."""
-    channel, there = whole.runs.channels[k], whole.there[:, k]
-    cells, residual = whole.runs.extras[test.column][there], whole.residual[there, k] / channel.factor
-    signed = residual * np.sign(whole.simulated[there, k]) if test.reversing else residual
-    within = whole.runs[test.within][there] if test.within else np.zeros(int(there.sum()), str)
+    channel, counts = whole.runs.channels[k], whole.counts[:, k]
+    cells, residual = whole.runs.extras[test.column][counts], whole.residual[counts, k] / channel.factor
+    signed = residual * np.sign(whole.simulated[counts, k]) if test.reversing else residual
+    within = whole.runs[test.within][counts] if test.within else np.zeros(int(counts.sum()), str)
     words, correlation, at = _words(cells), None, cells
     words = np.where(words == "", "not stated", words)
     levels: tuple[LevelMean, ...] = ()
@@ -532,11 +534,11 @@ def _coarser(
                 total += here.sum() * (residual[here].mean() - residual[mine].mean()) ** 2
         return total
 
-    found, all_of_it, there = [], between(words), whole.there[:, k]
+    found, all_of_it, counts = [], between(words), whole.counts[:, k]
     for name, cells in whole.runs.extras.items():
-        if name == column or _numbers(cells[there]):
+        if name == column or _numbers(cells[counts]):
             continue
-        coarse = _words(cells[there])
+        coarse = _words(cells[counts])
         if len(np.unique(coarse)) > 1 and _divides(words, coarse) and all_of_it > 0:
             share = between(coarse) / all_of_it
             found += [(name, float(share))] if share >= MOSTLY else []

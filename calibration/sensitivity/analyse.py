@@ -160,13 +160,13 @@ def _study_of(row: OutputRow, study: Study, found: Local, part: Part | None) -> 
     moved = (scores @ along.T) ** 2 * weight if study.inputs.is_posterior else scores**2 * weight
     variance = np.sum(scores**2 * weight, 1)
     linear = moved / np.where(variance > 0, variance, 1.0)[:, None]
-    there = np.isfinite(value)
-    share = np.where(there[:, None], linear, np.nan)
-    sd = np.where(there, np.sqrt(variance), np.nan)
+    finite = np.isfinite(value)
+    share = np.where(finite[:, None], linear, np.nan)
+    sd = np.where(finite, np.sqrt(variance), np.nan)
     if part is None:
         nothing = np.zeros(points)
         return OutputStudy(
-            row, value, slopes, elasticity, found.swing[name], sd, share, {}, {}, None, (), nothing, there
+            row, value, slopes, elasticity, found.swing[name], sd, share, {}, {}, None, (), nothing, finite
         )
     return OutputStudy(
         row,

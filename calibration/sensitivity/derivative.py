@@ -75,14 +75,14 @@ def terms(
         None where fewer than one point of some replicate has a number.
     """
     y = values.reshape(replicates, -1)
-    there = np.isfinite(y)
-    count = there.sum(1)
+    finite = np.isfinite(y)
+    count = finite.sum(1)
     if count.min() < 1 or count.sum() < 2 * replicates:
         return None
     weight = 1.0 / count.mean()
-    centre = y[there].mean()
-    y = np.where(there, y - centre, 0.0)
-    g = np.where(there[..., None], gradients.reshape(*y.shape, -1), 0.0)
+    centre = y[finite].mean()
+    y = np.where(finite, y - centre, 0.0)
+    g = np.where(finite[..., None], gradients.reshape(*y.shape, -1), 0.0)
     s = scores.reshape(g.shape)
     flat = np.where(normal, 1.0, np.sqrt(3.0) * s * (1 - s))
     mean = weight * np.sum(flat * g, 1)
@@ -92,7 +92,7 @@ def terms(
         lower=middle**2 + 2 * middle * (mean - middle),  # the square of a mean, linearised about it
         upper=weight * np.sum(g**2, 1) * np.where(normal, 1.0, 1 / np.pi**2),
         rows=int(count.sum()),
-        lost=int(there.size - count.sum()),
+        lost=int(finite.size - count.sum()),
     )
 
 

@@ -54,9 +54,9 @@ def local(study: Study) -> Local:
     inner = np.asarray(jacobian_of(inputs, centre))
     derivative, by_score, swing = {}, {}, {}
     for name, moved in by_columns.items():
-        there = np.isfinite(answer.values[name])[:, None]
-        derivative[name] = np.where(there, _by_inputs(inputs, moved), np.nan)
-        by_score[name] = np.where(there, np.einsum("pc,pci->pi", moved, inner), np.nan)
+        finite = np.isfinite(answer.values[name])[:, None]
+        derivative[name] = np.where(finite, _by_inputs(inputs, moved), np.nan)
+        by_score[name] = np.where(finite, np.einsum("pc,pci->pi", moved, inner), np.nan)
     along = directions(inputs)
     p = len(inputs.parameters)
     ends = []

@@ -203,8 +203,8 @@ def _outputs(
         made = evaluate(variation, source, values, conditions, options, names)
     else:
         made = _derived(variation, source, names, values, conditions)
-    there = done(made[STATUS])
-    return {name: x if name == STATUS else jnp.where(there, x, jnp.nan) for name, x in made.items()}
+    solved = done(made[STATUS])
+    return {name: x if name == STATUS else jnp.where(solved, x, jnp.nan) for name, x in made.items()}
 
 
 def _derived(

@@ -58,9 +58,9 @@ def effects(points: np.ndarray, values: np.ndarray) -> Effects | None:
 
     count, steps = len(points) // (points.shape[1] + 1), points.shape[1] + 1
     by = values.reshape(count, steps)
-    there = np.isfinite(by).all(1)
-    kept = np.repeat(there, steps)
-    if there.sum() < 2:
+    finite = np.isfinite(by).all(1)
+    kept = np.repeat(finite, steps)
+    if finite.sum() < 2:
         return None
     state = np.random.get_state()  # noqa: NPY002
     try:
@@ -68,15 +68,15 @@ def effects(points: np.ndarray, values: np.ndarray) -> Effects | None:
     finally:
         np.random.set_state(state)  # noqa: NPY002
     size = np.asarray(found["mu_star"], float)
-    elementary = _elementary(points[kept].reshape(-1, steps, points.shape[1]), by[there])
-    width = float(stats.t.ppf(0.5 + LEVEL / 2, int(there.sum()) - 1)) / np.sqrt(there.sum())
+    elementary = _elementary(points[kept].reshape(-1, steps, points.shape[1]), by[finite])
+    width = float(stats.t.ppf(0.5 + LEVEL / 2, int(finite.sum()) - 1)) / np.sqrt(finite.sum())
     error = width * np.abs(elementary).std(0, ddof=1)
     return Effects(
         np.asarray(found["mu"], float),
         Estimate(size, size - error, size + error),
         np.asarray(found["sigma"], float),
-        int(there.sum()),
-        int(count - there.sum()),
+        int(finite.sum()),
+        int(count - finite.sum()),
     )
 
 

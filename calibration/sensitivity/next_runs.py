@@ -77,12 +77,12 @@ def next_runs(study: Study, found: Local, candidates: Candidates) -> NextRuns | 
     inner = np.asarray(jacobian_of(study.inputs, rows))[:, :, :p]
     jacobian = np.stack([np.einsum("pc,pci->pi", moved[o.name], inner) for o in shown], 1)
     reading = np.stack([answer.values[o.name] for o in shown], 1)
-    there = np.isfinite(reading).all(1)
-    if not there.any():
+    finite = np.isfinite(reading).all(1)
+    if not finite.any():
         return None
-    information_of = information.fisher(jacobian[there], candidates.deviations(reading)[there])
+    information_of = information.fisher(jacobian[finite], candidates.deviations(reading)[finite])
     choice = information.choose(information_of, candidates.count)
-    picked = np.flatnonzero(there)[list(choice.rows)]
+    picked = np.flatnonzero(finite)[list(choice.rows)]
     slope = np.asarray(jax.jacfwd(study.inputs.values)(jnp.asarray(study.inputs.centre)))[study.inputs.places][:, :p]
     after = np.sqrt(np.einsum("ij,kjl,il->ki", slope, choice.covariance, slope))
     outputs = {}
@@ -93,5 +93,5 @@ def next_runs(study: Study, found: Local, candidates: Candidates) -> NextRuns | 
     whole = np.where(after[0] > 0, after[0], 1.0)
     chosen = points.at(picked)
     return NextRuns(
-        int(there.sum()), candidates.source, chosen, choice.gain, candidates.words, after / whole, outputs
+        int(finite.sum()), candidates.source, chosen, choice.gain, candidates.words, after / whole, outputs
     )

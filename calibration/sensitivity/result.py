@@ -149,8 +149,8 @@ class OutputStudy:
         main = next((self.overall[k].value for k in ("total", "shapley", "upper") if k in self.overall), None)
         if main is not None and np.isfinite(main).any():
             return np.clip(np.nan_to_num(main), 0.0, 1.0)
-        there = np.isfinite(self.share).any(1)
-        weight = np.where(there, np.nan_to_num(self.sd) ** 2, 0.0)
+        finite = np.isfinite(self.share).any(1)
+        weight = np.where(finite, np.nan_to_num(self.sd) ** 2, 0.0)
         if not weight.sum() > 0:
             return np.zeros(self.share.shape[1])
         return np.einsum("p,pk->k", weight, np.nan_to_num(self.share)) / weight.sum()

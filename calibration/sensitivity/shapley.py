@@ -109,17 +109,17 @@ def terms(design: Design, values: np.ndarray) -> Terms | None:
     """
     pairs, _, size = design.orders.shape
     whole, rest = values[:DRAWS], values[DRAWS:].reshape(pairs, 2, size - 1, INNER)
-    there = np.isfinite(rest).all((1, 2, 3))
-    if there.sum() < 10 or np.isfinite(whole).sum() < DRAWS // 2:
+    finite = np.isfinite(rest).all((1, 2, 3))
+    if finite.sum() < 10 or np.isfinite(whole).sum() < DRAWS // 2:
         return None
     variance = float(np.nanvar(whole))
-    cost = rest[there].var(-1, ddof=1)  # (pairs, 2, prefixes)
+    cost = rest[finite].var(-1, ddof=1)  # (pairs, 2, prefixes)
     edge = (*cost.shape[:2], 1)
     ladder = np.concatenate([np.zeros(edge), cost, np.full(edge, variance)], -1)
     of_orders = np.zeros((len(cost), 2, size))
-    np.put_along_axis(of_orders, design.orders[there], np.diff(ladder, axis=-1), -1)
+    np.put_along_axis(of_orders, design.orders[finite], np.diff(ladder, axis=-1), -1)
     parts = np.full((pairs, size), np.nan)
-    parts[there] = of_orders.mean(1)
+    parts[finite] = of_orders.mean(1)
     return Terms(variance, parts, float(1 - np.isfinite(values).mean()))
 
 
@@ -133,11 +133,11 @@ def of_vector(found: Sequence[Terms]) -> Terms:
     rows = max(len(terms.parts) for terms in found)
     whole = np.zeros((rows, found[0].parts.shape[1]))
     for terms in found:
-        there = np.isfinite(terms.parts).all(1)
-        kept = terms.parts[there]
+        finite = np.isfinite(terms.parts).all(1)
+        kept = terms.parts[finite]
         middle = kept.mean(0)
         whole += middle
-        whole[: len(there)][there] += rows / len(kept) * (kept - middle)
+        whole[: len(finite)][finite] += rows / len(kept) * (kept - middle)
     return Terms(sum(t.variance for t in found), whole, max(t.lost for t in found))
 
 

@@ -132,14 +132,14 @@ def terms(design: Design, values: np.ndarray) -> Terms | None:
     """
     d = design.inputs
     by = np.reshape(values, (design.replicates, design.size, design.blocks))
-    there = np.asarray(np.isfinite(by).all(-1))
-    count = there.sum(1)
+    finite = np.asarray(np.isfinite(by).all(-1))
+    count = finite.sum(1)
     if count.min() < 2:
         return None
-    by = np.where(there[..., None], by, 0.0)
+    by = np.where(finite[..., None], by, 0.0)
     a, b = by[..., 0], by[..., -1]
-    centre = (a + b)[there].mean() / 2
-    by = np.where(there[..., None], by - centre, 0.0)
+    centre = (a + b)[finite].mean() / 2
+    by = np.where(finite[..., None], by - centre, 0.0)
     a, b, ab = by[..., 0], by[..., -1], by[..., 1 : d + 1]
     # A replicate with more rows weighs more: sums over the mean number of rows, not means of each.
     weight = 1.0 / count.mean()
@@ -157,7 +157,7 @@ def terms(design: Design, values: np.ndarray) -> Terms | None:
         total=weight * np.sum((a[..., None] - ab) ** 2, 1) / 2,
         second=second,
         rows=int(count.sum()),
-        lost=int(there.size - count.sum()),
+        lost=int(finite.size - count.sum()),
     )
 
 

@@ -132,9 +132,9 @@ class Study:
         by_columns = self.model.derivatives(values, conditions)
         inner = np.asarray(jacobian_of(self.inputs, scores))
         moved = {name: np.einsum("pc,pci->pi", x, inner) for name, x in by_columns.items()}
-        there = {name: np.isfinite(x)[:, None] for name, x in answer.values.items()}
+        finite = {name: np.isfinite(x)[:, None] for name, x in answer.values.items()}
         self._count(answer, len(scores), began)
-        return answer.values, {name: np.where(there[name], g, np.nan) for name, g in moved.items()}
+        return answer.values, {name: np.where(finite[name], g, np.nan) for name, g in moved.items()}
 
 
 def values_of(inputs: Inputs, scores: np.ndarray) -> jax.Array:

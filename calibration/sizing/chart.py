@@ -46,17 +46,17 @@ class Chart:
 
 
 @compiled
-def _left(robot: Robot, of: Ratings, points: Point, speeds: Array, wanted: Array) -> Array:
+def _left(robot: Robot, rated: Ratings, points: Point, speeds: Array, wanted: Array) -> Array:
     """Margins by limit, shape (points, limits)."""
 
     def one(point: Point, wanted: Array) -> Array:
-        found, _ = travel(robot, point, of)
+        found, _ = travel(robot, point, rated)
         turns = found["motor_speed_rpm"]
         each = [
             found["adhesion"], jnp.clip(found["left"], -1.0, 1.0),
-            heat_left(robot, point, found["current"], of.temperature),
-            1 - turns / speeds[0], 1 - turns / speeds[1], 1 - found["gearbox_Nm"] / of.torque,
-            jnp.minimum(found["cell"] / of.voltage_cutoff, 1.0),
+            heat_left(robot, point, found["current"], rated.temperature),
+            1 - turns / speeds[0], 1 - turns / speeds[1], 1 - found["gearbox_Nm"] / rated.torque,
+            jnp.minimum(found["cell"] / rated.voltage_cutoff, 1.0),
             jnp.where(wanted > 0, found["speed_m_s"] / jnp.where(wanted > 0, wanted, 1.0) - 1, 1.0),
         ]  # fmt: skip
         # A robot at the limit of adhesion has its margin of both; it is adhesion's.

@@ -72,8 +72,8 @@ def build(robot: Robot, base_mass: float, configuration: str, design: Design) ->
         **{f"{name}.mass": chassis.mass + more for name, chassis in robot.configurations.items()},
         f"{configuration}.radius": radius,
     }  # fmt: skip
-    of = Ratings(design.cells, c["cutoff"], d["temperature"], d["torque"])
-    return params.replace(robot, values), of
+    rated = Ratings(design.cells, c["cutoff"], d["temperature"], d["torque"])
+    return params.replace(robot, values), rated
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,24 +185,26 @@ def _middle(robot: Robot, e: Envelope) -> Point:
     return jax.tree.map(lambda x: x[0], sheet.points(robot, middle))
 
 
-def evaluate(of: Task, design: Design) -> tuple[Array, Array]:
+def evaluate(asked: Task, design: Design) -> tuple[Array, Array]:
     """Objectives (as `OBJECTIVES`) and margins (as `Task.labels`) of one design; traceable.
 
     Margins are shares of what is required or permitted; met where not negative.
     """
-    robot, ratings = build(of.robot, of.base_mass, of.configuration, design)
-    found = jax.vmap(lambda p: travel(robot, p, ratings)[0])(of.points)
-    mass = jnp.asarray(robot.configurations[of.configuration].mass)
-    energy = found["energy_per_metre_Wh"][of.middle] / 3600.0
-    margins = [_margin(of, d, design, robot, ratings, found) for d in of.demands]
+    robot, ratings = build(asked.robot, asked.base_mass, asked.configuration, design)
+    found = jax.vmap(lambda p: travel(robot, p, ratings)[0])(asked.points)
+    mass = jnp.asarray(robot.configurations[asked.configuration].mass)
+    energy = found["energy_per_metre_Wh"][asked.middle] / 3600.0
+    margins = [_margin(asked, d, design, robot, ratings, found) for d in asked.demands]
     objectives = jnp.stack([mass, energy, jnp.asarray(design.drive["cost"])])
     return objectives, jnp.stack(margins)
 
 
-def _margin(of: Task, d: Demand, design: Design, robot: Robot, ratings: Ratings, found: Mapping[str, Array]) -> Array:
+def _margin(
+    asked: Task, d: Demand, design: Design, robot: Robot, ratings: Ratings, found: Mapping[str, Array]
+) -> Array:
     rows = np.array(d.rows, int)
     at = {key: x[rows] for key, x in found.items()}
-    points = jax.tree.map(lambda x: x[rows], of.points)
+    points = jax.tree.map(lambda x: x[rows], asked.points)
     travels = jnp.min(jnp.minimum(at["left"], 1.0))
     above = jnp.min(jnp.minimum(at["cell"] / ratings.voltage_cutoff, 1.0))
     r = d.requirement
@@ -217,7 +219,7 @@ def _margin(of: Task, d: Demand, design: Design, robot: Robot, ratings: Ratings,
         }  # fmt: skip
         return most[next(key for key, words in RATED.items() if words == d.label)]
     if r.name == "mass_kg":
-        share = 1 - jnp.asarray(robot.configurations[of.configuration].mass) / _limit(r)
+        share = 1 - jnp.asarray(robot.configurations[asked.configuration].mass) / _limit(r)
         return -share if r.least else share
     if r.name == "slope_deg":
         return jnp.minimum(travels, above)

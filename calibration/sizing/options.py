@@ -51,11 +51,11 @@ def drives(names: tuple[str, ...] = ()) -> tuple[Drive, ...]:
             continue
         for family in motor.gearboxes:
             for stages in sorted({g.stages for g in gearboxes() if g.family == family}):
-                of = sorted(
+                ranked = sorted(
                     (g for g in gearboxes() if (g.family, g.stages) == (family, stages)), key=lambda g: g.ratio
                 )
-                ratios = tuple(BELT_STAGE * g.ratio for g in of)
-                found.append(Drive(motor, family, int(stages), ratios, of[0]))
+                ratios = tuple(BELT_STAGE * g.ratio for g in ranked)
+                found.append(Drive(motor, family, int(stages), ratios, ranked[0]))
     return tuple(found)
 
 

@@ -114,14 +114,14 @@ class Sizing:
 
 
 @compiled
-def _measured(of: Task, designs: Design) -> tuple[Array, Array]:
+def _measured(problem: Task, designs: Design) -> tuple[Array, Array]:
     """Objectives and margins of designs, shapes (designs, objectives), (designs, margins)."""
-    return jax.vmap(lambda d: evaluate(of, d))(designs)
+    return jax.vmap(lambda d: evaluate(problem, d))(designs)
 
 
 @compiled
 def _descended(
-    of: Task,
+    problem: Task,
     designs: Design,
     low: Float[Array, "designs 3"],
     high: Float[Array, "designs 3"],
@@ -140,7 +140,7 @@ def _descended(
     adam = optax.adam(rate, b1=0.8, b2=0.95)
 
     def value(x: Array, d: Design, w: Array, multipliers: Array, weight: Array) -> tuple[Array, tuple[Array, Array]]:
-        objectives, margins = evaluate(of, dataclasses.replace(d, continuous=x))
+        objectives, margins = evaluate(problem, dataclasses.replace(d, continuous=x))
         f = jnp.sum(jnp.where(w > 0, w * jnp.log(jnp.where(w > 0, objectives, 1.0)), 0.0))
         g = jnp.where(kept > 0, jnp.clip(margins, -5.0, 5.0), 1.0)
         short = jnp.maximum(multipliers - weight * (g - 1e-3), 0.0)
@@ -193,12 +193,12 @@ class Space:
         )
 
 
-def space(robot: Robot, of: Task, options: Options) -> Space:
+def space(robot: Robot, problem: Task, options: Options) -> Space:
     """The choices for a robot."""
     n_drives, n_cells = len(options.drives), len(options.cells)
     every = list(itertools.product(range(n_drives), range(n_cells), range(CELLS[0], CELLS[1] + 1)))
     drive, cell, series = (np.array(x) for x in zip(*every, strict=True))
-    radius = float(robot.configurations[of.configuration].radius)
+    radius = float(robot.configurations[problem.configuration].radius)
 
     def bounds(k: int, ratio: str) -> np.ndarray:
         return np.log(
@@ -215,12 +215,12 @@ def space(robot: Robot, of: Task, options: Options) -> Space:
     return Space(options, drive, cell, series, bounds(0, "ratio_least"), bounds(1, "ratio_most"))
 
 
-def measured(of: Task, choice: Space, rows: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def measured(problem: Task, choice: Space, rows: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Objectives and margins of many designs, in calls of one size."""
     parts = []
     for first in range(0, len(rows), ROWS):
         some = np.minimum(np.arange(first, first + ROWS), len(rows) - 1)
-        f, g = jax.device_get(_measured(of, choice.designs(rows[some], x[some])))
+        f, g = jax.device_get(_measured(problem, choice.designs(rows[some], x[some])))
         parts.append((f[: len(rows) - first], g[: len(rows) - first]))
     f, g = (np.concatenate(p) for p in zip(*parts, strict=True))
     f = np.where(f > 0, f, np.inf)  # not moving, or no price: worse than any
@@ -250,8 +250,8 @@ def size(
             raise BadConfiguration(f"objective: got {name}; {choices(name, OBJECTIVES)}")
     sheet.refuse(robot, asked)
     chosen = options(robot, motors)
-    of = task(robot, asked, chosen)
-    choice = space(robot, of, chosen)
+    problem = task(robot, asked, chosen)
+    choice = space(robot, problem, chosen)
     rng = np.random.default_rng(seed)
     columns = [list(OBJECTIVES).index(name) for name in objectives]
     # Random designs of every choice: what can be met at all, and where to start.
@@ -261,9 +261,9 @@ def size(
     x = choice.low[rows] + (choice.high[rows] - choice.low[rows]) * rng.random((len(rows), 3)) ** np.array(
         [1.0, 1.0, 2.0]
     )
-    f, g = measured(of, choice, rows, x)
+    f, g = measured(problem, choice, rows, x)
     kept = g.max(axis=0) >= 0
-    unmeetable = tuple(label for label, k in zip(of.labels, kept, strict=True) if not k)
+    unmeetable = tuple(label for label, k in zip(problem.labels, kept, strict=True) if not k)
     misses = 5 * np.sum(np.maximum(-g[:, kept], 0.0), axis=1)
     shares = [len(s) for s in np.array_split(np.arange(starts), len(columns))]
     each = [_starts(choice, rows, np.log(f[:, c]) + misses, n) for c, n in zip(columns, shares, strict=True)]
@@ -276,16 +276,16 @@ def size(
     if len(columns) == 2:
         weights[:, columns[1]] += 1 - share
     x = np.array(_descended(
-        of, choice.designs(rows, x), jnp.asarray(choice.low[rows]), jnp.asarray(choice.high[rows]),
+        problem, choice.designs(rows, x), jnp.asarray(choice.low[rows]), jnp.asarray(choice.high[rows]),
         jnp.asarray(weights), jnp.asarray(kept, float),
     ))  # fmt: skip
     evaluated = len(choice.drive) * TRIES + starts * STEPS
-    f, g = measured(of, choice, rows, x)
+    f, g = measured(problem, choice, rows, x)
     cost = _cost(f, g, kept, weights)
     refined = np.argsort(cost)[: REFINED * len(columns)]
-    x[refined], count = _refine(of, choice, rows[refined], x[refined], kept, weights[refined], np.ones(3))
+    x[refined], count = _refine(problem, choice, rows[refined], x[refined], kept, weights[refined], np.ones(3))
     evaluated += count
-    f, g = measured(of, choice, rows, x)
+    f, g = measured(problem, choice, rows, x)
     alone = np.zeros(len(OBJECTIVES))
     alone[columns[0]] = 1.0
     cost = _cost(f, g, kept, np.tile(alone, (starts, 1)))
@@ -294,24 +294,28 @@ def size(
     for c in columns:
         w = np.eye(len(OBJECTIVES))[c]
         ranked = pool[np.argsort(np.where(np.isfinite(pool_f[:, c]), np.log(pool_f[:, c]) + misses, np.inf))]
-        more_rows, more_x, count = _enumerated(of, choice, np.array(list(dict.fromkeys(ranked))[:WHOLE]), kept, w)
+        more_rows, more_x, count = _enumerated(
+            problem, choice, np.array(list(dict.fromkeys(ranked))[:WHOLE]), kept, w
+        )
         evaluated += count
         real_rows, real_x = np.concatenate([real_rows, more_rows]), np.concatenate([real_x, more_x])
         real_w = np.concatenate([real_w, np.tile(w, (len(more_rows), 1))])
-    real_x, count = _refine(of, choice, real_rows, real_x, kept, real_w, np.array([0.0, 1.0, 0.0]))
+    real_x, count = _refine(problem, choice, real_rows, real_x, kept, real_w, np.array([0.0, 1.0, 0.0]))
     evaluated += count
-    real_f, real_g = measured(of, choice, real_rows, real_x)
+    real_f, real_g = measured(problem, choice, real_rows, real_x)
     real_cost = _cost(real_f, real_g, kept, np.tile(alone, (len(real_f), 1)))
     # The best of these with any ratio and parts of a cell: no search may have begun from their choice of parts.
     top = np.argsort(real_cost)[:REFINED]
-    more_x, count = _refine(of, choice, real_rows[top], real_x[top], kept, np.tile(alone, (len(top), 1)), np.ones(3))
+    more_x, count = _refine(
+        problem, choice, real_rows[top], real_x[top], kept, np.tile(alone, (len(top), 1)), np.ones(3)
+    )
     evaluated += count
     rows, x = np.concatenate([rows, real_rows[top]]), np.concatenate([x, more_x])
-    f, g = measured(of, choice, rows, x)
+    f, g = measured(problem, choice, rows, x)
     cost = _cost(f, g, kept, np.tile(alone, (len(rows), 1)))
 
     def found(rows: np.ndarray, x: np.ndarray, f: np.ndarray, g: np.ndarray, k: int) -> Found:
-        return _found(robot, of, choice, rows[k], x[k], f[k], np.where(kept, g[k], np.nan))
+        return _found(robot, problem, choice, rows[k], x[k], f[k], np.where(kept, g[k], np.nan))
 
     everything = np.concatenate([rows, real_rows]), np.concatenate([x, real_x])
     every_f, every_g = np.concatenate([f, real_f]), np.concatenate([g, real_g])
@@ -332,7 +336,7 @@ def size(
         good = [k for k in range(len(real_rows)) if np.all(real_g[k][kept] >= 0)]
         front = [found(real_rows, real_x, real_f, real_g, k) for k in _undominated(real_f[:, columns], good)]
     return Sizing(
-        of, chosen, objectives[0], unmeetable,
+        problem, chosen, objectives[0], unmeetable,
         found(rows, x, f, g, ideal) if np.all(g[ideal][kept] >= 0) else None,
         best[0] if best else None, tuple(best[1:]), by_motor, tuple(front), starts, evaluated,
     )  # fmt: skip
@@ -366,7 +370,13 @@ def _cost(f: np.ndarray, g: np.ndarray, kept: np.ndarray, weights: np.ndarray) -
 
 
 def _refine(
-    of: Task, choice: Space, rows: np.ndarray, x: np.ndarray, kept: np.ndarray, weights: np.ndarray, free: np.ndarray
+    problem: Task,
+    choice: Space,
+    rows: np.ndarray,
+    x: np.ndarray,
+    kept: np.ndarray,
+    weights: np.ndarray,
+    free: np.ndarray,
 ) -> tuple[np.ndarray, int]:
     """Designs after a search on shrinking boxes around them, and how many were evaluated.
 
@@ -379,7 +389,7 @@ def _refine(
     for _ in range(ROUNDS):
         tried = np.clip(x[:, None] + width * box, choice.low[rows][:, None], choice.high[rows][:, None])
         n = tried.shape[1]
-        f, g = measured(of, choice, np.repeat(rows, n), tried.reshape(-1, 3))
+        f, g = measured(problem, choice, np.repeat(rows, n), tried.reshape(-1, 3))
         cost = _cost(f, g, kept, np.repeat(weights, n, axis=0)).reshape(-1, n)
         x = tried[np.arange(len(rows)), np.argmin(cost, axis=1)]
         width, count = width * SHRINK, count + len(f)
@@ -405,7 +415,7 @@ def _real(
 
 
 def _enumerated(
-    of: Task, choice: Space, rows: np.ndarray, kept: np.ndarray, weights: np.ndarray
+    problem: Task, choice: Space, rows: np.ndarray, kept: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """The best designs of choices with every ratio of their sheets, few whole cells in parallel and three radii, and
     how many were evaluated."""
@@ -417,7 +427,7 @@ def _enumerated(
             of_row.append(row)
             points.append([math.log(ratio), low + share * (high - low), math.log(p)])
     every, x = np.array(of_row), np.array(points)
-    f, g = measured(of, choice, every, x)
+    f, g = measured(problem, choice, every, x)
     best = np.argsort(_cost(f, g, kept, np.tile(weights, (len(every), 1))))[:KEPT_WHOLE]
     return every[best], x[best], len(every)
 
@@ -432,12 +442,14 @@ def _undominated(f: np.ndarray, among: list[int]) -> list[int]:
     return front
 
 
-def _found(robot: Robot, of: Task, choice: Space, row: int, x: np.ndarray, f: np.ndarray, g: np.ndarray) -> Found:
+def _found(
+    robot: Robot, problem: Task, choice: Space, row: int, x: np.ndarray, f: np.ndarray, g: np.ndarray
+) -> Found:
     drive, cell = choice.options.drives[choice.drive[row]], choice.options.cells[choice.cell[row]]
     series = int(choice.in_series[row])
     ratio, radius, parallel = (float(v) for v in np.exp(x))
     design = jax.tree.map(lambda v: v[0], choice.designs(np.array([row]), x[None]))
-    made, _ = build(of.robot, of.base_mass, of.configuration, design)
+    made, _ = build(problem.robot, problem.base_mass, problem.configuration, design)
     made = jax.tree.map(lambda v: np.asarray(v) if eqx.is_array(v) else v, made)
 
     def rated(key: str) -> float:
@@ -456,7 +468,7 @@ def _found(robot: Robot, of: Task, choice: Space, row: int, x: np.ndarray, f: np
             made.gearbox, speed_limit=rated("speed_gearbox"), torque_limit=rated("torque")
         ),
     )  # fmt: skip
-    margins = {label: float(v) for label, v in zip(of.labels, g, strict=True) if np.isfinite(v)}
+    margins = {label: float(v) for label, v in zip(problem.labels, g, strict=True) if np.isfinite(v)}
     at_bound = tuple(
         f"{word} {name}"
         for word, bound in (("least", choice.low[row]), ("largest", choice.high[row]))

@@ -186,11 +186,11 @@ def points(robot: Robot, requirement: Requirement) -> Point:
     )  # fmt: skip
 
 
-def _changed(robot: Robot, of: Ratings, names: tuple[str, ...], theta: Array) -> tuple[Robot, Ratings]:
+def _changed(robot: Robot, rated: Ratings, names: tuple[str, ...], theta: Array) -> tuple[Robot, Ratings]:
     """The robot with parameters from a vector, and its ratings; `battery.cells` is among the latter."""
     values = dict(zip(names, theta, strict=True))
     cells = values.pop(CELLS)
-    return params.replace(robot, values), dataclasses.replace(of, cells=cells)
+    return params.replace(robot, values), dataclasses.replace(rated, cells=cells)
 
 
 def _unrated(robot: Robot) -> Robot:
@@ -217,7 +217,7 @@ def _unrated(robot: Robot) -> Robot:
 @compiled
 def _over(
     robot: Robot,
-    of: Ratings,
+    rated: Ratings,
     names: tuple[str, ...],
     rows: Float[Array, "rows parameters"],
     at: Point,
@@ -226,7 +226,7 @@ def _over(
     """Values and outcomes of a quantity over robots (rows of parameters) and points, shape (rows, points)."""
 
     def one(theta: Array, point: Point) -> tuple[Array, Array]:
-        changed, changed_ratings = _changed(robot, of, names, theta)
+        changed, changed_ratings = _changed(robot, rated, names, theta)
         found = evaluate(changed, point, changed_ratings, name)
         return found.value, found.outcome
 
@@ -234,11 +234,11 @@ def _over(
 
 
 @compiled
-def _gradient(robot: Robot, of: Ratings, names: tuple[str, ...], theta: Array, at: Point, name: str) -> Array:
+def _gradient(robot: Robot, rated: Ratings, names: tuple[str, ...], theta: Array, at: Point, name: str) -> Array:
     """Derivative of a quantity at one point by the parameters."""
 
     def value(theta: Array) -> Array:
-        changed, changed_ratings = _changed(robot, of, names, theta)
+        changed, changed_ratings = _changed(robot, rated, names, theta)
         return evaluate(changed, at, changed_ratings, name).value
 
     return jax.grad(value)(theta)
@@ -259,10 +259,10 @@ class _Held:
     def over(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Values in the unit of the name, outcomes, and margins (-inf without value), shape (rows, points)."""
         r, at, parts = self.requirement, self.at, []
-        robot, of = _unrated(self.robot), ratings(self.robot)
+        robot, rated = _unrated(self.robot), ratings(self.robot)
         for first in range(0, len(rows), ROWS):
             chosen = rows[np.minimum(np.arange(first, first + ROWS), len(rows) - 1)]
-            found = jax.device_get(_over(robot, of, self.names, jnp.asarray(chosen), at, _computed(r)))
+            found = jax.device_get(_over(robot, rated, self.names, jnp.asarray(chosen), at, _computed(r)))
             parts.append([x[: len(rows) - first] for x in found])
         value, outcome = (np.concatenate(x) for x in zip(*parts, strict=True))
         value = value / r.quantity.factor
@@ -364,8 +364,8 @@ def _with_changes(held: _Held, outcome: Outcome, every: Sequence[_Held], now: Se
         for k, name in enumerate(held.names):
             if name in other.names:
                 own[:, other.names.index(name)] = rows[:, k]
-        for of, margin in zip(broken, other.worst(own), strict=True):
-            of += [other.requirement.name] if margin < 0 else []
+        for names, margin in zip(broken, other.worst(own), strict=True):
+            names += [other.requirement.name] if margin < 0 else []
     with_breaks = [dataclasses.replace(c, breaks=tuple(dict.fromkeys(b))) for c, b in zip(found, broken, strict=True)]
     order = sorted(with_breaks, key=lambda c: (len(c.breaks) > 0, abs(math.log(c.after / c.before))))
     return dataclasses.replace(outcome, change=tuple(order))

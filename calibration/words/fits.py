@@ -159,13 +159,13 @@ def ended_at_edge(note: notes.EndedAtEdge) -> str:
 
 def shown_by(test: notes.Shown) -> str:
     """What the most telling test shows."""
-    of = f"the residuals of {channels.of(test.channel).label}" if test.channel else ""
+    whose = f"the residuals of {channels.of(test.channel).label}" if test.channel else ""
     return {
         "": "",
         "stated": "the residuals exceed the stated noise",
         "repeats": "the residuals exceed the scatter of repeated runs",
-        "follow": f"{of} follow {test.variable}",
-        "remember": f"{of} remember the sample before",
+        "follow": f"{whose} follow {test.variable}",
+        "remember": f"{whose} remember the sample before",
     }[test.what]
 
 

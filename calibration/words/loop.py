@@ -197,11 +197,11 @@ def use_it(found: DiscoveryResult) -> list[str]:
     return lines
 
 
-def _worst(errors: Errors, of: int) -> str:
+def _worst(errors: Errors, total: int) -> str:
     """The largest rms error of any channel, and of how many rows where not all are reached: `16.7 % (14/20)`."""
     rows = max(int(e["rows"]) for e in errors.values())
     worst = max((float(e["rms_percent"]) for e in errors.values() if e["rows"]), default=math.nan)
-    few = f" ({rows}/{of} reached)" if rows < of else ""
+    few = f" ({rows}/{total} reached)" if rows < total else ""
     return f"{worst:.1f} %{few}" if rows else "not reached"
 
 

@@ -88,5 +88,5 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
         "time_to_speed": times[k] + share * width[k],
         "energy_start": whole[k] + share * width[k] * (power[k] + here) / 2,
     }
-    there = run.result.status == CONVERGED
-    return {**{name: jnp.where(there, x, jnp.nan) for name, x in found.items()}, "status": run.result.status}
+    converged = run.result.status == CONVERGED
+    return {**{name: jnp.where(converged, x, jnp.nan) for name, x in found.items()}, "status": run.result.status}

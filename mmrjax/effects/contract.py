@@ -12,12 +12,12 @@ from mmrjax.robot import Robot
 from mmrjax.signals import Signals, State
 
 
-def _witness(place: str, of: str, seen: list[Signals]) -> Effect:
+def _witness(place: str, whose: str, seen: list[Signals]) -> Effect:
     """An effect that adds nothing, and keeps the signals that its balance hands to a term."""
 
     class Witness(Effect):
         balance = place
-        channel = of
+        channel = whose
         amplitude: Scalar = 0.0
 
         def term(self, robot: Robot, signals: Signals) -> Scalar:

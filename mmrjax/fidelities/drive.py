@@ -211,8 +211,8 @@ def _kept(
     signals, away = jax.tree.map(
         lambda x: jnp.where(going.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan), (signals, away)
     )
-    there = (end.status != BATTERY_EMPTY) & (end.status != FAILED)
-    answer = withhold(end, there, end.status != FAILED)
+    valid = (end.status != BATTERY_EMPTY) & (end.status != FAILED)
+    answer = withhold(end, valid, end.status != FAILED)
     return Trajectory(times, away, signals, answer)
 
 

@@ -261,8 +261,8 @@ def mission(
     order = jnp.tile(jnp.arange(profile.segments), profile.cycles)
     c, (time, q, rise, given, peaks, status, flags, found, kept) = jax.lax.scan(one, carry, order)
     shape = (profile.cycles, profile.segments)
-    of = {n: q[:, i].reshape(shape) for i, n in enumerate(names)}
-    each = Totals(time.reshape(shape), of, rise.reshape(shape), given.reshape(shape))
+    totals = {n: q[:, i].reshape(shape) for i, n in enumerate(names)}
+    each = Totals(time.reshape(shape), totals, rise.reshape(shape), given.reshape(shape))
     total = jax.tree.map(jnp.sum, each)
     bad = (status == STALLED) | (status == SLIDES) | (status == ROLLS_BACK) | (status == TIPS)
     first = jnp.argmax(bad)
@@ -302,27 +302,27 @@ def _course(
     ys, qs, stood, marks = c.buffer
     at = jnp.arange(len(ys))
     # Of each kept step its segment: the first whose count reaches beyond it.
-    of = jnp.minimum(jnp.searchsorted(kept, at, side="right"), len(kept) - 1)
-    there = at < kept[-1]
-    begun = jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.time.ravel())])[of]
+    segment = jnp.minimum(jnp.searchsorted(kept, at, side="right"), len(kept) - 1)
+    within = at < kept[-1]
+    begun = jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.time.ravel())])[segment]
     so_far = {
-        name: jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.of[name].ravel())])[of] + qs[:, i]
+        name: jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.of[name].ravel())])[segment] + qs[:, i]
         for i, name in enumerate(law.TOTALS)
     }
 
     def signals(y: Array, stands: Array, k: Array) -> Signals:
         return balances.signals_of(law.instant(robot, conditions, profile.row(k % profile.segments), y, stands)[0])
 
-    every = law.at_places(jax.vmap(signals)(ys, stood, of), so_far)
+    every = law.at_places(jax.vmap(signals)(ys, stood, segment), so_far)
     winding, housing = _temperatures(law, ys)
 
     def shown(x: Array) -> Array:
-        return jnp.where(there.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan)
+        return jnp.where(within.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan)
 
     return Course(
         time=shown(begun + ys[:, law.CLOCK]),
-        segment=jnp.where(there, of, -1),
-        event=jnp.where(there, marks, -1),
+        segment=jnp.where(within, segment, -1),
+        event=jnp.where(within, marks, -1),
         distance=shown(so_far["distance"]),
         path=shown(so_far["path"]),
         energy=shown(so_far["drawn"] - so_far["returned"]),

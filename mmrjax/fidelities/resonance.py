@@ -188,12 +188,12 @@ def confirmed(found: Sequence[Peak], modes: Mapping[float, Sequence[Mode]]) -> l
     """
     answer = list(found)
     for key in dict.fromkeys((p.mode, p.order, p.signal) for p in found if p.mode):
-        of = [k for k, p in enumerate(found) if (p.mode, p.order, p.signal) == key]
-        natural = np.array([next(m.frequency for m in modes[found[k].payload] if m.name == key[0]) for k in of])
+        alike = [k for k, p in enumerate(found) if (p.mode, p.order, p.signal) == key]
+        natural = np.array([next(m.frequency for m in modes[found[k].payload] if m.name == key[0]) for k in alike])
         if np.ptp(natural) < MOVES * natural.mean():
             continue
-        if np.polyfit(natural, [found[k].frequency for k in of], 1)[0] <= 0:
-            for k in of:
+        if np.polyfit(natural, [found[k].frequency for k in alike], 1)[0] <= 0:
+            for k in alike:
                 answer[k] = found[k]._replace(mode="")
     return answer
 
@@ -258,12 +258,14 @@ def resonances(found: Sequence[Peak]) -> list[Resonance]:
     keys = dict.fromkeys((p.mode, p.order, p.signal) for p in found)
     answer = []
     for key in keys:
-        of = [p for p in found if (p.mode, p.order, p.signal) == key]
-        speeds, lines = [p.speed for p in of], [p.frequency for p in of]
-        avoid = min(p.low for p in of), max(p.high for p in of)
+        alike = [p for p in found if (p.mode, p.order, p.signal) == key]
+        speeds, lines = [p.speed for p in alike], [p.frequency for p in alike]
+        avoid = min(p.low for p in alike), max(p.high for p in alike)
         ends = (min(speeds), max(speeds)), avoid, (min(lines), max(lines))
         answer.append(
-            Resonance(*key, *ends, tuple(p.payload for p in of), max(p.ripple for p in of), max(p.rise for p in of))
+            Resonance(
+                *key, *ends, tuple(p.payload for p in alike), max(p.ripple for p in alike), max(p.rise for p in alike)
+            )
         )
     return sorted(answer, key=lambda r: (list(SIGNALS).index(r.signal), -r.ripple))
 

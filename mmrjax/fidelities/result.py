@@ -102,13 +102,13 @@ def efficiency(out: Scalar, into: Scalar) -> Array:
     return jnp.where(forward, quotient(out, into), 0.0)
 
 
-def withhold(answer: Result, there: Array, sound: Array) -> Result:
-    """NaN in every number of `answer` where `there` is false; mass and adhesion used stand where `sound`.
+def withhold(answer: Result, valid: Array, sound: Array) -> Result:
+    """NaN in every number of `answer` where `valid` is false; mass and adhesion used stand where `sound`.
 
     The flags of a withheld member are cleared; its status says why it has no numbers.
     """
     blank = jax.tree.map(
-        lambda x: jnp.where(there, x, 0 if jnp.issubdtype(x.dtype, jnp.integer) else jnp.nan), answer
+        lambda x: jnp.where(valid, x, 0 if jnp.issubdtype(x.dtype, jnp.integer) else jnp.nan), answer
     )
     stands = {name: jnp.where(sound, getattr(answer, name), jnp.nan) for name in ("mass", "adhesion_used")}
     return dataclasses.replace(blank, **stands, status=answer.status)

@@ -179,14 +179,14 @@ def _trajectory(run: System, start: Motion, end: Motion, record: Record, sample:
     travelled = run.path.radius * jnp.concatenate([start.q[None, kind.SHAFTS], motions.q[:, kind.SHAFTS]])
     averages = kind.averaged(functools.partial(_average, run, time), travelled, record.passed, record.guided)
     status = kind.status(run, averages, end)
-    there = (status != FAILED) & (status != TIPS)
+    valid = (status != FAILED) & (status != TIPS)
     window = time[1:] > time[-1] - WINDOW * (time[-1] - time[0])
     signals, answer = signals_of(record.passed), kind.result_of(run, averages, status)
     load = jnp.sum(jnp.reshape(signals.normal, (len(motions.q), -1)), axis=-1)
     aloft = window & (load < ALOFT * jnp.sum(averages.signals.normal))
     jumps = jnp.sum(aloft) > JUMPS * jnp.sum(window)
     flags = answer.flags | mask({"jumps": jumps})
-    answer = withhold(dataclasses.replace(answer, flags=flags), there, status != FAILED)
+    answer = withhold(dataclasses.replace(answer, flags=flags), valid, status != FAILED)
     return Trajectory(time[1:], motions.q, motions.v, signals, record.reactions, averages, answer)
 
 

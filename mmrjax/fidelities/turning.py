@@ -221,8 +221,8 @@ def _settled(robot: Robot, conditions: Conditions) -> tuple[PlaneMotion, Float[A
         solve, determinant = inverse(jnp.asarray(slow) / search.step - search.jacobian)
         step = solve(search.rates)
         largest, patient = jnp.max(jnp.abs(step)), search.patient
-        there = search.y + step * jnp.where(patient, 1.0, _share(*held, search.y, step))
-        slope, found = jax.jacfwd(lambda y: (_balance(*held, y),) * 2, has_aux=True)(there)
+        next_y = search.y + step * jnp.where(patient, 1.0, _share(*held, search.y, step))
+        slope, found = jax.jacfwd(lambda y: (_balance(*held, y),) * 2, has_aux=True)(next_y)
         slope = jnp.where(moves[:, None], slope, still)  # what does not move has no equation of its own
         before, after = jnp.linalg.norm(search.rates), jnp.linalg.norm(found)
         worse = patient & (~(after <= WORSE * before + SMALL) | (largest > FAR)) & (search.turns > 0)
@@ -230,7 +230,7 @@ def _settled(robot: Robot, conditions: Conditions) -> tuple[PlaneMotion, Float[A
         ended = ~worse & (largest < SMALL) & settled
         y, found, slope = (
             jnp.where(worse, old, new)
-            for old, new in ((search.y, there), (search.rates, found), (search.jacobian, slope))
+            for old, new in ((search.y, next_y), (search.rates, found), (search.jacobian, slope))
         )
         length = jnp.clip(search.step * jnp.where(worse, SHORTER, LONGER), SHORTEST, LONGEST)
         gone = _Search(y, found, slope, length, search.turns + 1, patient, ended & (patient | (determinant > 0)))

@@ -288,6 +288,6 @@ def _print_derivatives(along: Along, found: Derivatives) -> None:
     for heading in ("by", "width", *SHOWN):
         shown.add_column(heading)
     for k, (name, unit, _, width) in enumerate(along.rows):
-        of = ((found.by[n][k], found.slope[n][k], found.slope_sd[n][k]) for n in SHOWN)
-        shown.add_row(name, f"{width:.2g} {unit}", *(f"{d:.2g} ({s:.2g} ± {sd:.1g})" for d, s, sd in of))
+        rows = ((found.by[n][k], found.slope[n][k], found.slope_sd[n][k]) for n in SHOWN)
+        shown.add_row(name, f"{width:.2g} {unit}", *(f"{d:.2g} ({s:.2g} ± {sd:.1g})" for d, s, sd in rows))
     say(shown)

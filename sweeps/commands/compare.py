@@ -139,10 +139,10 @@ def compared(
 def _summary(channel: Channel, table: dict[str, np.ndarray]) -> dict[str, Any]:
     measured, simulated = table[channel.column], table[f"simulated_{channel.column}"]
     difference = simulated - measured
-    there = difference[np.isfinite(difference)]
+    finite = difference[np.isfinite(difference)]
     return {
         **residual.summary(table[f"error_{channel.name}_percent"]),
-        "rms": float(np.sqrt(np.mean(there**2))) if there.size else float("nan"),
+        "rms": float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan"),
         "unit": channel.unit,
         "r2": residual.certainty(measured, simulated),
         "missing": int(np.isnan(measured).sum()),
@@ -191,9 +191,9 @@ def print_comparison(
     if len(table["status"]) <= 60:
         say(rows)
     shown = Table(title="Summary", title_justify="left")
-    of = " of its size" if sized else ""
+    share = " of its size" if sized else ""
     units = ("rms",) if sized else ()
-    for heading in ("rows of", "channel", "rows", *units, f"rms [%{of}]", f"worst [%{of}]", "R²"):
+    for heading in ("rows of", "channel", "rows", *units, f"rms [%{share}]", f"worst [%{share}]", "R²"):
         shown.add_column(heading, justify="left" if heading in ("rows of", "channel") else "right")
     for group, by_channel in summary.items():
         for channel in channels:

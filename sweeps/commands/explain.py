@@ -129,11 +129,11 @@ def _changes(effect: Effect) -> Iterator[str]:
         list(robot.configurations), voltage=24.0, slope_deg=5.0, payload=3.0, battery=float(effect.needs_battery)
     )
     sized = params.replace(within, {f"effects.{effect.name}.amplitude": np.asarray(spec.prior_sd(0.0))})
-    without, there = (mm.simulate(r, run) for r in (within, sized))
+    without, with_it = (mm.simulate(r, run) for r in (within, sized))
     for k, name in enumerate(robot.configurations):
         shares = {}
         for c in robot.channels:
-            before, after = float(without.reading[c.name][k]), float(there.reading[c.name][k])
+            before, after = float(without.reading[c.name][k]), float(with_it.reading[c.name][k])
             if np.isfinite(after) and before:
                 shares[c.label] = 100 * (after / before - 1)
         if any(abs(x) > 5e-3 for x in shares.values()):

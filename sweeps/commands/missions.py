@@ -241,13 +241,13 @@ def _segments(
     discharge = np.take_along_axis(discharge, np.maximum(last, 0), 1)
     on_battery = np.asarray(conditions.battery)[:, None] > 0.5
     charge = np.where(on_battery & whole, 1 - discharge / float(robot.battery.capacity), np.nan)
-    of = np.tile(np.arange(segments), cycles)
+    segment = np.tile(np.arange(segments), cycles)
     rows = {
         "run_id": np.repeat(names, count),
         "cycle": np.tile(np.repeat(np.arange(1, cycles + 1), segments), runs),
-        "segment": np.tile(of + 1, runs),
+        "segment": np.tile(segment + 1, runs),
         "time_s": begun.ravel(),
-        "mode": np.tile(np.array(source.modes)[of], runs),
+        "mode": np.tile(np.array(source.modes)[segment], runs),
         **{column: np.asarray(numbers[column]).ravel() for column in numbers},
         "state_of_charge": charge.ravel(),
         **outputs.codes(found.status.ravel(), found.flags.ravel()),
@@ -260,8 +260,8 @@ def _segments(
 def _segment_of(found: Mission, k: int) -> np.ndarray:
     """Segment of each kept step of a run; those after the last are of one beyond the end."""
     assert found.course is not None  # it was asked for
-    of = np.asarray(found.course.segment[k])
-    return np.where(of < 0, np.iinfo(of.dtype).max, of)
+    segment = np.asarray(found.course.segment[k])
+    return np.where(segment < 0, np.iinfo(segment.dtype).max, segment)
 
 
 def thinned(segment: np.ndarray, current: np.ndarray, most: int, marked: np.ndarray | None = None) -> np.ndarray:
@@ -289,11 +289,11 @@ def _course(
 ) -> dict[str, np.ndarray]:
     """Rows of history.csv of one run."""
     course = jax.tree.map(lambda x: np.asarray(x[k]), found.course)
-    there = course.segment >= 0
+    filled = course.segment >= 0
     signals = course.signals
-    marked = course.event[there] >= _LASTING
-    largest = np.abs(signals.current).reshape(len(there), -1).max(1)  # of either side
-    picked = np.flatnonzero(there)[thinned(course.segment[there], largest[there], most, marked)]
+    marked = course.event[filled] >= _LASTING
+    largest = np.abs(signals.current).reshape(len(filled), -1).max(1)  # of either side
+    picked = np.flatnonzero(filled)[thinned(course.segment[filled], largest[filled], most, marked)]
     course = jax.tree.map(lambda x: x[picked], course)
     signals, of_sides = course.signals, {}
     winding, housing = course.temperature_winding, course.temperature_housing

@@ -169,7 +169,7 @@ def _found(
     by_payload = dict(zip(payloads, linear, strict=True))
     tops: list[Peak] = []
     ends: dict[float, tuple[float, float]] = {}
-    for payload, of in by_payload.items():
+    for payload, own in by_payload.items():
         gridded = (table["payload_kg"] == payload) & np.isin(table["supply_voltage_V"], config.voltages_V)
         rows = np.flatnonzero(gridded & (table["status"] == "converged"))
         rows = rows[np.argsort(table["speed_mean_mm_s"][rows])]
@@ -181,13 +181,13 @@ def _found(
             for name in SIGNALS
             for peak in peaks(
                 name, payload, speed, table["passing_Hz"][rows], table[f"{name}_ripple_percent"][rows] / 100,
-                table[f"{name}_frequency_Hz"][rows], of,
+                table[f"{name}_frequency_Hz"][rows], own,
             )
         ]  # fmt: skip
         tops += here
         ends[payload] = float(speed[0]), float(speed[-1])
     tops = confirmed(tops, by_payload)
-    meets = [c for p, of in ends.items() for c in crossings(by_payload[p], p, what.travel, *of, tops)]
+    meets = [c for p, own in ends.items() for c in crossings(by_payload[p], p, what.travel, *own, tops)]
     return ResonanceResult(
         config.configuration, config.slope_deg, config.surface, what, robot, table, by_payload, tops, meets
     )
@@ -196,7 +196,8 @@ def _found(
 def _write(folder: RunFolder, config: configuration.Resonance, found: ResonanceResult) -> None:
     folder.write_table("points.csv", found.table)
     folder.write_table(
-        "modes.csv", _rows([{"payload_kg": p, **m._asdict()} for p, of in found.modes.items() for m in of], Mode)
+        "modes.csv",
+        _rows([{"payload_kg": p, **m._asdict()} for p, modes in found.modes.items() for m in modes], Mode),
     )
     folder.write_table("peaks.csv", _rows([p._asdict() for p in found.peaks], Peak))
     robot_file.write(found.robot, folder.partial / "robot.toml", note=f"the robot of this map, from {config.robot}")
@@ -220,12 +221,12 @@ def print_resonance(found: ResonanceResult) -> None:
     """Natural frequencies, and which speeds to avoid; for a person."""
     shown = Table(title="natural frequencies [Hz], mean (range over the belt's position), damping ratio", box=None)
     shown.title_justify = "left"
-    names = list(dict.fromkeys(m.name for of in found.modes.values() for m in of))
+    names = list(dict.fromkeys(m.name for own in found.modes.values() for m in own))
     shown.add_column("payload [kg]")
     for name in names:
         shown.add_column(name)
-    for payload, of in found.modes.items():
-        cells = {m.name: f"{m.frequency:.0f} ({span(m.low, m.high, 1)}), {m.damping:.2f}" for m in of}
+    for payload, own in found.modes.items():
+        cells = {m.name: f"{m.frequency:.0f} ({span(m.low, m.high, 1)}), {m.damping:.2f}" for m in own}
         shown.add_row(f"{payload:g}", *(cells.get(name, "-") for name in names))
     say(shown)
     say(found.statement())

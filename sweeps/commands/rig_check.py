@@ -124,16 +124,16 @@ class RigCheck:
             if name not in self.shown and self._means_nothing(name):
                 continue
             number = np.issubdtype(values.dtype, np.number)
-            there = values[np.isfinite(values)] if number else values
-            kinds = np.unique(there)
+            finite = values[np.isfinite(values)] if number else values
+            kinds = np.unique(finite)
             found.append(
                 {
                     "column": name,
                     "theirs": self.shown.get(name, ""),
                     "use": _use(name, self.robot) if name in self.shown else "not in the table",
                     "values": len(kinds),
-                    "least": float(there.min()) if number and len(there) else None,
-                    "greatest": float(there.max()) if number and len(there) else None,
+                    "least": float(finite.min()) if number and len(finite) else None,
+                    "greatest": float(finite.max()) if number and len(finite) else None,
                     "words": [] if number else kinds.tolist(),
                 }
             )

@@ -98,8 +98,12 @@ def stretches(found: Settled) -> dict[str, np.ndarray]:
     }
     for signal in found.signals:
         channel = signal.channel
-        of = {channel.column: "mean", channel.sd_column: "sd", channel.sd_column.replace("_sd_", "_change_"): "drift"}
-        for column, field in of.items():
+        fields = {
+            channel.column: "mean",
+            channel.sd_column: "sd",
+            channel.sd_column.replace("_sd_", "_change_"): "drift",
+        }
+        for column, field in fields.items():
             table[column] = np.array([getattr(s, field).get(channel.name, np.nan) for s in every])
     return table
 

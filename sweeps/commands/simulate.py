@@ -120,22 +120,22 @@ def over_time(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
     assert history is not None  # the fidelity was asked for it
     columns = run.ended(robot, batch)
     current, time = np.asarray(history.signals.total_current), np.asarray(history.time)
-    there = np.isfinite(current)
-    last = np.where(there.any(-1), there.shape[-1] - 1 - np.argmax(there[..., ::-1], -1), 0)
+    finite = np.isfinite(current)
+    last = np.where(finite.any(-1), finite.shape[-1] - 1 - np.argmax(finite[..., ::-1], -1), 0)
     rows = np.arange(len(last))
     motors = float(robot.sides) * np.asarray(history.signals.current)
-    columns[PEAK] = np.abs(np.where(there, motors, 0.0)).max(-1)
+    columns[PEAK] = np.abs(np.where(finite, motors, 0.0)).max(-1)
     columns["displacement_m"], columns["time_end_s"] = np.array(history.distance)[rows, last], time[rows, last]
-    empty = (status == BATTERY_EMPTY) & ~there[rows, -1]
+    empty = (status == BATTERY_EMPTY) & ~finite[rows, -1]
     if empty.any():
         signals = jax.tree.map(lambda x: np.asarray(x)[rows, last], history.signals)
         at_last = outputs.columns(jax.device_get(result(robot, signals, jnp.asarray(status))), robot.channels)
         for name, values in at_last.items():
-            columns[name] = np.where(empty & there.any(-1), values, columns[name])
-        after = time[rows, np.minimum(last + 1, there.shape[-1] - 1)] - time[rows, last]
+            columns[name] = np.where(empty & finite.any(-1), values, columns[name])
+        after = time[rows, np.minimum(last + 1, finite.shape[-1] - 1)] - time[rows, last]
         draws = np.asarray(robot.battery.current(signals.total_current))
         left = (float(robot.battery.capacity) - signals.discharge) / np.where(draws > 0, draws, np.nan)
-        left = np.where(empty & there.any(-1), np.clip(np.nan_to_num(left), 0.0, after), 0.0)
+        left = np.where(empty & finite.any(-1), np.clip(np.nan_to_num(left), 0.0, after), 0.0)
         columns["time_end_s"] = columns["time_end_s"] + left
         columns["displacement_m"] = np.nan_to_num(columns["displacement_m"] + left * np.nan_to_num(signals.speed))
     return columns

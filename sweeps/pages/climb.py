@@ -46,13 +46,15 @@ def write(folder: Path, found: ClimbResult, file: RobotFile) -> Path:
                 "name": name,
                 "unit": unit,
                 "meaning": meaning,
-                "value": f"{of.found[name]:.4g}",
+                "value": f"{derivatives.found[name]:.4g}",
                 "by": [
                     {"derivative": f"{d:.3g}", "slope": f"{s:.3g}", "sd": f"{sd:.1g}"}
-                    for d, s, sd in zip(of.by[name], of.slope[name], of.slope_sd[name], strict=True)
+                    for d, s, sd in zip(
+                        derivatives.by[name], derivatives.slope[name], derivatives.slope_sd[name], strict=True
+                    )
                 ],
             }
-            for of in ([found.derivatives] if found.derivatives else [])
+            for derivatives in ([found.derivatives] if found.derivatives else [])
             for name, (unit, meaning) in OUTPUTS.items()
         ],
         by=[{"name": n, "unit": u, "value": f"{v:.4g}", "width": f"{w:.2g}"} for n, u, v, w in found.along.rows]

@@ -156,12 +156,12 @@ def _run(axis: Axis) -> dict[str, Any]:
 
 def label_end(axes: Axes, x: np.ndarray, y: np.ndarray, words: str, colour: str, **keywords: Any) -> None:
     """Write `words` at the last finite point of a line, in the line's colour."""
-    there = np.nonzero(np.isfinite(y))[0]
-    if there.size:
+    finite = np.nonzero(np.isfinite(y))[0]
+    if finite.size:
         offset = keywords.pop("offset", (5, 0))
         axes.annotate(
             words,
-            (x[there[-1]], y[there[-1]]),
+            (x[finite[-1]], y[finite[-1]]),
             xytext=offset,
             textcoords="offset points",
             color=colour,

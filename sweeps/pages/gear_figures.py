@@ -106,9 +106,9 @@ def current_ripple(shown: list[Gear], title: str = "{}") -> tuple[Figure, list[d
         axes.annotate("", (start, level), (start + 1e3 * expected, level), arrowprops=arrow)
         axes.text(start, level + 0.05 * span, f"{1e3 * expected:.1f} ms, eq. (34)", fontsize=8.5, va="bottom")
         axes.set_title(title.format(gear.name))
-        of = gear.signals
+        signals = gear.signals
         drawn, travel, reaction = (
-            ripple.ripple(gear.time[tail], x[tail]) for x in (of.total_current, of.speed, of.normal)
+            ripple.ripple(gear.time[tail], x[tail]) for x in (signals.total_current, signals.speed, signals.normal)
         )
         facts.append(
             {

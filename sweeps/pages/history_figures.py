@@ -315,8 +315,8 @@ def courses(read: Iterable[Channel], history: Any, status: np.ndarray, names: Se
         readings = {c.name: np.asarray(history.reading[c.name][k]) / c.factor for c in shown}
         finite = np.flatnonzero(np.isfinite(np.stack(list(readings.values()))).all(0))
         upto = slice(0, int(finite[-1]) + 1 if finite.size else 0)
-        of = {channel: values[upto] for channel, values in readings.items()}
-        answer.append(Course(name, STATUSES[int(status[k])], np.asarray(history.time[k])[upto], of))
+        known = {channel: values[upto] for channel, values in readings.items()}
+        answer.append(Course(name, STATUSES[int(status[k])], np.asarray(history.time[k])[upto], known))
     return answer
 
 

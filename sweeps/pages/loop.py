@@ -109,9 +109,9 @@ def changes(found: DiscoveryResult) -> dict[str, Change]:
         moved = []
         for c in found.channels:
             a, b = without[c.name], with_it[c.name]
-            there = found.included & np.isfinite(a) & np.isfinite(b) & (b != 0)
-            if there.any():
-                moved.append(Change(c, float(np.sqrt(np.mean((a[there] / b[there] - 1) ** 2))), a, b))
+            usable = found.included & np.isfinite(a) & np.isfinite(b) & (b != 0)
+            if usable.any():
+                moved.append(Change(c, float(np.sqrt(np.mean((a[usable] / b[usable] - 1) ** 2))), a, b))
         if moved:
             most[name] = max(moved, key=lambda change: change.rms)
     return most
@@ -132,7 +132,7 @@ def would_be_seen(found: DiscoveryResult) -> list[dict[str, Any]]:
 def unseen(found: DiscoveryResult) -> list[dict[str, Any]]:
     """Errors of the refit and with what was found, by kind of block held out, with the rows that each reaches; marked
     where they are better or worse."""
-    of, many = len(found.runs), found.verdict != "none"
+    total, many = len(found.runs), found.verdict != "none"
     lines = []
     for kind, both in {"": found.errors, **found.errors_held_out}.items():
         worse = {w.channel for w in found.held_out_worse if w.kind == kind}
@@ -147,7 +147,7 @@ def unseen(found: DiscoveryResult) -> list[dict[str, Any]]:
         rows = [max(int(e["rows"]) for e in one.values()) for one in both[: 1 + many]]
         what = f"unseen: another {blocks.in_words(kind)}" if kind else "seen by the fit"
         shown = f"{rows[0]} → {rows[-1]}" if rows[0] != rows[-1] else str(rows[0])
-        lines.append({"what": what, "cells": cells, "reached": f"{shown} of {of}"})
+        lines.append({"what": what, "cells": cells, "reached": f"{shown} of {total}"})
     return lines
 
 

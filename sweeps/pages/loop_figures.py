@@ -262,18 +262,18 @@ def _over(table: dict[str, np.ndarray], column: str, label: str) -> tuple[np.nda
     return table[column], label
 
 
-def defects(table: dict[str, np.ndarray], verdict: str, blank: bool = False) -> Figure:
+def defects(table: dict[str, np.ndarray], verdict: str, crosses_zero: bool = False) -> Figure:
     """What each equation lacks, run by run, over the variable that shows it, before and after.
 
     Args:
-        blank: whether the robot is a rig, of which the equations are drawn that its readings close.
+        crosses_zero: whether readings may (`Layout.crosses_zero`): drawn are the equations that they close.
     """
     whens = ("before",) if verdict in ("none", "unnamed") else ("before", "after")
-    drawn = {b: DEFECT_WORDS[b] for b in (closed(table) if blank else DEFECT_WORDS)}
+    drawn = {b: DEFECT_WORDS[b] for b in (closed(table) if crosses_zero else DEFECT_WORDS)}
     fig, grid = figure(len(whens), len(drawn), 2.5 * len(whens) + 0.3, sharex="col", sharey="col")
     for row, when in enumerate(whens):
         for axes, (balance, (words, unit, column, label)) in zip(grid[row], drawn.items(), strict=True):
-            if blank:
+            if crosses_zero:
                 x, label = _over(table, column, label)
                 balance_words = RIG_WORDS.get(balance, words)
             else:
@@ -283,7 +283,7 @@ def defects(table: dict[str, np.ndarray], verdict: str, blank: bool = False) -> 
             for name, colour in colours_of(table["configuration"]).items():
                 mine = table["configuration"] == name
                 axes.plot(x[mine], y[mine], "o", ms=4.5, color=colour, label=name)
-            axes.set_title(f"{'torque' if blank and balance == 'track' else balance}, {when}")
+            axes.set_title(f"{'torque' if crosses_zero and balance == 'track' else balance}, {when}")
             axes.set_ylabel(f"{balance_words} [{unit}]")
             if row == len(whens) - 1:
                 axes.set_xlabel(label)
@@ -344,8 +344,8 @@ def curve(table: dict[str, np.ndarray], found: UnnamedDiscrepancy, sides: float 
     axes = grid[0, 0]
     axes.axhline(0, color=FAINT, lw=0.8)
     if found.defect is not None and found.defect_sd is not None and column in table:
-        there = np.isfinite(found.defect)
-        axes.errorbar(np.asarray(table[column])[there] * factor, found.defect[there], 2 * found.defect_sd[there],
+        finite = np.isfinite(found.defect)
+        axes.errorbar(np.asarray(table[column])[finite] * factor, found.defect[finite], 2 * found.defect_sd[finite],
                       fmt="o", ms=4, color=ORANGE, lw=0.7, label="each run, ±2 sd")  # fmt: skip
     scale = SHOWN.get(variable, 1.0)
     if found.window is not None:

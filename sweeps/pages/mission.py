@@ -199,8 +199,8 @@ def _demand(found: Missions, k: int) -> str:
             said.append(span(source.values[YAW_RATE], 1.0, channels.of(YAW_RATE).unit))
     elif mode == "voltage":
         shares = [(name, 0.01, "% duty") for name in ("duty", *PAIRS[0])] + [(name, 1.0, "V") for name in PAIRS[1]]
-        of = [span(source.values[name], one, unit) for name, one, unit in shares if name in source.values]
-        said.append(" and ".join(of) or "100 % duty")
+        spans = [span(source.values[name], one, unit) for name, one, unit in shares if name in source.values]
+        said.append(" and ".join(spans) or "100 % duty")
     units = {"voltage": "V", "slope_deg": "°", "payload": "kg", "current_other": "A"}
     said += [span(source.values[name], 1.0, unit) for name, unit in units.items() if name in source.values]
     return ", ".join([*said, *([source.surface[k]] if source.surface else [])])

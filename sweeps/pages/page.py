@@ -231,11 +231,11 @@ def render(
 
 def _beside(folder: Path, meanings: dict[str, str]) -> dict[str, str]:
     """Files that a run folder has, or is about to have, with what they are; what is known first."""
-    there = {p.name + "/" * p.is_dir() for p in folder.iterdir()} | {"manifest.json"}
-    there = {name for name in there if name in meanings or "." in name} - {"report.html"}  # no locks, no chunks
+    files = {p.name + "/" * p.is_dir() for p in folder.iterdir()} | {"manifest.json"}
+    files = {name for name in files if name in meanings or "." in name} - {"report.html"}  # no locks, no chunks
     return {
         name: meanings.get(name, "")
-        for name in [*(n for n in meanings if n in there), *sorted(there - set(meanings))]
+        for name in [*(n for n in meanings if n in files), *sorted(files - set(meanings))]
     }
 
 

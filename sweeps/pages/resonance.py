@@ -53,8 +53,8 @@ def _modes(found: ResonanceResult) -> list[dict[str, Any]]:
             "positions": f"{100 * m.positions:.0f}",
             "resonant": m.resonant,
         }
-        for payload, of in found.modes.items()
-        for m in of
+        for payload, modes in found.modes.items()
+        for m in modes
     ]
 
 

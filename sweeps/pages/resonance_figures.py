@@ -47,7 +47,7 @@ def _strong(found: ResonanceResult) -> set[tuple[str, int, str]]:
 
 def _top(found: ResonanceResult) -> float:
     """Greatest frequency drawn [Hz]."""
-    bands = [m.high for of in found.modes.values() for m in of if m.resonant]
+    bands = [m.high for modes in found.modes.values() for m in modes if m.resonant]
     lines = [found.table[f"{name}_frequency_Hz"][found.read] for name in _MARKS]
     seen = float(np.nanpercentile(np.concatenate(lines), 90)) if found.read.any() else 0.0
     return 1.15 * max([seen, *bands, 10.0])
@@ -104,15 +104,15 @@ def campbell(axes: Axes, found: ResonanceResult) -> None:
 def _bands(axes: Axes, found: ResonanceResult) -> None:
     """A band for each mode, from the least to the greatest frequency over payloads and positions of the belt."""
     others = iter(_OTHERS * 3)
-    names = dict.fromkeys(m.name for of in found.modes.values() for m in of if m.resonant)
+    names = dict.fromkeys(m.name for modes in found.modes.values() for m in modes if m.resonant)
     for name in names:
-        of = [(p, m) for p, members in found.modes.items() for m in members if m.name == name and m.resonant]
+        modes = [(p, m) for p, members in found.modes.items() for m in members if m.name == name and m.resonant]
         colour = _BANDS.get(name) or next(others)
-        low, high = min(m.low for _, m in of), max(m.high for _, m in of)
+        low, high = min(m.low for _, m in modes), max(m.high for _, m in modes)
         axes.axhspan(low, high, color=colour, alpha=0.13, lw=0, zorder=0)
-        ends = (of[0], of[-1]) if len(of) > 1 else (of[0],)
+        ends = (modes[0], modes[-1]) if len(modes) > 1 else (modes[0],)
         for payload, mode in ends:
-            axes.axhline(mode.frequency, color=colour, lw=1.0, ls="-" if payload == of[0][0] else "--", zorder=1)
+            axes.axhline(mode.frequency, color=colour, lw=1.0, ls="-" if payload == modes[0][0] else "--", zorder=1)
         means = " to ".join(dict.fromkeys(f"{mode.frequency:.0f}" for _, mode in ends))
         loads = " to ".join(dict.fromkeys(f"{payload:g}" for payload, _ in ends))
         axes.annotate(
@@ -132,9 +132,9 @@ def ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     norm = colors.Normalize(0, most)
     guess = found.travel
     for row, payload in enumerate(payloads):
-        of = np.flatnonzero(table["payload_kg"] == payload)
-        of = of[np.argsort(guess[of])]
-        good = of[found.read[of]]
+        rows = np.flatnonzero(table["payload_kg"] == payload)
+        rows = rows[np.argsort(guess[rows])]
+        good = rows[found.read[rows]]
         if len(good) > 1:
             x = guess[good]
             middle = (x[1:] + x[:-1]) / 2
@@ -142,7 +142,7 @@ def ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
             mesh = axes.pcolormesh(
                 edges, [row - 0.5, row + 0.5], ripple[good][None], norm=norm, cmap="YlOrBr", rasterized=True
             )
-        for k in of:
+        for k in rows:
             status = str(table["status"][k])
             if status != "converged" and np.isfinite(guess[k]):
                 marker = _UNREAD.get(status, ".")

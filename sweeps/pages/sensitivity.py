@@ -31,16 +31,16 @@ def write(folder: Path, found: SensitivityResult, file: RobotFile) -> Path:
     album.add("overview", partial(sensitivity_figures.overview, found))
     sections = []
     for name, study in found.outputs.items():
-        there = bool(study.studied.any()) and bool(np.isfinite(study.value).any())
+        has_numbers = bool(study.studied.any()) and bool(np.isfinite(study.value).any())
         pairs = _pairs(study, found)
-        if there:
+        if has_numbers:
             album.add(f"tornado_{name}", partial(sensitivity_figures.tornado, study, found))
             album.add(f"indices_{name}", partial(sensitivity_figures.indices, study, found))
         sections.append(
             {
                 "name": name,
                 "label": study.row.label,
-                "drawn": there,
+                "drawn": has_numbers,
                 "sentence": _sentence(study, found),
                 "pairs": pairs,
                 "second": study.second is not None,
@@ -75,11 +75,12 @@ def _sentence(study: OutputStudy, found: SensitivityResult) -> str:
     top = sensitivity_figures.ranked(share, 3)
     who = ", ".join(f"{found.names[k]} {100 * share[k]:.0f} %" for k in top)
     value, sd = study.value / row.factor, study.sd / row.factor
-    there = np.isfinite(value) & np.isfinite(sd)
+    finite = np.isfinite(value) & np.isfinite(sd)
     unit = "" if row.unit == "-" else f" {row.unit}"
     digits = row.resolution
-    spans = f"from {value[there].min():.{digits}f} to {value[there].max():.{digits}f}{unit} over the operating points"
-    spread = f"uncertain by ±{np.median(sd[there]):.{digits}f}{unit} (one sd, median of the points)"
+    low, high = value[finite].min(), value[finite].max()
+    spans = f"from {low:.{digits}f} to {high:.{digits}f}{unit} over the operating points"
+    spread = f"uncertain by ±{np.median(sd[finite]):.{digits}f}{unit} (one sd, median of the points)"
     return f"{who}. It goes {spans}, and is {spread}."
 
 

@@ -58,8 +58,8 @@ def front(found: SizeResult) -> Figure:
     names = list(dict.fromkeys(f.drive.motor.name for f in found.sizing.front))
     colours = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, "#8c564b", "#555555")
     for k, name in enumerate(names):
-        of = [i for i, f in enumerate(found.sizing.front) if f.drive.motor.name == name]
-        ax.plot(x[of], y[of], "o", color=colours[k % len(colours)], label=name)
+        members = [i for i, f in enumerate(found.sizing.front) if f.drive.motor.name == name]
+        ax.plot(x[members], y[members], "o", color=colours[k % len(colours)], label=name)
     ax.set_xlabel(f"{OBJECTIVES[first][1]} [{OBJECTIVES[first][0]}]")
     ax.set_ylabel(f"{OBJECTIVES[second][1]} [{OBJECTIVES[second][0]}]")
     ax.legend(title="motor")

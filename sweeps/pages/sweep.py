@@ -140,8 +140,10 @@ def _extremes(runs: Table, channels: Sequence[Channel]) -> list[dict[str, str]]:
 def _drawn(runs: Table) -> str:
     if not sweep_figures.on_ground(runs):
         return ""
-    of = sweep_figures.imposed(runs)
-    shown = sweep_figures.panels(runs[of], of)
+    imposed = sweep_figures.imposed(runs)
+    shown = sweep_figures.panels(runs[imposed], imposed)
     if sum(int(mask.sum()) for _, mask in shown) == len(runs["status"]):
         return ""
-    return f"{', '.join(name for name, _ in shown)} of {np.unique(runs[of]).size} {sweep_figures.PLURAL[of]}"
+    return (
+        f"{', '.join(name for name, _ in shown)} of {np.unique(runs[imposed]).size} {sweep_figures.PLURAL[imposed]}"
+    )

@@ -75,8 +75,8 @@ def sweep(runs: dict[str, np.ndarray], channel: Channel) -> Figure:
     volts = panels(runs[imposed(runs)], imposed(runs))
     if not is_map(runs):
         return _lines(runs, channel, kinds)
-    there = runs[channel.column][settled(runs, channel)]
-    low, high = (float(there.min()), float(there.max())) if there.size else (0.0, 1.0)
+    readings = runs[channel.column][settled(runs, channel)]
+    low, high = (float(readings.min()), float(readings.max())) if readings.size else (0.0, 1.0)
     norm = colors.Normalize(low, high if high > low else low + 1.0)
     payloads = np.unique(runs["payload_kg"])
     tall = min(0.3 * payloads.size, 2.2) + 1.0
@@ -179,18 +179,18 @@ def _ticks(setter: Any, levels: np.ndarray) -> None:
 
 def _scatter(axes: Axes, runs: dict[str, np.ndarray], index: np.ndarray, channel: Channel, norm: Any) -> None:
     values = runs[channel.column][index]
-    there = settled(runs, channel)[index]
+    settles = settled(runs, channel)[index]
     x, y = runs["slope_deg"][index], runs["payload_kg"][index]
-    axes.scatter(x[there], y[there], c=values[there], cmap="viridis", norm=norm, s=8, rasterized=True)
-    for status in np.unique(runs["status"][index][~there]):
-        pick = ~there & (runs["status"][index] == status)
+    axes.scatter(x[settles], y[settles], c=values[settles], cmap="viridis", norm=norm, s=8, rasterized=True)
+    for status in np.unique(runs["status"][index][~settles]):
+        pick = ~settles & (runs["status"][index] == status)
         axes.plot(x[pick], y[pick], "x", ms=3, color=FAINT, rasterized=True, label=words.short(str(status)))
-    if not there.all():
+    if not settles.all():
         axes.legend(loc="upper right", fontsize=7.5, frameon=True, markerscale=1.5)
 
 
 def _lines(runs: dict[str, np.ndarray], channel: Channel, kinds: list[str]) -> Figure:
-    column, there = channel.column, settled(runs, channel)
+    column, settles = channel.column, settled(runs, channel)
     over = own = imposed(runs)
     if on_ground(runs):
         over = "payload_kg" if np.unique(runs["payload_kg"]).size > 1 else "slope_deg"
@@ -208,7 +208,7 @@ def _lines(runs: dict[str, np.ndarray], channel: Channel, kinds: list[str]) -> F
             pick = np.nonzero(mine & mask)[0]
             pick = pick[np.argsort(runs[over][pick], kind="stable")]
             shade = colormaps["viridis"](0.15 + 0.7 * k / max(1, len(volts) - 1))
-            shown = np.where(there[pick], runs[column][pick], np.nan)
+            shown = np.where(settles[pick], runs[column][pick], np.nan)
             axes.plot(
                 runs[over][pick],
                 shown,
@@ -241,7 +241,7 @@ def _lines(runs: dict[str, np.ndarray], channel: Channel, kinds: list[str]) -> F
         axes.set(xlabel=label, title=kind)
         if volts[0][0]:
             axes.legend()
-    drawn = runs[column][there]
+    drawn = runs[column][settles]
     low, high = (float(drawn.min()), float(drawn.max())) if drawn.size else (0.0, 1.0)
     grid[0, 0].set_ylim(min(0.0, 1.1 * low), max(0.0, 1.1 * high) or 1.0)
     grid[0, 0].set_ylabel(axis_label(channel))

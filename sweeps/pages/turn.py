@@ -120,8 +120,8 @@ def circle(robot: Robot, row: Mapping[str, Any]) -> Figure:
 
 def path(robot: Robot, row: Mapping[str, Any], x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> Figure:
     """A path from above, the robot at its beginning and its end, and between."""
-    there = np.isfinite(x)
-    x, y, yaw = x[there], y[there], yaw[there]
+    finite = np.isfinite(x)
+    x, y, yaw = x[finite], y[finite], yaw[finite]
     fig, grid = figure(1, 1, 4.6)
     axes = grid[0, 0]
     axes.plot(-y, x, color=BLUE)
@@ -154,9 +154,9 @@ def over_yaw_rate(turns: dict[str, np.ndarray], row: Mapping[str, Any]) -> Figur
     """Current of either side and power over the yaw rate of settled turns, the one asked for marked."""
     fig, grid = figure(1, 2, 3.4)
 
-    def rate(of: Mapping[str, Any]) -> np.ndarray:
+    def rate(motion: Mapping[str, Any]) -> np.ndarray:
         # On the spot the curvature is without limit, the yaw rate is not.
-        return np.asarray(of["yaw_rate_rad_s"], float)
+        return np.asarray(motion["yaw_rate_rad_s"], float)
 
     rest = {name: np.asarray(values)[1:] for name, values in turns.items()}
     order = np.argsort(rate(rest))

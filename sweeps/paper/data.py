@@ -270,14 +270,14 @@ def supply_errors(robot: Robot, ratio: float, rows_of: Rows, battery: bool) -> d
         pick = (table["configuration"] == TRACKED) & (table["supply_voltage_V"] == voltage)
         if battery and mode == 1:
             continue
-        there = table.where(pick)
+        picked = table.where(pick)
         at = conditions(
             robot,
-            there["configuration"],
+            picked["configuration"],
             voltage=voltage,
-            payload=there["payload_kg"],
-            slope_deg=there["slope_deg"],
-            total_mass=there["total_mass_kg"],
+            payload=picked["payload_kg"],
+            slope_deg=picked["slope_deg"],
+            total_mass=picked["total_mass_kg"],
             adhesion=ratio,
             battery=float(battery),
         )

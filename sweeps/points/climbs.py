@@ -47,15 +47,15 @@ OUTPUTS: dict[str, tuple[str, str]] = {
 }
 
 
-def axis(of: Obstacle) -> Axis:
+def axis(obstacle: Obstacle) -> Axis:
     """What is known of the obstacle's size."""
     meaning = {"step": "height of the step", "stairs": "rise of each stair", "gap": "width of the trench"}
-    return Axis(SIZE, "mm", meaning[of.kind], (1.0, 5000.0), None)
+    return Axis(SIZE, "mm", meaning[obstacle.kind], (1.0, 5000.0), None)
 
 
-def attributes(of: Obstacle) -> dict[str, dict[str, Any]]:
+def attributes(obstacle: Obstacle) -> dict[str, dict[str, Any]]:
     """Outputs that a point has, by name, with their attributes in a store."""
-    names = (VERDICT, LARGEST) if of.find else tuple(name for name in OUTPUTS if name != LARGEST)
+    names = (VERDICT, LARGEST) if obstacle.find else tuple(name for name in OUTPUTS if name != LARGEST)
     found: dict[str, dict[str, Any]] = {
         name: {"units": OUTPUTS[name][0], "long_name": OUTPUTS[name][1]} for name in names
     }
@@ -64,18 +64,18 @@ def attributes(of: Obstacle) -> dict[str, dict[str, Any]]:
     return found
 
 
-def terrains_of(of: Obstacle, sizes: np.ndarray) -> Terrain:
+def terrains_of(obstacle: Obstacle, sizes: np.ndarray) -> Terrain:
     """Terrains of sizes [mm]."""
-    nose, tread = of.nose_mm / 1000, of.tread_mm / 1000
+    nose, tread = obstacle.nose_mm / 1000, obstacle.tread_mm / 1000
     make = {
         "step": lambda s: terrain.step(s, nose),
-        "stairs": lambda s: terrain.stairs(s, tread, of.count, nose),
+        "stairs": lambda s: terrain.stairs(s, tread, obstacle.count, nose),
         "gap": terrain.gap,
     }
-    return jax.vmap(make[of.kind])(jnp.asarray(sizes) / 1000)
+    return jax.vmap(make[obstacle.kind])(jnp.asarray(sizes) / 1000)
 
 
-def further(of: Obstacle, varied: Mapping[str, np.ndarray], robot: Robot, where: str) -> dict[str, float]:
+def further(obstacle: Obstacle, varied: Mapping[str, np.ndarray], robot: Robot, where: str) -> dict[str, float]:
     """A low voltage, where a sweep of climbs states none.
 
     Args:
@@ -87,13 +87,13 @@ def further(of: Obstacle, varied: Mapping[str, np.ndarray], robot: Robot, where:
     """
     if (why := refused(robot)) is not None:
         raise BadConfiguration(f"{where}, obstacle: {why}")
-    if of.find == (SIZE in varied):
-        wants = "find looks for it" if of.find else f"expected an axis {SIZE}, or find = true"
-        raise BadConfiguration(f"{where}, {SIZE}: got {'it' if of.find else 'none'}; {wants}")
-    one = None if of.sequence is None else terrains.read_sequence(of.sequence, robot, (0.0, 0.0))
+    if obstacle.find == (SIZE in varied):
+        wants = "find looks for it" if obstacle.find else f"expected an axis {SIZE}, or find = true"
+        raise BadConfiguration(f"{where}, {SIZE}: got {'it' if obstacle.find else 'none'}; {wants}")
+    one = None if obstacle.sequence is None else terrains.read_sequence(obstacle.sequence, robot, (0.0, 0.0))
     for name in ("levers_front_deg", "levers_rear_deg"):
         if name in varied and one is not None and one.begins is None:
-            raise BadConfiguration(f"{where}, {name}: {of.sequence} states all angles; expected one of the two")
+            raise BadConfiguration(f"{where}, {name}: {obstacle.sequence} states all angles; expected one of the two")
         for angle in varied.get(name, ()):
             if why := terrains.beyond(robot, angle) or terrains.below(robot, angle):
                 raise BadConfiguration(f"{where}, {name}: {why}")
@@ -114,7 +114,7 @@ def refused(robot: Robot) -> str | None:
 
 
 def computed(
-    of: Obstacle,
+    obstacle: Obstacle,
     variation: Variation,
     conditions: Conditions,
     values: np.ndarray | jax.Array,
@@ -139,34 +139,35 @@ def computed(
             robot,
             base,
         )
-    sequence = _sequences(of, robot, at, points)
+    sequence = _sequences(obstacle, robot, at, points)
 
     def run(sizes: np.ndarray, told: Callable[[float], None]) -> Climb:
         return climb_batch(
-            robot, at, terrains_of(of, sizes), sequence,
-            duration=of.duration_s, step=of.time_step_s, sample=SAMPLE, record=not of.find, progress=told,
+            robot, at, terrains_of(obstacle, sizes), sequence,
+            duration=obstacle.duration_s, step=obstacle.time_step_s, sample=SAMPLE, record=not obstacle.find,
+            progress=told,
         )  # fmt: skip
 
-    found = _numbers(run(sizes, told)) if sizes is not None else _searched(of, points, run, told)
+    found = _numbers(run(sizes, told)) if sizes is not None else _searched(obstacle, points, run, told)
     verdict = found[VERDICT]
     status = np.where(verdict == FAILED, FAILED_POINT, np.where(verdict == UNFINISHED, NOT_SETTLED, CONVERGED))
     told(1.0)
     return {**found, VERDICT: verdict.astype(np.uint8), STATUS: status.astype(np.uint8)}
 
 
-def _sequences(of: Obstacle, robot: Robot, conditions: Conditions, points: int) -> Sequence:
+def _sequences(obstacle: Obstacle, robot: Robot, conditions: Conditions, points: int) -> Sequence:
     each = 0 if jnp.ndim(robot.sides) else None
     angles = jax.vmap(lambda r, c: masses.lever_angles(r.running_gear, c), in_axes=(each, 0))(robot, conditions)
     front, rear = (jnp.broadcast_to(x, (points,)) for x in angles)
     found = jax.vmap(still)(front, rear)
-    if of.sequence is not None:
-        one = terrains.read_sequence(of.sequence, robot, (0.0, 0.0))
+    if obstacle.sequence is not None:
+        one = terrains.read_sequence(obstacle.sequence, robot, (0.0, 0.0))
         found = jax.tree.map(lambda x: jnp.broadcast_to(x, (points, *jnp.shape(x))), one)
         if found.begins is not None:
             found = dataclasses.replace(found, begins=jnp.stack([front, rear], axis=1))
-    if of.levers_voltage_V is None:
+    if obstacle.levers_voltage_V is None:
         return found
-    return dataclasses.replace(found, supply=jnp.full(points, of.levers_voltage_V))
+    return dataclasses.replace(found, supply=jnp.full(points, obstacle.levers_voltage_V))
 
 
 def _numbers(found: Climb) -> dict[str, np.ndarray]:
@@ -191,10 +192,10 @@ def _numbers(found: Climb) -> dict[str, np.ndarray]:
 
 
 def _searched(
-    of: Obstacle, points: int, run: Callable[..., Climb], told: Callable[[float], None]
+    obstacle: Obstacle, points: int, run: Callable[..., Climb], told: Callable[[float], None]
 ) -> dict[str, np.ndarray]:
     """The largest sizes that are got over, by bisection of all points side by side, and how the next one ends."""
-    low, high = SOUGHT[of.kind]
+    low, high = SOUGHT[obstacle.kind]
     rounds = 1 + int(np.ceil(np.log2((high - low) / NEAR)))
     over, beyond, verdict, sizes = (
         np.zeros(points),

@@ -189,8 +189,8 @@ def connect(address: str) -> Pool:
                 "--nthreads 1"
             ) from None
         here, kinds = program(), set()
-        for worker, (there, device) in client.run(introduce).items():
-            differ = differences(here, there)
+        for worker, (host, device) in client.run(introduce).items():
+            differ = differences(here, host)
             if differ:
                 raise BadConfiguration(f"--scheduler: {worker} has another program; it differs in {differ}")
             kinds.add(device)
@@ -288,8 +288,8 @@ def compute(work: bytes, name: str, chunk: int, expected: dict[str, Any]) -> dic
     Raises:
         BadConfiguration: this worker, which has come later than the others, is not like them.
     """
-    there, device = introduce()
-    differ = differences(expected, {**there, "device": {"device": device}})
+    host, device = introduce()
+    differ = differences(expected, {**host, "device": {"device": device}})
     if differ:
         raise BadConfiguration(f"--scheduler: a worker that came later has another program or device: {differ}")
     from sweeps.points.scale import Compiled, fetched

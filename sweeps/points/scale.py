@@ -334,13 +334,13 @@ def run(keep: Keep, job: Job, chunks: Produced, advance: Advance, times: Times) 
         computed = time.perf_counter()
         count = job.blocks.count(piece.chunk)
         here = fetched(piece.arrays, count)
-        there = time.perf_counter()
+        transferred = time.perf_counter()
         if stop.is_set():  # interrupted while it was computed
             return
         keep(piece.chunk, here, drawn(job, piece))
         times.compute += computed - start
-        times.transfer += there - computed
-        times.write += time.perf_counter() - there
+        times.transfer += transferred - computed
+        times.write += time.perf_counter() - transferred
         advance(count - piece.told)
 
     def keep_writing() -> None:

@@ -52,8 +52,12 @@ def task_of(config: Campaign, robot: Robot, turns: bool = False) -> Task:
     """The task that a configuration states; `turns`: whether its profile drives the sides apart."""
     if config.obstacle is None:
         return of_fidelity(config.model, config.options, robot, config.profile is not None, turns)
-    of, known = config.obstacle, climbs.attributes(config.obstacle)
-    own = {SIZE: climbs.axis(of)}, functools.partial(climbs.further, of), functools.partial(climbs.computed, of)
+    obstacle, known = config.obstacle, climbs.attributes(config.obstacle)
+    own = (
+        {SIZE: climbs.axis(obstacle)},
+        functools.partial(climbs.further, obstacle),
+        functools.partial(climbs.computed, obstacle),
+    )
     return Task("climb", {}, known, tuple(known), True, climbs.AT_ONCE, *own)
 
 

@@ -63,8 +63,8 @@ def intervals(
 
     def summary(found: run.Table) -> run.Table:
         seen = {name: values.reshape(-1, draws) for name, values in found.items()}
-        there = np.isin(seen[STATUS], DONE) & np.isfinite(seen[robot.channels[0].name])
-        return _summary({o.column: seen[o.name] for o in outputs.table(robot.channels)}, there)
+        counts = np.isin(seen[STATUS], DONE) & np.isfinite(seen[robot.channels[0].name])
+        return _summary({o.column: seen[o.name] for o in outputs.table(robot.channels)}, counts)
 
     whole = job.blocks.size[-1] == draws  # of a run all draws are in one chunk, which is kept in short
     with progress(draws, quiet=not slow, doing="draws") as advance:
@@ -74,31 +74,31 @@ def intervals(
     return Intervals(found if whole else summary(found), draws, robot.channels)
 
 
-def _summary(columns: dict[str, np.ndarray], there: np.ndarray) -> dict[str, np.ndarray]:
-    """Spread of each column over draws; arrays of shape (runs, draws), `there`: where a draw converges."""
-    enough = there.sum(1) >= 2
+def _summary(columns: dict[str, np.ndarray], counts: np.ndarray) -> dict[str, np.ndarray]:
+    """Spread of each column over draws; arrays of shape (runs, draws), `counts`: where a draw converges."""
+    enough = counts.sum(1) >= 2
     found: dict[str, np.ndarray] = {}
     for column, values in columns.items():
-        x = np.where(enough[:, None], np.where(there, values, np.nan), 0.0)
+        x = np.where(enough[:, None], np.where(counts, values, np.nan), 0.0)
         low, high = np.nanquantile(x, QUANTILES, axis=1)
         spread = np.nanstd(x, 1, ddof=1)
         found |= {
             column + end: np.where(enough, value, np.nan)
             for end, value in ((SD, spread), (LOWER, low), (UPPER, high))
         }
-    return {**found, SHARE: there.mean(1)}
+    return {**found, SHARE: counts.mean(1)}
 
 
 def say_intervals(table: dict[str, np.ndarray], found: Intervals) -> None:
     """The range of every channel over the runs, each end with its sd; and how many draws do not converge."""
     first = found.channels[0].column
-    there = np.isfinite(found.sd(first)) & np.isfinite(table[first])
-    if there.any():
+    finite = np.isfinite(found.sd(first)) & np.isfinite(table[first])
+    if finite.any():
         say(f"± one sd over {found.draws} robots drawn from the posterior; 95 % intervals are in the table")
     for c in found.channels:
         value, sd = table[c.column], found.sd(c.column)
-        if there.any():
-            rows = np.flatnonzero(there)
+        if finite.any():
+            rows = np.flatnonzero(finite)
             least, most = rows[np.argmin(value[rows])], rows[np.argmax(value[rows])]
             ends = [with_sd(value[k], sd[k], c.resolution) for k in dict.fromkeys((int(least), int(most)))]
             say(f"{c.label}: {' to '.join(ends)} {c.unit}")

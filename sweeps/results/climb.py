@@ -185,9 +185,9 @@ class ClimbResult:
         names = ("output", "unit", "value", *by, "derivative", "slope", "slope_sd")
         found_by = {name: (found.by[name], found.slope[name], found.slope_sd[name]) for name in OUTPUTS}
         return [
-            dict(zip(names, (n, unit, found.found[n], *of, *(float(x[k]) for x in found_by[n])), strict=True))
+            dict(zip(names, (n, unit, found.found[n], *row, *(float(x[k]) for x in found_by[n])), strict=True))
             for n, (unit, _) in OUTPUTS.items()
-            for k, of in enumerate(along.rows)
+            for k, row in enumerate(along.rows)
         ]
 
     def statement(self) -> str:

@@ -94,8 +94,8 @@ def postures(robot: Robot, runs: Runs, conditions: Conditions) -> Postures | Non
         "overall_height_mm": millimetres * limits.height,
     }
     first, side, step = jax.tree.map(lambda x: x[0], (conditions, lies, steps))
-    there = Drawn(side, float(rests.height[0]), 0.0, float(first.slope))
-    return Postures(table, there, _on_step(step), step_map(robot, first))
+    level = Drawn(side, float(rests.height[0]), 0.0, float(first.slope))
+    return Postures(table, level, _on_step(step), step_map(robot, first))
 
 
 def step_map(robot: Robot, conditions: Conditions) -> StepMap:
@@ -117,13 +117,15 @@ def of_requirements(robot: Robot, outcomes: Sequence[Outcome]) -> dict[str, tupl
         name = outcome.requirement.name
         if name not in ("step_mm", "gap_mm", "length_mm"):
             continue
-        of = Conditions(outcome.at["configuration"], payload=outcome.at.get("payload_kg", 0.0)).resolved(robot)
+        conditions = Conditions(outcome.at["configuration"], payload=outcome.at.get("payload_kg", 0.0)).resolved(
+            robot
+        )
         if name == "step_mm":
-            step, front, rear = jax.device_get(static_limits.best_step(robot, of))
+            step, front, rear = jax.device_get(static_limits.best_step(robot, conditions))
             drawn = _on_step(step)
         else:
             front = rear = float(static_limits.flush(robot)) if name == "gap_mm" else np.pi
-            stands = static_limits.with_levers(of, front, rear)
+            stands = static_limits.with_levers(conditions, front, rear)
             rests, side = posture.level(robot, stands), posture.outline(robot, stands)
             drawn = Drawn(jax.device_get(side.pitched(rests.pitch)), float(rests.height), 0.0)
         found[name] = drawn, float(np.degrees(front)), float(np.degrees(rear))

@@ -69,7 +69,10 @@ class ResonanceResult:
         found: dict[tuple[str, int], list[Resonance]] = {}
         for r in strongest(self.resonances):
             found.setdefault((r.mode, r.order), []).append(r)
-        ranges = [(min(r.avoid[0] for r in of), max(r.avoid[1] for r in of), of) for of in found.values()]
+        ranges = [
+            (min(r.avoid[0] for r in members), max(r.avoid[1] for r in members), members)
+            for members in found.values()
+        ]
         return sorted(ranges, key=lambda x: x[0])
 
     @property
@@ -78,11 +81,11 @@ class ResonanceResult:
         ranges = []
         speed = self.travel * MM
         for payload in self.modes:
-            of = np.flatnonzero((self.table["payload_kg"] == payload) & np.isfinite(speed))
-            of = of[np.argsort(speed[of])]
-            x = speed[of]
+            rows = np.flatnonzero((self.table["payload_kg"] == payload) & np.isfinite(speed))
+            rows = rows[np.argsort(speed[rows])]
+            x = speed[rows]
             edges = np.concatenate([x[:1], (x[1:] + x[:-1]) / 2, x[-1:]])
-            bad = self.table["status"][of] != "converged"
+            bad = self.table["status"][rows] != "converged"
             ranges += [(edges[k], edges[k + 1]) for k in np.flatnonzero(bad)]
         return _merged(ranges)
 
@@ -154,7 +157,7 @@ class ResonanceResult:
 
     def _spread(self) -> list[tuple[str, float, float]]:
         """Modes that amplify but change by an octave with the position of the belt, with their range [Hz]."""
-        every = [m for of in self.modes.values() for m in of if m.amplifies and not m.resonant]
+        every = [m for modes in self.modes.values() for m in modes if m.amplifies and not m.resonant]
         names = dict.fromkeys(m.name for m in every)
         return [
             (n, min(m.low for m in every if m.name == n), max(m.high for m in every if m.name == n)) for n in names
@@ -165,11 +168,11 @@ class ResonanceResult:
         rows = np.flatnonzero(self.table["table8"] & self.read)
         inside = []
         for voltage in np.unique(self.table["supply_voltage_V"][rows]):
-            of = rows[self.table["supply_voltage_V"][rows] == voltage]
-            hit = [k for k in of if self.shaken(k)]
+            found = rows[self.table["supply_voltage_V"][rows] == voltage]
+            hit = [k for k in found if self.shaken(k)]
             if hit:
                 loads = ", ".join(f"{self.table['payload_kg'][k]:g}" for k in hit)
-                inside.append(f"{voltage:g} V with {'every payload' if len(hit) == len(of) else loads + ' kg'}")
+                inside.append(f"{voltage:g} V with {'every payload' if len(hit) == len(found) else loads + ' kg'}")
         return (
             f"Of Table 8 at {self.slope_deg:g}°, affected at their own payload: {'; '.join(inside)}."
             if inside
@@ -206,16 +209,16 @@ class ResonanceResult:
             "speeds_m_s": self.speeds,
             "modes": [
                 {"payload_kg": payload, **m._asdict(), "resonant": m.resonant}
-                for payload, of in self.modes.items()
-                for m in of
+                for payload, members in self.modes.items()
+                for m in members
             ],
             "peaks": [p._asdict() for p in self.peaks],
             "crossings": [c._asdict() for c in self.crossings],
             "resonances": [r._asdict() for r in self.resonances],
             "avoid": [
-                {"low_m_s": low, "high_m_s": high, "mode": of[0].mode, "order": of[0].order,
-                 "ripple": {r.signal: r.ripple for r in of}, "rise": {r.signal: r.rise for r in of}}
-                for low, high, of in self.avoid
+                {"low_m_s": low, "high_m_s": high, "mode": members[0].mode, "order": members[0].order,
+                 "ripple": {r.signal: r.ripple for r in members}, "rise": {r.signal: r.rise for r in members}}
+                for low, high, members in self.avoid
             ],
             "quiet_m_s": self.quiet,
             "restless_m_s": self.restless,
@@ -253,11 +256,11 @@ def _listed(ranges: list[tuple[float, float, list[Resonance]]], what: str) -> st
     """Ranges to avoid, the lowest speed first; of many those that rise most."""
     most = sorted(ranges, key=lambda r: -max(x.rise for x in r[2]))[:SAID]
     texts = []
-    for low, high, of in sorted(most, key=lambda r: r[0]):
-        first, last = min(r.frequencies[0] for r in of), max(r.frequencies[1] for r in of)
-        meets = f"{of[0].mode} at {span(first, last, 1)} Hz meets " if of[0].mode else ""
-        order = f"{of[0].order} × {what}" if of[0].order else f"{span(first, last, 1)} Hz"
-        how = ", ".join(f"{SIGNALS[r.signal].label} {percent(100 * r.ripple)}" for r in of)
+    for low, high, members in sorted(most, key=lambda r: r[0]):
+        first, last = min(r.frequencies[0] for r in members), max(r.frequencies[1] for r in members)
+        meets = f"{members[0].mode} at {span(first, last, 1)} Hz meets " if members[0].mode else ""
+        order = f"{members[0].order} × {what}" if members[0].order else f"{span(first, last, 1)} Hz"
+        how = ", ".join(f"{SIGNALS[r.signal].label} {percent(100 * r.ripple)}" for r in members)
         texts.append(f"{span(low, high)} mm/s ({meets}{order}; ripple up to: {how})")
     more = f"; {len(ranges) - len(most)} more on the map" if len(ranges) > len(most) else ""
     return "; ".join(texts) + more

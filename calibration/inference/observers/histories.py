@@ -110,8 +110,8 @@ class HistoriesLinearization(Linearization):
 
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         moved = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.knots])
-        there = jnp.where(self.rows_of < 0, self.rows, self.rows_of)  # beyond the last row: dropped
-        out = jnp.zeros((self.rows, len(self.channels), shapes.shape[1])).at[there].set(moved, mode="drop")
+        place = jnp.where(self.rows_of < 0, self.rows, self.rows_of)  # beyond the last row: dropped
+        out = jnp.zeros((self.rows, len(self.channels), shapes.shape[1])).at[place].set(moved, mode="drop")
         return out.reshape(-1, shapes.shape[1])
 
     def places(self) -> np.ndarray:
@@ -222,8 +222,8 @@ class Histories(Observer):
     def sizes(cls, runs: Runs) -> np.ndarray:
         """The channel's root mean square: histories pass through zero while their instruments stay as they are."""
         measured = runs.measured()
-        there = np.isfinite(measured)
-        power = np.sum(np.where(there, measured, 0.0) ** 2, 0) / np.maximum(there.sum(0), 1)
+        finite = np.isfinite(measured)
+        power = np.sum(np.where(finite, measured, 0.0) ** 2, 0) / np.maximum(finite.sum(0), 1)
         return np.broadcast_to(np.sqrt(power), measured.shape)
 
     @classmethod
@@ -495,8 +495,8 @@ class Histories(Observer):
                         shape = f"effects.{e.effect.name}.{e.shape}"
                         wanted = e.values[jnp.minimum(point, len(e.values) - 1)]
                         put[shape] = jnp.where(value[amplitude] == 0, wanted, value[shape])
-                there = params.replace(whole, put)
-                return problem.whitened(self(there), data)[: data.measured.size]
+                robot = params.replace(whole, put)
+                return problem.whitened(self(robot), data)[: data.measured.size]
 
             return jax.jacfwd(readings)(jnp.zeros(len(effects)))
 
@@ -618,23 +618,23 @@ class Histories(Observer):
         names = bases_room.names(bases)
         orders = [w for w in bases_room.ORDERS if any(n[1] == w for n in names)]
 
-        def strongest(of: Diagnosis, variable: str) -> Strongest:
+        def strongest(diagnosis: Diagnosis, variable: str) -> Strongest:
             mine = [k for k, n in enumerate(names) if n[1] == variable]
-            k = max(mine, key=lambda j: np.asarray(of.scores.curve)[j])
-            return Strongest(names[k][0], float(of.scores.curve[k]), float(of.scores.explained[k]))
+            k = max(mine, key=lambda j: np.asarray(diagnosis.scores.curve)[j])
+            return Strongest(names[k][0], float(diagnosis.scores.curve[k]), float(diagnosis.scores.explained[k]))
 
-        def side(of: Diagnosis) -> TimeSide:
+        def side(diagnosis: Diagnosis) -> TimeSide:
             lags = min(LAGS, self.rows_of.shape[1] // 4)
-            test = of.test
+            test = diagnosis.test
             memory = Memory(
                 float(test.found.white),
                 test.threshold("white"),
                 test.p("white"),
                 lags,
-                _autocorrelation(of.linear, lags),
+                _autocorrelation(diagnosis.linear, lags),
             )
-            waves = {(w, bases_room.ORDERS[w][0]): strongest(of, w) for w in orders}
-            return TimeSide(memory, waves, strongest(of, "time"))
+            waves = {(w, bases_room.ORDERS[w][0]): strongest(diagnosis, w) for w in orders}
+            return TimeSide(memory, waves, strongest(diagnosis, "time"))
 
         samples = int((np.asarray(self.rows_of) >= 0).sum())
         unresolved = tuple(w for w in bases_room.ORDERS if w not in orders)
@@ -645,8 +645,8 @@ def _autocorrelation(linear: Linearization, lags: int) -> dict[str, list[float]]
     """Of each channel's residual over all runs, at lags 1 to `lags` samples."""
     x = np.asarray(linear.series())
     power = np.maximum(np.sum(x**2, (0, 1)), 1e-12)
-    of = [np.sum(x[:, k:] * x[:, :-k], (0, 1)) / power for k in range(1, lags + 1)]
-    return {name: [float(lag[k]) for lag in of] for k, name in enumerate(linear.channels)}
+    by_lag = [np.sum(x[:, k:] * x[:, :-k], (0, 1)) / power for k in range(1, lags + 1)]
+    return {name: [float(lag[k]) for lag in by_lag] for k, name in enumerate(linear.channels)}
 
 
 def _changes(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[np.ndarray]:
@@ -737,11 +737,11 @@ def with_begins(robot: Robot, runs: Runs, noise: Noise) -> Robot:
         at: dict[str, tuple[float, float]] = {}
         for k, channel in enumerate(runs.channels):
             field = "motor_speed" if channel.settled else "angle"
-            there = mine[np.isfinite(measured[mine, k])][:FIRST_SAMPLES]
-            if channel.zero_at_rest and field not in at and len(there):
+            finite = mine[np.isfinite(measured[mine, k])][:FIRST_SAMPLES]
+            if channel.zero_at_rest and field not in at and len(finite):
                 factor = 1 / _shown_of_unit(robot, int(rows[mine[0]]), channel)
-                value, sd = _extrapolated(runs["time_s"][there] - runs["time_s"][mine[0]], measured[there, k])
-                least = float(np.median(noise.sd[there, k]))
+                value, sd = _extrapolated(runs["time_s"][finite] - runs["time_s"][mine[0]], measured[finite, k])
+                least = float(np.median(noise.sd[finite, k]))
                 at[field] = factor * value, abs(factor) * max(sd, least)
         found[key] = Begin(**{field: value for field, (value, _) in at.items()})
         known += [(f"rig.{key}.{field}", value, sd) for field, (value, sd) in at.items()]
@@ -866,9 +866,9 @@ def _over_delays(problem: Problem, z: Array, data: Data, scanned: Array, values:
         at = jnp.where(scanned, value, z)
         late = observe.late(both, problem.robot(at).rig)
         error = data.weight * (late[..., 0] - data.measured) / data.sd
-        there = jnp.all(jnp.isfinite(late), -1)
-        error = jnp.where(there, error, MISSING * data.weight)
-        jacobian = jnp.where(there[..., None], (data.weight / data.sd)[..., None] * late[..., 1:], 0.0)
+        finite = jnp.all(jnp.isfinite(late), -1)
+        error = jnp.where(finite, error, MISSING * data.weight)
+        jacobian = jnp.where(finite[..., None], (data.weight / data.sd)[..., None] * late[..., 1:], 0.0)
         residual = jnp.concatenate([error.ravel(), at - data.centre])
         whole = jnp.concatenate([jacobian.reshape(-1, z.size), jnp.eye(z.size)])
         return _moved(residual, whole, at, scanned)
@@ -895,8 +895,8 @@ def _evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Ev
 
     def some(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
         filled = np.resize(np.arange(len(members)), TOGETHER)
-        of = None if active is None else np.asarray(active)[members[filled]]
-        return jax.device_get(_evaluate(problem, z[filled], weights[members[filled]], of))
+        own = None if active is None else np.asarray(active)[members[filled]]
+        return jax.device_get(_evaluate(problem, z[filled], weights[members[filled]], own))
 
     def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
         parts = [(z[k : k + TOGETHER], members[k : k + TOGETHER]) for k in range(0, len(members), TOGETHER)]

@@ -72,8 +72,8 @@ class SettledLinearization(Linearization):
 
 def shares(channel: str, sides: int) -> np.ndarray:
     """What a channel shows of each side [-]: of one of a side that alone, else their mean."""
-    of = channels.of(channel).side
-    return np.full(sides, 1 / sides) if of is None or sides == 1 else np.eye(sides)[of]
+    side = channels.of(channel).side
+    return np.full(sides, 1 / sides) if side is None or sides == 1 else np.eye(sides)[side]
 
 
 class SettledRuns(Observer):
@@ -228,9 +228,9 @@ class SettledRuns(Observer):
 
         def probed(x: Array) -> Robot:
             delta = x[size:].reshape(len(probes), *self.shape_sides)
-            there = problem.robot(x[:size])
+            robot = problem.robot(x[:size])
             put = tuple(eqx.tree_at(lambda e: e.amplitude, p, d) for p, d in zip(probes, delta, strict=True))
-            return dataclasses.replace(there, effects=(*there.effects, *put))
+            return dataclasses.replace(robot, effects=(*robot.effects, *put))
 
         wide = jnp.concatenate([z, jnp.zeros(len(probes) * math.prod(self.shape_sides))])
         r, slopes, _, signals = problem.linearised(probed, wide, data)

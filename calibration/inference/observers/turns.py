@@ -78,8 +78,8 @@ class TurnLinearization(SettledLinearization):
     @classmethod
     def sense(cls, signals: Signals) -> Array | float:
         shafts, turn = (jnp.asarray(x).T for x in (signals.direction, signals.direction_turn))
-        of = {"mass": jnp.ones_like(shafts)} | dict.fromkeys(ROUND, turn)
-        return jnp.stack([of.get(balance, shafts) for balance in cls.probed])[..., None]
+        sign = {"mass": jnp.ones_like(shafts)} | dict.fromkeys(ROUND, turn)
+        return jnp.stack([sign.get(balance, shafts) for balance in cls.probed])[..., None]
 
 
 class SettledTurns(SettledRuns):
