@@ -17,8 +17,6 @@ from calibration.data import runs as records
 from calibration.inference import identifiability
 from calibration.inference.calibrate import calibrate
 from calibration.inference.identifiability import HELD, held_by_prior
-from calibration.inference.notes import HeldByPrior
-from calibration.words.notes import sentence
 from mmrjax import robots
 from sweeps.commands import calibrate as command
 from sweeps.pages import calibration as calibration_page
@@ -70,10 +68,6 @@ def test_what_the_data_do_not_narrow_is_held(seed, parameters, readings, dead, a
 def test_rule_is_a_ratio_of_sds_and_holds_what_is_not_known():
     assert HELD == 0.9
     np.testing.assert_array_equal(held_by_prior(np.array([0.0, 0.71, 0.9, 0.90001, 1.0, np.nan, np.inf])), [0, 0, 0, 1, 1, 1, 1])  # fmt: skip
-    assert (
-        sentence(HeldByPrior(("a", "b")))
-        == "not determined by these runs (posterior sd above 0.9 of the prior's): a, b"
-    )
 
 
 def stated(noise):

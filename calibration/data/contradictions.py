@@ -145,7 +145,7 @@ def _voltage(runs: Runs, robot: Robot, column: str) -> None:
 
 def _time(runs: Runs) -> None:
     """Rows may come in any order; time that goes back now and then is of several recordings, or its clock was set."""
-    time, run = runs["time_s"], _run(runs)
+    time, run = runs["time_s"], runs.run_names
     for name in np.unique(run):
         mine = np.flatnonzero(run == name)
         back = np.flatnonzero(np.diff(time[mine]) < 0)
@@ -157,12 +157,8 @@ def _time(runs: Runs) -> None:
             )
 
 
-def _run(runs: Runs) -> np.ndarray:
-    return runs["run_id"] if runs.has("run_id") else np.zeros(len(runs), str)
-
-
 def _angle(runs: Runs) -> None:
-    angle, time, run = runs["output_angle_deg"], runs["time_s"], _run(runs)
+    angle, time, run = runs["output_angle_deg"], runs["time_s"], runs.run_names
     for name in np.unique(run):
         mine = np.flatnonzero(run == name)
         mine = mine[np.argsort(time[mine], kind="stable")]

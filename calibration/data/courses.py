@@ -46,11 +46,6 @@ def changing(runs: Runs) -> tuple[str, ...]:
     return tuple(c for c in dict.fromkeys((runs.layout.imposed_column, *CHANGING)) if runs.has(c))
 
 
-def names(runs: Runs) -> np.ndarray:
-    """Which run each row belongs to, shape (rows,)."""
-    return runs["run_id"] if runs.has("run_id") else np.zeros(len(runs), str)
-
-
 def applied(runs: Runs) -> np.ndarray:
     """Voltage that the driver gives the motors in every row, in turns the size of the larger one, 0 where they brake
     or coast [V], or the speed [rpm] or current [A] imposed on them; shape (rows,)."""
@@ -68,7 +63,7 @@ def varies(runs: Runs, columns: tuple[str, ...] | None = None) -> np.ndarray:
     found = np.zeros(len(runs), bool)
     if not runs.sampled:
         return found
-    _, run = np.unique(names(runs), return_inverse=True)
+    _, run = np.unique(runs.run_names, return_inverse=True)
     first = np.unique(run, return_index=True)[1][run]
     for column in (c for c in columns if runs.has(c)):
         differs = runs[column] != runs[column][first]
@@ -96,7 +91,7 @@ def divided(
 def stretches(runs: Runs) -> list[list[Stretch]]:
     """The stretches of every run, runs in the order of their names."""
     found = []
-    every, time, volts = names(runs), runs["time_s"], applied(runs)
+    every, time, volts = runs.run_names, runs["time_s"], applied(runs)
     columns = [runs[c] for c in changing(runs)]
     for name in np.unique(every):
         rows = np.flatnonzero(every == name)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.data.courses import applied, names
+from calibration.data.courses import applied
 from calibration.data.errors import BadData, number
 from calibration.data.instruments import step_of
 from calibration.data.runs import Runs
@@ -226,7 +226,7 @@ def shown(robot: Robot) -> tuple[Channel, ...]:
 
 def _in_order(runs: Runs) -> list[np.ndarray]:
     """Rows of each run, whose time increases from row to row."""
-    run, time = names(runs), runs["time_s"]
+    run, time = runs.run_names, runs["time_s"]
     each = [np.flatnonzero(run == name) for name in dict.fromkeys(run.tolist())]
     for rows in each:
         steps = np.diff(time[rows])
@@ -380,7 +380,7 @@ def _settled(
     """The settled end of a level, or why it has none."""
     time = runs["time_s"]
     begin, end, imposed = float(time[rows[0]]), float(time[rows[-1]]), float(np.mean(drives[rows]))
-    run = str(names(runs)[rows[0]])
+    run = str(runs.run_names[rows[0]])
     left = Stretch(run, rows, begin, end, imposed)
 
     def out(why: str, channel: str = "", size: float = 0.0) -> Stretch:

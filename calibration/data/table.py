@@ -106,6 +106,11 @@ class Runs:
         """Whether a row is a sample of a run."""
         return all(self.has(column) for column in TIME)
 
+    @property
+    def run_names(self) -> np.ndarray:
+        """Name of the run that each row is of, shape (rows,); of a table without `run_id` all are of one, ""."""
+        return self["run_id"] if self.has("run_id") else np.zeros(len(self), str)
+
     def where(self, rows: np.ndarray) -> Runs:
         """The rows that a mask or an index selects."""
         columns, extras = ({k: v[rows] for k, v in cells.items()} for cells in (self.columns, self.extras))

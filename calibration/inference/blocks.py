@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from calibration.data.columns import CURRENT, SPEED
-from calibration.data.courses import names as runs_of
 from calibration.data.courses import varies
 from calibration.data.runs import Runs
 from calibration.inference import held_out as refits
@@ -82,7 +81,7 @@ def blocks(runs: Runs, by: str) -> dict[str, np.ndarray]:
     changes = varies(runs, BLOCKS[by])
     if changes.all() and by != "run":
         return {}
-    labels = np.where(changes, np.char.add("run ", runs_of(runs).astype(str)), labels)
+    labels = np.where(changes, np.char.add("run ", runs.run_names.astype(str)), labels)
     names = list(dict.fromkeys(labels))
     single = by == "run" and len(names) == len(runs)  # rows that have nothing in common with others
     return {name: labels == name for name in names} if len(names) > 1 and not single else {}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.data.courses import names as runs_of
 from calibration.data.courses import varies
 from calibration.data.runs import Runs
 from calibration.inference import observers
@@ -41,7 +40,7 @@ def conduct(runs: Runs, robot: Robot) -> list[Note]:
     slow = known & np.isfinite(steady) & (speed < SLOW * steady)
     early = (lasts < UNDER_WAY) & (slow | ~known)
     slides = (lasts >= UNDER_WAY) & known & np.isfinite(movers) & (movers > 0) & (speed < SLIDING * movers)
-    slides &= ~np.isin(names, runs_of(runs)[varies(runs)])  # what is shown of those is a part of them
+    slides &= ~np.isin(names, runs.run_names[varies(runs)])  # what is shown of those is a part of them
     said: list[Note] = []
     if early.any():
         seen = slow & early

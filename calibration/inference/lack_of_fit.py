@@ -187,7 +187,7 @@ def _memory(fit: Residuals) -> tuple[float, Shown] | None:
     observe, runs, residual, counts = fit.observe, fit.runs, fit.whitened, fit.counts
     if not observe.axis:
         return None
-    run = runs["run_id"] if runs.has("run_id") else np.zeros(len(runs), str)
+    run = runs.run_names
     order = np.lexsort((runs[observe.axis], run))
     follows = run[order][1:] == run[order][:-1]
     found = []

@@ -203,7 +203,7 @@ def _by_row(fit: Residuals) -> _Units:
 def _by_run(fit: Residuals) -> _Units:
     """Means of each run; whitened ones times the root of how many samples they are of, so that noise has the sd 1."""
     rows = _by_row(fit)
-    run = fit.runs["run_id"] if fit.runs.has("run_id") else np.zeros(len(fit.runs), str)
+    run = fit.runs.run_names
     _, first, run_of = np.unique(run, return_index=True, return_inverse=True)
     member = run_of[:, None] == np.arange(len(first))  # (samples, runs)
     counts = member.T.astype(float) @ rows.counts

@@ -64,7 +64,7 @@ def over_log(found: Settled) -> Figure:
     rows = np.concatenate([s.rows for s in found.stretches]) if found.stretches else np.zeros(0, int)
     every = np.unique(np.concatenate([rows, np.arange(len(runs))]))
     clock, begin = np.zeros(len(runs)), 0.0
-    run = runs["run_id"] if runs.has("run_id") else np.zeros(len(runs), str)
+    run = runs.run_names
     for name in dict.fromkeys(run.tolist()):  # recordings one after the other
         mine = np.flatnonzero(run == name)
         clock[mine] = begin + runs["time_s"][mine] - runs["time_s"][mine[0]]

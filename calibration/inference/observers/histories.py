@@ -22,7 +22,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from calibration.data.courses import Stretch, applied, divided, stretches
-from calibration.data.courses import names as _names
 from calibration.data.errors import BadConfiguration, BadData, number
 from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
@@ -194,7 +193,7 @@ class Histories(Observer):
                 f"{runs.source}: time histories of a robot that turns are simulated, and not fitted; give its "
                 "settled turns, one a row, without time_s"
             )
-        names, first, run = np.unique(_names(runs), return_index=True, return_inverse=True)
+        names, first, run = np.unique(runs.run_names, return_index=True, return_inverse=True)
         mine = [np.flatnonzero(run == k) for k in range(len(names))]
         mine = [m[np.argsort(runs["time_s"][m], kind="stable")] for m in mine]
         sudden = _changes(runs, mine, robot.rig)
@@ -228,7 +227,7 @@ class Histories(Observer):
 
     @classmethod
     def check(cls, runs: Runs, noise: Noise) -> list[Note | str]:
-        names = _names(runs)
+        names = runs.run_names
         for name in np.unique(names):
             mine = names == name
             if len(np.unique(runs["configuration"][mine])) > 1:
@@ -253,7 +252,7 @@ class Histories(Observer):
     @classmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Note | str]:
         """Histories begin when the supply is switched on, the robot at rest, and show one sample at a time."""
-        names, measured = _names(runs), runs.measured()
+        names, measured = runs.run_names, runs.measured()
         # Current rises within a millisecond; what moves does not.
         resting = robot.rig.start == "rest" and robot.rig.imposed != "motor_speed"
         moving = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and resting]
@@ -727,7 +726,7 @@ def with_begins(robot: Robot, runs: Runs, noise: Noise) -> Robot:
     angle of the first samples, extrapolated to the first; free ones have the error of that as their prior."""
     if robot.rig.start == "rest" or not runs.sampled:
         return robot
-    names, measured = _names(runs), runs.measured()
+    names, measured = runs.run_names, runs.measured()
     found, known = dict[str, Begin](), []
     rows = runs.configurations(robot)
     for name in np.unique(names):
@@ -801,7 +800,7 @@ def _stops(runs: Runs) -> list[Note | str]:
     still = (applied(runs) == 0) & (runs["slope_deg"] != 0)
     if not still.any():
         return []
-    return [StopsOnSlope(tuple(dict.fromkeys(str(n) or "(no run_id)" for n in _names(runs)[still])))]
+    return [StopsOnSlope(tuple(dict.fromkeys(str(n) or "(no run_id)" for n in runs.run_names[still])))]
 
 
 def _knots(rows: np.ndarray, most: int) -> np.ndarray:
