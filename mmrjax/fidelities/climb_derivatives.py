@@ -150,7 +150,7 @@ def climb_derivatives(
     count = len(ran.time)
     top = crest(run.terrain, ran, verdict == OVER)
     found, by = _along(
-        lambda of: outputs(of[0].robot, of[0].terrain, of[1], top),
+        lambda run_of: outputs(run_of[0].robot, run_of[0].terrain, run_of[1], top),
         (run, ran),
         (turned, jax.tree.map(lambda x: x[:, :count], changed)),
     )
