@@ -131,10 +131,15 @@ def random_states(n=400):
     configuration, battery = rng.integers(0, 2, (2, n))
     run = Conditions(configuration, voltage, np.degrees(slope), payload, battery, charge, adhesion)
     moving = jax.jit(jax.vmap(balances.moving, in_axes=(None, 0, 0)))
-    return moving(
+    straight = moving(
         NOMINAL,
         run,
         State(*map(jnp.asarray, (current, motor, speed, charge)), memory, distance=jnp.zeros(n)),
+    )
+    turn = rng.uniform(-4, 4, n)
+    lateral = -np.sign(turn) * rng.uniform(0, 5, n)  # against the turn
+    return dataclasses.replace(
+        straight, side=rng.choice((-1.0, 1.0), n), yaw_rate=turn, direction_turn=np.sign(turn), moment_lateral=lateral
     )
 
 
@@ -236,7 +241,7 @@ def law_declared(effect: type[Effect]) -> None:
 #: What an effect's term may change with → the signals that make it.
 DRIVERS = {
     "current": ("current", "total_current"),
-    "speed": ("speed_motor", "speed_wheel", "speed_theoretical", "speed"),
+    "speed": ("speed_motor", "speed_wheel", "speed_theoretical", "speed", "yaw_rate"),
     "load": (
         "current", "payload", "mass", "normal", "demand", "traction", "torque_load", "torque_track_loss",
         "torque_electromagnetic",
@@ -246,6 +251,7 @@ DRIVERS = {
     "slope": ("slope",),
     "configuration": ("configuration", "on_tracks"),
     "direction": ("direction",),
+    "the side": ("side",),
     "angle": (),
     "position": (),
 }  # fmt: skip
@@ -407,6 +413,12 @@ LAWS = (
 )
 @pytest.mark.parametrize("effect", ALL, ids=lambda effect: effect.name)
 def test_effect_obeys(effect, law):
+    law(effect)
+
+
+@pytest.mark.parametrize("law", (law_declared, law_family, law_linear, law_unit), ids=lambda law: law.__name__[4:])
+@pytest.mark.parametrize("effect", effects.OF_TURNS.values(), ids=lambda effect: effect.name)
+def test_effect_of_turns_obeys(effect, law):
     law(effect)
 
 

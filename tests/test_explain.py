@@ -8,9 +8,11 @@ from mmrjax.errors import choices, near
 from sweeps.commands import explain
 from sweeps.pages import words
 
+EVERY = effects.BY_NAME | effects.OF_TURNS
+
 
 def said(kind, name):
-    return list(explain.EXPLAINED[kind](name, effects.BY_NAME))
+    return list(explain.EXPLAINED[kind](name, EVERY))
 
 
 @pytest.fixture
@@ -22,14 +24,14 @@ def unsimulated(monkeypatch):
 def test_every_name_has_an_explanation_of_its_kind(unsimulated):
     kinds = {"effects": "effect", "statuses": "status", "flags": "flag", "channels": "channel", "outputs": "output",
              "parameters": "parameter", "verdicts of a climb": "verdict of a climb"}  # fmt: skip
-    for kind, those in explain.names(effects.BY_NAME).items():
+    for kind, those in explain.names(EVERY).items():
         for name in those:
             lines = said(kinds[kind], name)
             assert lines and all(text and "None" not in text for _, text in lines), (name, lines)
 
 
 def test_an_effect_is_explained_by_what_its_class_states(unsimulated):
-    for name, effect in effects.BY_NAME.items():
+    for name, effect in EVERY.items():
         lines = dict(said("effect", name))
         spec = next(p.spec for p in params.walk(effect()) if p.spec.amplitude)
         equation, meaning, source = words_of.about(effect)

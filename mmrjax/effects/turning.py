@@ -22,7 +22,7 @@ class SideFriction(Effect):
     """
 
     balance = "motor"
-    driver = "direction"
+    driver = "the side"
 
     amplitude: Scalar = amplitude(
         unit="N·m",
@@ -45,7 +45,7 @@ class SideTorque(Effect):
     """
 
     balance = "motor"
-    driver = "load"
+    driver = "the side"
     rests_on = ("motor.torque_constant",)
 
     amplitude: Scalar = amplitude(
@@ -70,7 +70,7 @@ class SideVoltage(Effect):
     """
 
     balance = "electrical"
-    driver = "speed"
+    driver = "the side"
 
     amplitude: Scalar = amplitude(
         unit="-",
@@ -122,7 +122,7 @@ class SideRadius(Effect):
     """
 
     balance = "slip"
-    driver = "side"
+    driver = "the side"
 
     amplitude: Scalar = amplitude(
         unit="-",
