@@ -49,7 +49,7 @@ class NameTest:
         evidence: twice the log of that for it over a smooth curve of its own equation, the best one [σ²].
         row: number of the run without which the root is smallest, None where none was left out; root_without: then.
             A settled run is a row of its table, see `what`; of histories as if the others told as much.
-        again: share of the informative blocks without which an effect of its family or class is still the strongest.
+        again: share of the informative blocks without which an effect of its family is still the strongest.
         larger: effects of a set without it that is the better explanation, but not of a plausible size.
         remains: whether the largest set that was searched for leaves something in its equation.
         what: a run is called, `row` or `run`.

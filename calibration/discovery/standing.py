@@ -281,7 +281,7 @@ def name_tests(
         columns = np.concatenate([none, *(family_columns(linear, bases, k) for k in chosen)], 1)
         mine = space.library.of == space.library.names.index(effect)
         beside = *augment_with_columns(linear, columns), np.asarray(linear.signatures)[:, mine]
-        run, root_without = _weakest_run(space, linear.runs(), *beside)
+        run, root_without = _weakest_run(space, linear.runs(), *beside, differ=space.bare.observe.long)
         whole, others = (largest, fewer[effect]) if effect in fewer else (best, without)
         beside_all = most.linear if effect in fewer else after.linear
         tests.append(
@@ -316,8 +316,8 @@ def _lacks(space: CandidateSpace, seen: Diagnosis, bases: Bases) -> set[str]:
 
 
 def _varies_most(space: CandidateSpace, best: Candidate, effect: str, linear: Linearization) -> tuple[float, str]:
-    """Root of the most that an amplitude explains which changes with a variable, along a line or bent, all else fitted
-    again [σ], and the variable.
+    """Root of the most that an amplitude explains which changes with a variable, along a line or bent [σ], all else
+    fitted again; and the variable.
 
     What a law of another form leaves beside a name is, to first order, that name's own term with an amplitude that
     differs from place to place: so few columns see what a family of curves, with many more, leaves to chance. Of
@@ -386,9 +386,8 @@ def _chosen_again(
     blocks: Sequence[np.ndarray],
     settings: Settings,
 ) -> float:
-    """Share of the blocks without which an effect of its family, or one that explains as much with all rows, still
-    explains as much as any of the library, as `classes` has it, of those that leave half of what is known of it; 1
-    where there are none.
+    """Share of the blocks without which an effect of its family still explains as much as any of the library, as
+    `classes` has it, of those that leave half of what is known of it; 1 where there are none.
 
     Args:
         beside: Jacobian, residual and its own signatures, as `_root` takes them; signatures: of the library.
@@ -396,8 +395,6 @@ def _chosen_again(
     library, family, again = space.library, space.library[effect].family(), []
     akin = np.array([library[name].family() == family for name in library.names])[library.of]
     whole = _left_of(*beside)[0].max()
-    roots = _roots(*beside[:2], signatures)
-    akin = akin | (roots**2 >= _as_much(np.max(roots[akin]) ** 2, settings))
     for out in blocks:
         kept = _kept(space, out, len(signatures))
         every = signatures[kept]
@@ -405,13 +402,9 @@ def _chosen_again(
         if _left_of(j, e, own)[0].max() < 0.5 * whole:
             continue
         roots = _roots(j, e, every)
-        again.append(np.max(roots[akin]) ** 2 >= _as_much(np.max(roots) ** 2, settings))
+        most = np.max(roots) ** 2
+        again.append(np.max(roots[akin]) ** 2 >= most - max(settings.same, settings.form**2 * most))
     return float(np.mean(again)) if again else 1.0
-
-
-def _as_much(most: float, settings: Settings) -> float:
-    """What explains as much as that, but for what a class leaves open [σ²]."""
-    return most - max(settings.same, settings.form**2 * most)
 
 
 def _weakest_run(
@@ -420,14 +413,13 @@ def _weakest_run(
     jacobian: np.ndarray,
     residual: np.ndarray,
     signatures: np.ndarray,
+    differ: bool = False,
 ) -> tuple[int | None, float]:
     """Number of the run without which that root is smallest, and the root; None of fewer than three runs.
 
-    Runs of histories differ on purpose in what they can tell: there it is the root that all of them would have if the
-    others told as much.
-
     Args:
-        runs: rows of each.
+        runs: rows of each; differ: on purpose, in what they can tell, as those of histories do: then it is the root
+            that all of them would have if the others told as much.
     """
     least: tuple[int | None, float] = None, math.inf
     known, _ = _left_of(jacobian, residual, signatures)
@@ -436,7 +428,7 @@ def _weakest_run(
         out = np.zeros(len(space.included), bool)
         out[rows] = True
         rest = _rest(_kept(space, out, len(signatures)), jacobian, residual, signatures)
-        told = math.sqrt(np.max(_left_of(*rest)[0]) / np.max(known)) if space.bare.observe.long else 1.0
+        told = math.sqrt(np.max(_left_of(*rest)[0]) / np.max(known)) if differ else 1.0
         root = _root(*rest) / max(told, 1e-9)
         least = (k + 1, root) if root < least[1] else least
     return least
