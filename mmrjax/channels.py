@@ -68,7 +68,7 @@ class Channel:
 
     def __reduce__(self) -> tuple[Callable[[str], Channel], tuple[str]]:
         """Pickled by its name, so that tables and results go to other processes and back."""
-        return of, (self.name,)
+        return find, (self.name,)
 
 
 def _winding_temperature(robot: Robot, signals: Signals) -> Any:
@@ -368,7 +368,7 @@ def usual() -> tuple[Channel, ...]:
     return rows(USUAL)
 
 
-def of(name: str) -> Channel:
+def find(name: str) -> Channel:
     """The channel of a name.
 
     Raises:

@@ -74,7 +74,7 @@ def idle_columns(robot: Robot) -> set[str]:
     return found
 
 
-def of(robot: Robot, table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def without_idle(robot: Robot, table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """A table without what means nothing for the robot, the columns of its channels aside."""
     idle = idle_columns(robot) - {c.column for c in robot.channels}
     ends = ("", "_sd", "_lower", "_upper")

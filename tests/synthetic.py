@@ -38,7 +38,7 @@ def table(made: Any) -> Runs:
 
 def known(runs: Runs) -> Noise:
     """The sds that a table states."""
-    return noise.of(runs, observers.kind(runs).sizes(runs))
+    return noise.from_table(runs, observers.kind(runs).sizes(runs))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -167,11 +167,11 @@ def test_rows_have_every_row(found):
 def test_stated_noise_comes_before_columns_and_columns_before_estimates(measured):
     with_sd = changed(measured, total_current_sd_A=np.full(20, 0.05), speed_sd_mm_s=np.full(20, 4.0))
     sizes = observers.kind(with_sd).sizes(with_sd)
-    made = noise.of(with_sd, sizes, "current=2%")
+    made = noise.from_table(with_sd, sizes, "current=2%")
     assert made.source == ("stated", "estimated", "columns") and made.estimated.tolist() == [False, True, False]
     np.testing.assert_allclose(made.sd[:, 0], 0.02 * measured["total_current_A"])
     np.testing.assert_allclose(made.sd[:, 2], 4e-3)
-    assert noise.of(measured, sizes, "motor_speed=30rpm").sd[0, 1] == pytest.approx(math.pi)
+    assert noise.from_table(measured, sizes, "motor_speed=30rpm").sd[0, 1] == pytest.approx(math.pi)
 
 
 @pytest.mark.parametrize(
@@ -241,7 +241,7 @@ def test_thousands_of_rows_are_compared_at_once(measured):
     long = measured.where(np.tile(np.arange(20), 250))
     long = changed(long, payload_kg=long["payload_kg"] + 1e-3 * np.arange(5000))  # no two alike but by the last
     long.columns["payload_kg"][-1] = long["payload_kg"][19]
-    known = noise.of(long, SettledRuns.sizes(long), "current=2%,motor_speed=1%,speed=1%")
+    known = noise.from_table(long, SettledRuns.sizes(long), "current=2%,motor_speed=1%,speed=1%")
     began = time.monotonic()
     assert SettledRuns.check(long, known) == []
     long.columns["speed_mm_s"][-1] *= 2
@@ -384,7 +384,7 @@ def test_a_prediction_is_made_where_a_reading_is_missing(found_with_gaps):
 def test_a_missing_reading_weighs_nothing_whatever_number_stands_in_its_place(gaps):
     robot = robots.nominal()
     coordinates = priors.coordinates(robot, priors.default_names(["6T2A", "4W2T"], robot))
-    sd = noise.of(gaps, observers.kind(gaps).sizes(gaps), "current=9%,speed=4%").sd
+    sd = noise.from_table(gaps, observers.kind(gaps).sizes(gaps), "current=9%,speed=4%").sd
     posed = observers.pose(gaps, robot, coordinates, sd)
     starts = 0.3 * jnp.ones((5, len(coordinates)))  # as many as `found_with_gaps` compiled
     lost = jnp.isnan(gaps.measured())

@@ -82,7 +82,7 @@ def posed(base, made):
     """The problem that `found` solves."""
     guided, known = priors.guided(base, "6T2A")
     coordinates = priors.coordinates(guided, [GUIDE_FRICTION, STATIC], known)
-    sd = noise_room.of(made, observers.kind(made).sizes(made), STATED).sd
+    sd = noise_room.from_table(made, observers.kind(made).sizes(made), STATED).sd
     return observers.pose(made, guided, coordinates, sd, "track")
 
 

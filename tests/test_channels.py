@@ -140,7 +140,7 @@ def test_noise_is_of_the_channels_of_a_table(tmp_path, bench):
     assert noise.default(runs.channels) == "current=2%,motor_speed=0.5%,output_torque=1%"
     assert known.scaled({"output_torque": 2.0}).sd[0].tolist() == [*known.sd[0, :2], 0.1]
     with pytest.raises(calibration.data.errors.BadConfiguration, match="--noise speed=1%: no such channel"):
-        noise.of(runs, sizes, "speed=1%")
+        noise.from_table(runs, sizes, "speed=1%")
 
 
 def test_a_table_without_a_robot_has_every_channel_of_which_it_has_a_column(tmp_path):
@@ -200,7 +200,7 @@ def test_simulated_runs_have_the_columns_of_their_robot(bench):
 def read_by(robot, path):
     """All that a table says of its readings, as one robot's."""
     runs = calibration.read_runs(path, robot=robot)
-    known = noise.of(runs, observers.kind(runs).sizes(runs), None)
+    known = noise.from_table(runs, observers.kind(runs).sizes(runs), None)
     rows = calibrated(runs, robot).rows()
     return channels.names(runs.channels), runs.measured(), known.sd, known.source, list(rows), list(rows.values())
 

@@ -29,7 +29,7 @@ def space_of(world, folder):
     runs = records.read(folder / "table.csv", robot=robot)
     observer = observers.kind(runs)
     library = scales.library_for(robot, runs.conditions(robot), effects.BY_NAME)
-    sd = noise.of(runs, observer.sizes(runs)).sd
+    sd = noise.from_table(runs, observer.sizes(runs)).sd
     return discover.pose(runs, robot, sd, settings_for(observer), library=library)
 
 

@@ -56,7 +56,7 @@ def test_parameters_and_channels_are_explained_by_their_rows():
     assert dict(said("parameter", "6T2A.ground.friction.static"))["equation"]
     lines = dict(said("channel", "speed_mm_s"))
     assert "speed_sd_mm_s" in lines["column"] and lines["other units"].startswith("m/s, km/h")
-    assert lines["typical noise"].startswith(f"{100 * channels.of('speed').sd_share:g} %")
+    assert lines["typical noise"].startswith(f"{100 * channels.find('speed').sd_share:g} %")
     assert dict(said("output", "slip"))["equation"].startswith("1 - V / V_theoretical, eq. (33)")
 
 

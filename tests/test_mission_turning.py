@@ -12,7 +12,7 @@ import mmrjax as mm
 from mmrjax import missions, params
 from mmrjax.fidelities import mission_straight
 from mmrjax.fidelities.drive import drive
-from mmrjax.fidelities.mission import Mission, Start, Totals, begun, mission
+from mmrjax.fidelities.mission import Mission, Start, Totals, initial_unknowns, mission
 from mmrjax.fidelities.mission_steps import BREAKS_AWAY, events_of
 from mmrjax.missions import simulate_batch
 from mmrjax.profile import profile
@@ -56,7 +56,7 @@ def test_derivative_of_breaking_away_is_there_at_every_current(robot):
         return events_of(mission_straight, robot, held, asks, y, jnp.asarray(True), jnp.asarray(False))[BREAKS_AWAY]
 
     def rise(current):
-        y = begun(mission_straight, robot, held, Start(current=current)) / mission_straight.units(robot)
+        y = initial_unknowns(mission_straight, robot, held, Start(current=current)) / mission_straight.units(robot)
         y = y.at[mission_straight.CLOCK].set(0.00748)
         along = jnp.zeros_like(y).at[mission_straight.CURRENT].set(1.0)
         return [float(x) for x in jax.jvp(breaks, (y,), (along,))]

@@ -29,7 +29,7 @@ def pose(runs, robot, names=None, model="steady", stated=STATED):
 
 
 def sds(runs, stated):
-    return noise.of(runs, observers.kind(runs).sizes(runs), stated).sd
+    return noise.from_table(runs, observers.kind(runs).sizes(runs), stated).sd
 
 
 @pytest.fixture(scope="module")

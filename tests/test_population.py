@@ -55,7 +55,7 @@ def truth():
 
 @pytest.fixture(scope="module")
 def known(runs):
-    return noise.of(runs, SettledRuns.sizes(runs), "current=1%,motor_speed=0.2%,speed=0.2%")
+    return noise.from_table(runs, SettledRuns.sizes(runs), "current=1%,motor_speed=0.2%,speed=0.2%")
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +110,7 @@ def test_objective_is_the_misfit_where_the_noise_is_known(posed, known, found):
 
 def test_objective_with_noise_to_be_estimated_takes_the_most_probable(posed, runs, found):
     """n ln s is, but for a constant, ½ Σ (e/σ)² + n ln σ at the σ that makes it smallest."""
-    unknown = noise.of(runs, SettledRuns.sizes(runs))
+    unknown = noise.from_table(runs, SettledRuns.sizes(runs))
     worst = found.order[-2:]  # far above the least share that is taken for noise
     rows = Rows(found.reading[worst], found.adhesion_used[worst], found.status[worst], found.flags[worst])
     costs = population.objective(posed, unknown)(found.z[worst], rows)

@@ -128,7 +128,7 @@ def test_beginnings_are_measured_by_the_first_samples(tmp_path):
         table.write_text("\n".join(lines))
         runs = records.read(table, robot=robot)
         kind = observers.kind(runs)
-        known = noise.of(runs, kind.sizes(runs), "output_speed=1rpm,output_angle=1deg")
+        known = noise.from_table(runs, kind.sizes(runs), "output_speed=1rpm,output_angle=1deg")
         begun = kind.with_initial_states(robot, runs, known)
         assert begun.rig.begins.names == ("begin_",)
         begin = begun.rig.begins.members[0]
@@ -169,7 +169,9 @@ def imposed_speed(tmp_path, runs):
 @pytest.mark.parametrize("count", [1, 3])
 def test_an_imposed_speed_changes_within_each_run_and_nothing_else_does(tmp_path, count):
     robot, runs = imposed_speed(tmp_path, count)
-    made = observers.kind(runs).of(runs, observers.kind(runs).with_initial_states(robot, runs, noise.of(runs, 1.0)))
+    made = observers.kind(runs).of(
+        runs, observers.kind(runs).with_initial_states(robot, runs, noise.from_table(runs, 1.0))
+    )
     conditions = made.conditions
     assert conditions.motor_speed.shape == conditions.motor_acceleration.shape == made.times.shape
     assert conditions.configuration.shape == conditions.voltage.shape == (count,)

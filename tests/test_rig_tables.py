@@ -240,9 +240,11 @@ def test_the_step_of_an_instrument_is_in_its_noise(tmp_path):
         tmp_path, f"{BENCH}900,0.4\n1900,0.5\n", bench(instruments=(Instrument("total_current", quantum=0.06),))
     )
     sizes = observers.kind(runs).sizes(runs)
-    known = noise.of(runs, sizes, "current=0.01A")
+    known = noise.from_table(runs, sizes, "current=0.01A")
     assert known.sd == pytest.approx(np.sqrt(0.01**2 + 0.06**2 / 12))
-    assert noise.of(runs, sizes).sd == pytest.approx(0.02 * runs.measured())  # an estimate has it in it already
+    assert noise.from_table(runs, sizes).sd == pytest.approx(
+        0.02 * runs.measured()
+    )  # an estimate has it in it already
 
 
 # --- surfaces
@@ -333,7 +335,7 @@ def test_blocks_of_an_imposed_speed_are_its_levels(tmp_path):
 def test_what_is_said_of_constant_conditions_is_of_the_rig(tmp_path):
     robot = bench()
     runs = read(tmp_path, f"{BENCH}900,0.4\n900,0.41\n900,0.4\n900,0.41\n", robot)
-    known = noise.of(runs, observers.kind(runs).sizes(runs), "current=5%")
+    known = noise.from_table(runs, observers.kind(runs).sizes(runs), "current=5%")
     said = checks.check(runs, robot, (), known)
     assert [note for note in said if isinstance(note, Constant)] == [Constant("motor_speed_rpm", 900.0, "speed")]
 
@@ -502,7 +504,7 @@ def test_an_instrument_left_free_is_what_its_table_shows(tmp_path):
     assert instruments.with_inferred_instruments(free, runs).rig.instruments == runs.layout.instruments
     assert instruments.with_inferred_instruments(stated, runs) is stated
     size = np.ones((8, 1))
-    sds = [noise.of(records.read(path, robot=r), size).sd for r in (free, stated)]
+    sds = [noise.from_table(records.read(path, robot=r), size).sd for r in (free, stated)]
     np.testing.assert_allclose(sds[0], sds[1], rtol=1e-9)
     np.testing.assert_allclose(sds[0], np.hypot(0.01, 0.03 / np.sqrt(12)), rtol=1e-9)
     with pytest.raises(BadData, match="negative backward; or signed = false"):

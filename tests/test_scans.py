@@ -35,7 +35,7 @@ def coarse(tmp_path_factory):
 def posed(robot, runs):
     kind = observers.kind(runs)
     names = ("bench.loss_coulomb", "rig.delay")
-    return observers.pose(runs, robot, priors.coordinates(robot, names), noise.of(runs, kind.sizes(runs)).sd)
+    return observers.pose(runs, robot, priors.coordinates(robot, names), noise.from_table(runs, kind.sizes(runs)).sd)
 
 
 @pytest.mark.slow
@@ -43,7 +43,7 @@ def test_a_search_finds_a_delay_between_coarse_samples(coarse):
     """From the prior mean, 1.5 prior sds away and behind two cliffs."""
     robot, runs = coarse
     problem, kind = posed(robot, runs), observers.kind(runs)
-    known = noise.of(runs, kind.sizes(runs))
+    known = noise.from_table(runs, kind.sizes(runs))
     starts = problem.observe.starts(problem, np.random.default_rng(0), 1)
     found = multistart.search_one_by_one(problem, known, starts, multistart.first_shares(known), lambda said: None)
     low, high = (0.02 * z for z in scans.profiles(problem, found.best.z)[1].interval())

@@ -444,7 +444,27 @@ def of_errors(tree: ast.Module) -> set[int]:
     return found | {id(n) for function in functions if function.name in called for n in ast.walk(function)}
 
 
+def names_are_nouns(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
+    """No mask is called `there`, and no local or argument `of`."""
+    for node in walked(tree):
+        name = node.arg if isinstance(node, ast.arg) else node.id if isinstance(node, ast.Name) else ""
+        if (
+            name in ("there", "of")
+            and not isinstance(getattr(node, "ctx", None), ast.Load)
+            and id(node) not in fields(tree)
+        ):
+            yield node.lineno, f"calls something {name}"
+
+
+@functools.lru_cache(maxsize=4)
+def fields(tree: ast.Module) -> set[int]:
+    """Ids of the names of fields of classes."""
+    classes = (n for n in walked(tree) if isinstance(n, ast.ClassDef))
+    return {id(n.target) for found in classes for n in found.body if isinstance(n, ast.AnnAssign)}
+
+
 RULES: tuple[Rule, ...] = (
+    names_are_nouns,
     rooms_have_names_of_their_own,
     layers_import_those_before_them,
     balances_alone_sum_terms,
@@ -572,6 +592,8 @@ BAD = {
         "def f(x):\n    return g('one two three four five six')\ndef h(x):\n    raise BadData('no')",
     ),
     "imports sweeps.pages.page at its head": ("sweeps/commands/bad.py", "from sweeps.pages.page import render"),
+    "calls something there": ("sweeps/bad.py", "def f(x):\n    there = x > 0\n    return x[there]"),
+    "calls something of": ("mmrjax/bad.py", "def f(of):\n    return of"),
     "keeps state in threading.local": ("calibration/bad.py", "import threading\nX = threading.local()"),
 }
 #: What no rule may mind.

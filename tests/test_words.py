@@ -203,8 +203,8 @@ SAMPLES = [
     (
         of_loop.NoiseFromSeries(
             (
-                SeriesNoise(channels.of("total_current"), 0.0639, False, 7.45, "slope_deg", 4),
-                SeriesNoise(channels.of("speed"), 0.0124, True, 7.44, "slope_deg", 4),
+                SeriesNoise(channels.find("total_current"), 0.0639, False, 7.45, "slope_deg", 4),
+                SeriesNoise(channels.find("speed"), 0.0124, True, 7.44, "slope_deg", 4),
             )
         ),
         "no sd is stated for total_current, speed: total current 0.064 A, speed 1.2 % are estimated from how readings "

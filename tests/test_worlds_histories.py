@@ -213,7 +213,7 @@ def test_table_of_histories_passes_the_input_checks(quick, tmp_path):
         made.write(tmp_path)
         runs = records.read(tmp_path / "table.csv")
         kind = observers.kind(runs)
-        known = noise.of(runs, kind.sizes(runs))
+        known = noise.from_table(runs, kind.sizes(runs))
         assert runs.has("time_s") and len(runs) == made.label["rows"]
         assert kind.check(runs, known) == kind.check_start(runs, known, robots.nominal()) == []
         assert np.isnan(runs.measured()).sum() == made.label["missing"]

@@ -35,7 +35,7 @@ def shown(tmp_path, case, **amplitudes):
             truth |= {f"effects.{name}.{k}": x for k, x in fade.items()}
             truth[f"effects.{name}.amplitude"] = amplitudes[name]
     kind = observers.kind(runs)
-    robot = kind.with_initial_states(robot, runs, noise.of(runs, kind.sizes(runs)))
+    robot = kind.with_initial_states(robot, runs, noise.from_table(runs, kind.sizes(runs)))
     robot = params.replace(robot, {n: jnp.asarray(float(x)) for n, x in truth.items()})
     made = kind.of(runs, robot)
     reading = np.asarray(made(robot).reading) / [c.factor for c in robot.channels]

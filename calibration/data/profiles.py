@@ -46,7 +46,7 @@ def _range(condition: str) -> tuple[float, float]:
 
 
 def _speed(name: str) -> Quantity:
-    channel = channels.of(name)
+    channel = channels.find(name)
     return Quantity(
         name, units.of_channel(name), (channel.range[0] * channel.factor, channel.range[1] * channel.factor)
     )

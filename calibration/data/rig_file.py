@@ -225,7 +225,7 @@ def _instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrum
             if key not in ("signed", "quantum"):
                 raise BadConfiguration(f"{here}.{name}.{key}: no such key; {choices(key, ('signed', 'quantum'))}")
         signed, quantum = table.get("signed", True), table.get("quantum", 0.0)
-        channel = channels.of(name)
+        channel = channels.find(name)
         if not isinstance(signed, bool) and signed != FREE:
             raise BadConfiguration(
                 f"{here}.{name}.signed: got {signed!r}; expected true, false: shows magnitude alone, or {FREE!r}: "
@@ -353,7 +353,7 @@ def lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
         tables["surfaces"] = ["# each differs from the other by its ground alone"]
         tables["surfaces"] += [f'{name} = "{other}"' for name, other in rig.surfaces]
     for instrument in rig.instruments:
-        channel = channels.of(instrument.channel)
+        channel = channels.find(instrument.channel)
         size = f'"{FREE}"' if instrument.quantum is None else repr(instrument.quantum / channel.factor)
         step = [f"quantum = {size}  # [{channel.unit}] step of its readings"]
         tables[f"instruments.{channel.name}"] = [

@@ -143,8 +143,8 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
     extras = {c: _extra([row[header.index(c)] for row in rows[1:]]) for c in unknown}
     notes = (*notes, *capitals, *(_lacks(name, columns, layout) if measured else ()))
     notes += tuple(
-        f"{name}: {channels.of(i.channel).column} is positive where its side is driven backward; it is taken to show "
-        "magnitude alone, and magnitudes are compared"
+        f"{name}: {channels.find(i.channel).column} is positive where its side is driven backward; it is taken to "
+        "show magnitude alone, and magnitudes are compared"
         for i in unsigned
     )
     return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest(), extras, layout, notes)

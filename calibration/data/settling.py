@@ -265,7 +265,7 @@ def _signals(runs: Runs, each: list[np.ndarray], half: int) -> tuple[Signal, ...
             for rows in each:
                 whole[rows] = runs[angle][rows] * factor
                 shown[rows] = _rate(runs["time_s"][rows], whole[rows], half)
-            found.append(Signal(channels.of(rate), shown, whole, 0.0, _size(shown)))
+            found.append(Signal(channels.find(rate), shown, whole, 0.0, _size(shown)))
     if not found:
         raise BadData(f"{runs.source}: no channel with readings that settled travel shows")
     return tuple(found)
@@ -662,10 +662,10 @@ def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> 
             off = turns[one] / turns[other]
             unit = next((word for word, x in UNITS.items() if abs(math.log(off / x)) < NEAR), None)
             if unit is not None:
-                column = angles[one] if one in angles and not _read(runs, one) else channels.of(one).column
+                column = angles[one] if one in angles and not _read(runs, one) else channels.find(one).column
                 raise BadData(
                     f"{runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {column}: {off:.4g} times as fast as "
-                    f"{channels.of(other).column} says with the ratio of the rig's file; is it {unit}? write all "
+                    f"{channels.find(other).column} says with the ratio of the rig's file; is it {unit}? write all "
                     f"rows in its unit, or state [columns] {column} = {{column = ..., factor = {1 / off:.3g}}} in "
                     "the rig's file"
                 )
@@ -673,7 +673,7 @@ def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> 
 
 def _read(runs: Runs, channel: str) -> bool:
     """Whether a channel is read itself, and is no rate of an angle."""
-    return runs.has(channels.of(channel).column)
+    return runs.has(channels.find(channel).column)
 
 
 def _nothing(found: Settled) -> str:

@@ -25,7 +25,7 @@ def check(runs: Runs) -> None:
     """
     left, right = runs.of_sides
     for what in ("motor_speed", "motor_current"):
-        pair = [channels.of(f"{what}_{side}") for side in ("left", "right")]
+        pair = [channels.find(f"{what}_{side}") for side in ("left", "right")]
         if not all(c in runs.channels and runs.has(c.column) for c in pair):
             continue
         one, other = (runs[c.column] for c in pair)
@@ -37,7 +37,7 @@ def check(runs: Runs) -> None:
             runs, columns, (one, other), other - one, drive,
             "the larger one on the side that is driven faster: the sides of one pair of columns are exchanged",
         )  # fmt: skip
-    yaw = channels.of("yaw_rate").column
+    yaw = channels.find("yaw_rate").column
     if runs.has(yaw):
         _refuse_against(
             runs, yaw, (runs[yaw],), runs[yaw], right - left,
@@ -75,7 +75,7 @@ def magnitudes(columns: Mapping[str, np.ndarray], sides: tuple[str, ...]) -> tup
     """
     found = []
     for side, driven in zip(("left", "right"), sides, strict=False):
-        channel = channels.of(f"motor_current_{side}")
+        channel = channels.find(f"motor_current_{side}")
         if channel.column in columns and driven in columns:
             drive, shown = columns[driven], columns[channel.column]
             back = np.isfinite(shown) & (drive < -CLEAR * np.max(np.abs(drive)))

@@ -21,7 +21,7 @@ PERCENT = "percent"
 
 def of_channel(name: str) -> dict[str, float]:
     """SI values of the units of a channel, the one of its standard column first: `mm_s`, `m_s`, `km_h`, ..."""
-    channel = channels.of(name)
+    channel = channels.find(name)
     return {spelled(unit): factor for unit, factor in ((channel.unit, channel.factor), *channel.other_units)}
 
 

@@ -147,7 +147,7 @@ def discover(
 
         def other(factor: float) -> LoopStages:
             noise = known.scaled(dict.fromkeys(silent, factor))
-            return keep(f"noise {factor:g}", lambda: ready.trace(noise, of=traced))
+            return keep(f"noise {factor:g}", lambda: ready.trace(noise, known=traced))
 
         verdicts = {f: others.submit(other, f) for f in factors}
         found = keep(
@@ -196,13 +196,15 @@ class LoopInput:
         self,
         noise: Noise | None = None,
         progress: Tell = lambda note: None,
-        of: LoopStages | None = None,
+        known: LoopStages | None = None,
         later: Callable[[BaseFit], None] = lambda base: None,
         keep: Keep = kept.nothing,
     ) -> LoopStages:
         """The stages up to a verdict, with this noise or another; the others as of the function `trace`."""
         sds = self.noise if noise is None else noise
-        return trace(self.runs, self.robot, sds, self.settings, self.stated, self.library, progress, of, later, keep)
+        return trace(
+            self.runs, self.robot, sds, self.settings, self.stated, self.library, progress, known, later, keep
+        )
 
 
 def prepared(
@@ -301,7 +303,7 @@ class LoopStages:
     def families(self) -> tuple[str, ...]:
         """Families of what is established: of the members of each class, or where something without a name is."""
         if self.alike is not None and self.verdict != "unnamed":
-            return tuple(f for of, name in zip(self.alike.families, self._named, strict=True) if name for f in of)
+            return tuple(f for each, name in zip(self.alike.families, self._named, strict=True) if name for f in each)
         return () if self.where is None else (self.where.family,)
 
     @property
@@ -347,15 +349,15 @@ def trace(
     stated: Mapping[str, tuple[float, float]] | None = None,
     library: Library = effects.BY_NAME,
     progress: Tell = lambda note: None,
-    of: LoopStages | None = None,
+    known: LoopStages | None = None,
     later: Callable[[BaseFit], None] = lambda base: None,
     keep: Keep = kept.nothing,
 ) -> LoopStages:
     """The stages of the loop up to a verdict, in order; the noise is known. `later` is told the base
     fit as soon as something is missing. What is kept of a stage holds what those before it found, which is one whole.
 
-    What replicates of a bootstrap show in units of their own sds hardly depends on these: where the stages `of` the
-    same table with other sds are known, and the same rows count, their replicates serve.
+    What replicates of a bootstrap show in units of their own sds hardly depends on these: where the stages of the
+    same table with other sds are `known`, and the same rows count, their replicates serve.
 
     Where residuals are without structure and everywhere as many times the sds, it is the sds that are wrong: the
     stages go through again with such as the residuals show.
@@ -380,7 +382,7 @@ def trace(
 
     def tested(screened: Screening) -> tuple[Screening, Diagnosis]:
         weight = screened.base.space.weight
-        null = None if of is None or np.any(of.screened.base.space.weight != weight) else of.left.test.null
+        null = None if known is None or np.any(known.screened.base.space.weight != weight) else known.left.test.null
         return screened, diagnosis_of_base(screened, settings, sds.noise.freedom, null)
 
     def tried(screened: Screening, left: Diagnosis) -> tuple[Screening, Diagnosis, Search]:

@@ -239,18 +239,18 @@ def augment_with_columns(linear: Linearization, extra: np.ndarray) -> tuple[np.n
 
 
 def beside_columns(
-    linear: Linearization, bases: Bases, extra: np.ndarray, of: Sequence[str]
+    linear: Linearization, bases: Bases, extra: np.ndarray, names: Sequence[str]
 ) -> tuple[Statistics, np.ndarray]:
     """The strongest statistics that are left once further columns are fitted with the free parameters, and the normal
     deviate of every family of curves, -inf for those of the columns' own places.
 
     Args:
-        extra: columns over the readings, shape (readings, columns); of: their places.
+        extra: columns over the readings, shape (readings, columns); names: their places.
     """
     wide: tuple[Any, Any] = augment_with_columns(linear, extra)
     scores, _ = _looked_at(dataclasses.replace(linear, jacobian=wide[0], residual=wide[1]), bases)
     balances = np.array([n[0] for b in bases for n in b.names])
-    deviate = np.where(np.isin(balances, list(of)), -np.inf, np.asarray(scores.curve))
+    deviate = np.where(np.isin(balances, list(names)), -np.inf, np.asarray(scores.curve))
     nothing = jnp.asarray(-jnp.inf)
     found = Statistics(
         single=np.max(np.abs(np.asarray(scores.single))),

@@ -97,7 +97,7 @@ def parse(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float, bool]
     return found
 
 
-def of(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
+def from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
     """Noise of a table: `stated` channels as stated, else the file's sd columns, else to be estimated; what is known
     with the error by the step of an instrument, `Instrument.variance`.
 
@@ -148,11 +148,11 @@ def inferred(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
     Raises:
         BadConfiguration, BadData: as `of`.
     """
-    known = of(runs, sizes, stated)
+    known = from_table(runs, sizes, stated)
     if not known.estimated.any():
         return known
     sd, words, series = known.sd.copy(), list(known.source), []
-    guess = of(runs, sizes, default(runs.channels))
+    guess = from_table(runs, sizes, default(runs.channels))
     shown = (None,) * len(words) if runs.sampled else series_noise.estimate(runs, sizes)
     for k in np.flatnonzero(known.estimated):
         found = shown[k]

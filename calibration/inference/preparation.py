@@ -74,7 +74,7 @@ def prepare(
     own_mass.check_priors(priors, robot, runs)
     as_stated, weighed = robot, own_mass.remarks(robot, runs)
     robot = own_mass.with_table_mass(robot, runs)
-    known = (noise_room.inferred if assume else noise_room.of)(runs, observe.sizes(runs), noise)
+    known = (noise_room.inferred if assume else noise_room.from_table)(runs, observe.sizes(runs), noise)
     robot = observe.with_initial_states(robot, runs, known)
     found = Prepared(robot, observe, known, priors, (), tuple(former), (), (), (), tuple(weighed))
     names = tuple(choose(found))

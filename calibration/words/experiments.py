@@ -98,7 +98,7 @@ def _weigh(act: menu.Act) -> str:
 def _run(run: menu.Run) -> str:
     level = run.imposed != "voltage" and not any(run.slope)
     where = "" if run.setup in setups.WEIGHTLESS or level else f" {slopes(run.slope)}"
-    read = both([channels.of(c).label for c in run.channels])
+    read = both([channels.find(c).label for c in run.channels])
     turning = [menu.round_significant(v / RPM) for v in run.voltage]
     unit = {"voltage": "V", "motor_current": "A of each motor"}.get(run.imposed)
     at = amounts(turning, "rpm of the motor") if unit is None else amounts(run.voltage, unit)

@@ -46,7 +46,7 @@ def noise_off(note: notes.NoiseOff) -> str:
             "alike: are the sds right?"
         )
     return (
-        f"residuals of {channels.of(note.channel).label} are {note.factor:.2g} times the {note.source} sds, "
+        f"residuals of {channels.find(note.channel).label} are {note.factor:.2g} times the {note.source} sds, "
         "under all conditions alike: are these sds right?"
     )
 
@@ -159,7 +159,7 @@ def ended_at_edge(note: notes.EndedAtEdge) -> str:
 
 def shown_by(test: notes.Shown) -> str:
     """What the most telling test shows."""
-    whose = f"the residuals of {channels.of(test.channel).label}" if test.channel else ""
+    whose = f"the residuals of {channels.find(test.channel).label}" if test.channel else ""
     return {
         "": "",
         "stated": "the residuals exceed the stated noise",
@@ -198,7 +198,7 @@ LISTED = 6
 
 def residual_cluster(c: ResidualCluster) -> str:
     """Residuals that go with a column without a role."""
-    what = f"residuals of {channels.of(c.channel).label}"
+    what = f"residuals of {channels.find(c.channel).label}"
     within = f" within {c.within}" if c.within else ""
     signs = ", with opposite signs in the two directions of travel" if c.reversing else ""
     p = f"p = {c.p:.1g}"

@@ -400,7 +400,7 @@ def worse(found: Sequence[Worse], held_out: Mapping[str, tuple[Errors, Errors]])
     parts = []
     for kind, (before, after) in held_out.items():
         mine = [w for w in found if w.kind == kind]
-        changes = [f"{channels.of(w.channel).label} {_change(w.before, w.after)} %" for w in mine]
+        changes = [f"{channels.find(w.channel).label} {_change(w.before, w.after)} %" for w in mine]
         predicted = {n: (int(before[n]["rows"]), int(after[n]["rows"])) for n in after}
         if any(w.rows < max(predicted[w.channel]) for w in mine):
             changes[-1] += f" (of the {min(w.rows for w in mine)} rows that both predict)"

@@ -151,7 +151,7 @@ class Effect(eqx.Module):
         """Its memory after long steady travel; may read any signal computed before its balance."""
         raise NotImplementedError(f"{self.name} has a memory and no settled value")
 
-    def begun(self, robot: Robot, angle: Scalar) -> Scalar:
+    def initial(self, robot: Robot, angle: Scalar) -> Scalar:
         """Its memory where a history begins with the output at an angle [rad]: as at rest."""
         return jnp.zeros_like(angle)
 

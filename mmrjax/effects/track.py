@@ -415,7 +415,7 @@ class AngleFriction(Periodic, TrackEffect):
     def order(self, robot: Robot, configuration: Index) -> Scalar:
         return 1 / robot.gearbox.ratio
 
-    def begun(self, robot: Robot, angle: Scalar) -> Scalar:
+    def initial(self, robot: Robot, angle: Scalar) -> Scalar:
         return angle
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
@@ -445,7 +445,7 @@ class PositionFriction(TrackEffect):
         source="over ten radians a third of M_t0 of Table 3",
     )
 
-    def begun(self, robot: Robot, angle: Scalar) -> Scalar:
+    def initial(self, robot: Robot, angle: Scalar) -> Scalar:
         return angle
 
     def settled(self, robot: Robot, signals: Signals) -> Scalar:

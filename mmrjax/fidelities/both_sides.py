@@ -342,7 +342,7 @@ def averaged(average: Average, travelled: Array, passed: balances.Travel, guided
     """See `half_robot.averaged`: what is of the whole robot over the periods of either side."""
     both = jax.tree.map(lambda x: jnp.broadcast_to(x.reshape(*x.shape[:1], -1), (*x.shape[:1], 2)), passed)
     found, load, periods, changes = jax.vmap(average, in_axes=1)(jnp.abs(travelled), (both, guided))
-    travel = jax.tree.map(lambda x, of: x if of.ndim > 1 else jnp.mean(x), found, passed)
+    travel = jax.tree.map(lambda x, like: x if like.ndim > 1 else jnp.mean(x), found, passed)
     share = jnp.sum(load) / jnp.maximum(jnp.sum(travel.signals.normal), 1e-9)
     # A side that hardly moves has settled where its changes are small beside what the other one does.
     larger = [(change, jnp.max(size)) for change, size in changes]

@@ -128,7 +128,7 @@ def climb_derivatives(
     are made, with slopes over `widths` to both sides. The other arguments are those of `climb_batch`."""
     directions = jnp.eye(len(values))
     run, turned = _along(given, values, directions)
-    begun = functools.partial(_begun, step=step)
+    begun = functools.partial(_initial, step=step)
     state, moved = _along(begun, run, turned)
     steps, samples = round(sample / step), round(part / sample)
     records: list[Any] = []
@@ -150,7 +150,7 @@ def climb_derivatives(
     count = len(ran.time)
     top = crest(run.terrain, ran, verdict == OVER)
     found, by = _along(
-        lambda of: outputs(of[0].robot, of[0].terrain, of[1], top),
+        lambda run_of: outputs(run_of[0].robot, run_of[0].terrain, run_of[1], top),
         (run, ran),
         (turned, jax.tree.map(lambda x: x[:, :count], changed)),
     )
@@ -200,7 +200,7 @@ def _along(function: Callable[[Any], Any], at: Any, directions: Any) -> tuple[An
     return eqx.combine(found, arrays, further[-1]), changed
 
 
-def _begun(run: Given, step: float) -> Any:
+def _initial(run: Given, step: float) -> Any:
     return climb.begin(climb.system(*run, step))
 
 

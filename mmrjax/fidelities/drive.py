@@ -113,9 +113,9 @@ def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[
             radius = robot.chassis(conditions.configuration).radius / robot.gearbox.ratio
             rest = rest.at[2].set(radius * conditions.motor_speed / size[2])
     if robot.rig.begins is not None and conditions.begin is not None:
-        first = _begun(robot, conditions)
+        first = _initial(robot, conditions)
         angle = first[3] / robot.chassis(conditions.configuration).radius
-        memory = [effect.begun(robot, angle) for effect in robot.remembering]
+        memory = [effect.initial(robot, angle) for effect in robot.remembering]
         known = jnp.stack([*first, jnp.asarray(conditions.discharge, size.dtype), *memory])
         rest = rest.at[: len(known)].set(known / size[: len(known)])
     if not rolling:
@@ -128,7 +128,7 @@ def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[
     return jnp.where(jnp.all(jnp.isfinite(y)), y, rest)
 
 
-def _begun(robot: Robot, conditions: Conditions) -> Array:
+def _initial(robot: Robot, conditions: Conditions) -> Array:
     """Current, motor speed, speed and distance [SI] at the beginning of a history that does not begin at rest.
 
     The load rolls with the shafts, and the current is that at which the voltage balances: it follows within

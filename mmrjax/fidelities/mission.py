@@ -149,7 +149,7 @@ def law_of(conditions: Conditions, profile: Profile) -> Law:
     return mission_turning if profile.turns or conditions.turns else mission_straight
 
 
-def begun(law: Law, robot: Robot, conditions: Conditions, start: Start) -> Float[Array, " unknowns"]:
+def initial_unknowns(law: Law, robot: Robot, conditions: Conditions, start: Start) -> Float[Array, " unknowns"]:
     """The unknowns at the beginning, headed as the conditions say, else uphill; in SI."""
     ambient, heading = robot.motor.temperature_ambient, conditions.heading_deg
     winding, housing = (ambient if t is None else t for t in (start.temperature_winding, start.temperature_housing))
@@ -221,7 +221,7 @@ def mission(
     begin, law = Start() if start is None else start, law_of(conditions, profile)
     names, highest = list(law.TOTALS), len(law.PEAKS)
     dtype = jnp.result_type(conditions.voltage, profile.time)
-    y0 = begun(law, robot, conditions, begin).astype(dtype) / law.units(robot).astype(dtype)
+    y0 = initial_unknowns(law, robot, conditions, begin).astype(dtype) / law.units(robot).astype(dtype)
     q0 = jnp.zeros(len(names), dtype)
     whole, false = jnp.asarray(0), jnp.asarray(False)
     buffer = None

@@ -94,8 +94,8 @@ def simulate(
     _check_cutoff(robot, runs, source, config)
     with open_folder("simulate", config, robot, out, force, runs) as folder:
         found = simulated(robot, runs, source, config)
-        folder.write_table("segments.csv", capabilities.of(robot, found.segments))
-        folder.write_table("history.csv", capabilities.of(robot, found.course))
+        folder.write_table("segments.csv", capabilities.without_idle(robot, found.segments))
+        folder.write_table("history.csv", capabilities.without_idle(robot, found.course))
         print_missions(found, capabilities.idle_columns(robot))
         result = run.SimulationResult("simulate", config.model, robot, runs, found.table, found.to_json())
         return run.leave(folder, config, result, page("mission", file, found))

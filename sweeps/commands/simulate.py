@@ -68,7 +68,9 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         if drawn is not None and config.posterior is not None:
             found = uncertainty.intervals(robot, drawn, runs, config, config.posterior, folder)
             table |= found.columns
-        print_runs({key: value[:_SHOWN] for key, value in capabilities.of(robot, table).items()}, robot.channels)
+        print_runs(
+            {key: value[:_SHOWN] for key, value in capabilities.without_idle(robot, table).items()}, robot.channels
+        )
         for note in notes:
             say(note)
         if found is not None:
@@ -104,7 +106,7 @@ def _simulated(
         batch = jax.device_get(fidelity.histories(robot, conditions, config.options, told))
         told(1.0)
     assert batch.history is not None  # the fidelity was asked for it
-    folder.write_table("history.csv", capabilities.of(robot, history_table(robot, batch.history, runs)))
+    folder.write_table("history.csv", capabilities.without_idle(robot, history_table(robot, batch.history, runs)))
     if batch.history.reactions is not None:
         folder.write_table("reactions.csv", reactions_table(batch.history, runs))
     return {**run.conditions(robot, runs), **over_time(robot, batch)}, batch

@@ -37,7 +37,10 @@ def write(folder: Path, file: RobotFile, found: Missions) -> Path:
     runs, source = found.table, found.source
     first, robot = {key: value[0] for key, value in runs.items()}, file.robot
     name = found.segments["run_id"][0]
-    rows = {key: value[found.course["run_id"] == name] for key, value in capabilities.of(robot, found.course).items()}
+    rows = {
+        key: value[found.course["run_id"] == name]
+        for key, value in capabilities.without_idle(robot, found.course).items()
+    }
     idle = capabilities.idle_columns(robot)
     limit = float(robot.motor.temperature_limit)
     cycle = float(source.time[-1] - source.time[0]) if source.cycles > 1 else None
@@ -193,10 +196,10 @@ def _demand(found: Missions, k: int) -> str:
     mode = source.modes[k]
     said = []
     if mode in CONTROLLED:
-        channel = channels.of(mode)
+        channel = channels.find(mode)
         said.append(span(source.demand, channel.factor, channel.unit))
         if mode == "speed" and YAW_RATE in source.values:
-            said.append(span(source.values[YAW_RATE], 1.0, channels.of(YAW_RATE).unit))
+            said.append(span(source.values[YAW_RATE], 1.0, channels.find(YAW_RATE).unit))
     elif mode == "voltage":
         shares = [(name, 0.01, "% duty") for name in ("duty", *PAIRS[0])] + [(name, 1.0, "V") for name in PAIRS[1]]
         spans = [span(source.values[name], one, unit) for name, one, unit in shares if name in source.values]

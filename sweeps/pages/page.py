@@ -172,13 +172,13 @@ def supply(value: Any) -> str:
 
 def reading(value: Any, channel: str) -> str:
     """A reading with the digits that matter beside others of its kind, one less than its resolution."""
-    digits = max(channels.of(channel).resolution - 1, 0)
+    digits = max(channels.find(channel).resolution - 1, 0)
     return number(value, f"{{:.{digits}f}}")
 
 
 def error(value: Any, channel: str) -> str:
     """A difference of readings, with its sign, with a digit more than they."""
-    return number(value, f"{{:+.{channels.of(channel).resolution}f}}")
+    return number(value, f"{{:+.{channels.find(channel).resolution}f}}")
 
 
 def _grade(value: Any) -> str:

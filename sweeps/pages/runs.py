@@ -71,7 +71,7 @@ def write(
         picked = {key: value[chain] for key, value in runs.items()}
         album.add("power", lambda: power_figures.chain(picked, [names[k] for k in chain], robot.has_ground))
     single = len(names) == 1
-    shown = capabilities.of(robot, runs)
+    shown = capabilities.without_idle(robot, runs)
     return render(
         folder,
         "runs.html.j2",

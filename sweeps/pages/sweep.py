@@ -49,7 +49,7 @@ def write(folder: Path, file: RobotFile, *, model: str, runs: Table) -> Path:
         of_channels=robot.channels,
         title=f"Sweep of {len(runs['status'])} runs",
         model=model,
-        counts=counts(capabilities.of(robot, runs), robot.channels),
+        counts=counts(capabilities.without_idle(robot, runs), robot.channels),
         volts_drawn=_drawn(runs),
         **named(file),
     )

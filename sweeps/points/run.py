@@ -218,7 +218,7 @@ def leave(
     Args:
         folder: of the command; config: its configuration, with the robot's name; page: its page.
     """
-    folder.write_table("runs.csv", capabilities.of(result.robot, result.table))
+    folder.write_table("runs.csv", capabilities.without_idle(result.robot, result.table))
     robot_file.write(result.robot, folder.partial / "robot.toml", note=f"the robot of this run, from {config.robot}")
     folder.write_json("result.json", result.to_json())
     manifest = {"seed": None, "statuses": result.statuses}

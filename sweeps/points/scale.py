@@ -29,6 +29,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.profile import Profile
 from mmrjax.variation import FLAGS, STATUS, Variation, evaluate, pick
 from sweeps.points.axes import Plan, adhesions
+from sweeps.points.climbs import VERDICT
 from sweeps.points.design import ROW, Blocks
 from sweeps.points.tasks import Task
 
@@ -41,7 +42,7 @@ SHARED = 16_384
 #: Chunks that may wait for the writer, besides the one that it writes and the one that is computed.
 WAITING = 1
 #: Types in which outputs that are no numbers are stored.
-KINDS = {STATUS: "uint8", FLAGS: "uint16", "verdict": "uint8"}
+KINDS = {STATUS: "uint8", FLAGS: "uint16", VERDICT: "uint8"}
 
 
 @dataclasses.dataclass(frozen=True)

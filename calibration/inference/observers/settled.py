@@ -72,7 +72,7 @@ class SettledLinearization(Linearization):
 
 def shares(channel: str, sides: int) -> np.ndarray:
     """What a channel shows of each side [-]: of one of a side that alone, else their mean."""
-    side = channels.of(channel).side
+    side = channels.find(channel).side
     return np.full(sides, 1 / sides) if side is None or sides == 1 else np.eye(sides)[side]
 
 
