@@ -22,7 +22,9 @@ from calibration.discovery.settings import settings_for
 from calibration.discovery.smooth import FALL, LENGTHS, PRODUCT, SIZES, WIDE, smooth, surface
 from calibration.discovery.standing import (
     _chosen_again,
+    _lacks,
     _root,
+    _varies_most,
     _weakest_run,
     cost_of_names,
     evidence_of_names,
@@ -180,6 +182,12 @@ def test_root_is_that_of_what_a_column_explains_beside_others(toy):
     falls = [fall(np.repeat(~np.isin(rows, run), 3)) for run in runs]
     assert run == 1 + int(np.argmin(falls)) and least**2 == pytest.approx(min(falls), rel=1e-8)
     assert _weakest_run(space, runs[:2], jacobian, residual, signature) == (None, math.inf)
+    of_one = np.where(
+        np.repeat(np.isin(rows, runs[1]), 3)[:, None], signature, 0.1 * signature
+    )  # the others tell little
+    same = -np.append(10.0 * of_one[:, 0], np.zeros(len(residual) - readings))
+    alike = [_weakest_run(space, runs, jacobian, same, of_one, differ)[1] for differ in (False, True)]
+    assert alike[0] < 0.3 * _root(jacobian, same, of_one) < 0.9 * alike[1]
 
 
 @pytest.mark.parametrize(
@@ -197,12 +205,61 @@ def test_name_stands_by_its_score_its_curves_and_its_rows(root, without, evidenc
     assert (test.stands, test.rests_on, test.established) == (stands, rests_on, stands and rests_on is None)
     assert not any(
         dataclasses.replace(test, **bad).established
-        for bad in ({"again": 0.75}, {"larger": ("b",)}, {"remains": True})
+        for bad in ({"again": 0.75}, {"larger": ("b",)}, {"remains": True}, {"varies": 3.4})
     )
     of_runs = dataclasses.replace(test, what="run")  # of histories: chance alone
     assert of_runs.rests_on == (10 if without < 3.3 else None)
     renumbered = NameSupport(True, tests=(test,)).numbered(np.arange(1, 21) * 2)
     assert renumbered.rests_on("a") == (None if rests_on is None else 20) and renumbered.rests_on("b") is None
+
+
+def test_amplitude_that_changes_with_a_variable_is_seen_and_one_that_does_not_is_none():
+    """A drop along the current, against one that grows half as fast again towards the largest slope."""
+    rng, rows = np.random.default_rng(3), 60
+    x, current = np.linspace(-1.0, 1.0, rows), rng.uniform(1.0, 3.0, rows)
+    column = (20.0 * current[:, None] * [1.0, -0.5]).ravel()
+    variables = {"slope": x, "current": current}
+    linear = SimpleNamespace(
+        readings=2 * rows, rows=rows, at_points=lambda counts: counts,
+        variable=lambda name: variables.get(name, np.ones(rows)),
+    )  # fmt: skip
+    space = SimpleNamespace(
+        free=0, included=np.ones(rows, bool), bare=SimpleNamespace(observe=SimpleNamespace(long=False))
+    )
+    linear.jacobian = np.concatenate([column[:, None], np.eye(1)])
+    noise = rng.standard_normal(2 * rows)
+    for share, seen in ((0.0, False), (0.5, True)):
+        linear.residual = np.append(noise + column * share * np.repeat(x, 2), 0.0)
+        varies, over = _varies_most(space, candidate_of("a"), "a", linear)
+        assert (varies > 3.3) == seen and (not seen or over == "slope")
+        # along a straight line, by least squares with the column and without
+        line = np.append(column * np.repeat(x, 2), 0.0)[:, None]
+        left = [
+            np.sum((linear.residual - a @ np.linalg.lstsq(a, linear.residual, rcond=None)[0]) ** 2)
+            for a in (linear.jacobian, np.concatenate([linear.jacobian, line], 1))
+        ]
+        assert not seen or varies**2 == pytest.approx(left[0] - left[1], rel=1e-8)
+    space.bare.observe.long = True  # a history's readings answer to all of its past
+    assert _varies_most(space, candidate_of("a"), "a", linear) == (0.0, "")
+
+
+@pytest.mark.parametrize(("single", "lacks"), [(3.4, {"slip"}), (5.0, {"slip", "track"})])
+def test_what_is_left_lies_where_its_curve_and_where_its_strongest_effect_would(monkeypatch, single, lacks):
+    monkeypatch.setattr("calibration.discovery.standing.locate", lambda *a: SimpleNamespace(place="speed"))
+
+    class Library(SimpleNamespace):
+        def __getitem__(self, name):
+            return {
+                "a": SimpleNamespace(channel="", balance="ground"),
+                "b": SimpleNamespace(channel="", balance="motor"),
+            }[name]
+
+    space = SimpleNamespace(included=None, library=Library(names=("a", "b"), of=np.array([0, 1, 1])))
+    test = SimpleNamespace(rejected_with_margin=True, beyond_doubt=lambda kind: single > 3.7)
+    seen = SimpleNamespace(test=test, scores=SimpleNamespace(single=np.array([1.0, 0.0, -single])))
+    assert _lacks(space, seen, ()) == lacks
+    test.rejected_with_margin = False
+    assert _lacks(space, seen, ()) == set()
 
 
 def test_effect_has_to_be_the_strongest_again_without_blocks_that_leave_half_of_it(toy):

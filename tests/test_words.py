@@ -371,7 +371,9 @@ def test_every_reason_and_every_doubt_has_its_words():
     whys = {a.value for c in ast.walk(ast.parse(text)) if isinstance(c, ast.Call) for a in c.args[1:2]
             if ast.unparse(c.func) == "NameSupport" and isinstance(a, ast.Constant)}  # fmt: skip
     assert whys <= set(loop.REASONS)
-    worst = NameTest("a", 0.0, 3.0, (), -99.0, 1, 0.0, 0.0, ("b",), True)
+    worst = NameTest("a", 0.0, 3.0, (), -99.0, 1, 0.0, 0.0, ("b",), True, varies=4.0, over="speed")
+    schema = (ROOT / "docs" / "schemas" / "loop.schema.json").read_text(encoding="utf-8")
+    assert all(f'"{doubt}"' in schema for doubt in loop.DOUBTS)
     assert set(worst.fails) == set(loop.DOUBTS) and not NameTest("a", 4.0, 3.0, (), 0.0).fails
 
 

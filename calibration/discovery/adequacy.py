@@ -41,11 +41,13 @@ class AdequacyTest:
     @property
     def rejected_with_margin(self) -> bool:
         """Whether what is left is beyond doubt, so that a fit which leaves it is not the whole story."""
-        return any(self._beyond(kind, float(getattr(self.found, kind))) for kind in self.settings.shares)
+        return any(map(self.beyond_doubt, self.settings.shares))
 
-    def beyond_doubt(self, chi2: float) -> bool:
-        """Whether a fit that leaves such a χ² [σ²] leaves something, whatever that is."""
-        return "chi2" in self.settings.shares and self._beyond("chi2", chi2)
+    def beyond_doubt(self, kind: str, found: float | None = None) -> bool:
+        """Whether a fit that leaves such a statistic of a kind, None for what is found, leaves something."""
+        return kind in self.settings.shares and self._beyond(
+            kind, float(getattr(self.found, kind)) if found is None else found
+        )
 
     def _beyond(self, kind: str, found: float) -> bool:
         return found > self.threshold(kind) + self.settings.margins[kind]

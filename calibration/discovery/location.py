@@ -52,12 +52,8 @@ class DiscrepancyLocation:
         variable = self.variable if happens is None else happens.axis
         what = bases_room.in_words(self.place) if self.channel else EQUATION[self.balance]
         drivers = {"speed_motor": "speed", "current": "current" if self.balance == "electrical" else "load"}
-        drivers |= {
-            "payload": "load",
-            "slope": "demand" if self.balance == "slip" else "slope",
-            "yaw_rate": "speed",
-            "side": "the side",
-        }
+        drivers |= {"payload": "load", "slope": "demand" if self.balance == "slip" else "slope"}
+        drivers |= {"yaw_rate": "speed", "side": "the side"}
         return f"{what} that changes with {drivers.get(variable, variable)}"
 
     def to_json(self) -> dict[str, Any]:

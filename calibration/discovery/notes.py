@@ -32,8 +32,7 @@ class CurveOver(NamedTuple):
 #: names of two campaigns 7 have less than -6, of 6 wrong ones of laws outside the library 3 (docs/lab/findings.md).
 BETTER = 6.0
 #: Share of its root that an effect has to keep without any one run: without a row of a table, whose readings may be
-#: wrong by themselves; without a run of a history, hundreds of samples of few runs that differ on purpose, chance is
-#: asked alone.
+#: wrong by themselves; without a run of a history, hundreds of samples, chance is asked alone.
 KEPT = {"row": 1 / math.sqrt(3), "run": 0.0}
 #: Share of the blocks left out, of those that leave half of what is known of an effect, in which it has to be chosen
 #: again.
@@ -49,11 +48,13 @@ class NameTest:
             the strongest effect reaches that [σ]; curves: those beside.
         evidence: twice the log of that for it over a smooth curve of its own equation, the best one [σ²].
         row: number of the run without which the root is smallest, None where none was left out; root_without: then.
-            A settled run is a row of its table, see `what`.
+            A settled run is a row of its table, see `what`; of histories as if the others told as much.
         again: share of the informative blocks without which an effect of its family is still the strongest.
         larger: effects of a set without it that is the better explanation, but not of a plausible size.
         remains: whether the largest set that was searched for leaves something in its equation.
         what: a run is called, `row` or `run`.
+        varies: root of what an amplitude that changes with a variable explains beside the largest set [σ]; over: that
+            variable.
     """
 
     effect: str
@@ -67,6 +68,8 @@ class NameTest:
     larger: tuple[str, ...] = ()
     remains: bool = False
     what: str = "row"
+    varies: float = 0.0
+    over: str = ""
 
     @property
     def stands(self) -> bool:
@@ -88,6 +91,7 @@ class NameTest:
             "blocks": self.again < AGAIN,
             "larger": bool(self.larger),
             "remains": self.remains,
+            "form": self.varies > self.needed,
         }
         return tuple(doubt for doubt, holds in doubts.items() if holds)
 

@@ -207,7 +207,7 @@ def _one_curve(
     if equation(where.place) in {_equation(space, e) for e in best.effects}:
         # Names mend what a strong curve in their equation leaves at a base fit that it has pulled far away.
         curve = fit_discrepancy(space, base, left.linear, where.place, where.variable)
-        adequate = not left.test.beyond_doubt(curve.chi2[1])  # or there is no need to compile a closer look
+        adequate = not left.test.beyond_doubt("chi2", curve.chi2[1])  # or there is no need to compile a closer look
         if adequate and not diagnosis_beside(space, curve, bases, left).test.rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(_over(where.place, where.variable),))
     return NameSupport(True)
@@ -267,9 +267,8 @@ def name_tests(
         better: candidates that are the better explanation and not of a plausible size.
     """
     names, largest, tests = bases_room.names(bases), searched.best or best, []
-    lacks = set[str]()
-    if searched.diagnosis is not None and searched.diagnosis.test.rejected_with_margin:
-        lacks = {equation(locate(searched.diagnosis, bases, space.included).place)}
+    most = searched.diagnosis or after
+    lacks = _lacks(space, most, bases)
     fewer = dict(zip(largest.effects, without_each(space, largest, settings, searched.ladder), strict=True))
     each = without_each(space, best, settings, searched.ladder)
     fits = {c.active: c for c in (*each, *(c for e, c in fewer.items() if e in best.effects))}
@@ -282,8 +281,9 @@ def name_tests(
         columns = np.concatenate([none, *(family_columns(linear, bases, k) for k in chosen)], 1)
         mine = space.library.of == space.library.names.index(effect)
         beside = *augment_with_columns(linear, columns), np.asarray(linear.signatures)[:, mine]
-        run, root_without = _weakest_run(space, linear.runs(), *beside)
+        run, root_without = _weakest_run(space, linear.runs(), *beside, differ=space.bare.observe.long)
         whole, others = (largest, fewer[effect]) if effect in fewer else (best, without)
+        beside_all = most.linear if effect in fewer else after.linear
         tests.append(
             NameTest(
                 effect,
@@ -297,9 +297,46 @@ def name_tests(
                 next((c.effects for c in better if effect not in c.effects), ()),
                 own in lacks,
                 "run" if space.bare.observe.long else "row",
+                *_varies_most(space, whole, effect, beside_all),
             )
         )
     return tuple(tests)
+
+
+def _lacks(space: CandidateSpace, seen: Diagnosis, bases: Bases) -> set[str]:
+    """Equations in which a fit leaves something that is beyond doubt: where a curve is the most improbable, and where
+    the strongest effect would act."""
+    if not seen.test.rejected_with_margin:
+        return set()
+    lacks = {equation(locate(seen, bases, space.included).place)}
+    if seen.test.beyond_doubt("single"):
+        strongest = space.library.of[int(np.argmax(np.abs(np.asarray(seen.scores.single))))]
+        lacks.add(_equation(space, space.library.names[strongest]))
+    return lacks
+
+
+def _varies_most(space: CandidateSpace, best: Candidate, effect: str, linear: Linearization) -> tuple[float, str]:
+    """Root of the most that an amplitude explains which changes with a variable, along a line or bent [σ], all else
+    fitted again; and the variable.
+
+    What a law of another form leaves beside a name is, to first order, that name's own term with an amplitude that
+    differs from place to place: so few columns see what a family of curves, with many more, leaves to chance. Of
+    settled runs, where each row answers to its own term alone; 0 of histories.
+
+    Args:
+        linear: the fit of the candidate, linearised.
+    """
+    most = 0.0, ""
+    if space.bare.observe.long:
+        return most
+    jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
+    of_row = jacobian[: linear.readings, space.free + best.active.index(effect)].reshape(linear.rows, -1)
+    for variable in (v for v in (*VARIABLES, "speed") if _varies(linear, v, space.included)):
+        at = linear.variable(variable).reshape(-1, linear.rows).mean(0)
+        x = bases_room.scaled(np.nan_to_num(at), space.included.astype(float))
+        changed = np.stack([(of_row * shape[:, None]).ravel() for shape in (x, 2 * x**2 - 1)], 1)
+        most = max(most, (_root(jacobian, residual, changed), variable))
+    return most
 
 
 def _evidence_over_curves(
@@ -324,8 +361,14 @@ def _evidence_over_curves(
 
 def _root(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> float:
     """Root of the most that one of several columns over the readings explains, all else fitted again [σ]."""
-    a, b = _left_of(jacobian, residual, signatures)
-    return float(np.max(np.abs(b) / np.sqrt(np.maximum(a, 1e-12))))
+    return float(np.max(_roots(jacobian, residual, signatures)))
+
+
+def _roots(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> np.ndarray:
+    """The same of each column; 0 of what the fit imitates."""
+    left, told = _left_of(jacobian, residual, signatures)
+    root = np.abs(told) / np.sqrt(np.maximum(left, 1e-12))
+    return np.where(left > ABSORBED**2 * np.sum(signatures**2, 0), root, 0.0)
 
 
 def _left_of(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -358,11 +401,9 @@ def _chosen_again(
         j, e, own = _rest(kept, *beside)
         if _left_of(j, e, own)[0].max() < 0.5 * whole:
             continue
-        left, told = _left_of(j, e, every)
-        root = np.abs(told) / np.sqrt(np.maximum(left, 1e-12))
-        root = np.where(left > ABSORBED**2 * np.sum(every**2, 0), root, 0.0)
-        most = np.max(root) ** 2
-        again.append(np.max(root[akin]) ** 2 >= most - max(settings.same, settings.form**2 * most))
+        roots = _roots(j, e, every)
+        most = np.max(roots) ** 2
+        again.append(np.max(roots[akin]) ** 2 >= most - max(settings.same, settings.form**2 * most))
     return float(np.mean(again)) if again else 1.0
 
 
@@ -372,18 +413,23 @@ def _weakest_run(
     jacobian: np.ndarray,
     residual: np.ndarray,
     signatures: np.ndarray,
+    differ: bool = False,
 ) -> tuple[int | None, float]:
     """Number of the run without which that root is smallest, and the root; None of fewer than three runs.
 
     Args:
-        runs: rows of each.
+        runs: rows of each; differ: on purpose, in what they can tell, as those of histories do: then it is the root
+            that all of them would have if the others told as much.
     """
     least: tuple[int | None, float] = None, math.inf
+    known, _ = _left_of(jacobian, residual, signatures)
     counting = [(k, rows) for k, rows in enumerate(runs) if space.included[rows].any()]
     for k, rows in counting if len(counting) > 2 else ():
         out = np.zeros(len(space.included), bool)
         out[rows] = True
-        root = _root(*_rest(_kept(space, out, len(signatures)), jacobian, residual, signatures))
+        rest = _rest(_kept(space, out, len(signatures)), jacobian, residual, signatures)
+        told = math.sqrt(np.max(_left_of(*rest)[0]) / np.max(known)) if differ else 1.0
+        root = _root(*rest) / max(told, 1e-9)
         least = (k + 1, root) if root < least[1] else least
     return least
 

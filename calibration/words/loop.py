@@ -283,6 +283,7 @@ DOUBTS = {
     "blocks": ("blocks", "is chosen again in {again:.0f} % of the data with a block left out"),
     "larger": ("size", "has a rival of an implausible size ({larger})"),
     "remains": ("equation", "leaves something in its own equation"),
+    "form": ("its form", "would have another size at other values of {0.over} ({0.varies:.1f} σ)"),
 }
 
 
