@@ -65,13 +65,14 @@ def rig(tmp_path):
 @pytest.mark.parametrize("end", [KeyboardInterrupt, OutOfTime])
 def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypatch, tmp_path, end):
     def first(*_, keep, **__):
-        keep("verdict", lambda: SimpleNamespace(verdict="class"))
+        keep("verdict", lambda: SimpleNamespace(verdict="class", members=(("iron_loss", "windage"),), families=()))
         raise end
 
     monkeypatch.setattr(command, "discover", first)
     code, _, err = mmrjax(*rig)
     assert code == 130 and "kept: verdict; the same command with --out found goes on" in err
-    assert "verdict so far: class; errors held out and other noises are outstanding" in err
+    assert "s  verdict: class, iron_loss or windage; next, errors held out and other noises\n" in err  # at once
+    assert "verdict: class, iron_loss or windage; errors held out and other noises are outstanding" in err
     assert not (tmp_path / "found").exists()
 
     def again(*_, keep, **__):

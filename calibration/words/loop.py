@@ -17,6 +17,7 @@ from mmrjax import channels
 
 if TYPE_CHECKING:
     from calibration.discovery.clusters import Cluster
+    from calibration.discovery.discover import LoopStages
     from calibration.discovery.location import DiscrepancyLocation
     from calibration.discovery.result import (
         DiscoveryResult,
@@ -101,6 +102,12 @@ def _tentative(those: Sequence[notes.Missing], support: notes.NameSupport | None
         for one in those
     ]
     return f" Tentative, in the model since it predicts better: {'; '.join(each)}."
+
+
+def verdict(stages: LoopStages) -> str:
+    """The verdict as soon as it is known: `verdict: class, series_resistance or supply_sag`."""
+    sure = [" or ".join(members) for members in stages.members] or [f"a {family}" for family in stages.families]
+    return f"verdict: {', '.join((stages.verdict, *sure))}"
 
 
 def _without_name(where: DiscrepancyLocation, p: float, no_effect: str) -> str:

@@ -70,6 +70,8 @@ def loop(
 
         def keep(name: str, make: Callable[[], T]) -> T:
             found = stages[name] = folder.stage(name, make)
+            if name == "verdict":
+                timed(f"{said_of.verdict(found)}; next, errors held out and other noises")
             return found
 
         try:
@@ -104,7 +106,7 @@ def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> Non
     tell(f"kept: {', '.join(stages)}; the same command with --out {folder.path} goes on")
     if "verdict" in stages:
         traced = stages["verdict"]
-        tell(f"verdict so far: {traced.verdict}; errors held out and other noises are outstanding")
+        tell(f"{said_of.verdict(traced)}; errors held out and other noises are outstanding")
         return
     base = stages["base"][0].base
     robot = findings.proposed_robot(base.space, base.candidate)
