@@ -71,7 +71,7 @@ def loop(
         def keep(name: str, make: Callable[[], T]) -> T:
             found = stages[name] = folder.stage(name, make)
             if name == "verdict":
-                timed(f"{said_of.verdict(found)}; next, errors held out and other noises")
+                timed(f"{said_of.verdict(stages[name])}; next, errors held out and other noises")
             return found
 
         try:
