@@ -207,6 +207,8 @@ def test_name_stands_by_its_score_its_curves_and_its_rows(root, without, evidenc
         dataclasses.replace(test, **bad).established
         for bad in ({"again": 0.75}, {"larger": ("b",)}, {"remains": True}, {"varies": 3.4})
     )
+    # of a library of three effects chance reaches less than in a dozen looks at the amplitude
+    assert dataclasses.replace(test, varies=3.4, by_chance=3.5).established == test.established
     of_runs = dataclasses.replace(test, what="run")  # of histories: chance alone
     assert of_runs.rests_on == (10 if without < 3.3 else None)
     renumbered = NameSupport(True, tests=(test,)).numbered(np.arange(1, 21) * 2)
@@ -230,8 +232,9 @@ def test_amplitude_that_changes_with_a_variable_is_seen_and_one_that_does_not_is
     noise = rng.standard_normal(2 * rows)
     for share, seen in ((0.0, False), (0.5, True)):
         linear.residual = np.append(noise + column * share * np.repeat(x, 2), 0.0)
-        varies, over = _varies_most(space, candidate_of("a"), "a", linear)
-        assert (varies > 3.3) == seen and (not seen or over == "slope")
+        varies, over, by_chance = _varies_most(space, candidate_of("a"), "a", linear, 0.03)
+        assert (varies > by_chance) == seen and (not seen or over == "slope")
+        assert by_chance == pytest.approx(2.67, abs=0.01)  # two variables, along a line or bent: 0.03 / 4, both sides
         # along a straight line, by least squares with the column and without
         line = np.append(column * np.repeat(x, 2), 0.0)[:, None]
         left = [
@@ -240,7 +243,7 @@ def test_amplitude_that_changes_with_a_variable_is_seen_and_one_that_does_not_is
         ]
         assert not seen or varies**2 == pytest.approx(left[0] - left[1], rel=1e-8)
     space.bare.observe.long = True  # a history's readings answer to all of its past
-    assert _varies_most(space, candidate_of("a"), "a", linear) == (0.0, "")
+    assert _varies_most(space, candidate_of("a"), "a", linear, 0.03) == (0.0, "", math.inf)
 
 
 @pytest.mark.parametrize(("single", "lacks"), [(3.4, {"slip"}), (5.0, {"slip", "track"})])

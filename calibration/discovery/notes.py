@@ -54,7 +54,7 @@ class NameTest:
         remains: whether the largest set that was searched for leaves something in its equation.
         what: a run is called, `row` or `run`.
         varies: root of what an amplitude that changes with a variable explains beside the largest set [σ]; over: that
-            variable.
+            variable; by_chance: what chance leaves to as many variables, whatever the library has.
     """
 
     effect: str
@@ -70,6 +70,7 @@ class NameTest:
     what: str = "row"
     varies: float = 0.0
     over: str = ""
+    by_chance: float = 0.0
 
     @property
     def stands(self) -> bool:
@@ -91,7 +92,7 @@ class NameTest:
             "blocks": self.again < AGAIN,
             "larger": bool(self.larger),
             "remains": self.remains,
-            "form": self.varies > self.needed,
+            "form": self.varies > max(self.needed, self.by_chance),
         }
         return tuple(doubt for doubt, holds in doubts.items() if holds)
 

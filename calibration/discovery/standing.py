@@ -12,6 +12,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
+from statistics import NormalDist
 
 import numpy as np
 
@@ -297,7 +298,7 @@ def name_tests(
                 next((c.effects for c in better if effect not in c.effects), ()),
                 own in lacks,
                 "run" if space.bare.observe.long else "row",
-                *_varies_most(space, whole, effect, beside_all),
+                *_varies_most(space, whole, effect, beside_all, settings.shares["single"]),
             )
         )
     return tuple(tests)
@@ -315,28 +316,31 @@ def _lacks(space: CandidateSpace, seen: Diagnosis, bases: Bases) -> set[str]:
     return lacks
 
 
-def _varies_most(space: CandidateSpace, best: Candidate, effect: str, linear: Linearization) -> tuple[float, str]:
+def _varies_most(
+    space: CandidateSpace, best: Candidate, effect: str, linear: Linearization, share: float
+) -> tuple[float, str, float]:
     """Root of the most that an amplitude explains which changes with a variable, along a line or bent [σ], all else
-    fitted again; and the variable.
+    fitted again; the variable; and what chance leaves to so many looks (Bonferroni 1936).
 
     What a law of another form leaves beside a name is, to first order, that name's own term with an amplitude that
     differs from place to place: so few columns see what a family of curves, with many more, leaves to chance. Of
     settled runs, where each row answers to its own term alone; 0 of histories.
 
     Args:
-        linear: the fit of the candidate, linearised.
+        linear: the fit of the candidate, linearised; share: of clean tables in which chance exceeds that.
     """
     most = 0.0, ""
     if space.bare.observe.long:
-        return most
+        return *most, math.inf
     jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
     of_row = jacobian[: linear.readings, space.free + best.active.index(effect)].reshape(linear.rows, -1)
-    for variable in (v for v in (*VARIABLES, "speed") if _varies(linear, v, space.included)):
+    variables = [v for v in (*VARIABLES, "speed") if _varies(linear, v, space.included)]
+    for variable in variables:
         at = linear.variable(variable).reshape(-1, linear.rows).mean(0)
         x = bases_room.scaled(np.nan_to_num(at), space.included.astype(float))
         changed = np.stack([(of_row * shape[:, None]).ravel() for shape in (x, 2 * x**2 - 1)], 1)
         most = max(most, (_root(jacobian, residual, changed), variable))
-    return most
+    return *most, NormalDist().inv_cdf(1 - share / (4 * max(len(variables), 1)))  # two shapes, either sign
 
 
 def _evidence_over_curves(
