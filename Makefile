@@ -7,7 +7,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 READY := $(VENV)/ready
 TOOLS := $(VENV)/tools
 
-.PHONY: demo test test-all slow lint mutants campaign bench docs clean
+.PHONY: demo test quick test-all slow lint mutants campaign bench docs clean
 
 demo: $(READY)
 	$(BIN)/mmrjax loop measured --out runs/demo/loop --force
@@ -19,8 +19,12 @@ PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --
 # slower, which short tests don't feel.
 QUICK := XLA_FLAGS="--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
 
+# The checks of `lint` beside them: they need one core of two.
+test: $(TOOLS)
+	@$(MAKE) --no-print-directory -j2 lint quick
+
 # Bytecode is kept, whatever a machine's settings: tests start processes of their own.
-test: lint
+quick: $(TOOLS)
 	PYTHONDONTWRITEBYTECODE= $(QUICK) $(PYTEST) -m "not slow"
 
 # Everything: the tests that compile or run for long too, some two hours on two cores.
