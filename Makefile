@@ -39,7 +39,7 @@ lint: $(TOOLS)
 	$(BIN)/ruff format --check .
 	$(BIN)/python -m mypy
 
-# Whether `make test` notices plausible mistakes; a quarter of an hour on two cores.
+# Whether `make test` notices plausible mistakes; some four minutes on two cores.
 mutants: $(TOOLS)
 	$(QUICK) $(BIN)/python benchmarks/mutants.py --jobs 2
 
