@@ -377,6 +377,12 @@ def test_every_reason_and_every_doubt_has_its_words():
     assert set(worst.fails) == set(loop.DOUBTS) and not NameTest("a", 4.0, 3.0, (), 0.0).fails
 
 
+@pytest.mark.parametrize(("unit", "said"), [("-", "-0.0154 ± 0.00014"), ("ohm", "-0.0154 ± 0.00014 ohm")])
+def test_a_size_has_a_unit_where_there_is_one(unit, said):
+    amplitude = SimpleNamespace(value=-0.01541, sd=0.000141, unit=unit)
+    assert loop.size(SimpleNamespace(parameters={"amplitude": amplitude})) == said
+
+
 # --- verdicts -------------------------------------------------------------------------------------------
 
 OVER = CurveOver("slip", ("slope",))

@@ -388,6 +388,12 @@ def stated_value(name: str, s: StatedValue) -> str:
     return f"{freed_value(notes.FreedValue(name, s.value, s.unit))} (stated {s.stated:.3g}, {s.prior_sds:+.1f} sds)"
 
 
+def size(e: FoundEffect) -> str:
+    """Amplitude of an effect: `-0.0154 ± 0.00014`, with its unit where it has one."""
+    a = e.parameters["amplitude"]
+    return f"{a.value:.3g} ± {a.sd:.2g} {a.unit}".rstrip(" -")
+
+
 def alike(e: FoundEffect) -> str:
     """What these data cannot tell from an effect: other effects, and stated values that may be wrong instead."""
     others = ", ".join(

@@ -132,9 +132,8 @@ def print_discovery(found: DiscoveryResult) -> None:
             number = heading in numbers
             shown.add_column(heading, justify="right" if number else "left", no_wrap=number or heading == "effect")
         for e in found.effects:
-            a = e.parameters["amplitude"]
             shown.add_row(
-                said_of.called(found, e), ", or ".join(e.families), f"{a.value:.3g} ± {a.sd:.2g} {a.unit}",
+                said_of.called(found, e), ", or ".join(e.families), said_of.size(e),
                 f"{e.score:.0f}", f"{e.p_value:.2g}", said_of.alike(e) or "-",
             )  # fmt: skip
         say(shown)

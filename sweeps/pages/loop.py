@@ -68,8 +68,7 @@ def findings(found: DiscoveryResult, changed: Mapping[str, Change]) -> list[dict
     """Each effect of the model for the first screen: what it is, how large, how sure, what else it could be."""
     listed = []
     for e in found.effects:
-        a = e.parameters["amplitude"]
-        size = f"{a.value:.3g} ± {a.sd:.2g} {a.unit}"
+        size = words.size(e)
         if (change := changed.get(e.name)) is not None:
             size += f", which changes the {change.channel.label} by {100 * change.rms:.2g} %"
         sure, other = words.how_sure(found, e), words.alike(e)
