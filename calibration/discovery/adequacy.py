@@ -45,12 +45,10 @@ class AdequacyTest:
 
     def beyond_doubt(self, kind: str, found: float | None = None) -> bool:
         """Whether a fit that leaves such a statistic of a kind, None for what is found, leaves something."""
-        return kind in self.settings.shares and self._beyond(
-            kind, float(getattr(self.found, kind)) if found is None else found
-        )
-
-    def _beyond(self, kind: str, found: float) -> bool:
-        return found > self.threshold(kind) + self.settings.margins[kind]
+        if kind not in self.settings.shares:
+            return False
+        statistic = float(getattr(self.found, kind)) if found is None else found
+        return statistic > self.threshold(kind) + self.settings.margins[kind]
 
     @property
     def p_value(self) -> float:

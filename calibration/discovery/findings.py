@@ -46,13 +46,12 @@ from calibration.discovery.stated_values import Shift
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
 from calibration.inference import priors
-from calibration.inference.errors import summary
+from calibration.inference.errors import channel_errors
 from calibration.inference.held_out import held_out
 from calibration.inference.identifiability import held_by_prior
 from calibration.inference.linearization import Linearization, amplitude_of, shape_of, shape_scales, shaped
 from calibration.inference.optimizers import linearised, read
 from calibration.inference.problem import Observation, Problem
-from mmrjax import channels
 from mmrjax.balances import BALANCES
 from mmrjax.effects import Effect
 from mmrjax.robot import Robot
@@ -390,10 +389,4 @@ def errors(
     """Errors of every channel [%, and in σ] over the rows that count and have a simulated value."""
     simulated = np.where(included[:, None], simulated, np.nan)
     percent = problem.observe.percent(simulated, measured)
-    sigma = (simulated - measured) / sd
-    answer: Errors = {}
-    for k, name in enumerate(channels.names(problem.channels)):
-        finite = sigma[np.isfinite(sigma[:, k]), k]
-        rms = float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")
-        answer[name] = {**summary(percent[:, k]), "rms_sigma": rms}
-    return answer
+    return channel_errors(problem.channels, simulated, measured, sd, percent)

@@ -426,13 +426,13 @@ def _weakest_run(
             that all of them would have if the others told as much.
     """
     least: tuple[int | None, float] = None, math.inf
-    known, _ = _left_of(jacobian, residual, signatures)
+    known = np.max(_left_of(jacobian, residual, signatures)[0]) if differ else 1.0
     counting = [(k, rows) for k, rows in enumerate(runs) if space.included[rows].any()]
     for k, rows in counting if len(counting) > 2 else ():
         out = np.zeros(len(space.included), bool)
         out[rows] = True
         rest = _rest(_kept(space, out, len(signatures)), jacobian, residual, signatures)
-        told = math.sqrt(np.max(_left_of(*rest)[0]) / np.max(known)) if differ else 1.0
+        told = math.sqrt(np.max(_left_of(*rest)[0]) / known) if differ else 1.0
         root = _root(*rest) / max(told, 1e-9)
         least = (k + 1, root) if root < least[1] else least
     return least

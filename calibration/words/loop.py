@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from calibration.discovery.result import (
         DiscoveryResult,
         Errors,
+        Estimate,
         FoundEffect,
         Resolved,
         Sensitivity,
@@ -390,8 +391,11 @@ def stated_value(name: str, s: StatedValue) -> str:
 
 def size(e: FoundEffect) -> str:
     """Amplitude of an effect: `-0.0154 ± 0.00014`, with its unit where it has one."""
-    a = e.parameters["amplitude"]
-    return f"{a.value:.3g} ± {a.sd:.2g} {a.unit}".rstrip(" -")
+    return _estimate(e.parameters["amplitude"])
+
+
+def _estimate(found: Estimate) -> str:
+    return f"{found.value:.3g} ± {found.sd:.2g} {found.unit}".rstrip(" -")
 
 
 def alike(e: FoundEffect) -> str:
@@ -447,7 +451,7 @@ def resolved(found: Resolved) -> str:
     """What the track model says, in a sentence or two."""
     before, after = found.slip_rms
     gear = ", ".join(
-        f"{name.removeprefix('running_gear.')} {e.value:.3g} ± {e.sd:.2g} {e.unit}".rstrip(" -")
+        f"{name.removeprefix('running_gear.')} {_estimate(e)}"
         for name, e in found.constants.items() if name.startswith("running_gear.")
     )  # fmt: skip
     on = "" if found.settled else "; the search had not settled, go on with --members and more --generations"

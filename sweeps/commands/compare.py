@@ -138,11 +138,9 @@ def compared(
 
 def _summary(channel: Channel, table: dict[str, np.ndarray]) -> dict[str, Any]:
     measured, simulated = table[channel.column], table[f"simulated_{channel.column}"]
-    difference = simulated - measured
-    finite = difference[np.isfinite(difference)]
     return {
         **residual.summary(table[f"error_{channel.name}_percent"]),
-        "rms": float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan"),
+        "rms": residual.root_mean_square(simulated - measured),
         "unit": channel.unit,
         "r2": residual.certainty(measured, simulated),
         "missing": int(np.isnan(measured).sum()),
