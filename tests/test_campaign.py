@@ -207,7 +207,7 @@ def test_errors_are_of_the_rows_that_both_fits_predict():
 @pytest.mark.slow
 def test_a_line_holds_what_the_findings_rest_on():
     """A resistance of five sigmas, told nothing of the noise."""
-    x = loop.one(campaign.Task("library_unstated", 3, replicates=100, brief=True, stratum="plain"))
+    x = loop.work(campaign.Task("library_unstated", 3, replicates=100, brief=True, stratum="plain"))
     assert x["noise"]["speed"]["source"] == "series" and x["noise"]["speed"]["freedom"] > 20
     assert {e["name"] for e in x["effects"]} <= {t["effect"] for t in x["tests"]}
     assert np.isfinite(x["gain"]).all() and np.isfinite(x["elsewhere"]["gain"]).all()

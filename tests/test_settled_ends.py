@@ -69,8 +69,7 @@ def test_base_fit_of_clean_starts_is_global_on_any_ground(adhesion, creep):
 @pytest.fixture(scope="module")
 def gripping():
     """Six starts on a ground that holds, and the constants of their robot."""
-    with pytest.MonkeyPatch.context() as patch:
-        return on_ground(patch, (0.6, 0.6), 0.02)
+    return on_ground((0.6, 0.6), 0.02)
 
 
 def ends_of(runs, p):
@@ -85,12 +84,12 @@ def ends_of(runs, p):
 def test_ends_of_runs_that_grip_are_those_of_settled_travel(gripping):
     ends, slides, truth, sound = ends_of(*gripping)
     assert sound.all() and not slides.any()
-    there = np.isfinite(ends.mean)
-    assert there.sum() >= 15  # of six runs and three channels
-    off = np.abs(ends.mean - truth)[there]
+    known = np.isfinite(ends.mean)
+    assert known.sum() >= 15  # of six runs and three channels
+    off = np.abs(ends.mean - truth)[known]
     # a reading that still changes by less than a fiftieth is taken for settled
-    assert (off < 4 * ends.sd[there] + 0.02 * np.abs(truth[there])).all()
-    assert (ends.sd[there] >= settled_ends.FLOOR * np.abs(ends.mean[there]) - 1e-12).all()
+    assert (off < 4 * ends.sd[known] + 0.02 * np.abs(truth[known])).all()
+    assert (ends.sd[known] >= settled_ends.FLOOR * np.abs(ends.mean[known]) - 1e-12).all()
 
 
 @pytest.mark.slow
