@@ -25,7 +25,7 @@ from mmrjax import robots  # noqa: E402
 
 def grid(objective: str, points: int, kept: np.ndarray) -> tuple[float, int, float]:
     """The best feasible objective of a grid, how many designs it has, and seconds."""
-    robot, asked = robots.nominal(), requirements.paper()
+    robot, asked = robots.nominal(), requirements.load(None)
     chosen = options(robot)
     of = task(robot, asked, chosen)
     choice = search.space(robot, of, chosen)
@@ -50,7 +50,7 @@ def main() -> None:
     parser.add_argument("--grid", type=int, default=1_000_000)
     parser.add_argument("--objective", default="mass", choices=list(OBJECTIVES))
     given = parser.parse_args()
-    robot, asked = robots.nominal(), requirements.paper()
+    robot, asked = robots.nominal(), requirements.load(None)
     for words in ("with compilation", "once compiled"):
         begin, busy = time.perf_counter(), time.process_time()
         found = search.size(robot, asked, (given.objective,), starts=given.starts)
