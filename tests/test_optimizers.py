@@ -548,11 +548,16 @@ def test_rival_searches_end_where_three_agree_unless_one_is_lower():
     begin = jnp.asarray([[0.1, 0.0], [0.2, 0.0], [0.3, 0.0], [-1.2, 1.0], [-1.9, 2.0], [0.0, 0.0]])
     weights = jnp.ones((6, 1, 3))
     found, _ = fit.searches_long(evaluate, begin, data, weights, 40, 2, rivals=True)
-    np.testing.assert_allclose(found.cost[:5], [30, 30, 30, 0, 0], atol=1e-3)
-    assert found.converged[:5].all() and found.steps[3] > found.steps[0]
+    np.testing.assert_allclose(found.cost[3:5], 0, atol=1e-3)
+    assert found.converged[3:5].all() and found.steps[3] > found.steps[0]
     evaluated.clear()
     alone, _ = fit.searches_long(evaluate, begin, data, weights, 40, 2)
     assert max(evaluated) == 2 and sum(evaluated) == alone.steps.sum()  # what has ended leaves its place
-    assert found.steps[5] < alone.steps[5]
+    np.testing.assert_allclose(alone.cost[:5], [30, 30, 30, 0, 0], atol=1e-3)
+    # Nor does a search go on that cannot come down to where another one is.
+    assert (found.steps[[0, 1, 2, 5]] < alone.steps[[0, 1, 2, 5]]).all()
+    assert (found.cost[:3] < 31).all()
+    soon, _ = fit.searches_long(evaluate, begin, data, weights, 40, 2, worth=100.0)
+    assert (soon.steps <= alone.steps).all() and soon.steps.sum() < alone.steps.sum()
     same, _ = fit.searches_long(evaluate, begin[:3], data, weights[:3], 40, 2, rivals=True)
-    assert (same.steps <= found.steps[:3]).all()
+    assert (same.steps <= alone.steps[:3]).all()

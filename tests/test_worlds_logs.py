@@ -61,7 +61,8 @@ def test_logs_are_those_of_the_simulator_with_the_same_truth(tmp_path, imposed):
     left = [np.linalg.norm(remainder(c.ravel(), columns)) for c in changes]
     # Of 10 sds beside the constants, as far as what is left grows as the amplitude.
     terms = [
-        dataclasses.replace(t, amplitude=t.amplitude * np.clip(10 / x, 0.1, 30)) for t, x in zip(terms, left, strict=True)
+        dataclasses.replace(t, amplitude=t.amplitude * np.clip(10 / x, 0.1, 30))
+        for t, x in zip(terms, left, strict=True)
     ]
     theirs = logs.histories(rig, [rig.p] * (1 + len(terms)), [[], *([t] for t in terms)])
     case = logs.case(rig, "", 0.0, 1)
