@@ -232,7 +232,7 @@ NEAR = 1 / 12
 
 
 def roughness(x: np.ndarray, y: np.ndarray) -> float:
-    """Share of the variance of y that its mean over the other rows near each x leaves [-]; inf where x is constant."""
+    """Share of the variance of y that its mean over the other rows near x leaves [-]; inf where x is constant."""
     if not np.ptp(x) > 0:
         return np.inf
     near = np.exp(-0.5 * ((x[:, None] - x) / (NEAR * np.ptp(x))) ** 2) * (1 - np.eye(len(x)))
@@ -321,7 +321,7 @@ def defects(table: dict[str, np.ndarray], verdict: str, crosses_zero: bool = Fal
     """
     whens = ("before",) if verdict in ("none", "unnamed") else ("before", "after")
     drawn = {b: DEFECT_WORDS[b] for b in (closed(table) if crosses_zero else DEFECT_WORDS)}
-    fig, grid = figure(len(whens), len(drawn), 2.5 * len(whens) + 0.3, sharex="col", sharey="col")
+    fig, grid = figure(len(whens), len(drawn), 2.6 * len(whens) + 0.5, sharex="col", sharey="col")
     for row, when in enumerate(whens):
         for axes, (balance, (words, unit, column, of_what)) in zip(grid[row], drawn.items(), strict=True):
             balance_words = RIG_WORDS.get(balance, words) if crosses_zero else words

@@ -322,9 +322,9 @@ class SettledRuns(Observer):
 def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarray]:
     """The defects of each row that make its residual r, of each side where sides are driven apart.
 
-    The likeliest of r = -S δ + noise of one sd, where δ has the prior sds D^½, the size of what each equation is about
-    (rms over the table): δ = -D Sᵀ (S D Sᵀ + 1)⁻¹ r. A defect that the readings of a row hardly show is so next to
-    nothing, and never a residual over a vanishing slope; what they show of several together is shared out.
+    The likeliest of r = -S δ + noise of one sd, where δ has the prior sds D^½, the size of what each equation is
+    about (rms over the table): δ = -D Sᵀ (S D Sᵀ + 1)⁻¹ r. A defect that the readings of a row hardly show is so next
+    to nothing, and never a residual over a vanishing slope; what they show of several together is shared out.
     """
     assert isinstance(linear, SettledLinearization)
     rows = np.flatnonzero(included)
