@@ -24,7 +24,7 @@ def until(
     ended: Callable[[T], Bool[Array, ""]],
     own: Any,
     kept: Callable[[T], Any] = lambda state: state,
-    most: int = LANES,
+    most: int | None = None,
 ) -> Any:
     """The state at which `ended`, by `turn` from `begun`, without derivatives.
 
@@ -35,7 +35,8 @@ def until(
         begun: state of arrays, of `own`; turn: the next state, of `own` and a state; ended: of a state. They close
             over no traced number.
         own: what a member has of its own; numbers in it may be batched.
-        kept: what of the last state is returned; most: members that are at work at once.
+        kept: what of the last state is returned; most: members that are at work at once, `LANES` if
+            none are stated.
     """
     numbers, rest = eqx.partition(jax.lax.stop_gradient(own), eqx.is_array)
 
@@ -68,7 +69,7 @@ def until(
         return each(numbers)
 
     def refilled(numbers: Any, batched: Any, size: int) -> T:
-        lanes = min(size, most)
+        lanes = min(size, LANES if most is None else most)
         axes = jax.tree.map(lambda b: 0 if b else None, batched)
 
         def chosen(which: Array, one: T, other: T) -> T:
