@@ -60,7 +60,7 @@ def test_members_that_have_ended_when_they_begin_cost_no_turn(counted):
 
 
 def test_of_the_last_state_only_what_is_kept_is_returned():
-    turn, ended = (lambda own, s: (s[0] + own, s[1] + 1)), (lambda s: s[1] >= 3)  # noqa: E731
+    turn, ended = (lambda own, s: (s[0] + own, s[1] + 1)), (lambda s: s[1] >= 3)
     sums = jax.vmap(lambda x: lanes.until(lambda own: (own, own * 0), turn, ended, x, lambda s: s[0], 2))(
         jnp.arange(5.0)
     )

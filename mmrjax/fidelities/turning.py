@@ -266,8 +266,8 @@ def _settled(robot: Robot, conditions: Conditions) -> tuple[PlaneMotion, Float[A
         return _Linear(jnp.asarray(still), jnp.asarray(False), jnp.asarray(False))
 
     def linear(held: tuple[Robot, Conditions, Array, Array], _: _Linear) -> _Linear:
-        *held, y, solved = held
-        slope, found = jax.jacfwd(lambda y: (_balance(*held, y),) * 2, has_aux=True)(y)
+        y, solved = held[2:]
+        slope, found = jax.jacfwd(lambda y: (_balance(*held[:2], y),) * 2, has_aux=True)(y)
         slope = jnp.where(moves[:, None], slope, still)  # what does not move has no equation of its own
         solve, determinant = inverse(-slope)
         close = jnp.max(jnp.abs(solve(found))) < CLOSE
@@ -275,8 +275,8 @@ def _settled(robot: Robot, conditions: Conditions) -> tuple[PlaneMotion, Float[A
 
     def follow(held: tuple[Robot, Conditions, Array, _Linear]) -> _Search:
         """Its first step goes nowhere: it only looks round."""
-        *held, y, known = held
-        y = jnp.where(known.sound, y, guess(held))
+        y, known = held[2:]
+        y = jnp.where(known.sound, y, guess(held[:2]))
         first, turns = jnp.asarray(FIRST), jnp.asarray(0)
         return _Search(y, jnp.zeros_like(y), jnp.where(known.sound, known.jacobian, still), first, turns, known.sound)
 
