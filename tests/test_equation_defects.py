@@ -110,6 +110,13 @@ def test_voltage_of_a_side_is_its_share_of_the_supply():
     assert np.array_equal(loop_figures.conditions_and_readings(table)["voltage, left [V]"], given)
 
 
+def test_where_a_driver_passes_on_a_share_of_one_voltage_that_is_the_axis():
+    duty = RANDOM.uniform(-1, 1, 8)
+    table = {"configuration": np.full(8, "rig"), "supply_voltage_V": np.full(8, 48.0), "duty": duty}
+    for x, label in (loop_figures.depends_on(table, duty**3), loop_figures._over(table, "slope_deg", "slope [deg]")):
+        assert np.array_equal(x, 48.0 * duty) and label == "voltage given to the motors [V]"
+
+
 def test_defects_of_turns_are_drawn_by_side_over_what_that_side_does():
     table = turns()
     fig = loop_figures.defects(table, "none", crosses_zero=True)

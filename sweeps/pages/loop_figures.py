@@ -231,6 +231,14 @@ def errors(found: DiscoveryResult) -> Figure:
 NEAR = 1 / 12
 
 
+def given(table: dict[str, np.ndarray]) -> tuple[np.ndarray, str]:
+    """What is imposed in runs, of a supply the share that a driver passes on, and its label."""
+    own = imposed(table)
+    if own == "supply_voltage_V" and "duty" in table and np.isfinite(table["duty"]).all():
+        return table[own] * table["duty"], "voltage given to the motors [V]"
+    return table[own], IMPOSED_WORDS[own]
+
+
 def roughness(x: np.ndarray, y: np.ndarray) -> float:
     """Share of the variance of y that its mean over the other rows near x leaves [-]; inf where x is constant."""
     if not np.ptp(x) > 0:
@@ -244,9 +252,11 @@ def conditions_and_readings(table: dict[str, np.ndarray]) -> dict[str, np.ndarra
     the mean and the difference too."""
     known = {c.column: (c.label, c.unit) for c in EVERY} | CONDITION_WORDS
     if "duty_left" in table and "supply_voltage_V" in table:
-        given = {f"voltage_{s}_V": table["supply_voltage_V"] * table[f"duty_{s}"] for s in ("left", "right")}
-        table, known = table | given, known | {f"voltage_{s}_V": (f"voltage, {s}", "V") for s in ("left", "right")}
+        sides = {f"voltage_{s}_V": table["supply_voltage_V"] * table[f"duty_{s}"] for s in ("left", "right")}
+        table, known = table | sides, known | {f"voltage_{s}_V": (f"voltage, {s}", "V") for s in ("left", "right")}
     found = {f"{label} [{unit}]": table[c] for c, (label, unit) in known.items() if c in table}
+    values, words = given(table)
+    found |= {words: values}
     for label, left in list(found.items()):
         if (right := found.get(label.replace(", left", ", right"))) is not None and ", left" in label:
             both = label.replace(", left", "")
@@ -309,7 +319,7 @@ def _over(table: dict[str, np.ndarray], column: str, label: str, side: str = "")
         label = f"motor {'current' if 'current' in column else 'speed'} of that side [{column.rpartition('_')[2]}]"
     column = "total_" + column if column == "current_A" else column
     if column not in table or (column not in ("total_current_A", own) and np.unique(table[column]).size == 1):
-        return table[own], IMPOSED_WORDS[own]
+        return given(table)
     return table[column], label
 
 
