@@ -225,7 +225,7 @@ def test_first_screen_answers_in_a_minute(shown, capsys, tmp_path):
     assert words.answer(found) == f"No: missing is a {effect.families[0]}." and words.answer(found) in page.text
     a = effect.parameters["amplitude"]
     size, change = f"{a.value:.3g} ± {a.sd:.2g} {a.unit}", loop_page.changes(found)[effect.name]
-    size += f", which changes the {change.channel.label} by {100 * change.rms:.2g} %"
+    size += f", which changes the {change.channel.label} by {change.rms:.2g} %"
     assert f"{effect.families[0]} ({effect.name}): {size}; {words.how_sure(found, effect)}." in page.text
     stated, again, with_it = page.tables["summary"][1:]
     assert [line[0] for line in (stated, again, with_it)] == ["as stated", "fitted again", "with what was found"]
