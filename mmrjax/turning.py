@@ -275,8 +275,8 @@ def grip(
     if loads is not None:
         return _at_loads(loads, None, given)
     held = jax.lax.stop_gradient(given)
-    at = _loads(held)
-    found, rise = _at_loads(at, None, given), jax.jacfwd(lambda x: _at_loads(x, None, held))(at)
+    at, rise = _loads(held)
+    found = _at_loads(at, None, given)
     # The last step alone carries the derivatives, which are the implicit ones; it is so small that lines will do.
     change = _step(found.lacking, rise.lacking)
     return jax.tree.map(lambda x, slope: x - slope @ change, found, rise)
@@ -289,14 +289,14 @@ def _step(lacking: Float[Array, " 2"], slope: Float[Array, "2 2"]) -> Float[Arra
     return jnp.stack([d * first - b * second, a * second - c * first]) / (a * d - b * c)
 
 
-def _loads(given: _Given) -> Float[Array, " 2"]:
-    """The load that has moved [N] and the centre of pressure [m], without derivatives.
+def _loads(given: _Given) -> tuple[Float[Array, " 2"], Grip]:
+    """The load that has moved [N] and the centre of pressure [m], and how all rises with them; without derivatives.
 
     As long as all of the contact bears, the moments of its law do not depend on them.
     """
     stance, load = given.stance, given.load
 
-    def steps(loads: Array, given: _Given, even: Array | None) -> Array:
+    def steps(loads: Array, given: _Given, even: Array | None) -> tuple[Array, Grip]:
         def step(_: int, loads: Array) -> Array:
             def lacking(x: Array) -> tuple[Array, Array]:
                 return (_at_loads(x, even, given).lacking,) * 2
@@ -304,13 +304,14 @@ def _loads(given: _Given) -> Float[Array, " 2"]:
             slope, left = jax.jacfwd(lacking, has_aux=True)(loads)
             return loads - _step(left, slope)
 
-        return jax.lax.fori_loop(0, LOAD_STEPS, step, loads, unroll=even is not None)
+        found = jax.lax.fori_loop(0, LOAD_STEPS, step, loads, unroll=even is not None)
+        return found, jax.jacfwd(lambda x: _at_loads(x, even, given))(found)
 
     nothing = load * given.sliding[0]
     begun = jnp.stack([jnp.zeros_like(nothing), stance.ahead * jnp.ones_like(nothing)])
     even = moments(*_along(begun[1], given))
     found = steps(begun, given, even)
-    lifts = (stance.on_tracks > 0.5) & (jnp.maximum(jnp.abs(begun[1]), jnp.abs(found[1])) > stance.length / 6)
+    lifts = (stance.on_tracks > 0.5) & (jnp.maximum(jnp.abs(begun[1]), jnp.abs(found[0][1])) > stance.length / 6)
     return rarely(lifts, lambda at, given: steps(at, given, None), (begun, given), found)
 
 

@@ -50,6 +50,23 @@ def test_a_batch_takes_as_many_turns_as_its_lanes_need(counted):
     assert len(taken) < 4 * 50 < 41 * 30
 
 
+def test_members_that_have_ended_when_they_begin_cost_no_turn(counted):
+    """Three of a hundred that go on are at work together, wherever they stand."""
+    count, taken = counted
+    own = jnp.zeros(100).at[jnp.asarray([5, 50, 99])].set(7.0)
+    np.testing.assert_array_equal(jax.block_until_ready(jax.vmap(count)(own)), own)
+    jax.effects_barrier()
+    assert len(taken) <= 4 * 7
+
+
+def test_of_the_last_state_only_what_is_kept_is_returned():
+    turn, ended = (lambda own, s: (s[0] + own, s[1] + 1)), (lambda s: s[1] >= 3)
+    sums = jax.vmap(lambda x: lanes.until(lambda own: (own, own * 0), turn, ended, x, lambda s: s[0], 2))(
+        jnp.arange(5.0)
+    )
+    np.testing.assert_array_equal(sums, 4 * np.arange(5.0))
+
+
 def test_no_derivative_passes_through():
     assert float(jax.grad(lambda x: halves((x, 2.0))[0])(12.0)) == 0.0
 

@@ -27,7 +27,8 @@ class EquationDefects(Detail):
     """Defect of each equation in every run [its balance's unit], NaN for rows that do not count.
 
     Attributes:
-        before, after: balance → values, shape (rows,); what closes the readings' residual there.
+        before, after: balance, with its side where sides are driven apart (`track_left`) → values, shape (rows,);
+            what closes the readings' residual there.
     """
 
     before: dict[str, np.ndarray]

@@ -19,17 +19,24 @@ LANES = 256
 
 
 def until(
-    begun: Callable[[Any], T], turn: Callable[[Any, T], T], ended: Callable[[T], Bool[Array, ""]], own: Any
-) -> T:
+    begun: Callable[[Any], T],
+    turn: Callable[[Any, T], T],
+    ended: Callable[[T], Bool[Array, ""]],
+    own: Any,
+    kept: Callable[[T], Any] = lambda state: state,
+    most: int | None = None,
+) -> Any:
     """The state at which `ended`, by `turn` from `begun`, without derivatives.
 
     A batch of `jax.lax.while_loop` takes for each of its members as many turns as the longest of them. Here it takes
-    the mean, beside what the last `LANES` members take.
+    the mean, beside what the last `most` members take; those that have ended when they begin take none.
 
     Args:
         begun: state of arrays, of `own`; turn: the next state, of `own` and a state; ended: of a state. They close
             over no traced number.
         own: what a member has of its own; numbers in it may be batched.
+        kept: what of the last state is returned; most: members that are at work at once, `LANES` if
+            none are stated.
     """
     numbers, rest = eqx.partition(jax.lax.stop_gradient(own), eqx.is_array)
 
@@ -62,7 +69,7 @@ def until(
         return each(numbers)
 
     def refilled(numbers: Any, batched: Any, size: int) -> T:
-        lanes = min(size, LANES)
+        lanes = min(size, LANES if most is None else most)
         axes = jax.tree.map(lambda b: 0 if b else None, batched)
 
         def chosen(which: Array, one: T, other: T) -> T:
@@ -77,27 +84,36 @@ def until(
         go = jax.vmap(lambda x, s: turn(of(x), s), in_axes=(axes, 0))
         over = jax.vmap(ended)
 
+        begins = begin(numbers)
+        idle = over(begins)
+        order, size_busy = jnp.argsort(idle), size - jnp.sum(idle)
+
+        def member_of(place: Array) -> Array:
+            return order[jnp.minimum(place, size - 1)]
+
         def busy(carry: tuple) -> Array:
-            return jnp.any(carry[1] < size)
+            return jnp.any(carry[1] < size_busy)
 
         def step(carry: tuple) -> tuple:
-            found, index, following, state = carry
-            state = chosen(over(state), state, go(at(index), state))
-            free = over(state) & (index < size)
+            found, place, following, state = carry
+            member = member_of(place)
+            state = chosen(over(state), state, go(at(member), state))
+            free = over(state) & (place < size_busy)
             found = jax.tree.map(
-                lambda all_, x: all_.at[jnp.where(free, index, size)].set(x, mode="drop"), found, state
+                lambda all_, x: all_.at[jnp.where(free, member, size)].set(x, mode="drop"),
+                found,
+                jax.vmap(kept)(state),
             )
-            index = jnp.where(free, jnp.minimum(following + jnp.cumsum(free) - 1, size), index)
-            return found, index, following + jnp.sum(free), chosen(free, begin(at(index)), state)
+            place = jnp.where(free, following + jnp.cumsum(free) - 1, place)
+            return found, place, following + jnp.sum(free), chosen(free, begin(at(member_of(place))), state)
 
         first = jnp.arange(lanes)
-        state = begin(at(first))
-        found = jax.tree.map(lambda x: jnp.zeros((size, *x.shape[1:]), x.dtype), state)
-        return jax.lax.while_loop(busy, step, (found, first, jnp.asarray(lanes), state))[0]
+        carry = jax.vmap(kept)(begins), first, jnp.asarray(lanes), begin(at(member_of(first)))
+        return jax.lax.while_loop(busy, step, carry)[0]
 
     @custom_vmap
     def alone(numbers: Any) -> T:
-        return jax.lax.while_loop(lambda s: ~ended(s), lambda s: turn(of(numbers), s), begun(of(numbers)))
+        return kept(jax.lax.while_loop(lambda s: ~ended(s), lambda s: turn(of(numbers), s), begun(of(numbers))))
 
     @alone.def_vmap
     def together(size: int, batched: Any, numbers: Any) -> tuple[T, Any]:

@@ -49,11 +49,14 @@ OF_STRAIGHT = 5
 #: Unknowns that settle on level ground.
 SETTLING = 7
 
-#: Of the search for a settled turn: implicit Euler's first step, its shortest and longest [s]; by what the next is
-#: longer, and shorter where the rates grew by more than `WORSE`, or an unknown changed by more than `FAR` units.
+#: Of the first search for a settled turn: by how much an unknown is moved to look along it, a change so small that
+#: it has ended [units]; looks after which it is given up; and how far the last step may be from where it ended.
+ALONG, NEAR, SOON, CLOSE = 1e-6, 1e-7, 60, 1e-6
+#: Of the second: implicit Euler's first step, its shortest and longest [s]; by what the next is longer, and shorter
+#: where the rates grew by more than `WORSE`, or an unknown changed by more than `FAR` units.
 FIRST, SHORTEST, LONGEST, LONGER, SHORTER, WORSE, FAR = 0.05, 1e-6, 1e9, 3.0, 0.25, 1.05, 0.1
-#: The first attempt is given up after so many turns, and the second after `TURNS`.
-SOON = 12
+#: So many are followed at once, as few members of a batch need it.
+FEW = 32
 #: It has ended at a change so small where the rates are small too [1/s] or the step is long [s]; and failed after so
 #: many.
 SMALL, SMALL_RATE, LONG, TURNS = 1e-9, 1e-7, 10.0, 200
@@ -139,13 +142,40 @@ def _guess(robot: Robot, conditions: Conditions) -> Float[Array, " 11"]:
     return y.at[10].set(conditions.discharge) / jnp.asarray(_UNITS)
 
 
+class _Secant(eqx.Module):
+    """A search for a settled turn by Broyden's method.
+
+    Attributes:
+        y: those of the unknowns that settle, and the loads; rates: what `_balance` gives there.
+        inverse: of minus its Jacobian, as it is known so far.
+        looks: how often `_balance` was asked; solved: whether the search has ended.
+    """
+
+    y: Float[Array, " 9"]
+    rates: Float[Array, " 9"]
+    inverse: Float[Array, "9 9"]
+    looks: Scalar
+    solved: Array
+
+
+class _Linear(eqx.Module):
+    """`_balance` where a search has ended.
+
+    Attributes:
+        jacobian: of `_balance`; sound: whether that is a turn, and a stable one; known: whether this is known yet.
+    """
+
+    jacobian: Float[Array, "9 9"]
+    sound: Array
+    known: Array
+
+
 class _Search(eqx.Module):
-    """A search for a settled turn.
+    """A search for a settled turn along a run.
 
     Attributes:
         y: those of the unknowns that settle, and the loads; rates: what `_balance` gives; jacobian: of these by y.
-        step: length of the next step [s]; turns: steps taken in this attempt; patient: whether it is the second one.
-        solved: whether it has ended well.
+        step: length of the next step [s]; turns: steps taken; solved: whether it has ended well.
     """
 
     y: Float[Array, " 9"]
@@ -153,7 +183,6 @@ class _Search(eqx.Module):
     jacobian: Float[Array, "9 9"]
     step: Scalar
     turns: Scalar
-    patient: Array
     solved: Array
 
 
@@ -200,44 +229,76 @@ def _loads(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> Float
 def _settled(robot: Robot, conditions: Conditions) -> tuple[PlaneMotion, Float[Array, " 2"], Bool[Array, ""]]:
     """The motion of a settled turn on level ground, its loads, see `turning.grip`, and whether it was found.
 
-    Implicit Euler's steps, longer and longer, follow a run to where it settles; in the end they are Newton's, and the
-    last of those carries the derivatives, which are the implicit ones. A first attempt takes every step, none of them
-    farther than `_share` lets it. Where it has not ended soon, or at a turn that is not stable, a second begins anew
-    and takes none that lets the rates grow.
+    Broyden's method, which looks along each unknown first, finds most. Where it does not end, or at a turn that is
+    not stable, implicit Euler's steps, longer and longer, follow a run to where it settles, and none is taken that
+    lets the rates grow. The last step is Newton's and carries the derivatives, which are the implicit ones.
     """
     size = SETTLING + len(SIDES)
     moves = np.arange(size) >= (0 if conditions.of_sides().motor_speed is None else 4)
     still, slow = -np.eye(size), np.diag(np.arange(size) < SETTLING)
 
-    def begun(held: tuple[Robot, Conditions], patient: bool = False) -> _Search:
-        """Its first step goes nowhere: it only looks round."""
-        guess = jnp.concatenate([_guess(*held)[:SETTLING], jnp.zeros(len(SIDES))])
-        first, turns = jnp.asarray(FIRST), jnp.asarray(0)
-        return _Search(
-            guess, jnp.zeros_like(guess), jnp.asarray(still), first, turns, jnp.asarray(patient), jnp.asarray(False)
-        )
+    def guess(held: tuple[Robot, Conditions]) -> Float[Array, " 9"]:
+        return jnp.concatenate([_guess(*held)[:SETTLING], jnp.zeros(len(SIDES))])
 
-    def turn(held: tuple[Robot, Conditions], search: _Search) -> _Search:
-        solve, determinant = inverse(jnp.asarray(slow) / search.step - search.jacobian)
-        step = solve(search.rates)
-        largest, patient = jnp.max(jnp.abs(step)), search.patient
-        next_y = search.y + step * jnp.where(patient, 1.0, _share(*held, search.y, step))
-        slope, found = jax.jacfwd(lambda y: (_balance(*held, y),) * 2, has_aux=True)(next_y)
+    def secant(held: tuple[Robot, Conditions]) -> _Secant:
+        start = guess(held)
+        return _Secant(start, jnp.zeros_like(start), jnp.eye(size), jnp.asarray(0), jnp.asarray(False))
+
+    def look(held: tuple[Robot, Conditions], search: _Secant) -> _Secant:
+        """At where it begins, then along each unknown from there, then where the secants lead."""
+        aside = search.looks <= size
+        step = (search.inverse * search.rates).sum(-1)
+        taken = step * _share(*held, search.y, step)
+        taken = jnp.where(aside, ALONG * (np.arange(size) == search.looks - 1), taken)
+        found = _balance(*held, search.y + taken)
+        found = jnp.where(moves, found, guess(held) - search.y - taken)
+        gone = search.inverse @ (search.rates - found)
+        row = taken @ search.inverse
+        change = jnp.outer(taken - gone, row) / (taken @ gone)
+        inverse = jnp.where(
+            (search.looks > 0) & jnp.all(jnp.isfinite(change)), search.inverse + change, search.inverse
+        )
+        y = jnp.where(aside, search.y, search.y + taken)
+        rates = jnp.where(aside & (search.looks > 0), search.rates, found)
+        return _Secant(y, rates, inverse, search.looks + 1, ~aside & (jnp.max(jnp.abs(step)) < NEAR))
+
+    def unknown(_: tuple[Robot, Conditions, Array, Array]) -> _Linear:
+        return _Linear(jnp.asarray(still), jnp.asarray(False), jnp.asarray(False))
+
+    def linear(held: tuple[Robot, Conditions, Array, Array], _: _Linear) -> _Linear:
+        y, solved = held[2:]
+        slope, found = jax.jacfwd(lambda y: (_balance(*held[:2], y),) * 2, has_aux=True)(y)
         slope = jnp.where(moves[:, None], slope, still)  # what does not move has no equation of its own
+        solve, determinant = inverse(-slope)
+        close = jnp.max(jnp.abs(solve(found))) < CLOSE
+        return _Linear(slope, solved & close & (determinant > 0), jnp.asarray(True))
+
+    def follow(held: tuple[Robot, Conditions, Array, _Linear]) -> _Search:
+        """Its first step goes nowhere: it only looks round."""
+        y, known = held[2:]
+        y = jnp.where(known.sound, y, guess(held[:2]))
+        first, turns = jnp.asarray(FIRST), jnp.asarray(0)
+        return _Search(y, jnp.zeros_like(y), jnp.where(known.sound, known.jacobian, still), first, turns, known.sound)
+
+    def turn(held: tuple[Robot, Conditions, Array, _Linear], search: _Search) -> _Search:
+        step = inverse(jnp.asarray(slow) / search.step - search.jacobian)[0](search.rates)
+        largest, next_y = jnp.max(jnp.abs(step)), search.y + step
+        slope, found = jax.jacfwd(lambda y: (_balance(*held[:2], y),) * 2, has_aux=True)(next_y)
+        slope = jnp.where(moves[:, None], slope, still)
         before, after = jnp.linalg.norm(search.rates), jnp.linalg.norm(found)
-        worse = patient & (~(after <= WORSE * before + SMALL) | (largest > FAR)) & (search.turns > 0)
-        settled = (search.step > LONG) | patient & (after < SMALL_RATE)
-        ended = ~worse & (largest < SMALL) & settled
+        worse = (~(after <= WORSE * before + SMALL) | (largest > FAR)) & (search.turns > 0)
+        ended = ~worse & (largest < SMALL) & ((search.step > LONG) | (after < SMALL_RATE))
         y, found, slope = (
             jnp.where(worse, old, new)
             for old, new in ((search.y, next_y), (search.rates, found), (search.jacobian, slope))
         )
         length = jnp.clip(search.step * jnp.where(worse, SHORTER, LONGER), SHORTEST, LONGEST)
-        gone = _Search(y, found, slope, length, search.turns + 1, patient, ended & (patient | (determinant > 0)))
-        anew = ~patient & jnp.where(ended, determinant <= 0, search.turns >= SOON)
-        return jax.tree.map(lambda x, y: jnp.where(anew, x, y), begun(held, True), gone)
+        return _Search(y, found, slope, length, search.turns + 1, ended)
 
-    end = lanes.until(begun, turn, lambda search: (search.turns >= TURNS) | search.solved, (robot, conditions))
+    held = robot, conditions
+    first = lanes.until(secant, look, lambda s: (s.looks >= SOON) | s.solved, held, lambda s: (s.y, s.solved))
+    known = lanes.until(unknown, linear, lambda s: s.known, (*held, *first))
+    end = lanes.until(follow, turn, lambda s: (s.turns >= TURNS) | s.solved, (*held, first[0], known), most=FEW)
     sound = end.solved & jnp.all(jnp.isfinite(end.jacobian))
     slope = jnp.where(sound, end.jacobian, jnp.asarray(still))
     y = end.y + inverse(-slope)[0](jnp.where(sound, _balance(robot, conditions, end.y), 0.0))

@@ -176,8 +176,3 @@ def note(axes: Axes, words: str, x: float = 0.02, y: float = 0.97, **keywords: A
     """A remark in a corner of the axes (axes fractions)."""
     keywords = {"fontsize": 8.5, "color": INK, "va": "top", "ha": "left", **keywords}
     axes.text(x, y, words, transform=axes.transAxes, **keywords)
-
-
-def colours_of(configurations: np.ndarray) -> dict[str, str]:
-    """A colour for each configuration of a table, in the order of their first rows."""
-    return {name: colour for name, (colour, _) in looks(configurations).items()}

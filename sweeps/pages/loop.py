@@ -14,7 +14,7 @@ from calibration.data.columns import Layout
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference import blocks
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
-from calibration.inference.errors import rms_by_fit
+from calibration.inference.errors import OF_SIZE, percent_error, rms_by_fit, root_mean_square
 from calibration.inference.notes import FarFromPrior
 from calibration.words import loop as words
 from calibration.words.notes import sentence
@@ -70,7 +70,7 @@ def findings(found: DiscoveryResult, changed: Mapping[str, Change]) -> list[dict
     for e in found.effects:
         size = words.size(e)
         if (change := changed.get(e.name)) is not None:
-            size += f", which changes the {change.channel.label} by {100 * change.rms:.2g} %"
+            size += f", which changes the {change.channel.label} by {change.rms:.2g} %"
         sure, other = words.how_sure(found, e), words.alike(e)
         listed.append({"name": e.name, "what": ", or ".join(e.families), "size": size, "sure": sure, "alike": other})
     return listed
@@ -81,7 +81,7 @@ class Change:
     """What an effect of the robot that is written changes in the readings of the runs.
 
     Attributes:
-        channel: the one that it changes most; rms: by how much, as a share of the reading.
+        channel: the one that it changes most; rms: by how much [%], of what errors are percent of.
         without, with_it: simulated without and with it, all else alike [SI], shape (rows,).
     """
 
@@ -108,9 +108,9 @@ def changes(found: DiscoveryResult) -> dict[str, Change]:
         moved = []
         for c in found.channels:
             a, b = without[c.name], with_it[c.name]
-            usable = found.included & np.isfinite(a) & np.isfinite(b) & (b != 0)
-            if usable.any():
-                moved.append(Change(c, float(np.sqrt(np.mean((a[usable] / b[usable] - 1) ** 2))), a, b))
+            percent = percent_error(b[found.included], a[found.included], crosses_zero=found.percent_of == OF_SIZE)
+            if np.isfinite(percent).any():
+                moved.append(Change(c, root_mean_square(percent), a, b))
         if moved:
             most[name] = max(moved, key=lambda change: change.rms)
     return most
@@ -241,6 +241,7 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         columns=columns(found.channels),
         sized=sized,
         has_ground=found.robot.has_ground,
+        sides=max(1, len(loop_figures.defects_of(table, "before", "track"))),
         closed=loop_figures.closed(table) if sized and isinstance(found.detail, EquationDefects) else [],
         rms=rms_by_fit(table, found.channels, ("before", "after", "held_out_before", "held_out_after")),
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",

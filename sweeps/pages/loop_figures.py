@@ -12,8 +12,7 @@ from calibration.discovery.result import DiscoveryResult, Evidence, UnnamedDiscr
 from calibration.inference import blocks
 from calibration.inference.bases import in_words
 from calibration.inference.details import TimeStatistics
-from mmrjax.channels import MM, RPM, Channel
-from mmrjax.effects import BY_NAME
+from mmrjax.channels import EVERY, MM, RPM, Channel
 from sweeps.pages.figure_style import (
     BLUE,
     FAINT,
@@ -21,8 +20,8 @@ from sweeps.pages.figure_style import (
     INK,
     ORANGE,
     SKY,
-    colours_of,
     figure,
+    looks,
     note,
 )
 from sweeps.pages.sweep_figures import UNITS, imposed
@@ -46,6 +45,12 @@ IMPOSED_WORDS = {
     "supply_voltage_V": "supply voltage [V]",
     "motor_speed_rpm": "motor speed [rpm]",
     "motor_current_A": "motor current [A]",
+}
+#: Label and unit of conditions that no channel shows.
+CONDITION_WORDS = {
+    "supply_voltage_V": ("supply voltage", "V"),
+    "payload_kg": ("payload", "kg"),
+    "slope_deg": ("slope", "deg"),
 }
 
 
@@ -222,18 +227,64 @@ def errors(found: DiscoveryResult) -> Figure:
     return fig
 
 
-#: By what an effect changes with, the equation whose variable reveals it.
-REVEALS = {"current": "electrical", "load": "electrical", "speed": "track", "demand": "slip", "slope": "slip"}
+#: Of the range of a variable, over which the change by an effect is averaged when it is asked how smooth it runs.
+NEAR = 1 / 12
+
+
+def given(table: dict[str, np.ndarray]) -> tuple[np.ndarray, str]:
+    """What is imposed in runs, of a supply the share that a driver passes on, and its label."""
+    own = imposed(table)
+    if own == "supply_voltage_V" and "duty" in table and np.isfinite(table["duty"]).all():
+        return table[own] * table["duty"], "voltage given to the motors [V]"
+    return table[own], IMPOSED_WORDS[own]
+
+
+def roughness(x: np.ndarray, y: np.ndarray) -> float:
+    """Share of the variance of y that its mean over the other rows near x leaves [-]; inf where x is constant."""
+    if not np.ptp(x) > 0:
+        return np.inf
+    near = np.exp(-0.5 * ((x[:, None] - x) / (NEAR * np.ptp(x))) ** 2) * (1 - np.eye(len(x)))
+    return float(np.mean((y - near @ y / near.sum(1)) ** 2) / max(np.var(y), 1e-300))
+
+
+def conditions_and_readings(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What rows differ by, by its label: what is imposed, payload, slope, readings, and of what each side has its own
+    the mean and the difference too."""
+    known = {c.column: (c.label, c.unit) for c in EVERY} | CONDITION_WORDS
+    if "duty_left" in table and "supply_voltage_V" in table:
+        sides = {f"voltage_{s}_V": table["supply_voltage_V"] * table[f"duty_{s}"] for s in ("left", "right")}
+        table, known = table | sides, known | {f"voltage_{s}_V": (f"voltage, {s}", "V") for s in ("left", "right")}
+    found = {f"{label} [{unit}]": table[c] for c, (label, unit) in known.items() if c in table}
+    values, words = given(table)
+    found |= {words: values}
+    for label, left in list(found.items()):
+        if (right := found.get(label.replace(", left", ", right"))) is not None and ", left" in label:
+            both = label.replace(", left", "")
+            found |= {f"mean of both sides: {both}": (left + right) / 2, f"left less right: {both}": left - right}
+    return found
+
+
+def depends_on(table: dict[str, np.ndarray], change: np.ndarray) -> tuple[np.ndarray, str]:
+    """Over what an effect is drawn, and its label: that condition or reading over which what it changes of a reading
+    runs smoothest.
+
+    Args:
+        change: of the reading, shape (rows,), NaN where a row does not count.
+    """
+    use = np.isfinite(change)
+    every = {k: np.asarray(v, float) for k, v in conditions_and_readings(table).items()}
+    whole = {k: v for k, v in every.items() if np.isfinite(v[use]).all()}
+    label = min(whole, key=lambda k: roughness(whole[k][use], change[use]))
+    return whole[label], label
 
 
 def laws(found: DiscoveryResult, table: dict[str, np.ndarray], changes: Mapping[str, Change]) -> Figure:
     """What each effect that was found explains: readings less the same robot without it, and what it adds, over what
-    reveals it."""
+    that depends on."""
     fig, grid = figure(1, len(changes), 3.4)
     for axes, (name, change) in zip(grid[0], changes.items(), strict=True):
-        c, own = change.channel, imposed(table)
-        reveals = REVEALS.get(BY_NAME[name].driver) if name in BY_NAME else None
-        x, label = _over(table, *DEFECT_WORDS[reveals][2:]) if reveals else (table[own], IMPOSED_WORDS[own])
+        c = change.channel
+        x, label = depends_on(table, np.where(found.included, change.with_it - change.without, np.nan))
         measured = found.readings_of_rows.measured[:, [x.name for x in found.channels].index(c.name)]
         axes.axhline(0, color=FAINT, lw=0.8)
         for what, values, look in (
@@ -247,18 +298,28 @@ def laws(found: DiscoveryResult, table: dict[str, np.ndarray], changes: Mapping[
     return fig
 
 
+def defects_of(table: dict[str, np.ndarray], when: str, balance: str) -> dict[str, np.ndarray]:
+    """Defects of a balance by side, whose name is empty where sides are alike."""
+    sides = {side: f"defect_{when}_{balance}{'_' * bool(side)}{side}" for side in ("", "left", "right")}
+    return {side: table[column] for side, column in sides.items() if column in table}
+
+
 def closed(table: dict[str, np.ndarray]) -> list[str]:
     """Equations that the readings close: those with a defect somewhere, at least one."""
-    found = [b for b in DEFECT_WORDS if np.nan_to_num(table[f"defect_before_{b}"]).any()]
+    found = [b for b in DEFECT_WORDS if any(np.nan_to_num(x).any() for x in defects_of(table, "before", b).values())]
     return found or ["track"]
 
 
-def _over(table: dict[str, np.ndarray], column: str, label: str) -> tuple[np.ndarray, str]:
-    """The variable over which a defect is drawn, or what is imposed where a table lacks it or it does not vary."""
-    column = "total_" + column if column == "current_A" else column
+def _over(table: dict[str, np.ndarray], column: str, label: str, side: str = "") -> tuple[np.ndarray, str]:
+    """The variable over which a defect is drawn, of its side where it has one, or what is imposed where a table lacks
+    it or it does not vary."""
     own = imposed(table)
+    if side:
+        column = f"motor_current_{side}_A" if column == "current_A" else f"motor_speed_{side}_rpm"
+        label = f"motor {'current' if 'current' in column else 'speed'} of that side [{column.rpartition('_')[2]}]"
+    column = "total_" + column if column == "current_A" else column
     if column not in table or (column not in ("total_current_A", own) and np.unique(table[column]).size == 1):
-        return table[own], IMPOSED_WORDS[own]
+        return given(table)
     return table[column], label
 
 
@@ -270,24 +331,24 @@ def defects(table: dict[str, np.ndarray], verdict: str, crosses_zero: bool = Fal
     """
     whens = ("before",) if verdict in ("none", "unnamed") else ("before", "after")
     drawn = {b: DEFECT_WORDS[b] for b in (closed(table) if crosses_zero else DEFECT_WORDS)}
-    fig, grid = figure(len(whens), len(drawn), 2.5 * len(whens) + 0.3, sharex="col", sharey="col")
+    fig, grid = figure(len(whens), len(drawn), 2.6 * len(whens) + 0.5, sharex="col", sharey="col")
     for row, when in enumerate(whens):
-        for axes, (balance, (words, unit, column, label)) in zip(grid[row], drawn.items(), strict=True):
-            if crosses_zero:
-                x, label = _over(table, column, label)
-                balance_words = RIG_WORDS.get(balance, words)
-            else:
-                x, balance_words = table["total_" + column if column == "current_A" else column], words
-            y = table[f"defect_{when}_{balance}"] * (1e3 if balance == "slip" else 1.0)
+        for axes, (balance, (words, unit, column, of_what)) in zip(grid[row], drawn.items(), strict=True):
+            balance_words = RIG_WORDS.get(balance, words) if crosses_zero else words
+            by_side = defects_of(table, when, balance)
+            names = [(name, side) for name in dict.fromkeys(table["configuration"]) for side in by_side]
             axes.axhline(0, color=FAINT, lw=0.8)
-            for name, colour in colours_of(table["configuration"]).items():
+            for (name, side), (colour, marker) in zip(names, looks(map(", ".join, names)).values(), strict=True):
                 mine = table["configuration"] == name
-                axes.plot(x[mine], y[mine], "o", ms=4.5, color=colour, label=name)
+                x, label = _over(table, column, of_what, side)
+                y = by_side[side][mine] * (1e3 if balance == "slip" else 1.0)
+                axes.plot(x[mine], y, marker, ms=4.5, color=colour, label=f"{name}, {side}".removesuffix(", "))
             axes.set_title(f"{'torque' if crosses_zero and balance == 'track' else balance}, {when}")
             axes.set_ylabel(f"{balance_words} [{unit}]")
             if row == len(whens) - 1:
                 axes.set_xlabel(label)
-    grid[0, 0].legend(loc="best")
+                axes.locator_params(axis="x", nbins=5)
+    fig.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=4)
     return fig
 
 

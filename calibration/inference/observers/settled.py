@@ -44,8 +44,9 @@ CONTRADICTION = 6.0
 CONTRADICTION_SHARE = 0.25
 #: Searches side by side on a core: of a robot without effects, and with.
 MANY, FEW = 16, 4
-#: Balances to which the defect of a row is attributed, one for each equation that the channels close.
-EQUATIONS = ("electrical", "track", "slip")
+#: Balances to which the defect of a row is attributed, one for each equation that the channels close: what each is a
+#: part of, by its name among the signals.
+EQUATIONS = {"electrical": "voltage", "track": "torque_output", "slip": "speed_theoretical"}
 
 
 class SettledLinearization(Linearization):
@@ -314,20 +315,29 @@ class SettledRuns(Observer):
 
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> EquationDefects:
         """As the protocol says: a row's residual (simulated less measured) is split among the defects of the
-        balances `electrical`, `track` and `slip` that together make it."""
+        balances `electrical`, `track` and `slip`, of each side where they are driven apart, that together make it."""
         return EquationDefects(_defects(before.linear, included), _defects(after.linear, included))
 
 
 def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarray]:
-    rows = len(included)
+    """The defects of each row that make its residual r, of each side where sides are driven apart.
+
+    The likeliest of r = -S δ + noise of one sd, where δ has the prior sds D^½, the size of what each equation is
+    about (rms over the table): δ = -D Sᵀ (S D Sᵀ + 1)⁻¹ r. A defect that the readings of a row hardly show is so next
+    to nothing, and never a residual over a vanishing slope; what they show of several together is shared out.
+    """
     assert isinstance(linear, SettledLinearization)
-    along = (np.asarray(linear.of_sides(linear.probed.index(b)).sum(0))[:rows] for b in EQUATIONS)
-    sensitivity = np.stack(list(along), 2)
-    residual = np.asarray(linear.by_row())[:rows]
-    found = np.full((rows, len(EQUATIONS)), np.nan)
-    for k in np.flatnonzero(included):
-        found[k] = -np.linalg.lstsq(sensitivity[k], residual[k], rcond=None)[0]
-    return dict(zip(EQUATIONS, found.T, strict=True))
+    rows = np.flatnonzero(included)
+    slopes = np.stack([np.asarray(linear.of_sides(linear.probed.index(b)))[:, rows] for b in EQUATIONS])
+    about = [np.asarray(getattr(linear.signals, name))[rows] for name in EQUATIONS.values()]
+    sides, size = slopes.shape[1], np.array([np.sqrt(np.mean(x**2)) for x in about])
+    slopes = (slopes * size[:, None, None, None]).reshape(-1, *slopes.shape[2:]).transpose(1, 2, 0)
+    both = slopes @ slopes.transpose(0, 2, 1) + np.eye(slopes.shape[1])
+    shares = -slopes.transpose(0, 2, 1) @ np.linalg.solve(both, np.asarray(linear.by_row())[rows, :, None])
+    found = np.full((len(EQUATIONS) * sides, len(included)), np.nan)
+    found[:, rows] = np.repeat(size, sides)[:, None] * shares[:, :, 0].T
+    names = [f"{b}_{side}" for b in EQUATIONS for side in ("left", "right")] if sides > 1 else EQUATIONS
+    return dict(zip(names, found, strict=True))
 
 
 @functools.partial(compiled, options=SELDOM)

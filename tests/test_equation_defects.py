@@ -1,0 +1,142 @@
+"""What each equation lacks, row by row: nothing is a residual over a vanishing slope, each side has its own, and what
+was found is drawn over what it depends on."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import mmrjax as mm
+from calibration.inference.details import EquationDefects
+from calibration.inference.errors import OF_SIZE
+from calibration.inference.observers.settled import EQUATIONS, SettledLinearization, _defects
+from calibration.inference.observers.turns import TurnLinearization
+from mmrjax import channels, effects
+from mmrjax.signals import Signals
+from sweeps.pages import loop as page
+from sweeps.pages import loop_figures
+
+ROWS, COUNT, RANDOM = 12, 3, np.random.default_rng(0)
+#: Sizes of voltage, torque and speed; and how many sds of a reading a defect of that size is.
+SIZES, SEEN = {"voltage": 20.0, "torque_output": 2.0, "speed_theoretical": 0.5}, 200.0
+
+
+def linearised(kind, slopes, defects):
+    """A fit whose rows have defects (equations, sides, rows), by slopes (equations, sides, rows, channels)."""
+    sides = slopes.shape[1]
+    whole = np.zeros((len(kind.probed), *slopes.shape[1:]))
+    for slope, name in zip(slopes, EQUATIONS, strict=True):
+        whole[kind.probed.index(name)] = slope
+    residual = -np.einsum("esrc,esr->rc", slopes, defects)
+    shape = (ROWS, sides) if sides > 1 else (ROWS,)
+    signals = Signals(**{name: np.full(shape, size) for name, size in SIZES.items()})
+    scale = np.ones(residual.shape)
+    whole = whole if sides > 1 else whole[:, 0]
+    return kind(residual.ravel(), np.zeros((residual.size, 1)), np.zeros((residual.size, 0)), whole, scale, signals,
+                channels=tuple(map(str, range(residual.shape[1]))))  # fmt: skip
+
+
+def slopes_of(sides, count=COUNT):
+    size = np.array(list(SIZES.values()))[:, None, None, None]
+    return SEEN * RANDOM.normal(size=(len(EQUATIONS), sides, ROWS, count)) / size
+
+
+def test_defects_that_readings_show_are_found():
+    true = RANDOM.normal(size=(3, 1, ROWS)) * np.array([0.1, 0.01, 0.005])[:, None, None]
+    included = np.arange(ROWS) != 4
+    found = _defects(linearised(SettledLinearization, slopes_of(1), true), included)
+    assert list(found) == list(EQUATIONS)
+    for x, wanted, size in zip(found.values(), true[:, 0], SIZES.values(), strict=True):
+        assert np.isnan(x[4]) and np.isfinite(x[included]).all()
+        np.testing.assert_allclose(x[included], wanted[included], atol=2e-3 * size)
+
+
+@pytest.mark.parametrize("slope", [1e-3, 1e-6, 0.0])
+def test_no_defect_is_a_residual_over_a_vanishing_slope(slope):
+    slopes = slopes_of(1)
+    slopes[2, 0, 3] *= slope  # the slip of one row
+    linear = linearised(SettledLinearization, slopes, np.zeros((3, 1, ROWS)))
+    noisy = dataclasses.replace(linear, residual=RANDOM.normal(size=ROWS * COUNT))
+    found = _defects(noisy, np.ones(ROWS, bool))["slip"]
+    assert abs(found[3]) < SIZES["speed_theoretical"]
+
+
+def test_each_side_has_its_own_defects():
+    true = np.zeros((3, 2, ROWS))
+    true[0, 1] = 0.3  # the right one's voltage
+    found = _defects(linearised(TurnLinearization, slopes_of(2, 7), true), np.ones(ROWS, bool))
+    assert list(found) == [f"{b}_{side}" for b in EQUATIONS for side in ("left", "right")]
+    for name, x in found.items():
+        wanted, size = (0.3, 20.0) if name == "electrical_right" else (0.0, SIZES[EQUATIONS[name.rpartition("_")[0]]])
+        np.testing.assert_allclose(x, wanted, atol=2e-3 * size)
+
+
+def turns():
+    """Columns of a table of turns."""
+    n = 40
+    duty = RANDOM.uniform(-1, 1, (2, n))
+    voltage = np.repeat([15.0, 33.0], n // 2)
+    table = {"configuration": np.full(n, "6T2A"), "supply_voltage_V": voltage, "payload_kg": np.zeros(n)}
+    table |= {"duty_left": duty[0], "duty_right": duty[1], "slope_deg": np.zeros(n)}
+    for side, d in zip(("left", "right"), duty, strict=True):
+        table[f"motor_speed_{side}_rpm"] = 360 * d * voltage
+        table[f"motor_current_{side}_A"] = RANDOM.uniform(-2, 2, n)
+        table |= {f"defect_before_{b}_{side}": RANDOM.normal(size=n) for b in EQUATIONS}
+    return table
+
+
+@pytest.mark.parametrize(
+    ("change", "label"),
+    [
+        (lambda t: t["supply_voltage_V"] ** 2, "supply voltage [V]"),
+        (lambda t: np.abs(t["motor_current_right_A"]), "motor current, right [A]"),
+        (lambda t: t["motor_current_left_A"] - t["motor_current_right_A"], "left less right: motor current [A]"),
+        (lambda t: np.sin(t["motor_current_left_A"] + t["motor_current_right_A"]), "mean of both sides: motor current [A]"),
+        (lambda t: np.cos(t["slope_deg"]) + t["motor_current_left_A"], "motor current, left [A]"),
+    ],
+)  # fmt: skip
+def test_what_was_found_is_drawn_over_what_it_depends_on(change, label):
+    table = turns()
+    y = change(table)
+    y[3] = np.nan  # a row that does not count
+    x, said = loop_figures.depends_on(table, y)
+    assert said == label and x.shape == y.shape
+
+
+def test_voltage_of_a_side_is_its_share_of_the_supply():
+    table = turns()
+    given = table["supply_voltage_V"] * table["duty_left"]
+    assert np.array_equal(loop_figures.conditions_and_readings(table)["voltage, left [V]"], given)
+
+
+def test_where_a_driver_passes_on_a_share_of_one_voltage_that_is_the_axis():
+    duty = RANDOM.uniform(-1, 1, 8)
+    table = {"configuration": np.full(8, "rig"), "supply_voltage_V": np.full(8, 48.0), "duty": duty}
+    for x, label in (loop_figures.depends_on(table, duty**3), loop_figures._over(table, "slope_deg", "slope [deg]")):
+        assert np.array_equal(x, 48.0 * duty) and label == "voltage given to the motors [V]"
+
+
+def test_defects_of_turns_are_drawn_by_side_over_what_that_side_does():
+    table = turns()
+    fig = loop_figures.defects(table, "none", crosses_zero=True)
+    for axes, column in zip(
+        fig.axes, ("motor_current_{}_A", "motor_speed_{}_rpm", "motor_speed_{}_rpm"), strict=True
+    ):
+        lines = {line.get_label(): line.get_xdata() for line in axes.get_lines()}
+        for side in ("left", "right"):
+            assert np.array_equal(lines[f"6T2A, {side}"], table[column.format(side)])
+        assert "of that side" in axes.get_xlabel()
+
+
+def test_change_of_a_reading_that_crosses_zero_is_of_its_size(monkeypatch):
+    """A turn's yaw rate may be next to nothing; what an effect changes of it is no share of that."""
+    robot = dataclasses.replace(mm.nominal(), effects=(effects.BY_NAME["iron_loss"](amplitude=1.0),))
+    (yaw,) = channels.rows(["yaw_rate"])
+    rates = [np.array([1.0, -1.0, 1e-9]), np.array([1.1, -1.1, 0.1])]
+    monkeypatch.setattr(page.mm, "simulate", lambda *_: SimpleNamespace(yaw_rate=rates.pop(0)))
+    found = SimpleNamespace(
+        effects=[SimpleNamespace(name="iron_loss")], robot=robot, detail=EquationDefects({}, {}), channels=(yaw,),
+        runs=SimpleNamespace(conditions=lambda robot: None), included=np.ones(3, bool), percent_of=OF_SIZE,
+    )  # fmt: skip
+    assert page.changes(found)["iron_loss"].rms == pytest.approx(10 * np.sqrt(1.5), rel=1e-6)
