@@ -188,6 +188,13 @@ class CandidateSpace:
 
         return dataclasses.replace(self, bare=with_weight(self.bare), equipped=with_weight(self.equipped))
 
+    def fit_of(self, active: Sequence[str], z: np.ndarray) -> tuple[Problem, np.ndarray, tuple[int, ...] | None]:
+        """Problem, coordinates and indices of the effects of a fit; of one without effects those of the base alone, a
+        step of which costs a third and less."""
+        if not any(active):
+            return self.bare, np.asarray(z)[: self.free], None
+        return self.equipped, np.asarray(z), self.library.indices(active)
+
     def problem(self, active: Sequence[str]) -> Problem:
         """The problem with these effects in the slots."""
         coordinates = self.coordinates.with_effects(self.library.indices(active))

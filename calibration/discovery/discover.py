@@ -21,7 +21,7 @@ from calibration.data.runs import Runs
 from calibration.discovery import findings, kept, menu, prediction, preference, scales
 from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
-from calibration.discovery.candidates import BaseFit, Candidate, empty, filled, fit_base, fit_candidates, start
+from calibration.discovery.candidates import BaseFit, Candidate, filled, fit_base, fit_candidates, start
 from calibration.discovery.classes import Classes, classes, cosines
 from calibration.discovery.discrepancy import diagnosis_beside, fit_discrepancy, locate
 from calibration.discovery.experiments import Proposal, denser, no_menu, separating
@@ -652,7 +652,7 @@ def assemble_result(
     observe, rows = space.bare.observe, len(runs)
     numbers = np.arange(1, rows + 1) if numbers is None else numbers
     included = space.included[:rows]
-    before = findings.Fitted(space.equipped, base.z, space.library.indices(empty(settings)))
+    before = findings.Fitted(*space.fit_of(base.active, base.z))
     after, robot, z, sd = None, findings.proposed_robot(space, best), best.z, best.sd
     cost, converged = best.cost, best.converged
     posterior = of_fit(space, best.active, best.z, ends.linear)

@@ -104,9 +104,9 @@ def score_of(space: CandidateSpace, runs: Runs, candidate: Candidate) -> HeldOut
     """Scores of a candidate, fitted anew without each block of every kind."""
     data, rows, kinds = space.equipped.data, len(runs), space.bare.observe.blocks
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
-    active = space.library.indices(candidate.active)
+    problem, z, active = space.fit_of(candidate.active, candidate.z)
     reading = {
-        kind: held_out(space.equipped, candidate.z, list(by.values()), active).reading
+        kind: held_out(problem, z, list(by.values()), active).reading
         for kind, by in blocks_room.distinct(runs, kinds).items()
     }
     return scored(reading, measured, sd, counts, runs, kinds)

@@ -164,7 +164,8 @@ def _spread(problem: Problem, draws: np.ndarray) -> np.ndarray:
 def _coordinate(problem: Problem, k: int, value: float) -> float:
     """The coordinate at which a parameter has a value [SI]."""
     c = problem.coordinates
-    return float(((np.log(value) if c.scale[k] else value) - c.location[k]) / c.spread[k])
+    location, spread, scale = (np.asarray(x)[k] for x in (c.location, c.spread, c.scale))
+    return float(((np.log(value) if scale else value) - location) / spread)
 
 
 def _blunt(problem: Problem) -> Problem:
