@@ -555,7 +555,6 @@ def searches_long(
     places: int,
     *,
     rivals: bool = False,
-    worth: float = DECREMENT,
 ) -> tuple[Optimum, Observation]:
     """`levenberg_marquardt` of any number of members with the steps taken from outside, so that rollouts are compiled
     once in all; what has ended is not evaluated again and leaves its place to one that waits.
@@ -566,7 +565,6 @@ def searches_long(
         rivals: whether all search the same optimum, so that all end once `AGREE` have ended in one place and none is
             lower, and those that cannot come down to the lowest so far (by `HOPELESS` times what their step predicts)
             before.
-        worth: ends a search, with a share of its cost, ten times what its next step promises to gain.
 
     Returns:
         Where each search ended, and what the model says there.
@@ -586,7 +584,7 @@ def searches_long(
             at = begun if at is None else jax.tree.map(lambda old, new: _put(old, fresh, new[fresh]), at, begun)  # noqa: B023
         at, ends = jax.device_get(_steps(at, found, data, weights[mine.member], held.start, held.stop))
         ahead, seen = at.ahead, at.found[2]
-        small = 0.1 * (worth + DECREMENT_SHARE * ends.cost)
+        small = 0.1 * (DECREMENT + DECREMENT_SHARE * ends.cost)
         over = at.over | (at.steps >= max_steps) | ((at.rejected == 0) & (ends.decrement < small))
         cost[mine.holds[going]] = ends.cost[going]
         if rivals:

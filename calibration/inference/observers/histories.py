@@ -533,8 +533,7 @@ class Histories(Observer):
         def search(blunt: Problem, starts: np.ndarray, steps: int) -> Optimum:
             weights = np.repeat(np.asarray(blunt.data.weight)[None], len(starts), 0)
             evaluate = _evaluator(blunt, weights, None)
-            places, worth = self.policy.batch, settled_ends.WORTH
-            return searches_long(evaluate, starts, blunt.data, weights, steps, places, rivals=True, worth=worth)[0]
+            return searches_long(evaluate, starts, blunt.data, weights, steps, self.policy.batch)[0]
 
         if not problem.base.has_ground or problem.base.rig.imposed != "voltage":  # no grip that makes for valleys
             return scans.placed(problem, super().starts(problem, random, count))

@@ -50,8 +50,6 @@ FINER = (1.0, 0.25)
 STEPS, STEPS_BLUNT, SEARCHES = 40, 20, 8
 #: Sd of a blunt instrument, over its channel's root mean square [-].
 BLUNT = 0.03
-#: What a search with blunt instruments has to gain to go on [½σ²]: another one goes on from where it ends.
-WORTH = 0.3
 #: Draws of the prior, beside the settled ends.
 DRAWS = 96
 #: Points that are followed in one call, calls side by side on the cores.
