@@ -657,7 +657,7 @@ def assemble_result(
     cost, converged = best.cost, best.converged
     posterior = of_fit(space, best.active, best.z, ends.linear)
     if best is not base:
-        after = findings.Fitted(space.problem(best.active), best.z, space.library.indices(best.active))
+        after = findings.Fitted(*space.fit_of(best.active, best.z))
     elif curve is not None and beside is not None:
         after, ends = findings.Fitted(curve.problem, curve.z, None), beside
         robot, z, sd = curve.robot, curve.z, np.sqrt(np.diag(curve.covariance))

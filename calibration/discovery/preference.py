@@ -63,7 +63,8 @@ def compared(space: CandidateSpace, runs: Runs, best: Candidate, alike: Classes)
         return ()
 
     def sigma(c: Candidate, masks: list[np.ndarray]) -> np.ndarray:
-        reading = held_out(space.equipped, c.z, masks, space.library.indices(c.active)).reading
+        problem, z, active = space.fit_of(c.active, c.z)
+        reading = held_out(problem, z, masks, active).reading
         return np.where(counts, (reading - measured) / sd, np.nan)
 
     errors = [{kind: sigma(c, list(by.values())) for kind, by in kinds.items()} for c in others]

@@ -37,6 +37,8 @@ NEAR, MIXED_MOST = 0.3, 10.0
 TOLERANCE, TOLERANCE_LONG = 1e-6, 1e-3
 #: How many times the decrease that its linearisation predicts a search of rollouts is given the hope of.
 HOPELESS = 10.0
+#: Steps that tell what a search of rollouts still brings.
+LATELY = 5
 #: How many of them have to end in one place, to within so much of the objective, for it to be the optimum.
 AGREE, SAME = 3, 0.01
 #: Cores on which many searches run, at most.
@@ -563,8 +565,8 @@ def searches_long(
         starts: shape (members, coordinates); weights: of each member's readings, shape (members, rows, channels).
         places: searches side by side.
         rivals: whether all search the same optimum, so that all end once `AGREE` have ended in one place and none is
-            lower, and those that cannot come down to the lowest so far (by `HOPELESS` times what their step predicts)
-            before.
+            lower, and those that cannot come down to the lowest so far (by `HOPELESS` times what their step predicts,
+            or what their last `LATELY` steps brought) before.
 
     Returns:
         Where each search ended, and what the model says there.
@@ -572,6 +574,7 @@ def searches_long(
     starts, weights, held = np.asarray(starts), np.asarray(weights), penalties(data)
     mine = Places(range(len(starts)), max(places, len(starts) * rivals))
     cost, ahead = np.full(len(starts), np.inf), starts[mine.member]
+    trail = np.full((LATELY, len(mine.member)), np.nan)
     at: Progress | None = None
     while mine:
         fresh, going = mine.fill(), np.flatnonzero(mine.taken)
@@ -593,7 +596,10 @@ def searches_long(
             lower = mine.taken & ~over & (ends.cost < lowest - SAME)
             agree = np.sum(cost[done] < lowest + SAME) >= AGREE and not lower.any()
             so_far = min(lowest, np.min(ends.cost[mine.taken]))
-            over = over | (ends.cost - HOPELESS * ends.decrement > so_far + SAME) | agree
+            with np.errstate(invalid="ignore"):  # of what cannot be followed yet
+                hope = HOPELESS * np.fmin(ends.decrement, trail[0] - ends.cost)
+            over = over | (ends.cost - hope > so_far + SAME) | agree
+            trail = np.concatenate([trail[1:], ends.cost[None]])
         mine.leave(over, (ends, seen))
     return jax.tree.map(lambda *x: np.stack(x), *(mine.ended[k] for k in range(len(starts))))
 

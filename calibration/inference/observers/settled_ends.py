@@ -4,7 +4,8 @@ The misfit of a start has valleys: a run that grips where the measured one slide
 all the way down. How a run ends depends on that by its creep alone, so the base is fitted to the settled ends first,
 by `steady`, once for each adhesion of a grid. Histories are then fitted from there and from draws of the prior with
 blunt instruments, which lets no inrush outweigh all the rest; and since configurations share the drive alone, the
-best of each is put together with the best of the others.
+best of each is put together with the best of the others. A friction that rises until it slides has a valley of its
+own beside that of one that falls from a peak with the same creep, so the second is tried beside what was found.
 """
 
 from __future__ import annotations
@@ -54,7 +55,10 @@ BLUNT = 0.03
 DRAWS = 96
 #: Points that are followed in one call, calls side by side on the cores.
 TOGETHER = 16
+#: Distance of two starts in a coordinate from which they are two [prior sds].
+APART = 0.1
 STATIC, CREEP = "ground.friction.static", "ground.friction.speed_static"
+DYNAMIC, SLIDING = "ground.friction.dynamic", "ground.friction.speed_dynamic"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,7 +131,36 @@ def starts(
     blunt = _blunt(problem)
     found = search(blunt, _recombined(blunt, points)[:SEARCHES], STEPS_BLUNT)
     ended = np.asarray(found.z)[np.argsort(np.asarray(found.cost))]
-    return np.concatenate([_recombined(blunt, ended)[:1], ended])
+    best = _recombined(blunt, ended)[:1]
+    return _apart(np.concatenate([best, _peaked(problem, best[0]), ended]))
+
+
+def _peaked(problem: Problem, z: np.ndarray) -> np.ndarray:
+    """z with a friction that falls from a peak, creep and sliding friction the same: its μ_s, V_s and V_d in the
+    nominal ratios to μ_d and to each other, of one configuration and of all; shape (points, parameters)."""
+    c, out, every = problem.coordinates, [], z.copy()
+    value, nominal = np.asarray(c.value(z)), np.asarray(c.value(np.zeros(len(c))))
+    for name in problem.base.configurations:
+        own = [f"{name}.{x}" for x in (STATIC, CREEP, DYNAMIC, SLIDING)]
+        if not set(own[:3]) <= set(c.names):
+            continue
+        static, creep, dynamic, *sliding = (c.names.index(n) for n in own if n in c.names)
+        rise = value[dynamic] / nominal[dynamic] * nominal[static] / value[static]
+        new = {static: value[static] * rise, creep: value[creep] * rise}
+        new |= {k: new[creep] * nominal[k] / nominal[creep] for k in sliding}
+        out.append(z.copy())
+        for k, x in new.items():
+            out[-1][k] = every[k] = _coordinate(problem, k, x)
+    return np.stack([*out, every])
+
+
+def _apart(points: np.ndarray) -> np.ndarray:
+    """Points without those that are not apart from an earlier one."""
+    kept: list[np.ndarray] = []
+    for z in points:
+        if all(np.max(np.abs(z - k)) > APART for k in kept):
+            kept.append(z)
+    return np.stack(kept)
 
 
 def _recombined(problem: Problem, points: np.ndarray) -> np.ndarray:
