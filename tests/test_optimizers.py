@@ -559,3 +559,21 @@ def test_rival_searches_end_where_three_agree_unless_one_is_lower():
     assert (found.cost[:3] < 31).all()
     same, _ = fit.searches_long(evaluate, begin[:3], data, weights[:3], 40, 2, rivals=True)
     assert (same.steps <= alone.steps[:3]).all()
+
+
+def test_a_rival_that_promises_much_and_brings_nothing_ends():
+    """Member 0 is at its optimum of 2; the slopes of member 1 promise a fall from 2000 that does not come."""
+    slopes = np.array([[[1.0], [0.0], [1e-3]], [[-40.0], [0.0], [1e-3]]])
+
+    def evaluate(z, members):
+        r = np.stack([[z[k, 0], 2.0, 1e-3 * z[k, 0]] if m == 0 else [4000**0.5, 0, 0] for k, m in enumerate(members)])
+        return r, slopes[members], members
+
+    one = jnp.ones((1, 2))
+    data = problem.Data(0 * one, one, one, jnp.zeros(1), jnp.asarray(1.0))
+    found, alone = (
+        fit.searches_long(evaluate, np.array([[0.5], [0.0]]), data, np.ones((2, 1, 2)), 40, 2, rivals=r)[0]
+        for r in (True, False)
+    )
+    np.testing.assert_allclose(found.cost, [2, 2000], atol=1e-3)
+    assert found.steps[1] <= fit.LATELY + 1 < alone.steps[1]
