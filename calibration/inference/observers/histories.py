@@ -66,8 +66,6 @@ KNOTS, KNOT_STEPS = 256, 1e7
 LAGS = 12
 #: Values of a delay at which the misfit is looked at, fewest and most; and of what else is scanned, a run each.
 DELAYS, SCANNED = (256, 2048), 32
-#: Of a chassis' friction law what only sliding shows.
-SLIDING = ("ground.friction.dynamic", "ground.friction.speed_dynamic")
 #: Growth of steps after changes, over the usual one, from which on that is said.
 COARSE = 15
 #: A first sample so early shows a robot at rest [s]; how much of its largest speed, and how many sds, it may show.
@@ -327,7 +325,7 @@ class Histories(Observer):
 
     @classmethod
     def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        return ("motor.inductance", "motor.inertia", DELAY), ("inertia", *SLIDING)
+        return ("motor.inductance", "motor.inertia", DELAY), ("inertia", *settled_ends.SLIDING)
 
     def defective(
         self, robot: Robot, probes: tuple[Effect, ...]

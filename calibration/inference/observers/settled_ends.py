@@ -57,8 +57,9 @@ DRAWS = 96
 TOGETHER = 16
 #: Distance of two starts in a coordinate from which they are two [prior sds].
 APART = 0.1
-STATIC, CREEP = "ground.friction.static", "ground.friction.speed_static"
-DYNAMIC, SLIDING = "ground.friction.dynamic", "ground.friction.speed_dynamic"
+#: Of a chassis' friction law what creep shows, and what only sliding does.
+GRIP = STATIC, CREEP = "ground.friction.static", "ground.friction.speed_static"
+SLIDING = "ground.friction.dynamic", "ground.friction.speed_dynamic"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,7 +142,7 @@ def _peaked(problem: Problem, z: np.ndarray) -> np.ndarray:
     c, out, every = problem.coordinates, [], z.copy()
     value, nominal = np.asarray(c.value(z)), np.asarray(c.value(np.zeros(len(c))))
     for name in problem.base.configurations:
-        own = [f"{name}.{x}" for x in (STATIC, CREEP, DYNAMIC, SLIDING)]
+        own = [f"{name}.{x}" for x in (*GRIP, *SLIDING)]
         if not set(own[:3]) <= set(c.names):
             continue
         static, creep, dynamic, *sliding = (c.names.index(n) for n in own if n in c.names)
