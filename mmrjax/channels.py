@@ -78,20 +78,20 @@ def _winding_temperature(robot: Robot, signals: Signals) -> Any:
     return robot.motor.temperature_settled(signals.current)
 
 
-#: Of a robot that turns: of one side, and of the robot in the plane of the ground.
-_SIDES = ("left", "right")
+#: Sides of a robot that turns, in the order of every axis of 2.
+SIDES = ("left", "right")
 
 
 def _of_side(channel: Channel, side: int) -> Channel:
     """What one side shows of a channel that both sides have."""
     stem, unit = channel.column.rsplit("_", 1)
-    name = f"{channel.name}_{_SIDES[side]}"
+    name = f"{channel.name}_{SIDES[side]}"
     return dataclasses.replace(
         channel,
         name=name,
-        column=f"{stem}_{_SIDES[side]}_{unit}",
-        sd_column=f"{stem}_{_SIDES[side]}_sd_{unit}",
-        label=f"{channel.label}, {_SIDES[side]}",
+        column=f"{stem}_{SIDES[side]}_{unit}",
+        sd_column=f"{stem}_{SIDES[side]}_sd_{unit}",
+        label=f"{channel.label}, {SIDES[side]}",
         word=name,
         side=side,
     )

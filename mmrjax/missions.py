@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array
 
 from mmrjax import energy
-from mmrjax.channels import MM, RPM
+from mmrjax.channels import MM, RPM, SIDES
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Run
@@ -52,7 +52,6 @@ def _wh(name: str, label: str) -> Output:
     return Output(name, f"{name}_Wh", "Wh", JOULE_PER_WH, label, 3)
 
 
-_SIDES = ("left", "right")
 #: Numbers of a mission in the order of columns, in SI by `numbers`.
 OUTPUTS: tuple[Output, ...] = (
     Output("duration", "duration_s", "s", 1.0, "duration", 1),
@@ -85,9 +84,9 @@ OF_TURNS: tuple[Output, ...] = (
     Output("place_x", "place_x_m", "m", 1.0, "moved uphill, or ahead of the start", 2),
     Output("place_y", "place_y_m", "m", 1.0, "moved to the left of that", 2),
     Output("peak_yaw_rate", "peak_yaw_rate_rad_s", "rad/s", 1.0, "peak yaw rate", 3),
-    *(Output(f"rms_current_{s}", f"rms_current_{s}_A", "A", 1.0, f"rms current, {s} motor", 3) for s in _SIDES),
-    *(Output(f"peak_current_{s}", f"peak_current_{s}_A", "A", 1.0, f"peak current, {s} motor", 2) for s in _SIDES),
-    *(Output(f"winding_peak_{s}", f"winding_peak_{s}_C", "°C", 1.0, f"hottest winding, {s}", 1) for s in _SIDES),
+    *(Output(f"rms_current_{s}", f"rms_current_{s}_A", "A", 1.0, f"rms current, {s} motor", 3) for s in SIDES),
+    *(Output(f"peak_current_{s}", f"peak_current_{s}_A", "A", 1.0, f"peak current, {s} motor", 2) for s in SIDES),
+    *(Output(f"winding_peak_{s}", f"winding_peak_{s}_C", "°C", 1.0, f"hottest winding, {s}", 1) for s in SIDES),
 )
 
 
@@ -147,7 +146,7 @@ def totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array]:
         numbers |= {name: by_segment[name] for name in ("turned", "place_x", "place_y")} | {
             "peak_yaw_rate": peaks["yaw_rate"]
         }
-        for side in _SIDES:
+        for side in SIDES:
             numbers |= {
                 f"rms_current_{side}": _root(_quotient(by_segment[f"current_squared_{side}"], found.time)),
                 f"peak_current_{side}": peaks[f"current_{side}"],

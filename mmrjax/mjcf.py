@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mmrjax import channels
 from mmrjax.conditions import Conditions
 from mmrjax.masses import Masses, masses
 from mmrjax.params import Scalar
@@ -76,7 +77,7 @@ def bodies(robot: Robot, half: Masses, conditions: Conditions) -> Bodies:
         several, aside = robot.sides / 2, turning.width / 2
         pulley, spins = several * half.pulley, several * half.inertia_pulley
         mass = [2 * several * half.chassis] + [pulley] * 4
-        names = tuple(f"{name}_{side}" for side in ("left", "right") for name, _ in ends)
+        names = tuple(f"{name}_{side}" for side in channels.SIDES for name, _ in ends)
         places = [jnp.stack([x + zero, y * turning.width + zero, zero]) for y in SIDES for _, x in ends]
         centre = half.centre[0]
         apart = mass[0] * (half.forward - centre) ** 2 + 4 * (spins + pulley * (base**2 / 4 + aside**2 + centre**2))

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from mmrjax import channels
 from mmrjax.belt import Path
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import both_sides
@@ -139,7 +140,7 @@ def figure(view: Above, k: int) -> Any:
     )
     handles = [
         Line2D([], [], color=c, lw=4, label=f"{name} side, what bears")
-        for c, name in zip(_SIDES, ("left", "right"), strict=True)
+        for c, name in zip(_SIDES, channels.SIDES, strict=True)
     ]
     handles.append(
         Line2D([], [], color=_SLIDES, lw=1.5, label=f"sliding over the ground, {1e3 * SPEED:.0f} mm: 1 m/s")

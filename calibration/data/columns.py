@@ -35,7 +35,7 @@ DRIVING = ("duty", "mode")
 #: of either side get; and where it heads at the start, from uphill, positive to the left.
 SIDES: dict[str, tuple[float, float]] = {"duty_left": (-1.0, 1.0), "duty_right": (-1.0, 1.0)}
 #: The same where speeds are imposed.
-SPEEDS = tuple(channels.find(f"motor_speed_{side}").column for side in ("left", "right"))
+SPEEDS = tuple(channels.find(f"motor_speed_{side}").column for side in channels.SIDES)
 HEADING: dict[str, tuple[float, float]] = {"heading_deg": (-360.0, 360.0)}
 #: Angles of a tracked robot's levers, 0 along the wheelbase outward, positive up, 180 folded.
 LEVERS: dict[str, tuple[float, float]] = {

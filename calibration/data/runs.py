@@ -371,7 +371,7 @@ def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layou
     def words(column: str) -> list[str]:
         return sorted(_SIDE.get(word.casefold(), word.casefold()) for word in column.split("_"))
 
-    known = {tuple(words(c)): c for c in layout.known() if {"left", "right"} & set(words(c))}
+    known = {tuple(words(c)): c for c in layout.known() if set(channels.SIDES) & set(words(c))}
     for column in strange:
         meant = known.get(tuple(words(column)))
         if meant is not None and meant not in stated:

@@ -25,7 +25,7 @@ def check(runs: Runs) -> None:
     """
     left, right = runs.of_sides
     for what in ("motor_speed", "motor_current"):
-        pair = [channels.find(f"{what}_{side}") for side in ("left", "right")]
+        pair = [channels.find(f"{what}_{side}") for side in channels.SIDES]
         if not all(c in runs.channels and runs.has(c.column) for c in pair):
             continue
         one, other = (runs[c.column] for c in pair)
@@ -74,7 +74,7 @@ def magnitudes(columns: Mapping[str, np.ndarray], sides: tuple[str, ...]) -> tup
         columns: of the table; sides: those that say what drives either side.
     """
     found = []
-    for side, driven in zip(("left", "right"), sides, strict=False):
+    for side, driven in zip(channels.SIDES, sides, strict=False):
         channel = channels.find(f"motor_current_{side}")
         if channel.column in columns and driven in columns:
             drive, shown = columns[driven], columns[channel.column]

@@ -200,7 +200,7 @@ class Runs:
         column, factor = IMPOSED[robot.rig.imposed]
         imposed = robot.rig.imposed != "voltage"
         sides = {name: self[name] for name in HEADING if self.has(name)}
-        for side, name in zip(("left", "right"), self.layout.sides, strict=False):
+        for side, name in zip(channels.SIDES, self.layout.sides, strict=False):
             if self.has(name):
                 sides[f"{robot.rig.imposed if imposed else 'duty'}_{side}"] = factor * self[name]
         if imposed and not self.has(column):

@@ -8,6 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from mmrjax import channels
 from mmrjax.channels import MM
 from mmrjax.robot import Robot
 
@@ -32,7 +33,7 @@ def columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray) -> dic
     turn = np.asarray(reading["yaw_rate"])
     # A turn once in three hours is none: what is left of zero by rounding is no radius.
     rate = np.where(np.abs(turn) > 1e-9, turn, np.nan)
-    shafts = {side: np.asarray(reading[f"motor_speed_{side}"]) for side in ("left", "right")}
+    shafts = {side: np.asarray(reading[f"motor_speed_{side}"]) for side in channels.SIDES}
     rolled = {side: radius * n / float(robot.gearbox.ratio) for side, n in shafts.items()}
     units = float(robot.sides) / 2
     found = {
@@ -41,10 +42,10 @@ def columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray) -> dic
         "centre_y_mm": np.asarray(reading["speed"]) / rate / MM,
         "effective_width_mm": (rolled["right"] - rolled["left"]) / rate / MM,
     }
-    for side in ("left", "right"):
+    for side in channels.SIDES:
         current = np.asarray(reading[f"motor_current_{side}"])
         found[f"power_{side}_W"] = units * np.asarray(reading[f"motor_voltage_{side}"]) * current
-    for side in ("left", "right"):
+    for side in channels.SIDES:
         current = np.asarray(reading[f"motor_current_{side}"])
         found[f"winding_{side}_C"] = np.asarray(robot.motor.temperature_settled(jnp.asarray(current)))
     return {name: np.where(np.isnan(turn), np.nan, x) for name, x in found.items()}

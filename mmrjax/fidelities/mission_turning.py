@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax import balances, energy
+from mmrjax import balances, channels, energy
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import mission_straight as straight
@@ -41,7 +41,7 @@ STOPS = (MOTOR, GROUND, LATERAL, YAW)
 LONG, AT_REST, RESULT = True, turning, turning.result_of
 
 #: What is integrated beside them: name, and unit of a total; of current and torque the mean over both sides.
-OF_SIDES = tuple(f"current_squared_{side}" for side in ("left", "right"))
+OF_SIDES = tuple(f"current_squared_{side}" for side in channels.SIDES)
 TOTALS: dict[str, str] = {
     **straight.TOTALS, "place_x": "m", "place_y": "m", "turned": "rad", **dict.fromkeys(OF_SIDES, "A²·s"),
 }  # fmt: skip
@@ -185,7 +185,7 @@ def _of_sides(robot: Robot, each: dict[str, Any]) -> dict[str, Scalar]:
     """Peaks of one motor of either side."""
     current = jnp.asarray(each["current"]) / robot.sides
     both = (("current", current), ("temperature", jnp.asarray(each["temperature"])))
-    return {f"{name}_{side}": x[k] for name, x in both for k, side in enumerate(("left", "right"))}
+    return {f"{name}_{side}": x[k] for name, x in both for k, side in enumerate(channels.SIDES)}
 
 
 def over(robot: Robot, found: Found) -> dict[str, Scalar]:

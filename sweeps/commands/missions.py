@@ -300,7 +300,7 @@ def _course(
     if source.turns:
         reading, signals = balances.shown(robot, signals), balances.together(signals)
         of_sides = {c.column: np.asarray(reading[c.name]) / c.factor for c in channels.OF_TURNS}
-        for side, duty, hot in zip(("left", "right"), course.signals.duty.T, winding.T, strict=True):
+        for side, duty, hot in zip(channels.SIDES, course.signals.duty.T, winding.T, strict=True):
             of_sides |= {f"duty_{side}": duty, f"winding_temperature_{side}_C": hot}
         winding, housing = winding.max(1), housing.max(1)
     else:

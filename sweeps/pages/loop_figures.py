@@ -12,7 +12,7 @@ from calibration.discovery.result import DiscoveryResult, Evidence, UnnamedDiscr
 from calibration.inference import blocks
 from calibration.inference.bases import in_words
 from calibration.inference.details import TimeStatistics
-from mmrjax.channels import EVERY, MM, RPM, Channel
+from mmrjax.channels import EVERY, MM, RPM, SIDES, Channel
 from sweeps.pages.figure_style import (
     BLUE,
     FAINT,
@@ -252,8 +252,8 @@ def conditions_and_readings(table: dict[str, np.ndarray]) -> dict[str, np.ndarra
     the mean and the difference too."""
     known = {c.column: (c.label, c.unit) for c in EVERY} | CONDITION_WORDS
     if "duty_left" in table and "supply_voltage_V" in table:
-        sides = {f"voltage_{s}_V": table["supply_voltage_V"] * table[f"duty_{s}"] for s in ("left", "right")}
-        table, known = table | sides, known | {f"voltage_{s}_V": (f"voltage, {s}", "V") for s in ("left", "right")}
+        sides = {f"voltage_{s}_V": table["supply_voltage_V"] * table[f"duty_{s}"] for s in SIDES}
+        table, known = table | sides, known | {f"voltage_{s}_V": (f"voltage, {s}", "V") for s in SIDES}
     found = {f"{label} [{unit}]": table[c] for c, (label, unit) in known.items() if c in table}
     values, words = given(table)
     found |= {words: values}
@@ -300,7 +300,7 @@ def laws(found: DiscoveryResult, table: dict[str, np.ndarray], changes: Mapping[
 
 def defects_of(table: dict[str, np.ndarray], when: str, balance: str) -> dict[str, np.ndarray]:
     """Defects of a balance by side, whose name is empty where sides are alike."""
-    sides = {side: f"defect_{when}_{balance}{'_' * bool(side)}{side}" for side in ("", "left", "right")}
+    sides = {side: f"defect_{when}_{balance}{'_' * bool(side)}{side}" for side in ("", *SIDES)}
     return {side: table[column] for side, column in sides.items() if column in table}
 
 

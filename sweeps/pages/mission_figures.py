@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from mmrjax.channels import SIDES
 from mmrjax.energy import SINKS
 from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, note
 from sweeps.points.imposed import UNLIMITED
@@ -136,7 +137,7 @@ def _current(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], sides
 
 def of_motors(rows: Mapping[str, np.ndarray], name: str, unit: str) -> np.ndarray:
     """Of a motor on average; of motors of two sides, which cancel one another on the spot, of their sizes."""
-    of_sides = [np.abs(rows[f"{name}_{side}{unit}"]) for side in ("left", "right") if f"{name}_{side}{unit}" in rows]
+    of_sides = [np.abs(rows[f"{name}_{side}{unit}"]) for side in SIDES if f"{name}_{side}{unit}" in rows]
     return np.asarray(np.mean(of_sides, axis=0) if of_sides else rows[f"{name}{unit}"])
 
 

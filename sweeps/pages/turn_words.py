@@ -7,12 +7,11 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from mmrjax.channels import MM
+from mmrjax.channels import MM, SIDES
 from mmrjax.robot import Robot
 from sweeps.pages import words
 
 FULL = 2 * math.pi  # rad a turn
-SIDES = ("left", "right")
 #: What either side does: words, column, format.
 ROWS = (
     ("voltage [V]", "motor_voltage_{}_V", ".2f"),

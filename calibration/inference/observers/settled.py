@@ -336,7 +336,7 @@ def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarra
     shares = -slopes.transpose(0, 2, 1) @ np.linalg.solve(both, np.asarray(linear.by_row())[rows, :, None])
     found = np.full((len(EQUATIONS) * sides, len(included)), np.nan)
     found[:, rows] = np.repeat(size, sides)[:, None] * shares[:, :, 0].T
-    names = [f"{b}_{side}" for b in EQUATIONS for side in ("left", "right")] if sides > 1 else EQUATIONS
+    names = [f"{b}_{side}" for b in EQUATIONS for side in channels.SIDES] if sides > 1 else EQUATIONS
     return dict(zip(names, found, strict=True))
 
 
