@@ -1,7 +1,8 @@
-"""Cells of a table as text: what separates them, and the decimal mark of their numbers."""
+"""Cells of a table as text: how they are encoded, what separates them, and the decimal mark of their numbers."""
 
 from __future__ import annotations
 
+import codecs
 import csv
 import re
 from collections.abc import Sequence
@@ -11,6 +12,27 @@ from calibration.data.errors import BadData
 #: What may separate cells beside a comma, and how it is called.
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
 _COMMA, _POINT = (re.compile(rf"[+-]?\d*{mark}\d+(?:[eE][+-]?\d+)?") for mark in (",", r"\."))
+
+
+def text(name: str, content: bytes) -> tuple[str, tuple[str, ...]]:
+    """What a file says: UTF-8, UTF-16 that begins with its mark, or else what Windows writes in the West (code page
+    1252); and sentences on what was read otherwise than as UTF-8.
+
+    Raises:
+        BadData: bytes that are no text.
+    """
+    try:
+        if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            return content.decode("utf-16"), (f"{name}: is in UTF-16; read so",)
+        return content.decode("utf-8-sig"), ()
+    except UnicodeDecodeError as error:
+        wrong = f"{name}: cannot be read as a text file ({error}); save it as CSV in UTF-8"
+    try:
+        if b"\0" not in content:
+            return content.decode("cp1252"), (f"{name}: is not in UTF-8; read as Windows-1252",)
+    except UnicodeDecodeError:
+        pass
+    raise BadData(wrong)
 
 
 def cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], tuple[str, ...]]:

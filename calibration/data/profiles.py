@@ -232,11 +232,8 @@ def read(source: str | Path) -> ProfileTable:
 
 
 def _parsed(content: bytes, name: str) -> ProfileTable:
-    try:
-        lines = [line.strip() for line in content.decode("utf-8-sig").splitlines()]
-    except UnicodeDecodeError as error:
-        raise BadData(f"{name}: cannot be read as a UTF-8 text file ({error})") from error
-    lines = [line for line in lines if line]
+    text, encoded = delimited.text(name, content)
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
     above = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
     settings = _settings(name, lines[:above])
     rows, notes = delimited.cells(name, lines[above:])
@@ -261,7 +258,7 @@ def _parsed(content: bytes, name: str) -> ProfileTable:
         raise BadData(f"{name}: got {len(time)} rows times {settings['cycles']} cycles; expected at most {LONGEST}")
     return ProfileTable(
         name, time, modes, demand, values, cells.surfaces(), settings["linear"], settings["cycles"],
-        hashlib.sha256(content).hexdigest(), settings["begins"], notes,
+        hashlib.sha256(content).hexdigest(), settings["begins"], (*encoded, *notes),
     )  # fmt: skip
 
 

@@ -9,10 +9,10 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from calibration.data import units
 from calibration.data.columns import Layout
 from calibration.data.errors import BadConfiguration, choices, is_number
 from mmrjax import channels, params
+from mmrjax.errors import near
 from mmrjax.rig import BETWEEN, IMPOSED, STARTS, Instrument, Rig
 from mmrjax.robot import Robot
 from mmrjax.robots import DYNAMIC_SHARE
@@ -241,23 +241,20 @@ def _instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrum
     return tuple(found)
 
 
-def _known_columns() -> list[str]:
-    """Columns of tables by the names of this program, in every unit."""
-    known = list(Layout(channels=channels.EVERY).known())
-    for channel in channels.EVERY:
-        known += [f"{channel.name}_{unit}" for unit in units.of_channel(channel.name)]
-    return list(dict.fromkeys(known))
-
-
 def _columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
     here = f"{where}, columns"
     form = 'expected MINE = "THEIRS", or MINE = {column = "THEIRS", factor = 0.001}'
     if not isinstance(stated, dict):
         raise BadConfiguration(f"{here}: got {stated!r}; expected a table [columns]")
-    known, found = _known_columns(), []
+    layout, found = Layout(channels=channels.EVERY), []
+    known = layout.spellings()
     for mine, theirs in stated.items():
         if mine not in known:
-            raise BadConfiguration(f"{here}.{mine}: no such column of a table; {choices(mine, known)}")
+            hint = f"did you mean {close[0]}? " if (close := near(mine, known)) else ""
+            raise BadConfiguration(
+                f"{here}.{mine}: no such column of a table; {hint}allowed, also in other units: "
+                f"{', '.join(layout.known())}"
+            )
         table = {"column": theirs} if isinstance(theirs, str) else theirs
         if not isinstance(table, dict) or not isinstance(table.get("column"), str) or {*table} - {"column", "factor"}:
             raise BadConfiguration(f"{here}.{mine}: got {theirs!r}; {form}")

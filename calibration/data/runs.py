@@ -79,9 +79,9 @@ def read(source: str | Path, *, measured: bool = True, battery: bool = False, ro
 def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, *, inferred: bool) -> Runs:
     try:
         content = path.read_bytes()
-        text = content.decode("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise BadData(f"{name}: cannot be read as a UTF-8 text file ({error})") from error
+    except OSError as error:
+        raise BadData(f"{name}: cannot be read ({error})") from error
+    text, encoded = delimited.text(name, content)
     rows, notes = delimited.cells(name, [line for line in text.splitlines() if line.strip()])
     if not rows:
         expected = ", ".join((*layout.required(measured=True, battery=False), *layout.measured_columns))
@@ -141,13 +141,14 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
         columns["order"] = np.arange(1.0, len(rows))
     unknown = tuple(c for c, meaning in zip(header, meanings, strict=True) if meaning is None)
     extras = {c: _extra([row[header.index(c)] for row in rows[1:]]) for c in unknown}
-    notes = (*notes, *capitals, *(_lacks(name, columns, layout) if measured else ()))
+    notes = (*encoded, *notes, *capitals, *(_lacks(name, columns, layout) if measured else ()))
     notes += tuple(
         f"{name}: {channels.find(i.channel).column} is positive where its side is driven backward; it is taken to "
         "show magnitude alone, and magnitudes are compared"
         for i in unsigned
     )
-    return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest(), extras, layout, notes)
+    headings = {m.column: m.shown for m in meanings if m is not None}
+    return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest(), extras, layout, notes, headings)
 
 
 #: Bad cells that a message lists, at most.
@@ -351,14 +352,33 @@ def _check_header(
             got = f"; is {close[0]} meant?" if close else ""
             raise BadData(
                 f"{name}: column {layout.expected(column)} is missing{got} (required: {', '.join(required)})"
+                + ("" if close else _other_names(strange, column))
             )
     if measured and not any(c in stated for c in layout.measured_columns):
         expected = ", ".join(layout.measured_columns)
-        raise BadData(f"{name}: no column of a channel; expected at least one of {expected}")
+        other = _other_names(strange, layout.measured_columns[0])
+        raise BadData(f"{name}: no column of a channel; expected at least one of {expected}{other}")
     for column in strange:
         close = difflib.get_close_matches(column, [c for c in layout.known() if c not in stated], 1, 0.85)
         if close:
             raise BadData(f"{name}: unknown column {column}; did you mean {close[0]}? rename or remove it")
+
+
+#: Most columns of a table that a message names.
+NAMED = 8
+
+
+def _other_names(strange: list[str], column: str) -> str:
+    """How columns that have names of their own are told apart, for a message; empty where there are none."""
+    if not strange:
+        return ""
+    unit = column.rpartition("_")[2]
+    guess = next((c for c in strange if re.search(rf"\b{unit}\b", c)), "...")
+    shown = ", ".join(strange[:NAMED]) + (", ..." if len(strange) > NAMED else "")
+    return (
+        f"; other columns: {shown}; if one of them is it, say so in the robot's file, with the factor from its unit: "
+        f'[columns] {column} = {{column = "{guess}", factor = 1.0}}'
+    )
 
 
 #: How people call the sides.

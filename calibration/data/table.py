@@ -34,6 +34,7 @@ class Runs:
             they have no role, and looked at only for what residuals go with.
         layout: what its columns mean for the robot that it is of, and its channels.
         notes: sentences on how the file was read, and what it lacks.
+        headings: what the file calls the columns that it has, by their names here.
     """
 
     source: str
@@ -43,6 +44,7 @@ class Runs:
     extras: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     layout: Layout = dataclasses.field(default_factory=Layout)
     notes: tuple[str, ...] = ()
+    headings: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.columns["configuration"])

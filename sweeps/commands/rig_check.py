@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +38,7 @@ class RigCheck:
     Attributes:
         file: that was read; robot: of it; examples: its lines that still hold an example's number.
         origins: of its numbers; facts: that follow from them.
-        runs: of the table, None without one; shown: its columns by the names of this program; foresight: what it can
-            determine.
+        runs: of the table, None without one; foresight: what it can determine.
     """
 
     file: str
@@ -50,7 +47,6 @@ class RigCheck:
     origins: tuple[Origin, ...]
     facts: tuple[Fact, ...]
     runs: Runs | None = None
-    shown: Mapping[str, str] = dataclasses.field(default_factory=dict)
     foresight: Foresight | None = None
 
     def understood(self) -> list[str]:
@@ -119,9 +115,9 @@ class RigCheck:
         """Of each column of the table: what it is used for, its range."""
         if self.runs is None:
             return []
-        found = []
+        found, theirs = [], self.runs.headings
         for name, values in self.runs.columns.items():
-            if name not in self.shown and self._means_nothing(name):
+            if name not in theirs and self._means_nothing(name):
                 continue
             number = np.issubdtype(values.dtype, np.number)
             finite = values[np.isfinite(values)] if number else values
@@ -129,8 +125,8 @@ class RigCheck:
             found.append(
                 {
                     "column": name,
-                    "theirs": self.shown.get(name, ""),
-                    "use": _use(name, self.robot) if name in self.shown else "not in the table",
+                    "theirs": theirs.get(name, ""),
+                    "use": _use(name, self.robot) if name in theirs else "not in the table",
                     "values": len(kinds),
                     "least": float(finite.min()) if number and len(finite) else None,
                     "greatest": float(finite.max()) if number and len(finite) else None,
@@ -262,16 +258,7 @@ def examined(file: Path, data: str | None, effects: tuple[str, ...] = ()) -> Rig
         return found
     runs = read_runs(data, robot, measured=True, series=True)
     seen = foresight.foresee(runs, robot)
-    return dataclasses.replace(found, runs=runs, shown=_shown(runs, data), foresight=seen)
-
-
-def _shown(runs: Runs, data: str) -> dict[str, str]:
-    """Columns of a table as its file calls them, by the names of this program."""
-    if not Path(data).is_file():
-        return {name: name for name in runs.columns}
-    with Path(data).open(encoding="utf-8-sig", newline="") as stream:
-        header = [cell.strip() for cell in next(csv.reader(stream))]
-    return {m.column: m.shown for m in runs.layout.meanings(runs.source, header) if m is not None}
+    return dataclasses.replace(found, runs=runs, foresight=seen)
 
 
 def _table(title: str, *headings: str) -> Table:
