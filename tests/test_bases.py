@@ -51,6 +51,14 @@ def test_order_of_a_grid_that_is_run_through_is_collinear_with_its_conditions():
     assert collinearity(table(), few) == collinearity(table(order=np.ones(ROWS)), COUNTS) == 1.0
 
 
+def test_order_of_levels_that_rise_one_way_and_then_the_other_is_that_of_the_levels():
+    volts = np.array([5, 6.5, 8, 9.5, 11, 12.5, 14, 15.5, 17, 18.5, 20, 22, 24, -7, -11, -15, -19, -23])
+    columns = {"configuration": np.full(18, "bench"), "supply_voltage_V": volts, "order": np.arange(18.0)}
+    axes = ("supply_voltage_V",)
+    assert collinearity(columns, np.ones(18), axes) > COLLINEAR
+    assert max(collinearity(shuffled(columns, seed), np.ones(18), axes) for seed in range(20)) < 0.7
+
+
 def test_collinearity_is_not_made_by_the_number_of_terms():
     """R² of noise is the share of the parameters; adjusted for them it is about 0."""
     found = [collinearity(shuffled(table(), seed), COUNTS) for seed in range(40)]

@@ -242,6 +242,8 @@ def test_first_screen_answers_in_a_minute(shown, capsys, tmp_path):
     weak = NameTest(effect.name, 6.0, 3.3, (), 5.0, 7, 2.5)
     tentative = dataclasses.replace(found, support=NameSupport(False, "beside", tests=(weak,)))
     assert words.answer(tentative) == f"No: perhaps a {effect.families[0]}."
+    twice = dataclasses.replace(tentative, effects=(effect, dataclasses.replace(effect, name="windage")))
+    assert words.answer(twice) == words.answer(tentative)  # one kind, said once
     assert words.how_sure(tentative, effect) == "tentative: it predicts, but rests on row 7"
     assert words.answer(dataclasses.replace(found, verdict="none", effects=())).startswith("Yes")
 

@@ -159,6 +159,7 @@ returns_current = false
 total_current_A = {column = "I", factor = 0.001}
 surface = "floor"
 motor_speed_rad_s = "w"
+time_ms = "t"
 [instruments.total_current]
 signed = false
 quantum = 0.026
@@ -173,6 +174,7 @@ amplitude = 1e-4
         ("total_current_A", "I", 0.001),
         ("surface", "floor", 1.0),
         ("motor_speed_rad_s", "w", 1.0),
+        ("time_ms", "t", 1.0),
     )
     assert robot.rig.instruments == (
         Instrument("total_current", False, 0.026),

@@ -130,6 +130,9 @@ def test_columns_of_other_names_are_those_that_the_robots_file_says(tmp_path):
     assert read(tmp_path, "motor_speed_rpm,total_current_A,v\n900,0.4,1\n", unread).unknown == ("v",)
     with pytest.raises(BadData, match=r"column motor_speed_rpm \(in the robot's file: ticks_s\) is missing"):
         read(tmp_path, "I_mean\n0.4\n", robot)
+    # The message names the columns that may be it, and the likeliest by its unit.
+    with pytest.raises(BadData, match=r"other columns: t, n \[rpm\]; .* motor_speed_rpm = {column = \"n \[rpm\]\""):
+        read(tmp_path, "t,n [rpm],total_current_A\n1,900,0.4\n", bench())
 
 
 BENCH = "motor_speed_rpm,total_current_A\n"

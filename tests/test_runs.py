@@ -151,8 +151,8 @@ def test_bad_tables_are_refused_in_one_sentence(tmp_path, case):
 def test_missing_and_binary_files_are_refused(tmp_path):
     with pytest.raises(BadData, match=r"no such file and no packaged table; packaged: measured, simulated_by_paper"):
         records.read(tmp_path / "none.csv")
-    (tmp_path / "picture.csv").write_bytes(b"\x89PNG\xff\xfe")
-    with pytest.raises(BadData, match="cannot be read as a UTF-8"):
+    (tmp_path / "picture.csv").write_bytes(b"\x89PNG\r\n\x1a\n\xff\xfe")
+    with pytest.raises(BadData, match="cannot be read as a text file"):
         records.read(tmp_path / "picture.csv")
 
 
@@ -175,6 +175,26 @@ def test_semicolons_and_decimal_commas_are_taken_and_said(tmp_path):
             np.testing.assert_array_equal(found[column], usual[column])
         assert len(found.notes) == 1 and f"runs.csv: columns are separated by {said}" in found.notes[0]
     assert usual.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("encoding", "said"), [("utf-16", "is in UTF-16; read so"), ("cp1252", "read as Windows-1252")]
+)
+def test_tables_in_other_encodings_are_read_and_said(tmp_path, encoding, said):
+    text = f"{HEADER},Öl [µm]\n{ROW},1\n"
+    usual = records.read(written(tmp_path, text))
+    (tmp_path / "runs.csv").write_bytes(text.encode(encoding))
+    found = records.read(tmp_path / "runs.csv")
+    assert found.unknown == ("Öl [µm]",) and usual.notes == () and found.notes[0].endswith(said)
+    for column in usual.columns:
+        np.testing.assert_array_equal(found[column], usual[column])
+
+
+def test_bytes_that_are_no_text_are_refused(tmp_path):
+    for content in (b"\x89PNG\r\n\0\0\xff", b"\xff\xfea\0b"):
+        (tmp_path / "runs.csv").write_bytes(content)
+        with pytest.raises(BadData, match=r"runs\.csv: cannot be read as a text file \(.*; save it as CSV in UTF-8"):
+            records.read(tmp_path / "runs.csv")
 
 
 def test_commas_and_points_in_one_column_are_refused(tmp_path):

@@ -11,6 +11,8 @@ from calibration.data.errors import BadData
 
 #: What may separate cells beside a comma, and how it is called.
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
+#: Bytes that no text has.
+_CONTROLS = re.compile(rb"[\0-\x08\x0e-\x1f]")
 _COMMA, _POINT = (re.compile(rf"[+-]?\d*{mark}\d+(?:[eE][+-]?\d+)?") for mark in (",", r"\."))
 
 
@@ -28,7 +30,7 @@ def text(name: str, content: bytes) -> tuple[str, tuple[str, ...]]:
     except UnicodeDecodeError as error:
         wrong = f"{name}: cannot be read as a text file ({error}); save it as CSV in UTF-8"
     try:
-        if b"\0" not in content:
+        if not _CONTROLS.search(content):
             return content.decode("cp1252"), (f"{name}: is not in UTF-8; read as Windows-1252",)
     except UnicodeDecodeError:
         pass

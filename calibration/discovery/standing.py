@@ -34,6 +34,8 @@ from calibration.inference.linearization import Linearization
 CURVES = 3
 #: Curves that are tried by themselves, whether one of them does without any name.
 ALONE = 4
+#: Share of what a fit with an effect gains that slopes without it have to promise to be asked about other effects.
+PROMISED = 0.8
 #: Balances whose curves stand for effects of a balance: those of one equation. What a speed meter shows too much is
 #: what slip takes away.
 EQUATION = {"mass": "ground", "speed": "slip"} | {
@@ -278,10 +280,12 @@ def name_tests(
         own = _equation(space, effect)
         linear = seen[without.active]
         chosen, _ = _curves_beside(after.linear, after, bases, {own}, CURVES, settings)
-        none = np.zeros((linear.readings, 0))
-        columns = np.concatenate([none, *(family_columns(linear, bases, k) for k in chosen)], 1)
-        mine = space.library.of == space.library.names.index(effect)
-        beside = *augment_with_columns(linear, columns), np.asarray(linear.signatures)[:, mine]
+        beside = _beside(space, linear, bases, chosen, effect)
+        promised = _root(np.asarray(linear.jacobian), np.asarray(linear.residual), beside[2]) ** 2
+        judged, signatures = beside, linear.signatures
+        if promised < PROMISED * 2 * (without.cost - best.cost):
+            judged = _put_back(space, best, effect, _beside(space, after.linear, bases, chosen, effect))
+            signatures = after.linear.signatures
         run, root_without = _weakest_run(space, linear.runs(), *beside, differ=space.bare.observe.long)
         whole, others = (largest, fewer[effect]) if effect in fewer else (best, without)
         beside_all = most.linear if effect in fewer else after.linear
@@ -294,7 +298,7 @@ def name_tests(
                 _evidence_over_curves(space, whole, others, effect, seen[others.active], bases, settings),
                 run,
                 root_without,
-                _chosen_again(space, effect, beside, np.asarray(linear.signatures), blocks, settings),
+                _chosen_again(space, effect, judged, np.asarray(signatures), blocks, settings),
                 next((c.effects for c in better if effect not in c.effects), ()),
                 own in lacks,
                 "run" if space.bare.observe.long else "row",
@@ -382,6 +386,29 @@ def _left_of(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray)
     return np.sum(signatures**2, 0) - np.sum(inside**2, 0), signatures.T @ left[: len(signatures)]
 
 
+def _beside(
+    space: CandidateSpace, linear: Linearization, bases: Bases, curves: Sequence[int], effect: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Jacobian and residual of a fit with families of curves beside, and an effect's signatures over its readings."""
+    columns = [np.zeros((linear.readings, 0)), *(family_columns(linear, bases, k) for k in curves)]
+    own = np.asarray(linear.signatures)[:, space.library.of == space.library.names.index(effect)]
+    return *augment_with_columns(linear, np.concatenate(columns, 1)), own
+
+
+def _put_back(
+    space: CandidateSpace, best: Candidate, effect: str, beside: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same of a fit with the effect, what that explains put back by its amplitude.
+
+    Where it explains much, the fit without it may be so far off that what its slopes promise of each effect is
+    nothing that a fit would find.
+    """
+    jacobian, residual, signatures = beside
+    k = space.free + best.active.index(effect)
+    left = residual - jacobian[:, k] * best.z[k]
+    return np.delete(jacobian, [k, k + len(best.active)], 1), left, signatures
+
+
 def _chosen_again(
     space: CandidateSpace,
     effect: str,
@@ -394,7 +421,7 @@ def _chosen_again(
     `classes` has it, of those that leave half of what is known of it; 1 where there are none.
 
     Args:
-        beside: Jacobian, residual and its own signatures, as `_root` takes them; signatures: of the library.
+        beside: Jacobian, residual and its own signatures, as `_root` takes them; signatures: of the library, there.
     """
     library, family, again = space.library, space.library[effect].family(), []
     akin = np.array([library[name].family() == family for name in library.names])[library.of]

@@ -316,7 +316,8 @@ def collinearity(columns: Mapping[str, np.ndarray], weight: np.ndarray, axes: Se
     cannot be told from what the conditions do.
 
     Conditions are a level for each combination of configuration, what is imposed and payload, where these are few
-    beside the runs, else a level for each configuration and polynomials of the others; and a polynomial of the slope.
+    beside the runs, else a level for each configuration and direction and polynomials of the others; and a polynomial
+    of the slope.
 
     Args:
         columns, weight: as of `families`; axes: columns of the conditions, None: of the packaged robot's.
@@ -325,11 +326,12 @@ def collinearity(columns: Mapping[str, np.ndarray], weight: np.ndarray, axes: Se
     x = np.asarray(columns["order"], float)[counts]
     if len(x) < 4 or np.ptp(x) == 0:
         return 1.0
-    _, which = np.unique(np.asarray(columns["configuration"])[counts], return_inverse=True)
+    _, configuration = np.unique(np.asarray(columns["configuration"])[counts], return_inverse=True)
     conditions = axes_of(None) if axes is None else axes
     others = [c for c in conditions if c != VARIABLES["slope"]]
-    cells = np.stack([which, *(np.asarray(columns[c], float)[counts] for c in others)], 1)
-    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    values = np.stack([configuration, *(np.asarray(columns[c], float)[counts] for c in others)], 1)
+    _, which = np.unique(np.c_[configuration, np.sign(values[:, 1:])], axis=0, return_inverse=True)
+    _, cell = np.unique(values, axis=0, return_inverse=True)
     few = cell.max() + 1 <= FEW_CELLS * len(x)
     smooth = [VARIABLES["slope"]] * (VARIABLES["slope"] in conditions) if few else conditions
     terms = list(np.eye(len(x))[cell.ravel() if few else which.ravel()].T)

@@ -55,7 +55,9 @@ def _verdict(said: notes.Summary) -> str:
         if said.missing:
             text += _tentative(said.missing, said.support)
         elif said.nearest:
-            text += f" Nearest comes {' and '.join(said.nearest)}: {reason(said.support)}."
+            one = len(said.nearest) == 1
+            text += f" Nearest {'comes' if one else 'come'} {' and '.join(said.nearest)}, which "
+            text += f"{'does' if one else 'do'} not stand."
         return text
     names = [_named(one) for one in said.missing if one.established]
     in_model = _tentative([one for one in said.missing if not one.established], said.support)
@@ -168,8 +170,10 @@ def answer(found: DiscoveryResult) -> str:
     if lacks is not None and not weak:
         place = bases.in_words(lacks.channel or lacks.balance)
         return f"No. Something is missing in the {place}, and nothing in the library explains it."
-    parts = [f"missing is {' and '.join(map(_kind_of, sure))}"] * bool(sure)
-    parts += [f"{'perhaps also' if sure else 'perhaps'} {' and '.join(map(_kind_of, weak))}"] * bool(weak)
+    kinds = list(dict.fromkeys(map(_kind_of, sure)))
+    perhaps = [k for k in dict.fromkeys(map(_kind_of, weak)) if k not in kinds]
+    parts = [f"missing is {' and '.join(kinds)}"] * bool(kinds)
+    parts += [f"{'perhaps also' if kinds else 'perhaps'} {' and '.join(perhaps)}"] * bool(perhaps)
     return f"No: {'; '.join(parts)}."
 
 
