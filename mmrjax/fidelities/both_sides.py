@@ -286,6 +286,7 @@ def _differentiated(primals: tuple[System, Motion], tangents: tuple[Any, Any]) -
 def _fallen(run: System, motion: Motion, found: _Forces, gained: Float[Array, " 10"]) -> Float[Array, " 10"]:
     """K Δv, see `resistance`, without K."""
     at, pulled, levers = found.sides.at, found.pulled, found.levers
+    assert pulled.aside is not None
     after = forces_after(at, pulled, levers, found.rises, gained)
     losses, shafts = _losses(run, plane_motion(run, motion), found.sides)
     cos, sin, y = cosine(motion.q[YAW]), sine(motion.q[YAW]), SIDES * _width(run)
