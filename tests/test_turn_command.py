@@ -142,7 +142,7 @@ def row(**changes):
     usual = {
         "configuration": "6T2A", "status": "converged", "yaw_rate_rad_s": 0.5, "turning_radius_mm": 400.0,
         "speed_mm_s": 200.0, "effective_width_mm": 365.0, "power_left_W": 5.0, "power_right_W": 5.0,
-        "winding_left_C": 40.0, "winding_right_C": 40.0, "power_supply_W": 10.0,
+        "winding_left_C": 40.0, "winding_right_C": 40.0, "power_supply_W": 10.0, "slope_deg": 0.0,
     }  # fmt: skip
     return usual | sides | changes
 
@@ -159,6 +159,10 @@ def test_turns_are_told_in_plain_words():
     assert "to the left: a circle of 400 mm radius" in said()
     assert "on the spot to the right at 0.50 rad/s, 4.8 turns a minute" in said(yaw_rate_rad_s=-0.5, speed_mm_s=0.2)
     assert "Straight at 200 mm/s" in said(turning_radius_mm=float("inf"), yaw_rate_rad_s=0.0)
+    sloping = said(slope_deg=10.0, yaw_rate_rad_s=-0.04)
+    assert "0.04 rad/s to the right: on a slope the heading changes, and no turn is a circle." in sloping
+    assert "track width" in said() and "track width" not in sloping
+    assert "Straight at 200 mm/s" in said(slope_deg=10.0, turning_radius_mm=float("inf"), yaw_rate_rad_s=0.0)
     assert "stalled" in said(status="stalled")
     assert "the right motor stands at 1.00 A" in said(motor_speed_right_rpm=0.2)
     back = said(motor_current_left_A=-0.4, motor_speed_left_rpm=900.0, power_left_W=-3.0)

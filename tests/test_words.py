@@ -22,6 +22,7 @@ from calibration.words import fits, loop, steps, tables
 from calibration.words.notes import SAID, in_words, sentence
 from mmrjax import channels
 from sweeps import console
+from sweeps.pages.words import FILES
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Notes, and what is said of them.
@@ -644,3 +645,11 @@ def test_lines_of_a_terminal_have_80_columns_and_those_of_a_file_are_whole(monke
     assert " ".join(console.wrapped(text).split()) == " ".join(text.split())
     console.say(text)
     assert capsys.readouterr().out.rstrip("\n") == text
+
+
+def test_what_lies_beside_a_page_is_said():
+    """Every table that a command writes has a line in the list of files."""
+    sources = [path.read_text() for path in (ROOT / "sweeps").rglob("*.py")]
+    written = {name for text in sources for name in re.findall(r'write_table\("([a-z_.]+)"', text)}
+    assert len(written) > 10
+    assert written <= set(FILES)

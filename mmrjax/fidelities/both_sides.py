@@ -10,7 +10,7 @@ and speed v_x - ω y_s; `turning.Law` at each contact takes the place of Fig. 7 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -222,6 +222,40 @@ def dynamics(
     return mjx.full_m(model, data), data.qfrc_bias
 
 
+class _Forces(eqx.Module):
+    """Of an instant, all that a step is made of: mass matrix M, damping K, and `push`, Δt (Q - c)."""
+
+    sides: _Sides
+    signals: Signals
+    pulled: Pull
+    levers: _Levers
+    rises: Array
+    mass: Float[Array, "10 10"]
+    damping: Float[Array, "10 10"]
+    push: Float[Array, " 10"]
+
+
+def _forces(run: System, motion: Motion, stored: bool = False) -> _Forces:
+    """All of an instant; contacts and signals `stored`, or XLA computes their derivatives again for each that reads
+    them."""
+
+    def found(x: Any) -> Any:
+        return jax.lax.optimization_barrier(x) if stored else x
+
+    sides = found(_contacts(run, motion))
+    signals, pulled = found(_resolved(run, plane_motion(run, motion), sides))
+    damping, levers, rises = resistance(run, motion, signals, sides, pulled)
+    mass, bias = dynamics(run, motion, jnp.asarray(run.robot.sides / 2 * half_robot.rotating(run, signals)))
+    push = run.step * (generalized(run, motion, signals, sides.at, pulled) - bias)
+    return _Forces(sides, signals, pulled, levers, rises, mass, damping, push)
+
+
+def _solver(run: System, found: _Forces) -> Callable[[Float[Array, " 10"]], Float[Array, " 10"]]:
+    factors = elimination.factorise([list(row) for row in found.mass + run.step * found.damping])
+    return lambda push: jnp.stack([jnp.asarray(x) for x in elimination.substitute(factors, list(push))])
+
+
+@eqx.filter_custom_jvp
 def advance(run: System, motion: Motion) -> tuple[Motion, balances.Travel, Float[Array, " 2"]]:
     """One step, see `half_robot.advance`: (M + Δt K) Δv = Δt (Q - c).
 
@@ -229,24 +263,57 @@ def advance(run: System, motion: Motion) -> tuple[Motion, balances.Travel, Float
         The motion after it; all of an instant before it, with forces and accelerations of the step; the load on each
         lower guide before it [N].
     """
-    sides = _contacts(run, motion)
-    plane = plane_motion(run, motion)
-    signals, pulled = _resolved(run, plane, sides)
-    damping, levers, rises = resistance(run, motion, signals, sides, pulled)
-    mass, bias = dynamics(run, motion, jnp.asarray(run.robot.sides / 2 * half_robot.rotating(run, signals)))
-    push = generalized(run, motion, signals, sides.at, pulled) - bias
-    whole = mass + run.step * damping
-    factors = elimination.factorise([list(row) for row in whole])
-    gained = jnp.stack([jnp.asarray(x) for x in elimination.substitute(factors, list(run.step * push))])
+    found = _forces(run, motion)
+    return _moved(run, motion, found, _solver(run, found)(found.push))
+
+
+@advance.def_jvp
+def _differentiated(primals: tuple[System, Motion], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
+    """See `half_robot.advance`; of K its product with Δv alone."""
+    found = _forces(*primals)
+    solve = _solver(primals[0], found)
+    gained = solve(found.push)
+
+    def held(run: System, motion: Motion) -> tuple[Array, _Forces]:
+        forces = _forces(run, motion, stored=True)
+        fallen = _fallen(run, motion, forces, gained)
+        return forces.push - forces.mass @ gained - run.step * fallen, forces
+
+    _, (left, changed) = eqx.filter_jvp(held, primals, tangents)
+    return eqx.filter_jvp(_moved, (*primals, found, gained), (*tangents, changed, solve(left)))
+
+
+def _fallen(run: System, motion: Motion, found: _Forces, gained: Float[Array, " 10"]) -> Float[Array, " 10"]:
+    """K Δv, see `resistance`, without K."""
+    at, pulled, levers = found.sides.at, found.pulled, found.levers
+    assert pulled.aside is not None
+    after = forces_after(at, pulled, levers, found.rises, gained)
+    losses, shafts = _losses(run, plane_motion(run, motion), found.sides)
+    cos, sin, y = cosine(motion.q[YAW]), sine(motion.q[YAW]), SIDES * _width(run)
+    ahead, turn = cos * gained[X] + sin * gained[Y], gained[YAW]
+    rolls = losses * (ahead - y * turn)
+    own = jnp.zeros(COORDINATES, motion.v.dtype).at[SHAFTS].set(shafts * gained[SHAFTS])
+    own = own.at[jnp.asarray([X, Y, YAW])].add(jnp.stack([cos * jnp.sum(rolls), sin * jnp.sum(rolls), -y @ rolls]))
+    for lever, now, then in zip(
+        (levers.along, levers.across, levers.off), (pulled.force, pulled.aside, at.force), after, strict=True
+    ):
+        each = jnp.einsum("sci,sc->si", lever, now - then)
+        own = own.at[OF_SIDE[0]].add(each[0]).at[OF_SIDE[1]].add(each[1])
+    return run.robot.sides / 2 * own
+
+
+def _moved(
+    run: System, motion: Motion, found: _Forces, gained: Float[Array, " 10"]
+) -> tuple[Motion, balances.Travel, Float[Array, " 2"]]:
     v = motion.v + gained
 
     def later(own: Conditions, signals: Signals, memory: Mapping[str, Scalar]) -> Any:
         of_side = dataclasses.replace(run, conditions=own), dataclasses.replace(motion, memory=memory)
         return half_robot.later(*of_side, signals)
 
-    each = jax.vmap(later)(run.conditions.of_sides(), signals, motion.memory)
+    each = jax.vmap(later)(run.conditions.of_sides(), found.signals, motion.memory)
     after = Motion(motion.q + run.step * v, v, each.current, each.discharge[0], each.memory)
-    return after, _travel(run, motion, signals, sides, pulled, levers, rises, gained), pulled.guided
+    return after, _travel(run, motion, found, gained), found.pulled.guided
 
 
 def forces_after(
@@ -265,13 +332,10 @@ def forces_after(
     return ahead, aside, at.force - down
 
 
-def _travel(
-    run: System, motion: Motion, signals: Signals, sides: _Sides, pulled: Pull, levers: _Levers, rises: Array,
-    gained: Array,
-) -> balances.Travel:  # fmt: skip
+def _travel(run: System, motion: Motion, found: _Forces, gained: Float[Array, " 10"]) -> balances.Travel:
     """All of a step, its forces those at its end to first order."""
-    at, several = sides.at, run.robot.sides / 2
-    ahead, aside, normal = forces_after(at, pulled, levers, rises, gained)
+    sides, signals, at, several = found.sides, found.signals, found.sides.at, run.robot.sides / 2
+    ahead, aside, normal = forces_after(at, found.pulled, found.levers, found.rises, gained)
     forward = run.half.centre[0]
     arm = at.lever_x - forward
     load, moment = jnp.sum(normal, axis=-1), jnp.sum(aside * arm, axis=-1)

@@ -262,13 +262,17 @@ def _settled(robot: Robot, conditions: Conditions) -> tuple[PlaneMotion, Float[A
         rates = jnp.where(aside & (search.looks > 0), search.rates, found)
         return _Secant(y, rates, inverse, search.looks + 1, ~aside & (jnp.max(jnp.abs(step)) < NEAR))
 
+    def around(robot: Robot, conditions: Conditions, y: Array) -> tuple[Array, Array]:
+        """The Jacobian of `_balance`, and itself; what does not move has no equation of its own."""
+        slope, found = jax.jacfwd(lambda y: (_balance(robot, conditions, y),) * 2, has_aux=True)(y)
+        return jnp.where(moves[:, None], slope, still), found
+
     def unknown(_: tuple[Robot, Conditions, Array, Array]) -> _Linear:
         return _Linear(jnp.asarray(still), jnp.asarray(False), jnp.asarray(False))
 
     def linear(held: tuple[Robot, Conditions, Array, Array], _: _Linear) -> _Linear:
         y, solved = held[2:]
-        slope, found = jax.jacfwd(lambda y: (_balance(*held[:2], y),) * 2, has_aux=True)(y)
-        slope = jnp.where(moves[:, None], slope, still)  # what does not move has no equation of its own
+        slope, found = around(*held[:2], y)
         solve, determinant = inverse(-slope)
         close = jnp.max(jnp.abs(solve(found))) < CLOSE
         return _Linear(slope, solved & close & (determinant > 0), jnp.asarray(True))
@@ -283,8 +287,7 @@ def _settled(robot: Robot, conditions: Conditions) -> tuple[PlaneMotion, Float[A
     def turn(held: tuple[Robot, Conditions, Array, _Linear], search: _Search) -> _Search:
         step = inverse(jnp.asarray(slow) / search.step - search.jacobian)[0](search.rates)
         largest, next_y = jnp.max(jnp.abs(step)), search.y + step
-        slope, found = jax.jacfwd(lambda y: (_balance(*held[:2], y),) * 2, has_aux=True)(next_y)
-        slope = jnp.where(moves[:, None], slope, still)
+        slope, found = around(*held[:2], next_y)
         before, after = jnp.linalg.norm(search.rates), jnp.linalg.norm(found)
         worse = (~(after <= WORSE * before + SMALL) | (largest > FAR)) & (search.turns > 0)
         ended = ~worse & (largest < SMALL) & ((search.step > LONG) | (after < SMALL_RATE))

@@ -52,6 +52,10 @@ def turn(robot: Robot, row: Mapping[str, Any], ended: Mapping[str, float] | None
     return Turn(answer, [(a, b, c) for a, b, c in sides], _notes(robot, row) if going else [])
 
 
+def _sloping(row: Mapping[str, Any]) -> bool:
+    return float(row["slope_deg"]) != 0
+
+
 def _way(row: Mapping[str, Any]) -> str:
     return SIDES[0] if float(row["yaw_rate_rad_s"]) > 0 else SIDES[1]
 
@@ -66,6 +70,11 @@ def _moves(row: Mapping[str, Any]) -> str:
     rate, radius, speed = (float(row[c]) for c in ("yaw_rate_rad_s", "turning_radius_mm", "speed_mm_s"))
     if not math.isfinite(radius):
         return f"Straight at {speed:.0f} mm/s."
+    if _sloping(row):
+        return (
+            f"There {speed:.0f} mm/s ahead and {abs(rate):.2f} rad/s to the {_way(row)}: on a slope the heading "
+            "changes, and no turn is a circle."
+        )
     if abs(speed) < SPOT:
         minute = 60 / FULL * abs(rate)
         return f"Turns on the spot to the {_way(row)} at {abs(rate):.2f} rad/s, {minute:.1f} turns a minute."
@@ -79,7 +88,7 @@ def _notes(robot: Robot, row: Mapping[str, Any]) -> list[str]:
     notes = []
     own = float(robot.configurations[str(row["configuration"])].turning.width) / MM
     width = float(row["effective_width_mm"])
-    if math.isfinite(width):
+    if math.isfinite(width) and not _sloping(row):
         notes.append(
             f"effective track width {width:.0f} mm, {width / own:.2f} times the {own:.0f} mm between the sides: the "
             "difference of the sides' speeds that a turn takes, over what it would take without sliding"
