@@ -8,6 +8,7 @@ levers' drives follow a sequence of angles at most at the levers' rate, or have 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -28,6 +29,7 @@ from mmrjax.lever_drives import LeverDrive, Swing, lever_drive, swing
 from mmrjax.masses import Masses, without_levers
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
+from mmrjax.running_gear import RunningGear
 from mmrjax.signals import GRAVITY, Signals, State
 from mmrjax.terrain import Terrain
 from mmrjax.track import Track
@@ -43,6 +45,8 @@ SETTLES, RISES = 0.3, 0.1  # before the motors are switched on, and until they h
 TURNED_OVER = np.radians(100.0)
 #: A robot that gains less than this way [m] in this time [s] is stuck.
 GAIN, PATIENCE = 5e-3, 2.0
+#: How far a lever may begin below the ground [m], which is on it then.
+ON_GROUND = 4e-4
 #: A belt slower than this [m/s] stands; a body that bears more than this share of the weight hangs.
 STANDS, BEARS = 5e-3, 0.1
 #: Time in which levers come to their rate and near their angle [s], and rate below which they are let stand [rad/s].
@@ -523,11 +527,20 @@ def _judged(
 
 
 def begin(run: System, motion: Motion | None = None) -> tuple[Motion, Energy, Progress]:
-    """What a run begins with: motion (None: at rest before the obstacle), no energy yet, and that it goes on."""
+    """What a run begins with: motion (None: at rest before the obstacle), no energy yet, and that it goes on, or that
+    it failed, as its levers would begin below the ground."""
+    angles, gear = _turned(*run.sequence.first), run.shape.gear
+    under = clearance(run.shape.main.first + gear.grouser_height, gear, angles) < -ON_GROUND
+    buried = jnp.any(under & (run.shape.on_tracks > 0.5)) & (motion is None)
     motion = stand(run) if motion is None else motion
     zero = jnp.zeros_like(motion.q[0])
     energy = dict.fromkeys((*SOURCES, *LOSSES), zero)
-    return motion, energy, Progress(jnp.asarray(_RUNNING), zero, motion.q[0], zero, zero)
+    return motion, energy, Progress(jnp.where(buried, FAILED, _RUNNING), zero, motion.q[0], zero, zero)
+
+
+def clearance(axle: Scalar, gear: RunningGear, angles: Float[Array, " levers"]) -> Float[Array, " levers"]:
+    """How far the rollers of levers at `angles` [rad] are above level ground [m], the axles `axle` above it [m]."""
+    return axle + gear.lever_length * jnp.sin(angles) - gear.levers.roller
 
 
 def sampled(run: System, state: Any, first: Scalar, steps: int, samples: int) -> tuple[Any, Passed]:
@@ -548,6 +561,15 @@ def sampled(run: System, state: Any, first: Scalar, steps: int, samples: int) ->
         return (after, kept, progress), passed
 
     return jax.lax.scan(sample, state, jnp.arange(samples))
+
+
+def divided(duration: float, step: float, sample: float, part: float) -> tuple[int, int, int]:
+    """How a run of a `duration` is divided: into parts no longer than `part`, samples of a part, steps of a sample.
+
+    A sample is of whole steps and all parts are alike, so the run may be longer by some samples.
+    """
+    steps, parts = max(round(sample / step), 1), math.ceil(duration / part - 1e-9)
+    return parts, math.ceil(duration / (parts * steps * step) - 1e-9), steps
 
 
 class Climb(eqx.Module):
@@ -628,12 +650,11 @@ def climb_batch(
         start: motions with which the runs begin; None: at rest before the obstacle.
         progress: told the share of the time that is done.
     """
-    steps, samples = round(sample / step), round(part / sample)
+    parts, samples, steps = divided(duration, step, sample, part)
     state = _begin(robot, conditions, terrain, sequence, step, start)
     kept: list[Passed] = []
-    parts = int(np.ceil(duration / part - 1e-9))
     for k in range(parts):
-        first = jnp.asarray(k * part)
+        first = jnp.asarray(k * samples * steps * step)
         state, passed = _compiled(robot, conditions, terrain, sequence, state, first, step, steps, samples)
         verdict = np.asarray(state[2].verdict)
         last = passed if record else jax.tree.map(lambda x: x[:, -1:], passed)
