@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import zarr
+from pydantic import ValidationError
 
 from calibration.data.errors import BadConfiguration
 from mmrjax import params, terrain
@@ -47,6 +48,11 @@ REFUSED = {
                                  r"levers_front_deg: at -30 deg they begin 72 mm below the ground"),
     "beyond the range": ({"kind": "step"}, {"levers_rear_deg": [190], "obstacle_mm": [50]}, r"expected -180 to 180 deg"),
     "no size at all": ({"kind": "step"}, {"obstacle_mm": [0]}, r"obstacle_mm: got 0; expected 1 to 5000 mm"),
+    "levers of a wheeled robot": ({"kind": "step"}, {"levers_front_deg": [30], "obstacle_mm": [50], "configuration": ["6T2A", "4W2T"]},
+                                  r"levers_front_deg: 4W2T has no levers; those that have: 6T2A"),
+    "a nose larger than its tread": ({"kind": "stairs", "nose_mm": 100, "tread_mm": 190}, {"obstacle_mm": [250]},
+                                     r"nose_mm: got 100; expected less than half of rise and tread, 95"),
+    "a nose larger than its rise": ({"kind": "stairs", "nose_mm": 40}, {"obstacle_mm": [70, 90]}, r"expected less than .* 35$"),
     "a name that is none": ({"kind": "step"}, {"obstacle_mm": [50], "friction": [1]}, r"neither a parameter"),
 }  # fmt: skip
 
@@ -57,6 +63,17 @@ def test_sweeps_that_cannot_be_climbed_are_refused_in_one_sentence(case):
     with pytest.raises(BadConfiguration, match=message) as error:
         axes.plan(Campaign(obstacle=Obstacle(**of), axes=varied), ROBOT, "map.toml")
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "kind", "kinds"),
+    [("tread_mm", 300, "step", "stairs"), ("count", 2, "gap", "stairs"), ("nose_mm", 5, "gap", "step or stairs")],
+)
+def test_keys_of_another_obstacle_are_refused(key, value, kind, kinds):
+    with pytest.raises(ValidationError, match=f"{key} acts with kind {kinds} only"):
+        Obstacle(kind=kind, **{key: value})
+    # as a file of all keys has them
+    assert Obstacle(**Obstacle(kind=kind).model_dump()) == Obstacle(kind=kind)
 
 
 def test_size_is_an_obstacles_alone():

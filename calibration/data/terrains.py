@@ -87,23 +87,22 @@ def read_terrain(path: Path) -> Terrain:
     columns, names = _read(path, "--terrain", [("x_m", "z_m"), ("x_mm", "z_mm")])
     unit = names[0].rpartition("_")[2]
     x, z = (columns[name] * _LENGTHS[unit] for name in names)
-    across, up = np.abs(np.diff(x)), np.abs(np.diff(z))
-    largest, wall = max(np.ptp(x), np.ptp(z)), np.max(up, where=up > across, initial=0.0)
-    wrong = (
-        f"is {1000 * largest:g} mm large; expected at least {1000 * SMALLEST:g} mm" if largest < SMALLEST
-        else f"is {largest:g} m large; expected at most {LARGEST:g} m" if largest > LARGEST
-        else f"has a wall of {wall:g} m; expected at most {WALL:g} m" if wall > WALL
-        else ""
-    )  # fmt: skip
-    if wrong:
-        # too small in the smaller unit, or too large in the larger one
-        other, word = ("m", "metres") if largest < SMALLEST else ("mm", "millimetres")
-        hint = "" if other == unit else f"; is the file in {word}? Name its columns x_{other} and z_{other} then"
-        raise BadData(f"{path.name}: {wrong}{hint}")
     try:
-        return terrain.polyline(x - x[0], z - z[0])
+        found = terrain.polyline(x - x[0], z - z[0])
     except ValueError as error:
         raise BadData(f"{path.name}: {error}") from error
+    across, up = np.abs(np.diff(x)), np.abs(np.diff(z))
+    largest, wall = max(np.ptp(x), np.ptp(z)), np.max(up, where=up > across, initial=0.0)
+    if SMALLEST <= largest <= LARGEST and wall <= WALL:
+        return found
+    wrong, other, word = f"is {largest:g} m large; expected at most {LARGEST:g} m", "mm", "millimetres"
+    if largest < SMALLEST:
+        wrong, other, word = f"is {1e3 * largest:g} mm large; expected at least {1e3 * SMALLEST:g} mm", "m", "metres"
+    elif largest <= LARGEST:
+        wrong = f"has a wall of {wall:g} m; expected at most {WALL:g} m"
+    # too small in the smaller unit, or too large in the larger one
+    hint = "" if other == unit else f"; is the file in {word}? Name its columns x_{other} and z_{other} then"
+    raise BadData(f"{path.name}: {wrong}{hint}")
 
 
 def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Sequence:

@@ -127,7 +127,8 @@ class Passed(eqx.Module):
         stored: in motion, height, contacts and windings, of the whole robot [J].
         body: share of all normal force that the body bears [-].
         grip: share of what its friction could hold that the ground gives to all that rolls [-].
-        centre: x of the centre of mass [m]; margin: how far it is within the outermost contacts [m].
+        centre: x of the centre of mass [m]; margin: how far it is within the outermost contacts [m], of a sample the
+            largest.
     """
 
     time: Scalar
@@ -550,10 +551,13 @@ def sampled(run: System, state: Any, first: Scalar, steps: int, samples: int) ->
         motion, energy, progress = state
 
         def small(carry: Any, j: Array) -> tuple[Any, None]:
-            return advance(run, carry[0], first + (k * steps + j) * run.step, carry[1]), None
+            *after, passed = advance(run, carry[0], first + (k * steps + j) * run.step, carry[1])
+            # contacts that leave the ground for some steps bear nevertheless
+            most = jnp.maximum(passed.margin, carry[2].margin)
+            return (*after, dataclasses.replace(passed, margin=most)), None
 
         nothing = jax.eval_shape(lambda: advance(run, motion, first, energy)[2])
-        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), nothing)
+        nothing = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf, x.dtype), nothing)
         (after, spent, passed), _ = jax.lax.scan(small, (motion, energy, nothing), jnp.arange(steps))
         ended = progress.verdict != _RUNNING
         after, progress = _judged(run, motion, passed, after, progress)
