@@ -170,6 +170,28 @@ def test_interrupted_map_goes_on_after_its_last_chunk(mmrjax, tmp_path, monkeypa
     assert store["energy_J"][:].tolist() == [[60, 560 - 60], [90, 530], [120, 560]]
 
 
+def test_page_says_the_largest_obstacle_and_where_it_is_got_over(mmrjax, tmp_path, monkeypatch):
+    """Climbs in closed form: the steeper the levers the higher, up to the last, which falls."""
+
+    def closed(of, variation, conditions, values, sizes, told):
+        most = np.array([70, 250, 40])[(np.asarray(values)[:, 0] / 30).astype(int)]
+        own = {climbs.LARGEST: most * 1.0} if of.find else {climbs.VERDICT: np.where(sizes <= most, OVER, TIPS)}
+        found = {name: np.full(len(most), 1.0) for name in climbs.attributes(of)} | own
+        found[climbs.VERDICT] = found[climbs.VERDICT].astype(np.uint8)
+        return {**found, STATUS: np.zeros(len(most), np.uint8)}
+
+    monkeypatch.setattr(climbs, "computed", closed)
+    text = MAP.replace("report = false", "")
+    (tmp_path / "map.toml").write_text(text)
+    (tmp_path / "find.toml").write_text(text.replace("obstacle_mm = [60, 500]", "").replace('"step"', '"step"\nfind = true'))
+    for name, size in {"map": 60, "find": 250}.items():
+        assert mmrjax("sweep", f"{name}.toml", "--out", name)[0] == 0
+        page = (tmp_path / name / "report.html").read_text("utf-8")
+        where = "levers_front_deg 0 deg" if name == "map" else "levers_front_deg 30 deg"
+        assert f"The largest obstacle that is got over: {size} mm, at {where}." in page
+    assert "height of the step [mm]" in (tmp_path / "map" / "report.html").read_text("utf-8")
+
+
 @pytest.mark.slow
 def test_store_of_climbs_is_filled_in_shares_and_its_page_has_the_map(mmrjax, tmp_path):
     (tmp_path / "map.toml").write_text(

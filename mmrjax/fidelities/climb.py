@@ -127,8 +127,8 @@ class Passed(eqx.Module):
         stored: in motion, height, contacts and windings, of the whole robot [J].
         body: share of all normal force that the body bears [-].
         grip: share of what its friction could hold that the ground gives to all that rolls [-].
-        centre: x of the centre of mass [m]; margin: how far it is within the outermost contacts [m], of a sample the
-            largest.
+        centre: x of the centre of mass [m]; base: how far the outermost contacts are behind and ahead of it [m], of
+            a sample the furthest, as contacts that leave the ground for some steps bear nevertheless.
     """
 
     time: Scalar
@@ -146,7 +146,13 @@ class Passed(eqx.Module):
     body: Scalar
     grip: Scalar
     centre: Scalar
-    margin: Scalar
+    base: Float[Array, " 2"]
+
+    @property
+    def margin(self) -> Scalar:
+        """How far gravity's line through the centre of mass is within the outermost contacts [m]; 0 without any."""
+        least = jnp.min(self.base, axis=-1)
+        return jnp.where(jnp.isfinite(least), least, 0.0)
 
 
 class System(eqx.Module):
@@ -435,18 +441,15 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
         body=jnp.sum(at.force * (1 - at.rolls)) / jnp.maximum(total, 1e-9),
         grip=jnp.sum(jnp.abs(pulled.force) * at.rolls) / jnp.maximum(held, 1e-9),
         centre=centre,
-        margin=_margin(centre, at),
+        base=_base(centre, at),
     )
     return after, spent, passed
 
 
-def _margin(centre: Scalar, at: Footing) -> Scalar:
-    """How far gravity's line through the centre of mass is within the outermost contacts [m], level ground assumed
-    below."""
-    bears = at.force > 0
-    first = jnp.min(jnp.where(bears, at.place, jnp.inf))
-    last = jnp.max(jnp.where(bears, at.place, -jnp.inf))
-    return jnp.where(jnp.any(bears), jnp.minimum(centre - first, last - centre), 0.0)
+def _base(centre: Scalar, at: Footing) -> Float[Array, " 2"]:
+    """How far the outermost contacts are behind and ahead of the centre of mass [m], level ground assumed below."""
+    bears, ahead = at.force > 0, at.place - centre
+    return jnp.stack([jnp.max(jnp.where(bears, way, -jnp.inf)) for way in (-ahead, ahead)])
 
 
 def _shaft_loss(run: System, motion: Motion, signals: Signals, at: Footing) -> Scalar:
@@ -552,9 +555,8 @@ def sampled(run: System, state: Any, first: Scalar, steps: int, samples: int) ->
 
         def small(carry: Any, j: Array) -> tuple[Any, None]:
             *after, passed = advance(run, carry[0], first + (k * steps + j) * run.step, carry[1])
-            # contacts that leave the ground for some steps bear nevertheless
-            most = jnp.maximum(passed.margin, carry[2].margin)
-            return (*after, dataclasses.replace(passed, margin=most)), None
+            base = jnp.maximum(passed.base, carry[2].base)
+            return (*after, dataclasses.replace(passed, base=base)), None
 
         nothing = jax.eval_shape(lambda: advance(run, motion, first, energy)[2])
         nothing = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf, x.dtype), nothing)
