@@ -146,7 +146,7 @@ def polyline(x: Sequence[float] | np.ndarray, z: Sequence[float] | np.ndarray, s
     if (back := np.flatnonzero(up[1:] * up[:-1] < 0)).size:
         k = int(back[0]) + 1
         raise ValueError(
-            f"terrain: z goes from {z[k]:g} back to {z[k + 1]:g} m at x = {x[k]:g} m; expected walls that rise or fall"
+            f"terrain: z goes from {z[k]:g} back to {z[k + 1]:g} m at x = {x[k]:g} m; expected a wall up or down"
         )
     points = [(x[0] - FAR, z[0]), *zip(x, z, strict=True), (x[-1] + FAR, z[-1])]
     return _terrain(points, float(x[-1]), size=size)

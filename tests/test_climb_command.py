@@ -81,10 +81,19 @@ def test_files_of_terrain_and_sequence_are_read_with_their_units(tmp_path):
 
 FILES = {
     "millimetres": ("x_m,z_m\n0,0\n3000,120\n", r"is 3000 m large; .* is the file in millimetres\?"),
-    "millimetres of a kerb": ("x_m,z_m\n0,0\n0,40\n", r"has a wall of 40 m; expected at most 5 m; is the file in millimetres\?"),
-    "metres": ("x_mm,z_mm\n0,0\n0.3,0.12\n", r"is 0\.3 mm large; expected at least 1 mm; is the file in metres\? Name"),
+    "millimetres of a kerb": (
+        "x_m,z_m\n0,0\n0,40\n",
+        r"has a wall of 40 m; expected at most 5 m; is the file in millimetres\?",
+    ),
+    "metres": (
+        "x_mm,z_mm\n0,0\n0.3,0.12\n",
+        r"is 0\.3 mm large; expected at least 1 mm; is the file in metres\? Name",
+    ),
     "too large in millimetres": ("x_mm,z_mm\n0,0\n3e6,120\n", r"is 3000 m large; expected at most 50 m$"),
-    "a wall that goes back": ("x_m,z_m\n0,0\n0,-0.05\n0,0.1\n1,0.1\n", r"z goes from -0\.05 back to 0\.1 m at x = 0 m"),
+    "a wall that goes back": (
+        "x_m,z_m\n0,0\n0,-0.05\n0,0.1\n1,0.1\n",
+        r"z goes from -0\.05 back to 0\.1 m at x = 0 m",
+    ),
     "no units": ("x,z\n0,0\n1,0\n", r"got columns x, z; expected x_m and z_m, or x_mm and z_mm"),
     "folds back": ("x_m,z_m\n0,0\n0.3,0.1\n0.2,0.2\n", r"x falls from 0\.3 to 0\.2 m at point 3"),
     "a word": ("x_m,z_m\n0,0\n1,high\n", r"row 3, z_m: got 'high'; expected a number"),

@@ -51,8 +51,8 @@ REFUSED = {
     "levers of a wheeled robot": ({"kind": "step"}, {"levers_front_deg": [30], "obstacle_mm": [50], "configuration": ["6T2A", "4W2T"]},
                                   r"levers_front_deg: 4W2T has no levers; those that have: 6T2A"),
     "a nose larger than its tread": ({"kind": "stairs", "nose_mm": 100, "tread_mm": 190}, {"obstacle_mm": [250]},
-                                     r"nose_mm: got 100; expected less than half of rise and tread, 95"),
-    "a nose larger than its rise": ({"kind": "stairs", "nose_mm": 40}, {"obstacle_mm": [70, 90]}, r"expected less than .* 35$"),
+                                     r"nose_mm: got 100; expected less than half of rise and tread, 95 mm"),
+    "a nose larger than its rise": ({"kind": "stairs", "nose_mm": 40}, {"obstacle_mm": [70, 90]}, r"expected less than .* 35 mm$"),
     "a name that is none": ({"kind": "step"}, {"obstacle_mm": [50], "friction": [1]}, r"neither a parameter"),
 }  # fmt: skip
 
@@ -183,7 +183,9 @@ def test_page_says_the_largest_obstacle_and_where_it_is_got_over(mmrjax, tmp_pat
     monkeypatch.setattr(climbs, "computed", closed)
     text = MAP.replace("report = false", "")
     (tmp_path / "map.toml").write_text(text)
-    (tmp_path / "find.toml").write_text(text.replace("obstacle_mm = [60, 500]", "").replace('"step"', '"step"\nfind = true'))
+    (tmp_path / "find.toml").write_text(
+        text.replace("obstacle_mm = [60, 500]", "").replace('"step"', '"step"\nfind = true')
+    )
     for name, size in {"map": 60, "find": 250}.items():
         assert mmrjax("sweep", f"{name}.toml", "--out", name)[0] == 0
         page = (tmp_path / name / "report.html").read_text("utf-8")

@@ -113,7 +113,8 @@ def course(found: ClimbResult) -> Figure:
     rows = [
         ("angle [deg]", {"pitch, nose up": ("pitch_deg", BLUE), "front levers": ("front_deg", ORANGE),
                          "rear levers": ("rear_deg", PURPLE)}),
-        ("place, margin [mm]", {"middle from obstacle": ("x_mm", BLUE), "margin of tipping": ("margin_mm", VERMILION)}),
+        ("place, margin [mm]", {"middle from obstacle": ("x_mm", BLUE),
+                                "margin of tipping": ("margin_mm", VERMILION)}),
         ("motor current [A]", {"each traction motor": ("traction_current_A", BLUE),
                                "front levers": ("front_current_A", ORANGE),
                                "rear levers": ("rear_current_A", PURPLE)}),

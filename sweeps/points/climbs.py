@@ -93,7 +93,8 @@ def further(obstacle: Obstacle, varied: Mapping[str, np.ndarray], robot: Robot, 
     sizes = varied.get(SIZE, ())
     if obstacle.kind == "stairs" and 2 * obstacle.nose_mm >= (least := min([obstacle.tread_mm, *sizes])):
         raise BadConfiguration(
-            f"{where}, obstacle.nose_mm: got {obstacle.nose_mm:g}; expected less than half of rise and tread, {least / 2:g}"
+            f"{where}, obstacle.nose_mm: got {obstacle.nose_mm:g}; expected less than half of rise and tread, "
+            f"{least / 2:g} mm"
         )
     one = None if obstacle.sequence is None else terrains.read_sequence(obstacle.sequence, robot, (0.0, 0.0))
     for name in ("levers_front_deg", "levers_rear_deg"):
