@@ -184,12 +184,12 @@ def test_page_says_the_largest_obstacle_and_where_it_is_got_over(mmrjax, tmp_pat
     text = MAP.replace("report = false", "")
     (tmp_path / "map.toml").write_text(text)
     (tmp_path / "find.toml").write_text(
-        text.replace("obstacle_mm = [60, 500]", "").replace('"step"', '"step"\nfind = true')
+        text.replace("obstacle_mm = [60, 500]", "adhesion = [0.5]").replace('"step"', '"step"\nfind = true')
     )
     for name, size in {"map": 60, "find": 250}.items():
         assert mmrjax("sweep", f"{name}.toml", "--out", name)[0] == 0
         page = (tmp_path / name / "report.html").read_text("utf-8")
-        where = "levers_front_deg 0 deg" if name == "map" else "levers_front_deg 30 deg"
+        where = "levers_front_deg 0 deg" if name == "map" else "levers_front_deg 30 deg, adhesion 0.5"
         assert f"The largest obstacle that is got over: {size} mm, at {where}." in page
     assert "height of the step [mm]" in (tmp_path / "map" / "report.html").read_text("utf-8")
 
