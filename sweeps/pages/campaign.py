@@ -116,8 +116,8 @@ def _largest(values: np.ndarray, found: dict[str, np.ndarray], layout: Layout) -
         return "No obstacle is got over."
     at = []
     for name, value in zip(names, values[k], strict=True):
-        labels, unit = layout.labels.get(name), layout.coordinates[name].get("units", "")
-        at.append(f"{name} {labels[int(value)] if labels else f'{value:.4g} {unit.removeprefix("1")}'.strip()}")
+        labels, unit = layout.labels.get(name), layout.coordinates[name].get("units", "").removeprefix("1")
+        at.append(f"{name} {labels[int(value)] if labels else f'{value:.4g} {unit}'.strip()}")
     rest = ", ".join(words for name, words in zip(names, at, strict=True) if name != SIZE)
     return f"The largest obstacle that is got over: {sizes[k]:.4g} mm{', at ' if rest else ''}{rest}."
 
