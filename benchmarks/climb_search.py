@@ -1,23 +1,26 @@
 """The highest step that a robot gets over, by a search over sequences of its lever angles; and time of 1000 climbs.
 
-    python benchmarks/climb_search.py --surface asphalt --members 2048 --generations 4 --out found.json
+    python benchmarks/climb_search.py --surface asphalt --members 1024 --generations 4 --out found.csv
+    mmrjax climb --step 400 --surface asphalt --sequence found.csv --film
 
-Members have angles of front and rear levers at knots of time, and a height of their own; of each generation the
-highest that were got over beget the next, angles and height changed at random. `--adhesion 4` is a ground that holds
-whatever is asked, which shows what geometry and torque leave. `--begin` begets the first generation of a sequence,
-which `--stretch` makes slower.
+Members have angles of front and rear levers at knots of time, and a height of their own; those that do best beget the
+next generation, angles and height changed at random. Where a grouser meets the edge decides, so one climb may be
+luck: each member climbs `--tries` steps within `BAND` below its height, and what it does is that height less `MISSED`
+times the share that it does not get over. `--adhesion 4` is a ground that holds whatever is asked, which shows what
+geometry and torque leave. `--begin` begets the first generation of a sequence, which `--stretch` makes slower.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data import terrains
 from mmrjax import params, robots, terrain
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.climb import NAMES, OVER, Sequence, climb_batch
@@ -28,6 +31,8 @@ KNOTS = np.array([0.3, 1.5, 3.0, 4.5, 6.0, 7.5, 9.0, 10.5])
 LENGTH = 13.0
 #: Least angle in which a lever begins [deg].
 FLUSH = -8.4
+#: Heights over which a member is tried, and what it loses where none of them is got over [m].
+BAND, MISSED = 0.04, 0.2
 
 
 def run(
@@ -53,10 +58,10 @@ def run(
     )
 
 
-def begotten(random: np.random.Generator, path: str, stretch: float, n: int) -> np.ndarray:
-    """Angles of a first generation: those of a file of time and angles, made slower, and moved in all but one."""
-    time, *angles = np.loadtxt(path, delimiter=",", skiprows=1).T
-    own = np.stack([np.interp(KNOTS, stretch * time, a) for a in angles])
+def begotten(random: np.random.Generator, begin: Sequence, stretch: float, n: int) -> np.ndarray:
+    """Angles of a first generation: those of a sequence over time, made slower, and moved in all but one."""
+    at = stretch * np.asarray(begin.at)
+    own = np.stack([np.interp(KNOTS, at, np.degrees(np.asarray(a))) for a in (begin.front, begin.rear)])
     spread = np.linspace(0, 30, n)[:, None, None]
     return bounded(own + spread * random.normal(size=(n, *own.shape)))
 
@@ -80,28 +85,27 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--surface", default="lacquered_wood", choices=list(SURFACES))
     parser.add_argument("--adhesion", type=float, help="in place of the surface's, as a ratio to the bench")
-    parser.add_argument("--members", type=int, default=2048)
+    parser.add_argument("--members", type=int, default=256)
+    parser.add_argument("--tries", type=int, default=4, help="steps that each member climbs")
     parser.add_argument("--generations", type=int, default=4)
     parser.add_argument("--volts", type=float, default=12.0)
     parser.add_argument("--payload", type=float, default=0.0)
     parser.add_argument("--step", type=float, default=2e-4)
     parser.add_argument("--seconds", type=float, default=1e9, help="after which no generation is begun")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--begin", help="CSV of time_s, front_deg, rear_deg, of which the first generation is begotten"
-    )
+    parser.add_argument("--begin", type=Path, help="CSV of time_s, front_deg, rear_deg: begets the first generation")
     parser.add_argument("--stretch", type=float, default=1.0)
     parser.add_argument("--heights", type=float, nargs=2, default=(100.0, 300.0), help="of the first generation [mm]")
     parser.add_argument("--levers-voltage", type=float, help="highest of the levers' motors; else the supply's")
     parser.add_argument("--levers-current", type=float, help="at which the levers' driver limits their motors")
-    parser.add_argument("--out")
+    parser.add_argument("--out", type=Path, help="CSV of the sequence that does best, for mmrjax climb --sequence")
     told = parser.parse_args()
     robot, random = robots.nominal(), np.random.default_rng(told.seed)
     if told.levers_current is not None:
         robot = params.replace(robot, {"running_gear.levers.current_limit": told.levers_current})
     adhesion = adhesion_ratio(told.surface, True) if told.adhesion is None else told.adhesion
-    n, begun, parents = told.members, time.time(), []
-    best: list[tuple[float, np.ndarray, float]] = []
+    n, begun = told.members, time.time()
+    best: list[tuple[float, float, int, np.ndarray]] = []
     for generation in range(told.generations):
         if time.time() - begun > told.seconds:
             break
@@ -110,34 +114,34 @@ def main() -> None:
             held = random.uniform([[-60], [-90]], [[120], [180]], (n, 2, len(KNOTS)))
             # half of them stay for a while where they are
             angles = bounded(np.where(random.random(held.shape) < 0.5, np.roll(held, 1, axis=2), held))
-            if told.begin:
-                angles = begotten(random, told.begin, told.stretch, n)
+            if told.begin is not None:
+                begin = terrains.read_sequence(told.begin, robot, (0.0, 0.0))
+                angles = begotten(random, begin, told.stretch, n)
             heights = random.uniform(low, high, n)
         else:
-            parents = np.array([angles for _, angles, _ in best])
-            tops = np.array([h for h, *_ in best])
+            parents = np.array([angles for *_, angles in best])
+            tops = np.array([h for _, h, *_ in best])
             angles = mutated(random, parents, n, 25.0 * 0.7**generation)
             heights = random.choice(tops, n) + random.uniform(-0.01, 0.04, n)
         start = time.time()
-        found = run(robot, angles, heights, told.volts, adhesion, told.payload, told.step, told.levers_voltage)
+        tried = (heights[:, None] - np.linspace(0, BAND, told.tries)).ravel()
+        each = np.repeat(angles, told.tries, axis=0)
+        found = run(robot, each, tried, told.volts, adhesion, told.payload, told.step, told.levers_voltage)
         took = time.time() - start
-        over = np.flatnonzero(found.verdict == OVER)
-        best += [(float(heights[k]), angles[k], float(found.ended[k])) for k in over]
+        over = np.sum(found.verdict.reshape(n, told.tries) == OVER, axis=1)
+        does = heights - MISSED * (1 - over / told.tries)
+        best += [(float(does[k]), float(heights[k]), int(over[k]), angles[k]) for k in np.flatnonzero(over)]
         best = sorted(best, key=lambda b: -b[0])[:48]
         counts = {name: int(np.sum(found.verdict == k)) for k, name in enumerate(NAMES)}
-        top = f"{1000 * best[0][0]:.0f} mm" if best else "none"
-        print(f"generation {generation}: {took:.1f} s, {counts}, highest {top}", flush=True)
-    if best and told.out:
-        height, angles, ended = best[0]
-        with open(told.out, "w") as stream:
-            json.dump(
-                {
-                    "surface": told.surface, "adhesion": adhesion, "volts": told.volts, "payload_kg": told.payload,
-                    "height_mm": 1000 * height, "time_s": ended, "knots_s": KNOTS.tolist(),
-                    "front_deg": angles[0].round(1).tolist(), "rear_deg": angles[1].round(1).tolist(),
-                    "others_mm": [round(1000 * h, 1) for h, *_ in best],
-                }, stream, indent=1,
-            )  # fmt: skip
+        all_of = [f"{1000 * height:.0f} mm" for _, height, got, _ in best if got == told.tries]
+        top = f"highest with all {told.tries} {all_of[0]}" if all_of else "none with all"
+        print(f"generation {generation}: {took:.1f} s, {counts}, {top}", flush=True)
+        if best and told.out:
+            _, height, got, angles = best[0]
+            where = f"{told.surface}, {told.volts:g} V, {told.payload:g} kg"
+            said = f"# {where}: {got} of {told.tries} steps of {1000 * (height - BAND):.0f} to {1000 * height:.0f} mm"
+            rows = np.column_stack([KNOTS, *angles.round(1)])
+            np.savetxt(told.out, rows, "%g", ",", header="time_s,front_deg,rear_deg", footer=said, comments="")
 
 
 if __name__ == "__main__":

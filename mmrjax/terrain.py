@@ -127,7 +127,7 @@ def polyline(x: Sequence[float] | np.ndarray, z: Sequence[float] | np.ndarray, s
     """Level ground up to the first point (x, z) [m], the polyline, level ground from its last point on.
 
     Raises:
-        ValueError: fewer than two points, no number, or x falls.
+        ValueError: fewer than two points, no number, x falls, or a wall goes back on itself.
     """
     x, z = np.asarray(x, float), np.asarray(z, float)
     if x.ndim != 1 or x.shape != z.shape or len(x) < 2:
@@ -142,5 +142,11 @@ def polyline(x: Sequence[float] | np.ndarray, z: Sequence[float] | np.ndarray, s
         )
     keep = np.concatenate([[True], (np.diff(x) != 0) | (np.diff(z) != 0)])
     x, z = x[keep], z[keep]
+    up = np.where(np.diff(x) == 0, np.diff(z), 0.0)
+    if (back := np.flatnonzero(up[1:] * up[:-1] < 0)).size:
+        k = int(back[0]) + 1
+        raise ValueError(
+            f"terrain: z goes from {z[k]:g} back to {z[k + 1]:g} m at x = {x[k]:g} m; expected a wall up or down"
+        )
     points = [(x[0] - FAR, z[0]), *zip(x, z, strict=True), (x[-1] + FAR, z[-1])]
     return _terrain(points, float(x[-1]), size=size)

@@ -489,6 +489,8 @@ class Climb(RobotPart, SupplyPart, OutputPart):
             raise PydanticCustomError("idle", "find stairs needs stairs, whose tread and count stay")
         if self.find is not None and given and not given[0].startswith(self.find):
             raise PydanticCustomError("idle", f"find {self.find} acts without {given[0]}")
+        if self.nose_mm and (self.gap_mm is not None or self.terrain is not None or self.find == "gap"):
+            raise PydanticCustomError("idle", "nose_mm acts with steps and stairs only")
         if self.battery and self.supply_voltage_V is not None:
             raise PydanticCustomError("idle", "supply_voltage_V acts without battery only")
         for name in ("film", "derivatives"):

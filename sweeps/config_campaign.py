@@ -6,9 +6,10 @@ import dataclasses
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
+from pydantic_core import PydanticCustomError
 
 from calibration.data.errors import BadConfiguration, choices
 from mmrjax.channels import RPM
@@ -41,6 +42,13 @@ class Obstacle(Part):
     levers_voltage_V: float | None = Field(default=None, gt=0, le=1e6)
     duration_s: float = Field(default=20.0, gt=0, le=600)
     time_step_s: float = Field(default=1e-4, gt=0, le=1e-3)
+
+    @model_validator(mode="after")
+    def _of_its_kind(self) -> Self:
+        for name, kinds in {"tread_mm": ("stairs",), "count": ("stairs",), "nose_mm": ("step", "stairs")}.items():
+            if getattr(self, name) != type(self).model_fields[name].default and self.kind not in kinds:
+                raise PydanticCustomError("idle", f"{name} acts with kind {' or '.join(kinds)} only")
+        return self
 
 
 class Campaign(RobotPart, ProfilePart, BatchPart, OutputPart):

@@ -39,11 +39,12 @@ def batch(runs, robot=ROBOT, **options):
 
 @functools.cache
 def first_second():
-    """Onto a step, and against a wall; a member without numbers beside them."""
+    """Onto a step, and against a wall; a member without numbers and one with levers in the ground beside them."""
     runs = [
         (terrain.step(0.05, size=SIZE), (45, 20), (-8.4, -60), 24),
         (terrain.step(0.25, size=SIZE), (45, 80), (-8.4, -60), 24),
         (terrain.step(np.nan, size=SIZE), 45, 180, 24),
+        (terrain.step(0.05, size=SIZE), -30, 180, 24),
     ]
     return batch(runs, duration=0.64, part=0.64)
 
@@ -58,7 +59,8 @@ def energy_left(record, k):
 
 def test_energy_in_is_stored_and_lost_at_every_instant_and_a_failed_member_harms_no_other():
     record = first_second().record
-    assert first_second().names == ["unfinished", "unfinished", "failed"]
+    assert first_second().names == ["unfinished", "unfinished", "failed", "failed"]
+    assert first_second().ended[3] == 0
     assert all(np.isfinite(np.asarray(x)[:2]).all() for x in jax.tree.leaves(record.motion))
     for k in range(2):
         left, come, since = energy_left(record, k)
@@ -66,6 +68,26 @@ def test_energy_in_is_stored_and_lost_at_every_instant_and_a_failed_member_harms
         assert np.abs(left[running] / come[running]).max() < 1e-3
         assert all(since[name][-1] > 2e-3 * come[-1] for name in LOSSES), since  # or it would not be missed
     assert np.ptp(np.asarray(record.motion.q)[0, :, 1]) > 0.01  # it has climbed
+    # belts bear on either side of the centre of mass until the levers lift it, though grousers leave the ground before
+    assert record.margin[0][record.time[0] < 0.43].min() > 0.1
+
+
+@pytest.mark.parametrize(("duration", "step"), [(20.0, 1e-4), (2.5, 1e-4), (2.0, 3e-4), (0.3, 7e-4), (0.05, 1e-3)])
+def test_parts_of_a_run_follow_on_each_other_and_end_with_it(monkeypatch, duration, step):
+    parts = []
+
+    def part(robot, conditions, ground, sequence, state, first, step, steps, samples):
+        parts.append((float(first), steps * step, samples))
+        return state, jnp.zeros((1, samples))
+
+    running = None, None, climb.Progress(jnp.array([climb._RUNNING]), *[jnp.zeros(1)] * 4)
+    monkeypatch.setattr(climb, "_begin", lambda *a: running)
+    monkeypatch.setattr(climb, "_compiled", part)
+    climb_batch(ROBOT, None, None, None, duration=duration, step=step)
+    first, sample, samples = (np.array(x) for x in zip(*parts, strict=True))
+    ends = first + sample * samples
+    assert first[0] == 0 and first[1:] == pytest.approx(ends[:-1]) and np.all(sample * samples <= 1 + 2 * sample)
+    assert duration - 1e-9 <= ends[-1] <= duration + len(parts) * sample[0]
 
 
 def test_tracks_of_levers_lose_what_table_3_says_at_their_own_speed():

@@ -21,7 +21,10 @@ SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "climb.sch
 
 REFUSED = {
     "levers of a wheeled robot": (["--step", "50", "--configuration", "4W2T", "--levers-front", "30"],
-                                  r"4W2T has no levers; expected --configuration 6T2A"),
+                                  r"4W2T has no levers; those that have: 6T2A"),
+    "a derivative by levers of a wheeled robot": (["--step", "50", "--configuration", "4W2T", "--derivatives",
+                                                   "payload,levers_front_deg"],
+                                                  r"got levers_front_deg; expected adhesion, payload, voltage, obstacle_mm"),
     "a lever below the ground": (["--step", "50", "--levers-front", "-30"],
                                  r"levers front: at -30 deg they begin 72 mm below the ground; expected at least -8\.5"),
     "an angle beyond the range": (["--step", "50", "--levers-rear", "190"],
@@ -29,6 +32,9 @@ REFUSED = {
     "a stair without tread": (["--stairs", "170x0x3"], r"--stairs: got a tread of 0 mm; expected 10 to 5000 mm"),
     "words for stairs": (["--stairs", "high"], r"--stairs: got high; expected RISExTREADxCOUNT"),
     "a nose larger than its stair": (["--stairs", "100x290x2", "--nose", "60"], r"--nose: got 60 mm; expected less than"),
+    "a nose of a gap": (["--gap", "50", "--nose", "10"], r"nose_mm acts with steps and stairs only"),
+    "a nose of a terrain": (["--terrain", "t.csv", "--nose", "10"], r"nose_mm acts with steps and stairs only"),
+    "a nose in a search of gaps": (["--find", "gap", "--nose", "10"], r"nose_mm acts with steps and stairs only"),
     "two obstacles": (["--step", "50", "--gap", "90"], r"step_mm and gap_mm are stated both"),
     "none": ([], r"no obstacle is stated"),
     "angles beside a sequence of them": (["--step", "50", "--sequence", "s.csv", "--levers-front", "30"],
@@ -75,6 +81,19 @@ def test_files_of_terrain_and_sequence_are_read_with_their_units(tmp_path):
 
 FILES = {
     "millimetres": ("x_m,z_m\n0,0\n3000,120\n", r"is 3000 m large; .* is the file in millimetres\?"),
+    "millimetres of a kerb": (
+        "x_m,z_m\n0,0\n0,40\n",
+        r"has a wall of 40 m; expected at most 5 m; is the file in millimetres\?",
+    ),
+    "metres": (
+        "x_mm,z_mm\n0,0\n0.3,0.12\n",
+        r"is 0\.3 mm large; expected at least 1 mm; is the file in metres\? Name",
+    ),
+    "too large in millimetres": ("x_mm,z_mm\n0,0\n3e6,120\n", r"is 3000 m large; expected at most 50 m$"),
+    "a wall that goes back": (
+        "x_m,z_m\n0,0\n0,-0.05\n0,0.1\n1,0.1\n",
+        r"z goes from -0\.05 back to 0\.1 m at x = 0 m",
+    ),
     "no units": ("x,z\n0,0\n1,0\n", r"got columns x, z; expected x_m and z_m, or x_mm and z_mm"),
     "folds back": ("x_m,z_m\n0,0\n0.3,0.1\n0.2,0.2\n", r"x falls from 0\.3 to 0\.2 m at point 3"),
     "a word": ("x_m,z_m\n0,0\n1,high\n", r"row 3, z_m: got 'high'; expected a number"),

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import zarr
+from pydantic import ValidationError
 
 from calibration.data.errors import BadConfiguration
 from mmrjax import params, terrain
@@ -47,6 +48,11 @@ REFUSED = {
                                  r"levers_front_deg: at -30 deg they begin 72 mm below the ground"),
     "beyond the range": ({"kind": "step"}, {"levers_rear_deg": [190], "obstacle_mm": [50]}, r"expected -180 to 180 deg"),
     "no size at all": ({"kind": "step"}, {"obstacle_mm": [0]}, r"obstacle_mm: got 0; expected 1 to 5000 mm"),
+    "levers of a wheeled robot": ({"kind": "step"}, {"levers_front_deg": [30], "obstacle_mm": [50], "configuration": ["6T2A", "4W2T"]},
+                                  r"levers_front_deg: 4W2T has no levers; those that have: 6T2A"),
+    "a nose larger than its tread": ({"kind": "stairs", "nose_mm": 100, "tread_mm": 190}, {"obstacle_mm": [250]},
+                                     r"nose_mm: got 100; expected less than half of rise and tread, 95 mm"),
+    "a nose larger than its rise": ({"kind": "stairs", "nose_mm": 40}, {"obstacle_mm": [70, 90]}, r"expected less than .* 35 mm$"),
     "a name that is none": ({"kind": "step"}, {"obstacle_mm": [50], "friction": [1]}, r"neither a parameter"),
 }  # fmt: skip
 
@@ -57,6 +63,17 @@ def test_sweeps_that_cannot_be_climbed_are_refused_in_one_sentence(case):
     with pytest.raises(BadConfiguration, match=message) as error:
         axes.plan(Campaign(obstacle=Obstacle(**of), axes=varied), ROBOT, "map.toml")
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "kind", "kinds"),
+    [("tread_mm", 300, "step", "stairs"), ("count", 2, "gap", "stairs"), ("nose_mm", 5, "gap", "step or stairs")],
+)
+def test_keys_of_another_obstacle_are_refused(key, value, kind, kinds):
+    with pytest.raises(ValidationError, match=f"{key} acts with kind {kinds} only"):
+        Obstacle(kind=kind, **{key: value})
+    # as a file of all keys has them
+    assert Obstacle(**Obstacle(kind=kind).model_dump()) == Obstacle(kind=kind)
 
 
 def test_size_is_an_obstacles_alone():
@@ -151,6 +168,30 @@ def test_interrupted_map_goes_on_after_its_last_chunk(mmrjax, tmp_path, monkeypa
     assert climbed == [[0.0, 0.0], [30.0, 30.0], [60.0, 60.0]]
     store = zarr.open_group(tmp_path / "map" / "results.zarr", mode="r")
     assert store["energy_J"][:].tolist() == [[60, 560 - 60], [90, 530], [120, 560]]
+
+
+def test_page_says_the_largest_obstacle_and_where_it_is_got_over(mmrjax, tmp_path, monkeypatch):
+    """Climbs in closed form: the steeper the levers the higher, up to the last, which falls."""
+
+    def closed(of, variation, conditions, values, sizes, told):
+        most = np.array([70, 250, 40])[(np.asarray(values)[:, 0] / 30).astype(int)]
+        own = {climbs.LARGEST: most * 1.0} if of.find else {climbs.VERDICT: np.where(sizes <= most, OVER, TIPS)}
+        found = {name: np.full(len(most), 1.0) for name in climbs.attributes(of)} | own
+        found[climbs.VERDICT] = found[climbs.VERDICT].astype(np.uint8)
+        return {**found, STATUS: np.zeros(len(most), np.uint8)}
+
+    monkeypatch.setattr(climbs, "computed", closed)
+    text = MAP.replace("report = false", "")
+    (tmp_path / "map.toml").write_text(text)
+    (tmp_path / "find.toml").write_text(
+        text.replace("obstacle_mm = [60, 500]", "adhesion = [0.5]").replace('"step"', '"step"\nfind = true')
+    )
+    for name, size in {"map": 60, "find": 250}.items():
+        assert mmrjax("sweep", f"{name}.toml", "--out", name)[0] == 0
+        page = (tmp_path / name / "report.html").read_text("utf-8")
+        where = "levers_front_deg 0 deg" if name == "map" else "levers_front_deg 30 deg, adhesion 0.5"
+        assert f"The largest obstacle that is got over: {size} mm, at {where}." in page
+    assert "height of the step [mm]" in (tmp_path / "map" / "report.html").read_text("utf-8")
 
 
 @pytest.mark.slow

@@ -63,6 +63,13 @@ def cannot_stand(robot: Robot) -> str | None:
     return None
 
 
+def without_levers(robot: Robot, configuration: str) -> str:
+    """Why a configuration has no levers; empty where it has."""
+    have = [name for name, c in robot.configurations.items() if float(c.on_tracks) > 0.5]
+    others = f"those that have: {', '.join(have)}" if have else "no configuration of the robot has"
+    return "" if configuration in have else f"{configuration} has no levers; {others}"
+
+
 def misplaced(runs: Runs, robot: Robot) -> tuple[int, str, str] | None:
     """Row and column in which levers cannot stand as a table states it, and why: a configuration without them, an
     angle beyond their range; None where they can."""
@@ -74,9 +81,7 @@ def misplaced(runs: Runs, robot: Robot) -> tuple[int, str, str] | None:
     on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[runs.configurations(robot)]
     if not on_tracks.all():
         row = int(np.argmin(on_tracks))
-        have = [n for n, c in robot.configurations.items() if float(c.on_tracks) > 0.5]
-        others = f"those that have: {', '.join(have)}" if have else "no configuration of the robot has"
-        return row, stated[0], f"{runs['configuration'][row]} has no levers; {others}"
+        return row, stated[0], without_levers(robot, runs["configuration"][row])
     levers = robot.running_gear.levers
     low, high = (float(np.degrees(x)) for x in (levers.angle_least, levers.angle_most))
     for name in stated:

@@ -12,16 +12,15 @@ import numpy as np
 from calibration.data import delimited
 from calibration.data.errors import BadConfiguration, BadData
 from mmrjax import terrain
-from mmrjax.fidelities.climb import Sequence
+from mmrjax.fidelities.climb import ON_GROUND, Sequence, clearance
 from mmrjax.robot import Robot
 from mmrjax.terrain import Terrain
 
-#: A polyline longer or higher than this is taken for one in other units [m].
-LARGEST = 50.0
+#: A polyline longer or higher than the first, smaller than the second, or with a wall higher than the third is taken
+#: for one in other units [m].
+LARGEST, SMALLEST, WALL = 50.0, 1e-3, 5.0
 #: Voltage of a motor that nothing here has [V].
 HIGHEST = 1000.0
-#: The part of a lever's angle that lies within this of the ground at the start is on it [rad].
-ON_GROUND = 2e-3
 #: Metres of one.
 _LENGTHS = {"m": 1.0, "mm": 1e-3}
 
@@ -82,20 +81,28 @@ def read_terrain(path: Path) -> Terrain:
 
     Raises:
         BadConfiguration: no such file.
-        BadData: columns without units, cells without numbers, ground that folds back, metres that are millimetres, or
-            a first point that is not at the origin's height.
+        BadData: columns without units, cells without numbers, ground that folds back, metres that are millimetres or
+            the other way round.
     """
     columns, names = _read(path, "--terrain", [("x_m", "z_m"), ("x_mm", "z_mm")])
-    scale = _LENGTHS[names[0].rpartition("_")[2]]
-    x, z = (columns[name] * scale for name in names)
-    largest = max(np.ptp(x), np.ptp(z))
-    if largest > LARGEST:
-        hint = "; is the file in millimetres? Name its columns x_mm and z_mm then" if scale == 1.0 else ""
-        raise BadData(f"{path.name}: is {largest:g} m large; expected at most {LARGEST:g} m{hint}")
+    unit = names[0].rpartition("_")[2]
+    x, z = (columns[name] * _LENGTHS[unit] for name in names)
     try:
-        return terrain.polyline(x - x[0], z - z[0])
+        found = terrain.polyline(x - x[0], z - z[0])
     except ValueError as error:
         raise BadData(f"{path.name}: {error}") from error
+    across, up = np.abs(np.diff(x)), np.abs(np.diff(z))
+    largest, wall = max(np.ptp(x), np.ptp(z)), np.max(up, where=up > across, initial=0.0)
+    if SMALLEST <= largest <= LARGEST and wall <= WALL:
+        return found
+    wrong, other, word = f"is {largest:g} m large; expected at most {LARGEST:g} m", "mm", "millimetres"
+    if largest < SMALLEST:
+        wrong, other, word = f"is {1e3 * largest:g} mm large; expected at least {1e3 * SMALLEST:g} mm", "m", "metres"
+    elif largest <= LARGEST:
+        wrong = f"has a wall of {wall:g} m; expected at most {WALL:g} m"
+    # too small in the smaller unit, or too large in the larger one
+    hint = "" if other == unit else f"; is the file in {word}? Name its columns x_{other} and z_{other} then"
+    raise BadData(f"{path.name}: {wrong}{hint}")
 
 
 def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Sequence:
@@ -139,19 +146,14 @@ def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Sequ
 def below(robot: Robot, angle: float) -> str:
     """Why levers cannot begin at an angle [deg] on level ground; empty where they can."""
     gear = robot.running_gear
-    axle, reach, roller = (
-        float(np.asarray(x))
-        for x in (robot.radius_pulley + gear.grouser_height, gear.lever_length, gear.levers.roller)
-    )
-    under = axle + reach * np.sin(np.radians(angle)) - roller
-    least = -float(np.degrees(np.arcsin((axle - roller) / reach)))
+    axle = robot.radius_pulley + gear.grouser_height
+    above = float(clearance(axle, gear, jnp.radians(angle)))
+    if above >= -ON_GROUND:
+        return ""
+    least = -float(np.degrees(np.arcsin((axle - gear.levers.roller) / gear.lever_length)))
     return (
-        ""
-        if under >= -ON_GROUND * reach
-        else (
-            f"at {angle:.4g} deg they begin {-1000 * under:.0f} mm below the ground; expected at least {least:.1f} "
-            "deg there, where they lie on it (a sequence may press them down later)"
-        )
+        f"at {angle:.4g} deg they begin {-1000 * above:.0f} mm below the ground; expected at least {least:.1f} "
+        "deg there, where they lie on it (a sequence may press them down later)"
     )
 
 

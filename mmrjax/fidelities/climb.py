@@ -8,6 +8,7 @@ levers' drives follow a sequence of angles at most at the levers' rate, or have 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -28,6 +29,7 @@ from mmrjax.lever_drives import LeverDrive, Swing, lever_drive, swing
 from mmrjax.masses import Masses, without_levers
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
+from mmrjax.running_gear import RunningGear
 from mmrjax.signals import GRAVITY, Signals, State
 from mmrjax.terrain import Terrain
 from mmrjax.track import Track
@@ -43,6 +45,8 @@ SETTLES, RISES = 0.3, 0.1  # before the motors are switched on, and until they h
 TURNED_OVER = np.radians(100.0)
 #: A robot that gains less than this way [m] in this time [s] is stuck.
 GAIN, PATIENCE = 5e-3, 2.0
+#: How far a lever may begin below the ground [m], which is on it then.
+ON_GROUND = 4e-4
 #: A belt slower than this [m/s] stands; a body that bears more than this share of the weight hangs.
 STANDS, BEARS = 5e-3, 0.1
 #: Time in which levers come to their rate and near their angle [s], and rate below which they are let stand [rad/s].
@@ -123,7 +127,8 @@ class Passed(eqx.Module):
         stored: in motion, height, contacts and windings, of the whole robot [J].
         body: share of all normal force that the body bears [-].
         grip: share of what its friction could hold that the ground gives to all that rolls [-].
-        centre: x of the centre of mass [m]; margin: how far it is within the outermost contacts [m].
+        centre: x of the centre of mass [m]; base: how far the outermost contacts are behind and ahead of it [m], of
+            a sample the furthest, as contacts that leave the ground for some steps bear nevertheless.
     """
 
     time: Scalar
@@ -141,7 +146,13 @@ class Passed(eqx.Module):
     body: Scalar
     grip: Scalar
     centre: Scalar
-    margin: Scalar
+    base: Float[Array, " 2"]
+
+    @property
+    def margin(self) -> Scalar:
+        """How far gravity's line through the centre of mass is within the outermost contacts [m]; 0 without any."""
+        least = jnp.min(self.base, axis=-1)
+        return jnp.where(jnp.isfinite(least), least, 0.0)
 
 
 class System(eqx.Module):
@@ -430,18 +441,15 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
         body=jnp.sum(at.force * (1 - at.rolls)) / jnp.maximum(total, 1e-9),
         grip=jnp.sum(jnp.abs(pulled.force) * at.rolls) / jnp.maximum(held, 1e-9),
         centre=centre,
-        margin=_margin(centre, at),
+        base=_base(centre, at),
     )
     return after, spent, passed
 
 
-def _margin(centre: Scalar, at: Footing) -> Scalar:
-    """How far gravity's line through the centre of mass is within the outermost contacts [m], level ground assumed
-    below."""
-    bears = at.force > 0
-    first = jnp.min(jnp.where(bears, at.place, jnp.inf))
-    last = jnp.max(jnp.where(bears, at.place, -jnp.inf))
-    return jnp.where(jnp.any(bears), jnp.minimum(centre - first, last - centre), 0.0)
+def _base(centre: Scalar, at: Footing) -> Float[Array, " 2"]:
+    """How far the outermost contacts are behind and ahead of the centre of mass [m], level ground assumed below."""
+    bears, ahead = at.force > 0, at.place - centre
+    return jnp.stack([jnp.max(jnp.where(bears, way, -jnp.inf)) for way in (-ahead, ahead)])
 
 
 def _shaft_loss(run: System, motion: Motion, signals: Signals, at: Footing) -> Scalar:
@@ -523,11 +531,20 @@ def _judged(
 
 
 def begin(run: System, motion: Motion | None = None) -> tuple[Motion, Energy, Progress]:
-    """What a run begins with: motion (None: at rest before the obstacle), no energy yet, and that it goes on."""
+    """What a run begins with: motion (None: at rest before the obstacle), no energy yet, and that it goes on, or that
+    it failed, as its levers would begin below the ground."""
+    angles, gear = _turned(*run.sequence.first), run.shape.gear
+    under = clearance(run.shape.main.first + gear.grouser_height, gear, angles) < -ON_GROUND
+    buried = jnp.any(under & (run.shape.on_tracks > 0.5)) & (motion is None)
     motion = stand(run) if motion is None else motion
     zero = jnp.zeros_like(motion.q[0])
     energy = dict.fromkeys((*SOURCES, *LOSSES), zero)
-    return motion, energy, Progress(jnp.asarray(_RUNNING), zero, motion.q[0], zero, zero)
+    return motion, energy, Progress(jnp.where(buried, FAILED, _RUNNING), zero, motion.q[0], zero, zero)
+
+
+def clearance(axle: Scalar, gear: RunningGear, angles: Float[Array, " levers"]) -> Float[Array, " levers"]:
+    """How far the rollers of levers at `angles` [rad] are above level ground [m], the axles `axle` above it [m]."""
+    return axle + gear.lever_length * jnp.sin(angles) - gear.levers.roller
 
 
 def sampled(run: System, state: Any, first: Scalar, steps: int, samples: int) -> tuple[Any, Passed]:
@@ -537,10 +554,12 @@ def sampled(run: System, state: Any, first: Scalar, steps: int, samples: int) ->
         motion, energy, progress = state
 
         def small(carry: Any, j: Array) -> tuple[Any, None]:
-            return advance(run, carry[0], first + (k * steps + j) * run.step, carry[1]), None
+            *after, passed = advance(run, carry[0], first + (k * steps + j) * run.step, carry[1])
+            base = jnp.maximum(passed.base, carry[2].base)
+            return (*after, dataclasses.replace(passed, base=base)), None
 
         nothing = jax.eval_shape(lambda: advance(run, motion, first, energy)[2])
-        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), nothing)
+        nothing = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf, x.dtype), nothing)
         (after, spent, passed), _ = jax.lax.scan(small, (motion, energy, nothing), jnp.arange(steps))
         ended = progress.verdict != _RUNNING
         after, progress = _judged(run, motion, passed, after, progress)
@@ -548,6 +567,15 @@ def sampled(run: System, state: Any, first: Scalar, steps: int, samples: int) ->
         return (after, kept, progress), passed
 
     return jax.lax.scan(sample, state, jnp.arange(samples))
+
+
+def divided(duration: float, step: float, sample: float, part: float) -> tuple[int, int, int]:
+    """How a run of a `duration` is divided: into parts no longer than `part`, samples of a part, steps of a sample.
+
+    A sample is of whole steps and all parts are alike, so the run may be longer by some samples.
+    """
+    steps, parts = max(round(sample / step), 1), math.ceil(duration / part - 1e-9)
+    return parts, math.ceil(duration / (parts * steps * step) - 1e-9), steps
 
 
 class Climb(eqx.Module):
@@ -628,12 +656,11 @@ def climb_batch(
         start: motions with which the runs begin; None: at rest before the obstacle.
         progress: told the share of the time that is done.
     """
-    steps, samples = round(sample / step), round(part / sample)
+    parts, samples, steps = divided(duration, step, sample, part)
     state = _begin(robot, conditions, terrain, sequence, step, start)
     kept: list[Passed] = []
-    parts = int(np.ceil(duration / part - 1e-9))
     for k in range(parts):
-        first = jnp.asarray(k * part)
+        first = jnp.asarray(k * samples * steps * step)
         state, passed = _compiled(robot, conditions, terrain, sequence, state, first, step, steps, samples)
         verdict = np.asarray(state[2].verdict)
         last = passed if record else jax.tree.map(lambda x: x[:, -1:], passed)

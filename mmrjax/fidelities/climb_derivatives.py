@@ -130,11 +130,10 @@ def climb_derivatives(
     run, turned = _along(given, values, directions)
     begun = functools.partial(_initial, step=step)
     state, moved = _along(begun, run, turned)
-    steps, samples = round(sample / step), round(part / sample)
+    parts, samples, steps = climb.divided(duration, step, sample, part)
     records: list[Any] = []
-    parts = int(np.ceil(duration / part - 1e-9))
     for k in range(parts):
-        first = jnp.asarray(k * part)
+        first = jnp.asarray(k * samples * steps * step)
         (state, record), (moved, changed) = _part((run, state), (turned, moved), first, step, steps, samples)
         records.append(jax.device_get((record, changed)))
         if progress is not None:

@@ -13,6 +13,7 @@ from jaxtyping import Array
 from rich.table import Table
 
 from calibration.data import robot_file, terrains
+from calibration.data.contradictions import without_levers
 from calibration.data.errors import BadConfiguration
 from mmrjax import params, terrain
 from mmrjax.conditions import Conditions
@@ -144,7 +145,8 @@ def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, se
     kind = next((k for k, size in sizes.items() if size is not None), None)
     levers = {"levers_front_deg": "front", "levers_rear_deg": "rear"}
     known = ["adhesion", "payload", "discharge" if config.battery else "voltage"]
-    known += [*(levers if sequence.begins is None else ()), *([SIZE] if kind is not None else [])]
+    moved = sequence.begins is None and not without_levers(robot, config.configuration or "")
+    known += [*(levers if moved else ()), *([SIZE] if kind is not None else [])]
     for k, name in enumerate(names):
         if name in names[:k]:
             raise BadConfiguration(f"--derivatives: got {name} twice; expected each once")
@@ -237,11 +239,7 @@ def _sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
     gear = robot.running_gear
     tracked = bool(np.asarray(robot.configurations[name].on_tracks) > 0.5)
     if not tracked and stated != (None, None, None):
-        with_levers = [n for n, c in robot.configurations.items() if np.asarray(c.on_tracks) > 0.5]
-        raise BadConfiguration(
-            f"--levers-front, --levers-rear, --sequence: {name} has no levers"
-            + (f"; expected --configuration {' or '.join(with_levers)}" if with_levers else "")
-        )
+        raise BadConfiguration(f"--levers-front, --levers-rear, --sequence: {without_levers(robot, name)}")
     own = float(np.degrees(np.asarray(gear.lever_front))), 180 - float(np.degrees(np.asarray(gear.lever_rear)))
     angles = []
     for option, given, usual in zip(("--levers-front", "--levers-rear"), stated[1:], own, strict=True):

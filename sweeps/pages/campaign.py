@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mmrjax import signals
+from mmrjax.fidelities.climb import OVER
 from mmrjax.variation import STATUS
 from sweeps.pages import campaign_figures, words
 from sweeps.pages.campaign_figures import Varied
 from sweeps.pages.page import Album, named, render
-from sweeps.points.climbs import SIZE, VERDICT
+from sweeps.points.climbs import LARGEST, SIZE, VERDICT
 from sweeps.points.zarr_store import STORE, Layout
 from sweeps.results.climb import VERDICTS
 
@@ -69,7 +70,10 @@ def write(folder: Path, file: RobotFile, layout: Layout, result: dict[str, Any])
             rest = [k for k, n in enumerate(layout.design.names) if n not in (SIZE, *pair)]
             shown = np.all(values[:, rest] == [layout.design.axes[layout.design.names[k]][0] for k in rest], axis=1)
             across, up = (
-                Varied(values[shown, layout.design.names.index(n)], _label(n, known[n].get("units", "")))
+                Varied(
+                    values[shown, layout.design.names.index(n)],
+                    _label(known[n]["long_name"].split(",")[0], known[n].get("units", "")),
+                )
                 for n in (*pair, SIZE)
             )
             album.add("endings", partial(campaign_figures.endings, codes[shown], meanings, across, up))
@@ -95,9 +99,27 @@ def write(folder: Path, file: RobotFile, layout: Layout, result: dict[str, Any])
         varied=_varied(layout, values),
         outputs=rows,
         verdicts=verdicts,
+        largest=_largest(values, found, layout),
         thinned=len(values),
         **named(file),
     )
+
+
+def _largest(values: np.ndarray, found: dict[str, np.ndarray], layout: Layout) -> str:
+    """The largest obstacle that is got over and the first point at which it is, in words; empty of other sweeps."""
+    if VERDICT not in found:
+        return ""
+    names = layout.design.names
+    sizes = found[LARGEST] if LARGEST in found else values[:, names.index(SIZE)] * (found[VERDICT] == OVER)
+    k = int(np.argmax(sizes))
+    if sizes[k] <= 0:
+        return "No obstacle is got over."
+    at = []
+    for name, value in zip(names, values[k], strict=True):
+        labels, unit = layout.labels.get(name), layout.coordinates[name].get("units", "").removeprefix("1")
+        at.append(f"{name} {labels[int(value)] if labels else f'{value:.4g} {unit}'.strip()}")
+    rest = ", ".join(words for name, words in zip(names, at, strict=True) if name != SIZE)
+    return f"The largest obstacle that is got over: {sizes[k]:.4g} mm{', at ' if rest else ''}{rest}."
 
 
 def _label(name: str, unit: str) -> str:

@@ -95,11 +95,11 @@ def silhouettes(found: ClimbResult) -> Figure:
     shown = instants(found)
     q = coordinates(found.table)
     fig, axes = figure(-(-len(shown) // 3), 3, 2.7 * -(-len(shown) // 3))
-    for ax, (name, k) in zip(axes.ravel(), shown, strict=False):
+    for n, (ax, (name, k)) in enumerate(zip(axes.ravel(), shown, strict=False), 1):
         _ground(ax, found, q[k, 0] - 0.5, q[k, 0] + 0.5)
         _draw(ax, found, q[k])
-        ax.set(xlim=(q[k, 0] - 0.48, q[k, 0] + 0.48), ylim=(q[k, 1] - 0.34, q[k, 1] + 0.34), aspect="equal")
-        ax.set_title(f"{found.table['time_s'][k]:.2f} s: {name}", fontsize=9)
+        ax.set(xlim=(q[k, 0] - 0.48, q[k, 0] + 0.48), ylim=(q[k, 1] - 0.38, q[k, 1] + 0.38), aspect="equal")
+        ax.set_title(f"{n}: {found.table['time_s'][k]:.2f} s, {name}", fontsize=9)
         ax.axis("off")
     for ax in axes.ravel()[len(shown) :]:
         ax.axis("off")
@@ -107,28 +107,32 @@ def silhouettes(found: ClimbResult) -> Figure:
 
 
 def course(found: ClimbResult) -> Figure:
-    """Posture, margin and the currents of all drives over the place of the robot."""
+    """Posture, margin and the currents of all drives over time, with the instants of the silhouettes."""
     t = found.table
-    x = t["x_mm"]
     fig, axes = figure(4, 1, 8.0, sharex=True)
     rows = [
         ("angle [deg]", {"pitch, nose up": ("pitch_deg", BLUE), "front levers": ("front_deg", ORANGE),
                          "rear levers": ("rear_deg", PURPLE)}),
-        ("margin of tipping [mm]", {"margin": ("margin_mm", VERMILION)}),
+        ("place, margin [mm]", {"middle from obstacle": ("x_mm", BLUE),
+                                "margin of tipping": ("margin_mm", VERMILION)}),
         ("motor current [A]", {"each traction motor": ("traction_current_A", BLUE),
                                "front levers": ("front_current_A", ORANGE),
                                "rear levers": ("rear_current_A", PURPLE)}),
         ("energy [J]", {"from the supply": ("supply_J", INK), "sliding": ("sliding_J", VERMILION),
                         "windings": ("winding_J", ORANGE), "stored": ("stored_J", GREEN)}),
     ]  # fmt: skip
+    at = [t["time_s"][k] for _, k in instants(found)]
     for ax, (label, lines) in zip(axes.ravel(), rows, strict=True):
         for name, (column, colour) in lines.items():
-            ax.plot(x, t[column], color=colour, lw=1.3, label=name)
+            ax.plot(t["time_s"], t[column], color=colour, lw=1.3, label=name)
         ax.set_ylabel(label)
-        ax.axvline(0, color=FAINT, lw=0.8)
-        if len(lines) > 1:
-            ax.legend(loc="upper left", ncols=len(lines))
-    axes[-1, 0].set_xlabel("middle of the robot from where the obstacle begins [mm]")
+        for x in at:
+            ax.axvline(x, color=FAINT, lw=0.8)
+        ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
+    above = axes[0, 0].secondary_xaxis("top")
+    above.set_xticks(at, [str(n) for n in range(1, len(at) + 1)])
+    above.tick_params(length=0)
+    axes[-1, 0].set_xlabel("time [s]")
     return fig
 
 

@@ -12,6 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.data.columns import IMPOSED as OF_IMPOSED
+from calibration.data.columns import LEVERS
+from calibration.data.contradictions import without_levers
 from calibration.data.errors import BadConfiguration, choices, stated_number
 from mmrjax import variation
 from mmrjax.rig import IMPOSED
@@ -104,6 +106,10 @@ def plan(config: Campaign, robot: Robot, where: str) -> Plan:
             f"{where}, voltage: acts without battery only, whose voltage is that of its charge; remove one of them"
         )
     _acting({*fixed, *design.names}, robot, where, surface)
+    if levers := sorted({*fixed, *design.names} & {*LEVERS}):
+        for k in np.atleast_1d(axes.get(CONFIGURATION, fixed.get(CONFIGURATION, 0.0))):
+            if why := without_levers(robot, robot.configurations.names[int(k)]):
+                raise BadConfiguration(f"{where}, {levers[0]}: {why}")
     own = AXIS[robot.rig.imposed]
     if not robot.rig.inherits and own not in {*fixed, *design.names} and fixed.get("battery", 0.0) <= 0.5:
         level = imposed.default(robot, f"{where}, conditions.{own}")

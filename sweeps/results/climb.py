@@ -30,7 +30,7 @@ VERDICTS: dict[str, tuple[str, str]] = {
     "slides": ("slides", "it comes no further and its tracks run on: the ground does not hold them"),
     "hangs": ("hangs", "it comes no further with its body on an edge, or has fallen into a gap"),
     "unfinished": ("is under way", "the time was over while it still went on; take a longer --duration"),
-    "failed": ("failed", "numbers of the run went wrong; please report the conditions"),
+    "failed": ("failed", "numbers of the run went wrong, or its levers would begin below the ground"),
 }
 
 
