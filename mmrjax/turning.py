@@ -27,6 +27,8 @@ from mmrjax.rarely import rarely
 
 #: Of a side's contact line from the middle of the robot, in shares of B [-]: left, right.
 SIDES = np.array([0.5, -0.5])
+#: Widths of the packaged robot between and over its tracks, between which its contact lines are [m] (Table 6).
+BETWEEN, OVER = 0.208, 0.278
 #: Square of a sliding speed too small to have a direction [m²/s²].
 STILL = 1e-16
 #: Newton steps of the transfer of load; the contact's forces are nearly bilinear in it.
@@ -60,7 +62,7 @@ class Turning(eqx.Module):
         meaning="distance B of the contact lines of left and right side",
         bounds=(0.0, 5.0),
         sd=0.012,
-        source="middle of 208-278 mm, the widths between and over the tracks (Table 6: B_b, B_T)",
+        source=f"middle of {BETWEEN:g} and {OVER:g} m, the widths between and over the tracks (Table 6: B_b, B_T)",
     )
     lateral: Scalar = parameter(
         1.0,

@@ -148,7 +148,7 @@ def row(**changes):
 
 
 def test_turns_are_told_in_plain_words():
-    from mmrjax import robots
+    from mmrjax import params, robots
 
     robot = robots.nominal()
 
@@ -164,6 +164,9 @@ def test_turns_are_told_in_plain_words():
     assert "track width" in said() and "track width" not in sloping
     assert "Straight at 200 mm/s" in said(slope_deg=10.0, turning_radius_mm=float("inf"), yaw_rate_rad_s=0.0)
     assert "stalled" in said(status="stalled")
+    assert "parts allow" not in said()
+    robot = params.replace(robot, {"6T2A.turning.width": 0.5})
+    assert "500 mm between the sides is none that the packaged robot's parts allow, 208 to 278 mm" in said()
     assert "the right motor stands at 1.00 A" in said(motor_speed_right_rpm=0.2)
     back = said(motor_current_left_A=-0.4, motor_speed_left_rpm=900.0, power_left_W=-3.0)
     assert "the left motor is driven by the turn: 0.40 A brake it, 3.0 W go back to the supply" in back

@@ -9,6 +9,7 @@ from typing import Any
 
 from mmrjax.channels import MM, SIDES
 from mmrjax.robot import Robot
+from mmrjax.turning import BETWEEN, OVER
 from sweeps.pages import words
 
 FULL = 2 * math.pi  # rad a turn
@@ -92,6 +93,11 @@ def _notes(robot: Robot, row: Mapping[str, Any]) -> list[str]:
         notes.append(
             f"effective track width {width:.0f} mm, {width / own:.2f} times the {own:.0f} mm between the sides: the "
             "difference of the sides' speeds that a turn takes, over what it would take without sliding"
+        )
+    if robot.rig.inherits and not BETWEEN <= own * MM <= OVER:
+        notes.append(
+            f"{own:.0f} mm between the sides is none that the packaged robot's parts allow, {BETWEEN / MM:.0f} to "
+            f"{OVER / MM:.0f} mm"
         )
     for side in SIDES:
         power, current = float(row[f"power_{side}_W"]), float(row[f"motor_current_{side}_A"])
