@@ -207,6 +207,22 @@ REFUSED = {
 }
 
 
+def test_a_load_that_drives_its_motors_takes_voltage_from_their_back_emf(tmp_path):
+    """E is 4.71 V: a motor that brakes with 1.3 A of 2 ohm has 2.11 V left; one that takes -0.4 A has not."""
+    winch = {"torque_constant": 0.5}
+    robot = bench(shown=("motor_current", "motor_voltage"), load=winch)
+    header = "motor_speed_rpm,motor_voltage_V,motor_current_A\n"
+    runs = read(tmp_path, f"{header}-900,-2.11,1.3\n-100,0.7,0.6\n900,5.5,0.4\n", robot)
+    assert runs["motor_voltage_V"] == pytest.approx([-2.11, 0.7, 5.5])
+    with pytest.raises(BadData, match=r"row 1, motor_voltage_V: got -2.11 at .* of -900, too small"):
+        read(tmp_path, f"{header}-900,-2.11,-0.4\n900,5.5,0.4\n", robot)
+    unread = bench(shown=("output_torque", "motor_voltage"), load=winch)
+    header = "motor_speed_rpm,motor_voltage_V,output_torque_Nm\n"
+    assert len(read(tmp_path, f"{header}-900,-2.11,2\n900,5.5,2\n1800,11,2\n", unread)) == 3
+    with pytest.raises(BadData, match=r"row 1, motor_voltage_V: got -2.11 at"):
+        read(tmp_path, f"{header}-900,-2.11,2\n900,2,2\n1800,11,2\n", unread)
+
+
 @pytest.mark.parametrize("case", REFUSED, ids=list(REFUSED))
 def test_bad_tables_of_rigs_are_refused_in_one_sentence(tmp_path, case):
     make, text, sentence = REFUSED[case]

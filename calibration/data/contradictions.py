@@ -18,8 +18,11 @@ from mmrjax.running_gear import RunningGear
 #: Share of the motors' back-EMF below which no voltage turns them at an imposed speed [-], and least back-EMF that
 #: tells [V].
 TOO_SMALL, LEAST = 0.5, 0.2
-#: Channel of a column whose instrument may show magnitude alone.
+#: Share of the rows that may brake, where no current says which.
+MOST_BRAKING = 0.5
+#: Channel of a column whose instrument may show magnitude alone; of columns of currents, the motors' first.
 MAGNITUDES = {"motor_voltage_V": "motor_voltage"}
+CURRENTS = {"motor_current_A": "motor_current", "total_current_A": "total_current"}
 #: Jump of an angle between samples that is a turn lost [deg], and least multiple of the step that is usual.
 TURN, UNUSUAL = 180.0, 4.0
 #: Share of rows before which time goes back, up to which they are no rows in another order.
@@ -129,7 +132,8 @@ def _mass(runs: Runs, robot: Robot) -> None:
 
 
 def _voltage(runs: Runs, robot: Robot, column: str) -> None:
-    """The motors' back-EMF follows from the imposed speed; a supply may be turned round by its bridge."""
+    """The motors' back-EMF follows from the imposed speed; a supply may be turned round by its bridge. What a load
+    drives brakes, with less voltage by as much as its current takes: where no current is read, some rows may."""
     if not runs.has(column) or not np.nan_to_num(runs[column]).any():
         return
     voltage = runs[column]
@@ -137,8 +141,13 @@ def _voltage(runs: Runs, robot: Robot, column: str) -> None:
     along = np.abs(voltage) if runs.layout.magnitude(MAGNITUDES.get(column, "")) else voltage * np.sign(back)
     if column == SUPPLY and (voltage > 0).all():
         along = np.abs(voltage)
-    wrong = np.flatnonzero((np.abs(back) > LEAST) & (along < TOO_SMALL * np.abs(back)))
-    if wrong.size:
+    current = next((c for c in CURRENTS if runs.has(c) and not runs.layout.magnitude(CURRENTS[c])), None)
+    if current is not None:
+        motors = float(robot.sides) if current == "total_current_A" else 1.0
+        along = along - np.nan_to_num(runs[current]) / motors * float(robot.motor.resistance) * np.sign(back)
+    tells = np.abs(back) > LEAST
+    wrong = np.flatnonzero(tells & (along < TOO_SMALL * np.abs(back)))
+    if wrong.size > (0 if current else MOST_BRAKING * np.sum(tells)):
         row = int(wrong[0])
         why = "of the other sign" if along[row] < 0 else "too small"
         raise BadData(
