@@ -207,6 +207,28 @@ REFUSED = {
 }
 
 
+@pytest.mark.parametrize(
+    ("column", "cells"),
+    [
+        ("time_s", ("1764072000.25", "1764072000.5", "1764072001.5")),
+        ("time_ms", ("1764072000250", "1764072000500", "1764072001500")),
+        ("time_s", ("2026-11-25 12:00:00.25", "2026-11-25 12:00:00.5", "2026-11-25 12:00:01.5")),
+        ("time_ms", ("2026-11-25T12:00:00.250Z", "2026-11-25T13:00:00.5+01:00", "2026-11-25T12:00:01.500Z")),
+        ("time_s", ("11:59:59.75", "12:00:00", "12:00:01")),
+    ],
+)
+def test_times_of_day_count_from_the_first_of_each_run(tmp_path, column, cells):
+    rows = "".join(f"{run},{cell},12,0.4\n" for run in "ab" for cell in cells)
+    robot = bench("voltage")
+    runs = read(tmp_path, f"run_id,{column},supply_voltage_V,total_current_A\n{rows}", robot)
+    assert runs["time_s"] == pytest.approx([0, 0.25, 1.25] * 2, abs=1e-6)
+    assert any(f"{column} is a time of day; counted from the first of each run" in note for note in runs.notes)
+    usual = read(tmp_path, "time_s,supply_voltage_V,total_current_A\n5,12,0.4\n6,12,0.4\n7,12,0.4\n", robot)
+    assert usual["time_s"] == pytest.approx([5, 6, 7]) and usual.notes == ()
+    with pytest.raises(BadData, match=r"row 2, time_s: got 25\.11\.2026 12:00; .*expected a number"):
+        read(tmp_path, "time_s,supply_voltage_V,total_current_A\n5,12,0.4\n25.11.2026 12:00,12,0.4\n", robot)
+
+
 def test_a_load_that_drives_its_motors_takes_voltage_from_their_back_emf(tmp_path):
     """E is 4.71 V: a motor that brakes with 1.3 A of 2 ohm has 2.11 V left; one that takes -0.4 A has not."""
     winch = {"torque_constant": 0.5}

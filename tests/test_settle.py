@@ -157,10 +157,6 @@ BAD = {
         lambda c: {k: v for k, v in c.items() if k != "time_s"},
         r"column time_s is missing, and a row is a settled run already; give it to loop",
     ),
-    "time of day": (
-        lambda c: c | {"time_s": c["time_s"] + 1.7e9},
-        r"row 1, time_s: got 17\d+\.0; is it the time of day\? subtract that of the first row; expected 0 to 1e\+06",
-    ),
     "frozen": (
         lambda c: c | {"motor_speed_rpm": np.full(600, 812.0)},
         r"rows 1 to 600, motor_speed_rpm: 812 rpm in every row; the channel is frozen or not connected; remove",

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.data import contradictions, delimited, instruments, sides, surfaces, units
+from calibration.data import clock, contradictions, delimited, instruments, sides, surfaces, units
 from calibration.data.columns import (
     CONDITIONS,
     DEFAULTS,
@@ -107,6 +107,11 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
             if meaning.column == "configuration":
                 cells, more = _configurations_in_case(name, cells, layout)
                 capitals = (*capitals, *more)
+            if meaning.column in TIME:
+                each = next((i for i, m in enumerate(meanings) if m is not None and m.column == "run_id"), None)
+                names = ["" if each is None else row[each] for row in rows[1:]]
+                cells, said = clock.from_the_first(name, meaning, cells, names)
+                capitals = (*capitals, *([said] if said else []))
             if battery and meaning.column == SUPPLY and layout.imposed == "voltage":
                 _refuse_stated(name, cells)
                 continue
@@ -459,8 +464,6 @@ def _hint(meaning: Meaning, cell: str, readings: tuple[str, ...]) -> str:
     far = abs(value) > FAR * max(map(abs, quantity.limits(mine)))
     if far and meaning.column in DUTY:
         return "a command of another size? divide by its largest, of a log by [columns] duty = {column, factor}; "
-    if far and meaning.column in TIME:
-        return "is it the time of day? subtract that of the first row; "
     for unit, column in named.items():
         low, high = quantity.limits(unit)
         if far and unit != mine and low <= value <= high:

@@ -1,0 +1,52 @@
+"""Times of day and dates as loggers write them, counted from the first of each recording."""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Sequence
+
+from calibration.data.columns import Meaning
+
+#: What follows a day where a cell holds a time alone.
+_SOME_DAY = "1970-01-01T"
+
+
+def from_the_first(name: str, meaning: Meaning, cells: Sequence[str], runs: Sequence[str]) -> tuple[list[str], str]:
+    """Cells of a column of time as what has passed since the earliest of their run, and a sentence on that; as they
+    are, and an empty one, where they are no times of day: neither dates and times as ISO 8601 writes them nor numbers
+    that are all beyond what a time may be (seconds since 1970).
+
+    Args:
+        name: of the file; meaning: of the column; runs: `run_id` of each cell.
+    """
+    clock = [_seconds(cell) for cell in cells]
+    factor = meaning.value(1.0)
+    if not all(map(math.isfinite, clock)):
+        high = meaning.limits()[1]
+        clock = [_number(cell) * factor for cell in cells]
+        if not all(x > high * factor for x in clock):
+            return list(cells), ""
+    first: dict[str, float] = {}
+    for x, run in zip(clock, runs, strict=True):
+        first[run] = min(x, first.get(run, x))
+    passed = [repr(round(x - first[r], 9) / factor) for x, r in zip(clock, runs, strict=True)]
+    return passed, f"{name}: {meaning.shown} is a time of day; counted from the first of each run"
+
+
+def _seconds(cell: str) -> float:
+    """Since some day of a date and time, NaN of what is none."""
+    if ":" not in cell:
+        return math.nan
+    try:
+        when = datetime.datetime.fromisoformat(cell if "-" in cell[:5] else _SOME_DAY + cell)
+    except ValueError:
+        return math.nan
+    return when.replace(tzinfo=when.tzinfo or datetime.UTC).timestamp()
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan
