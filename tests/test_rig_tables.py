@@ -218,7 +218,8 @@ REFUSED = {
     ],
 )
 def test_times_of_day_count_from_the_first_of_each_run(tmp_path, column, cells):
-    rows = "".join(f"{run},{cell},12,0.4\n" for run in "ab" for cell in cells)
+    later = [cell.replace("1764072", "1764079").replace("2026-11-25", "2026-11-27") for cell in cells]
+    rows = "".join(f"{run},{cell},12,0.4\n" for run, each in (("a", cells), ("b", later)) for cell in each)
     robot = bench("voltage")
     runs = read(tmp_path, f"run_id,{column},supply_voltage_V,total_current_A\n{rows}", robot)
     assert runs["time_s"] == pytest.approx([0, 0.25, 1.25] * 2, abs=1e-6)
