@@ -20,17 +20,20 @@ from sweeps.pages import loop_figures
 ROWS, COUNT, RANDOM = 12, 3, np.random.default_rng(0)
 #: Sizes of voltage, torque and speed; and how many sds of a reading a defect of that size is.
 SIZES, SEEN = {"voltage": 20.0, "torque_output": 2.0, "speed_theoretical": 0.5}, 200.0
+#: What turns the output, of a gearbox 16 : 1.
+SHAFT = {"torque_electromagnetic": 0.15, "speed_motor": 320.0, "speed_output": 20.0}
 
 
-def linearised(kind, slopes, defects):
-    """A fit whose rows have defects (equations, sides, rows), by slopes (equations, sides, rows, channels)."""
+def linearised(kind, slopes, defects, **others):
+    """A fit whose rows have defects (equations, sides, rows), by slopes (equations, sides, rows, channels); `others`:
+    sizes of signals."""
     sides = slopes.shape[1]
     whole = np.zeros((len(kind.probed), *slopes.shape[1:]))
     for slope, name in zip(slopes, EQUATIONS, strict=True):
         whole[kind.probed.index(name)] = slope
     residual = -np.einsum("esrc,esr->rc", slopes, defects)
     shape = (ROWS, sides) if sides > 1 else (ROWS,)
-    signals = Signals(**{name: np.full(shape, size) for name, size in SIZES.items()})
+    signals = Signals(**{name: np.full(shape, size) for name, size in (SIZES | SHAFT | others).items()})
     scale = np.ones(residual.shape)
     whole = whole if sides > 1 else whole[:, 0]
     return kind(residual.ravel(), np.zeros((residual.size, 1)), np.zeros((residual.size, 0)), whole, scale, signals,
@@ -60,6 +63,15 @@ def test_no_defect_is_a_residual_over_a_vanishing_slope(slope):
     noisy = dataclasses.replace(linear, residual=RANDOM.normal(size=ROWS * COUNT))
     found = _defects(noisy, np.ones(ROWS, bool))["slip"]
     assert abs(found[3]) < SIZES["speed_theoretical"]
+
+
+def test_a_motor_that_turns_nothing_but_itself_may_lack_torque():
+    """At the output there is none, of which a share would be nothing too."""
+    true = np.zeros((3, 1, ROWS))
+    true[1] = 0.1
+    found = _defects(linearised(SettledLinearization, slopes_of(1), true, torque_output=0.0), np.ones(ROWS, bool))
+    np.testing.assert_allclose(found["track"], 0.1, rtol=0.1)
+    np.testing.assert_allclose(found["electrical"], 0.0, atol=0.1)
 
 
 def test_each_side_has_its_own_defects():

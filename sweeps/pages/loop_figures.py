@@ -54,6 +54,10 @@ CONDITION_WORDS = {
 }
 
 
+#: Letters of labels that stand side by side below a figure.
+ABREAST = 110
+
+
 def before_after(table: dict[str, np.ndarray], channels: Sequence[Channel], verdict: str) -> Figure:
     """Residual of every reading in sigmas, before and after; runs grouped by configuration and voltage."""
     own = imposed(table)
@@ -62,7 +66,11 @@ def before_after(table: dict[str, np.ndarray], channels: Sequence[Channel], verd
     fig, grid = figure(len(channels), 1, 1.8 * len(channels), sharex=True)
     levels = np.unique(table[own]).size
     few = levels <= 8 or own == "supply_voltage_V"  # else a group by configuration alone
-    groups = [f"{table['configuration'][k]}" + (f", {table[own][k]:g} {UNITS[own]}" if few else "") for k in order]
+    one = np.unique(table["configuration"]).size == 1
+    words = [
+        ([] if one and few else [f"{table['configuration'][k]}"], f"{table[own][k]:g} {UNITS[own]}") for k in order
+    ]
+    groups = [", ".join([*name, level] if few else name) for name, level in words]
     edges = [i for i in range(1, len(groups)) if groups[i] != groups[i - 1]]
     x = np.arange(len(order))
     for axes, channel in zip(grid[:, 0], channels, strict=True):
@@ -80,8 +88,9 @@ def before_after(table: dict[str, np.ndarray], channels: Sequence[Channel], verd
         axes.set_ylabel(f"{channel.label} [σ]")
     grid[0, 0].legend(loc="upper left", ncols=2, bbox_to_anchor=(0, 1.28))
     starts = [0, *edges]
-    grid[-1, 0].set_xticks([(a + b - 1) / 2 for a, b in zip(starts, [*edges, len(order)], strict=True)],
-                           [groups[a] for a in starts])  # fmt: skip
+    told = [groups[a] for a in starts]
+    grid[-1, 0].set_xticks([(a + b - 1) / 2 for a, b in zip(starts, [*edges, len(order)], strict=True)], told,
+                           rotation=90 if sum(len(word) + 2 for word in told) > ABREAST else 0)  # fmt: skip
     grid[-1, 0].grid(axis="x", visible=False)
     varied = own == "supply_voltage_V" or any(np.unique(table[c]).size > 1 for c in beside)
     within = "by slope, then payload" if beside and varied else f"by {IMPOSED_WORDS[own].partition(' [')[0]}"

@@ -44,6 +44,8 @@ CONTRADICTION = 6.0
 CONTRADICTION_SHARE = 0.25
 #: Searches side by side on a core: of a robot without effects, and with.
 MANY, FEW = 16, 4
+#: Share of the torque that motors make which the torque at the output is at least taken to be about [-].
+LOST = 0.1
 #: Balances to which the defect of a row is attributed, one for each equation that the channels close: what each is a
 #: part of, by its name among the signals.
 EQUATIONS = {"electrical": "voltage", "track": "torque_output", "slip": "speed_theoretical"}
@@ -319,18 +321,29 @@ class SettledRuns(Observer):
         return EquationDefects(_defects(before.linear, included), _defects(after.linear, included))
 
 
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(x**2)))
+
+
 def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarray]:
     """The defects of each row that make its residual r, of each side where sides are driven apart.
 
     The likeliest of r = -S δ + noise of one sd, where δ has the prior sds D^½, the size of what each equation is
     about (rms over the table): δ = -D Sᵀ (S D Sᵀ + 1)⁻¹ r. A defect that the readings of a row hardly show is so next
-    to nothing, and never a residual over a vanishing slope; what they show of several together is shared out.
+    to nothing, and never a residual over a vanishing slope; what they show of several together is shared out. The
+    torque is at least a share of what the motors make: one that turns nothing but itself may lack some too.
     """
     assert isinstance(linear, SettledLinearization)
     rows = np.flatnonzero(included)
     slopes = np.stack([np.asarray(linear.of_sides(linear.probed.index(b)))[:, rows] for b in EQUATIONS])
     about = [np.asarray(getattr(linear.signals, name))[rows] for name in EQUATIONS.values()]
-    sides, size = slopes.shape[1], np.array([np.sqrt(np.mean(x**2)) for x in about])
+    sides, size = slopes.shape[1], np.array([_rms(x) for x in about])
+    made, turning, output = (
+        _rms(np.asarray(getattr(linear.signals, name))[rows])
+        for name in ("torque_electromagnetic", "speed_motor", "speed_output")
+    )
+    k = [*EQUATIONS].index("track")
+    size[k] = max(size[k], LOST * made * turning / max(output, 1e-12))
     slopes = (slopes * size[:, None, None, None]).reshape(-1, *slopes.shape[2:]).transpose(1, 2, 0)
     both = slopes @ slopes.transpose(0, 2, 1) + np.eye(slopes.shape[1])
     shares = -slopes.transpose(0, 2, 1) @ np.linalg.solve(both, np.asarray(linear.by_row())[rows, :, None])
