@@ -70,8 +70,9 @@ def test_a_motor_that_turns_nothing_but_itself_may_lack_torque():
     true = np.zeros((3, 1, ROWS))
     true[1] = 0.1
     found = _defects(linearised(SettledLinearization, slopes_of(1), true, torque_output=0.0), np.ones(ROWS, bool))
-    np.testing.assert_allclose(found["track"], 0.1, rtol=0.1)
-    np.testing.assert_allclose(found["electrical"], 0.0, atol=0.1)
+    # Of most rows: where random slopes are nearly alike, a row's residual is shared out.
+    assert np.median(found["track"]) == pytest.approx(0.1, rel=0.02)
+    assert np.median(np.abs(found["electrical"])) < 0.005 * SIZES["voltage"]
 
 
 def test_each_side_has_its_own_defects():
