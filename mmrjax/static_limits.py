@@ -235,18 +235,20 @@ def limits(robot: Robot, conditions: Conditions) -> Limits:
 
 
 @jax.jit
-def _over_levers(robot: Robot, conditions: Conditions, angles: Float[Array, "n 2"]) -> Step:
-    def at(pair: Array) -> Step:
+def _over_levers(robot: Robot, conditions: Conditions, angles: Float[Array, "n 2"]) -> tuple[Step, Array]:
+    def at(pair: Array) -> tuple[Step, Array]:
         here = dataclasses.replace(conditions, levers_front_deg=pair[0], levers_rear_deg=pair[1])
-        return step(posture.outline(robot, here))
+        side = posture.outline(robot, here)
+        return step(side), jnp.asarray(posture.rest(side, here.slope, 0.0).margin)
 
     return jax.lax.map(at, angles, batch_size=256)
 
 
-def steps_over_levers(
+def over_levers(
     robot: Robot, conditions: Conditions, front_deg: Float[np.ndarray, " n"], rear_deg: Float[np.ndarray, " m"]
-) -> Step:
-    """The highest step with the levers at each pair of angles [deg], for one run; leaves of shape (n, m, ...)."""
+) -> tuple[Step, Float[Array, "n m"]]:
+    """The highest step with the levers at each pair of angles [deg], for one run, and the margin of tipping at rest
+    on its slope [m] (see `Posture`); leaves of shape (n, m, ...)."""
     pairs = np.stack(np.meshgrid(front_deg, rear_deg, indexing="ij"), -1)
     found = _over_levers(robot, conditions, jnp.asarray(pairs.reshape(-1, 2), float))
     return jax.tree.map(lambda x: x.reshape(*pairs.shape[:2], *x.shape[1:]), found)

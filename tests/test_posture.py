@@ -186,7 +186,7 @@ def test_no_posture_stands_on_a_higher_step_than_the_best(robot, least):
     def angles(at):
         return np.unique(np.clip([*np.arange(-180.0, 181.0, 30.0), *(at + np.linspace(-3, 3, 7))], least, 180.0))
 
-    heights = np.asarray(static_limits.steps_over_levers(of, conditions, angles(front), angles(rear)).height)
+    heights = np.asarray(static_limits.over_levers(of, conditions, angles(front), angles(rear))[0].height)
     assert heights.max() <= float(best.height) + 1e-8
     assert heights.max() == pytest.approx(float(best.height), abs=1e-6)
     assert np.median(heights) < float(best.height) - 0.02
@@ -198,7 +198,7 @@ def test_no_posture_stands_on_a_higher_step_than_the_best(robot, least):
 
 
 def test_map_over_levers_is_that_of_single_postures(robot):
-    found = static_limits.steps_over_levers(
+    found, margin = static_limits.over_levers(
         robot, run(payload=2.0), np.array([-54.0, 180.0]), np.array([-39.0, 0.0, 180.0])
     )
     assert found.height.shape == (2, 3)
@@ -206,6 +206,8 @@ def test_map_over_levers_is_that_of_single_postures(robot):
         for k, rear in enumerate((-39.0, 0.0, 180.0)):
             single = highest_step(posture.outline(robot, run(front, rear, payload=2.0)))
             assert float(found.height[i, k]) == pytest.approx(float(single.height), abs=1e-12)
+            rest = posture.posture(robot, run(front, rear, payload=2.0))
+            assert float(margin[i, k]) == pytest.approx(float(rest.margin), abs=1e-12)
 
 
 @pytest.mark.parametrize("name", ["length", "width", "height", "ahead", "on_tracks"])

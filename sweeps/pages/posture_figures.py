@@ -79,17 +79,22 @@ def rest_and_step(found: Postures) -> Figure:
 
 
 def steps(over: StepMap) -> Figure:
-    """Highest step over the angles of front and rear levers, the run's own marked, and the best posture drawn."""
-    fig, grid = figure(1, 2, 4.0)
-    axes = grid[0, 0]
-    drawn = axes.contourf(over.angles_deg, over.angles_deg, over.step_mm, levels=12, cmap="cividis")
-    fig.colorbar(drawn, ax=axes, label="highest step [mm]")
-    axes.plot(over.own_deg[1], over.own_deg[0], "o", color="white", mec=INK, ms=8, label="this run")
-    axes.plot(over.rear_deg, over.front_deg, "*", color=VERMILION, mec="white", ms=13, label="highest")
-    axes.set(xlabel="rear levers [°]", ylabel="front levers [°]", title="Highest step over lever angles")
-    axes.set_xticks(np.arange(-180, 181, 60))
-    axes.set_yticks(np.arange(-180, 181, 60))
-    axes.legend(loc="upper right", labelcolor=INK, facecolor="white", frameon=True)
+    """Highest step and margin of tipping over the angles of front and rear levers, the run's own marked, and the
+    posture of the highest step."""
+    fig, grid = figure(2, 2, 7.6)
+    maps = ((over.step_mm, "highest step [mm]"), (over.margin_mm, "margin of tipping at rest [mm]"))
+    for axes, (values, label) in zip(grid[:, 0], maps, strict=True):
+        drawn = axes.contourf(over.angles_deg, over.angles_deg, values, levels=12, cmap="cividis")
+        fig.colorbar(drawn, ax=axes, label=label)
+        axes.plot(over.own_deg[1], over.own_deg[0], "o", color="white", mec=INK, ms=8, label="this run")
+        axes.plot(over.rear_deg, over.front_deg, "*", color=VERMILION, mec="white", ms=13, label="highest")
+        axes.set(
+            xlabel="rear levers [°]", ylabel="front levers [°]", title=f"{label.partition(' [')[0].capitalize()}"
+        )
+        axes.set_xticks(np.arange(-180, 181, 60))
+        axes.set_yticks(np.arange(-180, 181, 60))
+    grid[0, 0].legend(loc="upper right", labelcolor=INK, facecolor="white", frameon=True)
+    grid[1, 1].axis("off")
     best = f"Highest: {over.step_mm.max():.0f} mm, front {over.front_deg:g}°, rear {over.rear_deg:g}°"
     silhouette(grid[0, 1], over.best, best)
     return fig

@@ -38,16 +38,17 @@ class Drawn:
 
 @dataclasses.dataclass(frozen=True)
 class StepMap:
-    """Highest steps over angles of the levers.
+    """Highest steps and margins of tipping over angles of the levers.
 
     Attributes:
-        angles_deg: of front and rear; step_mm: shape (front, rear).
+        angles_deg: of front and rear; step_mm, margin_mm (at rest on the run's slope): shape (front, rear).
         best: the highest, drawn; front_deg, rear_deg: there.
         own_deg: the run's own angles, front and rear.
     """
 
     angles_deg: np.ndarray
     step_mm: np.ndarray
+    margin_mm: np.ndarray
     best: Drawn
     front_deg: float
     rear_deg: float
@@ -99,12 +100,14 @@ def postures(robot: Robot, runs: Runs, conditions: Conditions) -> Postures | Non
 
 
 def step_map(robot: Robot, conditions: Conditions) -> StepMap:
-    """Highest steps of one run over the angles of its levers."""
-    found = jax.device_get(static_limits.steps_over_levers(robot, conditions, ANGLES, ANGLES))
+    """Highest steps and margins of tipping of one run over the angles of its levers."""
+    found, margin = jax.device_get(static_limits.over_levers(robot, conditions, ANGLES, ANGLES))
     front, rear = np.unravel_index(np.argmax(found.height), found.height.shape)
     best = _on_step(jax.tree.map(lambda x: x[front, rear], found))
     own = tuple(float(np.degrees(x)) for x in lever_angles(robot.running_gear, conditions))
-    return StepMap(ANGLES, found.height / MM, best, float(ANGLES[front]), float(ANGLES[rear]), (own[0], own[1]))
+    return StepMap(
+        ANGLES, found.height / MM, margin / MM, best, float(ANGLES[front]), float(ANGLES[rear]), (own[0], own[1])
+    )
 
 
 def of_requirements(robot: Robot, outcomes: Sequence[Outcome]) -> dict[str, tuple[Drawn, float, float]]:
