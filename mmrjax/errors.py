@@ -11,12 +11,13 @@ class UsageError(ValueError):
     """Wrong use of the public API; one sentence: where, what came, what is allowed."""
 
 
-def choices(word: str, allowed: Iterable[str], most: int = 1) -> str:
-    """«did you mean X? allowed: ...» for an unknown word; up to `most` that are near it."""
+def choices(word: str, allowed: Iterable[str], most: int = 1, shown: Iterable[str] | None = None) -> str:
+    """«did you mean X? allowed: ...» for an unknown word; up to `most` that are near it. `shown`: those that are
+    listed, where not all are."""
     allowed = list(allowed)
     found = near(word, allowed, most)
     hint = f"did you mean {', '.join(found)}? " if found else ""
-    return f"{hint}allowed: {', '.join(allowed)}"
+    return f"{hint}allowed: {', '.join(allowed if shown is None else shown)}"
 
 
 def near(word: str, allowed: Iterable[str], most: int = 1) -> list[str]:

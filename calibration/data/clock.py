@@ -6,6 +6,7 @@ import datetime
 import math
 from collections.abc import Sequence
 
+from calibration.data import delimited
 from calibration.data.columns import Meaning
 
 #: What follows a day where a cell holds a time alone.
@@ -24,7 +25,7 @@ def from_the_first(name: str, meaning: Meaning, cells: Sequence[str], runs: Sequ
     factor = meaning.value(1.0)
     if not all(map(math.isfinite, clock)):
         high = meaning.limits()[1]
-        clock = [_number(cell) * factor for cell in cells]
+        clock = [delimited.number(cell) * factor for cell in cells]
         if not all(x > high * factor for x in clock):
             return list(cells), ""
     first: dict[str, float] = {}
@@ -43,10 +44,3 @@ def _seconds(cell: str) -> float:
     except ValueError:
         return math.nan
     return when.replace(tzinfo=when.tzinfo or datetime.UTC).timestamp()
-
-
-def _number(cell: str) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        return math.nan

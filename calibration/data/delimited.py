@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import csv
+import math
 import re
 from collections.abc import Sequence
 
@@ -71,3 +72,11 @@ def cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], tuple[str, 
             "column, and nothing between thousands"
         )
     return rows, (f"{said}, and numbers have decimal commas; read so" if comma else f"{said}; read so",)
+
+
+def number(cell: str) -> float:
+    """A cell's number, NaN of what is none."""
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan

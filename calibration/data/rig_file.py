@@ -12,7 +12,6 @@ from typing import Any
 from calibration.data.columns import Layout
 from calibration.data.errors import BadConfiguration, choices, is_number
 from mmrjax import channels, params
-from mmrjax.errors import near
 from mmrjax.rig import BETWEEN, IMPOSED, STARTS, Instrument, Rig
 from mmrjax.robot import Robot
 from mmrjax.robots import DYNAMIC_SHARE
@@ -250,11 +249,8 @@ def _columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
     known = layout.spellings()
     for mine, theirs in stated.items():
         if mine not in known:
-            hint = f"did you mean {close[0]}? " if (close := near(mine, known)) else ""
-            raise BadConfiguration(
-                f"{here}.{mine}: no such column of a table; {hint}allowed, also in other units: "
-                f"{', '.join(layout.known())}"
-            )
+            listed = choices(mine, known, shown=layout.known())
+            raise BadConfiguration(f"{here}.{mine}: no such column of a table; {listed}; also in other units")
         table = {"column": theirs} if isinstance(theirs, str) else theirs
         if not isinstance(table, dict) or not isinstance(table.get("column"), str) or {*table} - {"column", "factor"}:
             raise BadConfiguration(f"{here}.{mine}: got {theirs!r}; {form}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence as Rows
 from pathlib import Path
 
@@ -32,7 +31,7 @@ def stairs(text: str) -> tuple[float, float, int]:
         BadConfiguration: something else, or a stair without rise or tread.
     """
     cells = text.lower().replace("×", "x").split("x")
-    numbers = [_number(c) for c in cells]
+    numbers = [delimited.number(c) for c in cells]
     if len(cells) != 3 or not np.isfinite(numbers).all():
         raise BadConfiguration(f"--stairs: got {text}; expected RISExTREADxCOUNT in mm, such as 170x290x3")
     rise, tread, count = numbers
@@ -41,13 +40,6 @@ def stairs(text: str) -> tuple[float, float, int]:
             unit = "" if name == "count" else " mm"
             raise BadConfiguration(f"--stairs: got a {name} of {value:g}{unit}; expected {least} to {most}{unit}")
     return rise / 1000, tread / 1000, int(count)
-
-
-def _number(cell: str) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        return math.nan
 
 
 def _read(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[dict[str, np.ndarray], Rows[str]]:
@@ -68,7 +60,7 @@ def _read(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[dict[str, n
         for name in names:
             j = header.index(name)
             cell = row[j] if j < len(row) else ""
-            if not np.isfinite(value := _number(cell)):
+            if not np.isfinite(value := delimited.number(cell)):
                 raise BadData(f"{path.name} row {k}, {name}: got {cell!r}; expected a number")
             found[name].append(value)
     if len(rows) < 2:

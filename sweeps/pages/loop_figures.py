@@ -66,11 +66,10 @@ def before_after(table: dict[str, np.ndarray], channels: Sequence[Channel], verd
     fig, grid = figure(len(channels), 1, 1.8 * len(channels), sharex=True)
     levels = np.unique(table[own]).size
     few = levels <= 8 or own == "supply_voltage_V"  # else a group by configuration alone
-    one = np.unique(table["configuration"]).size == 1
-    words = [
-        ([] if one and few else [f"{table['configuration'][k]}"], f"{table[own][k]:g} {UNITS[own]}") for k in order
+    named = not few or np.unique(table["configuration"]).size > 1
+    groups = [
+        ", ".join([str(table["configuration"][k])] * named + [f"{table[own][k]:g} {UNITS[own]}"] * few) for k in order
     ]
-    groups = [", ".join([*name, level] if few else name) for name, level in words]
     edges = [i for i in range(1, len(groups)) if groups[i] != groups[i - 1]]
     x = np.arange(len(order))
     for axes, channel in zip(grid[:, 0], channels, strict=True):

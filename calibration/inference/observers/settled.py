@@ -19,6 +19,7 @@ from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.details import EquationDefects
+from calibration.inference.errors import root_mean_square
 from calibration.inference.linearization import Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
 from calibration.inference.notes import Note
@@ -321,10 +322,6 @@ class SettledRuns(Observer):
         return EquationDefects(_defects(before.linear, included), _defects(after.linear, included))
 
 
-def _rms(x: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(x**2)))
-
-
 def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarray]:
     """The defects of each row that make its residual r, of each side where sides are driven apart.
 
@@ -337,9 +334,9 @@ def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarra
     rows = np.flatnonzero(included)
     slopes = np.stack([np.asarray(linear.of_sides(linear.probed.index(b)))[:, rows] for b in EQUATIONS])
     about = [np.asarray(getattr(linear.signals, name))[rows] for name in EQUATIONS.values()]
-    sides, size = slopes.shape[1], np.array([_rms(x) for x in about])
+    sides, size = slopes.shape[1], np.array([root_mean_square(x) for x in about])
     made, turning, output = (
-        _rms(np.asarray(getattr(linear.signals, name))[rows])
+        root_mean_square(np.asarray(getattr(linear.signals, name))[rows])
         for name in ("torque_electromagnetic", "speed_motor", "speed_output")
     )
     k = [*EQUATIONS].index("track")
