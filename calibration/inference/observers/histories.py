@@ -437,7 +437,14 @@ class Histories(Observer):
 
     def late(self, every: Float[Array, "runs instants ..."], rig: Rig) -> Float[Array, "rows ..."]:
         """Of every row, what is there between the instants before and after it less the rig's delay."""
-        return jax.vmap(lambda run, at: rig.late(self.times[run], every[run], at))(self.run, self.time)
+
+        def of_run(times: Array, every: Array, rows: Array) -> Array:
+            return jax.vmap(lambda at: rig.late(times, every, at))(self.time[rows])
+
+        found = jax.vmap(of_run)(self.times, every, self.rows_of)
+        # What is shown of no row is dropped.
+        place = jnp.where(self.rows_of < 0, len(self.run), self.rows_of)
+        return jnp.zeros((len(self.run), *found.shape[2:]), found.dtype).at[place].set(found, mode="drop")
 
     @property
     def crosses_zero(self) -> bool:
