@@ -154,6 +154,8 @@ def discover(
             "result",
             lambda: assemble_result(traced, distinct, ready.numbers, ready.settings, ready.library, tell),
         )
+        if not all(verdict.done() for verdict in verdicts.values()):
+            tell(Step("others"))
         for f, verdict in verdicts.items():
             try:
                 sensitivity.append(in_short(f, verdict.result(left()), ready.numbers))

@@ -18,6 +18,7 @@ STEPS = {
     "shape": "the shape of what is missing",
     "errors": "errors on data held out",
     "next": "the next experiment",
+    "others": "the verdicts with the other noises",
     "gear stated": "resolved: friction through the track model, its running gear as stated",
     "gear free": "resolved: the running gear free",
     # a sensitivity study
