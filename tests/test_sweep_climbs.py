@@ -109,9 +109,9 @@ def test_each_point_has_its_own_robot_levers_and_obstacle(monkeypatch):
 def test_points_of_which_the_robot_varies_are_single_climbs():
     of = Obstacle(kind="step", duration_s=0.5, time_step_s=2e-4)
     variation = Variation(ROBOT, ("levers_front_deg", "motor.resistance", "payload"))
-    values = np.array([[30.0, 0.6, 0.0], [50.0, 1.5, 4.0]])
+    values = np.array([[50.0, 0.6, 0.0], [50.0, 1.5, 4.0]])
     conditions = Conditions(np.zeros(2, int), voltage=np.full(2, 24.0)).resolved(ROBOT)
-    found = climbs.computed(of, variation, conditions, values, np.array([60.0, 90.0]), lambda share: None)
+    found = climbs.computed(of, variation, conditions, values, np.array([90.0, 90.0]), lambda share: None)
     robot = params.replace(ROBOT, {"motor.resistance": 1.5})
     one = climb_batch(
         robot, Conditions(np.zeros(1, int), voltage=24.0, payload=4.0).resolved(robot),
