@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from mmrjax import derived, params
+from mmrjax.compiling import SELDOM
 from mmrjax.conditions import Conditions
 from mmrjax.derived import posture, start, steepest_slope
 from mmrjax.fidelities.drive import drive
@@ -89,9 +90,12 @@ def test_steepest_slope_ends_at_the_limit_and_is_missing_where_the_flat_is_not_h
 @pytest.mark.slow
 @pytest.mark.parametrize(("static", "voltage"), [(0.32, 24.0), (2.5, 2.0)])
 def test_steepest_slope_derivatives_are_finite_differences(robot, static, voltage):
+    """As users' programs are compiled, and as those that run a few times are."""
     tuned = changed(robot, **{"6T2A__ground__friction__static": static})
     theta, f = function(tuned, Conditions(0, voltage, payload=5.0), steepest_slope.compute)
-    exact = jax.jacfwd(lambda t: f(t)["steepest_slope"])(theta)
+    forward = jax.jacfwd(lambda t: f(t)["steepest_slope"])
+    exact = forward(theta)
+    np.testing.assert_allclose(jax.jit(forward, compiler_options=SELDOM)(theta), exact, rtol=1e-9)
     twice = differences(f, theta, 1e-6)["steepest_slope"]
     np.testing.assert_allclose(exact, twice, rtol=1e-5, atol=1e-4 * np.abs(twice).max())
     np.testing.assert_allclose(jax.jacrev(lambda t: f(t)["steepest_slope"])(theta), exact, rtol=1e-9, atol=1e-9)

@@ -13,6 +13,7 @@ from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration
 from calibration.inference import noise, observers, priors
 from calibration.inference.calibrate import calibrate
+from calibration.inference.observers.histories import Histories
 from mmrjax import channels, params
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import histories as integrator
@@ -150,6 +151,25 @@ def test_what_is_imposed_acts_later_by_the_delay():
     shown = [float(rig.late(times, values, at)) for at in (-1.0, 0.1, 0.7, 1.2, 1.7, 9.0)]
     assert shown == pytest.approx([3.0, 3.0, 4.0, 5.0, 4.5, 4.0])
     assert rig.clock(jnp.asarray([-0.5, 0.0, 0.3])).tolist() == pytest.approx([-0.5, 0.0, 0.5])
+
+
+def test_a_delay_reads_the_run_of_each_row_and_takes_memory_by_rows():
+    """Two runs, the rows in no order; a run of 3000 rows takes less than each row's own copy of the run."""
+    times = jnp.asarray([[0.0, 0.5, 1.0], [0.0, 0.25, 0.5]])
+    every = jnp.stack([10 * times, -times], -1)
+    order = [1, 0, 1, 0, 0], [2, 1, 1, 2, 0], [[4, 1, 3], [2, 0, -1]]
+    run, instant, rows_of = (jnp.asarray(x) for x in order)
+    seen = Histories(Conditions(0, 1.0), times, run, instant, rows_of, rows_of).late(every, Rig(delay=0.1))
+    at = np.maximum(np.asarray(times)[run, instant] - 0.1, 0.0)
+    np.testing.assert_allclose(seen, np.stack([10 * at, -at], -1), rtol=1e-12)
+
+    count = 3000
+    along = jnp.arange(count)
+    long = Histories(
+        Conditions(0, 1.0), jnp.linspace(0, 1, count)[None], jnp.zeros(count, int), along, along[None], along[None]
+    )
+    program = jax.jit(lambda x: long.late(x, Rig(delay=0.1))).lower(jnp.zeros((1, count, 2))).compile()
+    assert program.memory_analysis().temp_size_in_bytes < 8 * 100 * count
 
 
 def imposed_speed(tmp_path, runs):
