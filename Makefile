@@ -15,8 +15,8 @@ demo: $(READY)
 	@echo "open runs/demo/loop/report.html, then runs/demo/table8/report.html"
 
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations=10 --durations-min=2
-# The compiler's older emitters, and few of its optimizations: a program compiles in a quarter of the time and runs
-# slower, which short tests don't feel. At level 0 these emitters make wrong programs of some derivatives.
+# The compiler's older emitters, and few of its optimizations: a program compiles faster and runs slower, which short
+# tests don't feel. At level 0 these emitters make wrong programs of some derivatives.
 QUICK := XLA_FLAGS="--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1 --xla_cpu_parallel_codegen_split_count=1"
 
 # The checks of `lint` beside them: they need one core of two.

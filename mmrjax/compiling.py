@@ -31,8 +31,9 @@ def for_equations(x: T) -> T:
 
 #: Options of XLA for programs over a few hundred points: compiled in three quarters of the time, no slower to run.
 SMALL = {"xla_cpu_use_fusion_emitters": False}
-#: The same for programs that run a few times each: compiled in a third of the time, and half as fast. Not level 0:
-#: the older emitters make wrong programs of some derivatives there (NaN, or zero; jaxlib 0.10.2).
+#: The same for programs that run a few times each, with few optimizations. Not level 0, which compiles faster (the
+#: loop on `measured` with nothing kept 40 s, 46 at level 1, two quiet cores, two runs each): the older emitters make
+#: wrong programs of some derivatives there (NaN, or zero; jaxlib 0.10.2).
 SELDOM = {**SMALL, "xla_backend_optimization_level": 1}
 
 

@@ -141,16 +141,16 @@ class Rig(eqx.Module):
             self, instruments=rectified, columns=(), priors=(), start=STARTS[0], between_rows=BETWEEN[0], surfaces=()
         )
 
-    def late(self, times: Float[Array, " times"], values: Array, at: Scalar) -> Array:
+    def late(self, times: Float[Array, " times"], values: Array, at: Scalar | Float[Array, "..."]) -> Array:
         """What happens at instants, by the clock of tables, whose column of what is imposed acts `delay` later.
 
         Args:
             times: since what is imposed acts [s], increasing; values: at those, shape (times, ...).
-            at: an instant of the tables' clock [s].
+            at: instants of the tables' clock [s], of any shape.
 
         Returns:
-            The value at `at` - delay: on the straight line between the instants about it, held before the first and
-            after the last.
+            The values at `at` - delay, of that shape first: on the straight line between the instants about it, held
+            before the first and after the last.
         """
         wanted = at - self.delay
         k = jnp.clip(jnp.searchsorted(times, wanted, side="right") - 1, 0, times.shape[0] - 2)
@@ -158,6 +158,7 @@ class Rig(eqx.Module):
         share = jnp.clip(jnp.where(gap > 0, (wanted - times[k]) / jnp.where(gap > 0, gap, 1.0), 0.0), 0.0, 1.0)
         if not jnp.issubdtype(values.dtype, jnp.inexact):
             return values[k]
+        share = jnp.reshape(share, (*jnp.shape(share), *[1] * (values.ndim - 1)))
         # An instant itself takes nothing of the one after it, which may be no number.
         after = jnp.where((share < 1e-9) & jnp.isnan(values[k + 1]), values[k], values[k + 1])
         return values[k] + share * (after - values[k])

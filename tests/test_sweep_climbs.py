@@ -109,9 +109,9 @@ def test_each_point_has_its_own_robot_levers_and_obstacle(monkeypatch):
 def test_points_of_which_the_robot_varies_are_single_climbs():
     of = Obstacle(kind="step", duration_s=0.5, time_step_s=2e-4)
     variation = Variation(ROBOT, ("levers_front_deg", "motor.resistance", "payload"))
-    values = np.array([[50.0, 0.6, 0.0], [50.0, 1.5, 4.0]])
-    conditions = Conditions(np.zeros(2, int), voltage=np.full(2, 24.0)).resolved(ROBOT)
-    found = climbs.computed(of, variation, conditions, values, np.array([90.0, 90.0]), lambda share: None)
+    values = np.array([[30.0, 0.6, 0.0], [50.0, 1.5, 4.0], [50.0, 0.6, 0.0]])
+    conditions = Conditions(np.zeros(3, int), voltage=np.full(3, 24.0)).resolved(ROBOT)
+    found = climbs.computed(of, variation, conditions, values, np.array([60.0, 90.0, 90.0]), lambda share: None)
     robot = params.replace(ROBOT, {"motor.resistance": 1.5})
     one = climb_batch(
         robot, Conditions(np.zeros(1, int), voltage=24.0, payload=4.0).resolved(robot),
@@ -122,8 +122,8 @@ def test_points_of_which_the_robot_varies_are_single_climbs():
     alone = climbs._numbers(one)
     for name, value in alone.items():
         assert float(found[name][1]) == pytest.approx(float(value[0]), rel=1e-6), name
-    assert found["furthest_mm"][0] > found["furthest_mm"][1] + 1  # with less resistance and payload
-    assert found[STATUS].tolist() == [3, 3]  # not settled: the time was over
+    assert found["furthest_mm"][2] > found["furthest_mm"][1] + 1  # with less resistance and payload
+    assert found[STATUS].tolist() == [3, 3, 3]  # not settled: the time was over
 
 
 def test_map_of_verdicts_has_each_point_in_its_colour():

@@ -82,10 +82,7 @@ def as_tables(rig: Rig, time: Float[Array, "runs samples"], values: T) -> tuple[
 
 @compiled
 def _late(rig: Rig, time: Array, values: T, clock: Array) -> T:
-    def of_run(times: Array, x: Array, clock: Array) -> Array:
-        return jax.vmap(lambda at: rig.late(times, x, at))(clock)
-
-    return jax.tree.map(lambda x: jax.vmap(of_run)(time, x, clock), values)
+    return jax.tree.map(lambda x: jax.vmap(rig.late)(time, x, clock), values)
 
 
 class Run(eqx.Module):

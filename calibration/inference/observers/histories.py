@@ -91,6 +91,14 @@ LEVELS = 6
 ROUNDING = 1e-3
 
 
+def _by_row(
+    of_runs: Float[Array, "runs samples ..."], rows_of: Int[Array, "runs samples"], rows: int
+) -> Float[Array, "rows ..."]:
+    """What is known of each sample of the runs, by the table's rows; beyond the last row of a run it is dropped."""
+    place = jnp.where(rows_of < 0, rows, rows_of)
+    return jnp.zeros((rows, *of_runs.shape[2:]), of_runs.dtype).at[place].set(of_runs, mode="drop")
+
+
 class HistoriesLinearization(Linearization):
     """Of histories: `defects` has shape (balances, runs, knots, samples, channels), a defect at each knot of a run.
 
@@ -107,9 +115,7 @@ class HistoriesLinearization(Linearization):
 
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         moved = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.knots])
-        place = jnp.where(self.rows_of < 0, self.rows, self.rows_of)  # beyond the last row: dropped
-        out = jnp.zeros((self.rows, len(self.channels), shapes.shape[1])).at[place].set(moved, mode="drop")
-        return out.reshape(-1, shapes.shape[1])
+        return _by_row(moved, self.rows_of, self.rows).reshape(-1, shapes.shape[1])
 
     def places(self) -> np.ndarray:
         return np.unique(np.asarray(self.knots))
@@ -437,14 +443,7 @@ class Histories(Observer):
 
     def late(self, every: Float[Array, "runs instants ..."], rig: Rig) -> Float[Array, "rows ..."]:
         """Of every row, what is there between the instants before and after it less the rig's delay."""
-
-        def of_run(times: Array, every: Array, rows: Array) -> Array:
-            return jax.vmap(lambda at: rig.late(times, every, at))(self.time[rows])
-
-        found = jax.vmap(of_run)(self.times, every, self.rows_of)
-        # What is shown of no row is dropped.
-        place = jnp.where(self.rows_of < 0, len(self.run), self.rows_of)
-        return jnp.zeros((len(self.run), *found.shape[2:]), found.dtype).at[place].set(found, mode="drop")
+        return _by_row(jax.vmap(rig.late)(self.times, every, self.time[self.rows_of]), self.rows_of, len(self.run))
 
     @property
     def crosses_zero(self) -> bool:
