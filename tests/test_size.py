@@ -19,6 +19,7 @@ from calibration.sizing import chart, search, sheet
 from calibration.sizing.design import OBJECTIVES, build, evaluate, task
 from calibration.sizing.options import BELT_STAGE, MOTOR, drives, options
 from mmrjax import params
+from mmrjax.requirements import QUANTITIES
 from tests.commands import command
 from tests.pages import Tables, drawn, outside
 
@@ -239,6 +240,14 @@ def test_step_that_is_asked_for_decides_the_design(robot):
     best = search.size(robot, asked, ("mass",), starts=32, motors=(MOTOR,)).best
     meets(best, asked)
     assert 0.6 <= best.radius / float(robot.radius_pulley) < 0.75
+
+
+@pytest.mark.parametrize("name", sorted(QUANTITIES))
+def test_ratings_of_parts_are_asked_somewhere_whatever_else_is(robot, name):
+    """Of a robot that only has to turn, climb or be light too."""
+    limit = {"endurance_min": '{ least = 9, duty = "driving" }', "stairs_rise_mm": "{ least = 9, tread_mm = 290 }"}
+    of = task(robot, requirements.read(f"{name} = {limit.get(name, 9)}", "r.toml"), options(robot))
+    assert all(d.rows for d in of.demands) and {d.requirement is None for d in of.demands} == {True, False}
 
 
 REFUSED = {

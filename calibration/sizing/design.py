@@ -116,7 +116,8 @@ class Task(eqx.Module):
 def task(robot: Robot, asked: Requirements, options: Options) -> Task:
     """The points of requirements: corners of each envelope, each point once.
 
-    Slope and payload required are taken as conditions in which the robot has to travel.
+    Slope and payload required are taken as conditions in which the robot has to travel. Ratings of the parts hold
+    where it is to travel for long: in the middle of the envelope if no requirement says where.
     """
     name = asked.envelope.configuration or robot.configurations.names[0]
     index: dict[tuple[float, ...], int] = {}
@@ -134,9 +135,9 @@ def task(robot: Robot, asked: Requirements, options: Options) -> Task:
         at = sheet.points(robot, r)
         rows = [tuple(row(p) for p in corner) for corner in _corners(robot, r, at)]
         demands.append(Demand(r, label(r), tuple(k for corner in dict.fromkeys(rows) for k in corner)))
-    travelling = sorted({k for d in demands if d.requirement and d.requirement.name in LASTING for k in d.rows})
-    demands += [Demand(None, words, tuple(travelling)) for words in RATED.values()]
     middle = row(_middle(robot, asked.envelope))
+    travelling = sorted({k for d in demands if d.requirement and d.requirement.name in LASTING for k in d.rows})
+    demands += [Demand(None, words, tuple(travelling) or (middle,)) for words in RATED.values()]
     points: Point = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *kept)
     one_cell = params.strong(dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, cells=1)))
     return Task(one_cell, name, options.base_mass, points, middle, tuple(demands))
