@@ -77,6 +77,10 @@ __all__ = [
     "sweep",
 ]
 
+#: For XLA_FLAGS, before JAX is imported. Without LLVM's quick selection of instructions, which acts at level 0 of its
+#: optimizations and makes wrong programs of some derivatives there (NaN, or zero; jaxlib 0.10.2).
+SOUND_AT_LEVEL_0 = "--xla_backend_extra_options=-fast-isel=false"
+
 if "JAX_ENABLE_X64" not in os.environ:
     if "jax" in sys.modules:
         sys.modules["jax"].config.update("jax_enable_x64", True)

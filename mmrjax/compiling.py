@@ -8,12 +8,14 @@ columns of files, the class of an effect whose prior is of another size. What ha
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
 
+from mmrjax import SOUND_AT_LEVEL_0
 from mmrjax.programs import Programs
 
 P = ParamSpec("P")
@@ -31,10 +33,9 @@ def for_equations(x: T) -> T:
 
 #: Options of XLA for programs over a few hundred points: compiled in three quarters of the time, no slower to run.
 SMALL = {"xla_cpu_use_fusion_emitters": False}
-#: The same for programs that run a few times each, with few optimizations. Not level 0, which compiles faster (the
-#: loop on `measured` with nothing kept 40 s, 46 at level 1, two quiet cores, two runs each): the older emitters make
-#: wrong programs of some derivatives there (NaN, or zero; jaxlib 0.10.2).
-SELDOM = {**SMALL, "xla_backend_optimization_level": 1}
+#: The same for programs that run a few times each, with few optimizations: none where that is sound, as from the
+#: command line (the loop on `measured` with nothing kept then takes 63 s of processor time, 78 at level 1).
+SELDOM = {**SMALL, "xla_backend_optimization_level": 0 if SOUND_AT_LEVEL_0 in os.environ.get("XLA_FLAGS", "") else 1}
 
 
 def compiled(function: Callable[P, T], *, options: dict[str, Any] | None = None) -> Callable[P, T]:

@@ -16,7 +16,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 
 from calibration.data.errors import InputError
-from mmrjax import __version__, fidelities
+from mmrjax import SOUND_AT_LEVEL_0, __version__, fidelities
 from sweeps import config, config_campaign
 from sweeps import options as made
 
@@ -504,17 +504,20 @@ def _prepared(resolved: Any, no_cache: bool = False) -> Any:
     """A command's configuration, once the environment is ready for the jax that the command will import.
 
     Runs of the track model have hung for good, one sweep in seven on two cores, with every thread asleep in
-    XLA's CPU executor (jax 0.10.2); with this flag none of twelve did (docs/benchmarks.md). Whoever sets
+    XLA's CPU executor (jax 0.10.2); with one thread none of twelve did (docs/benchmarks.md). Whoever sets
     XLA_FLAGS, be it to nothing, is heeded.
     """
-    if hasattr(resolved, "model") and fidelities.facts(resolved.model).one_thread:
-        os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
-    _start_jax(no_cache)
+    one_thread = hasattr(resolved, "model") and fidelities.facts(resolved.model).one_thread
+    _start_jax(no_cache, ("--xla_cpu_multi_thread_eigen=false",) * one_thread)
     return resolved
 
 
-def _start_jax(no_cache: bool) -> None:
-    """Import jax with double precision, and with the compilation cache unless it is not wanted."""
+def _start_jax(no_cache: bool, flags: tuple[str, ...] = ()) -> None:
+    """Import jax with double precision, by flags of XLA, and with the compilation cache unless it is not wanted."""
+    if "jax" not in sys.modules:  # which takes it when it starts
+        flags = SOUND_AT_LEVEL_0, *flags
+    if flags:
+        os.environ.setdefault("XLA_FLAGS", " ".join(flags))
     from sweeps import compilation_cache
 
     if not no_cache:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
+import subprocess
+import sys
 
 import equinox as eqx
 import jax
@@ -11,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import derived, params
+from mmrjax import SOUND_AT_LEVEL_0, derived, params
 from mmrjax.compiling import SELDOM
 from mmrjax.conditions import Conditions
 from mmrjax.derived import posture, start, steepest_slope
@@ -100,6 +103,18 @@ def test_steepest_slope_derivatives_are_finite_differences(robot, static, voltag
     np.testing.assert_allclose(exact, twice, rtol=1e-5, atol=1e-4 * np.abs(twice).max())
     np.testing.assert_allclose(jax.jacrev(lambda t: f(t)["steepest_slope"])(theta), exact, rtol=1e-9, atol=1e-9)
     assert np.abs(exact).max() > 1
+
+
+@pytest.mark.slow
+def test_derivatives_are_sound_without_optimizations_as_the_command_line_compiles():
+    """The test above once more, in a process of its own; by LLVM's quick selection they were NaN."""
+    code = (
+        f"import pytest; ended = pytest.main(['-q', {__file__!r}, '-k', 'finite_differences and 2.5-2.0'])\n"
+        "from mmrjax.compiling import SELDOM; assert SELDOM['xla_backend_optimization_level'] == 0 == ended"
+    )
+    environment = {**os.environ, "XLA_FLAGS": SOUND_AT_LEVEL_0}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert done.returncode == 0 and "1 passed" in done.stdout, done.stdout
 
 
 @pytest.mark.slow

@@ -358,11 +358,14 @@ def _evidence_over_curves(
 ) -> float:
     """Twice the log of the evidence for an effect of a candidate over the best smooth curve of its equation [σ²].
 
+    Both pay for having been searched for in that equation: the effect among the effects, the curve among the curves.
+
     Args:
         without: the same fit without it; linear: that one, linearised.
     """
-    cost = _cost_of(space, best, best.active.index(effect), settings) + 2 * math.log(len(space.library))
     own = _equation(space, effect)
+    there = sum(_equation(space, name) == own for name in space.library.names)
+    cost = _cost_of(space, best, best.active.index(effect), settings) + 2 * math.log(there)
     tried = [e for e, over in _curves(space, linear, bases, set()) if equation(over.place) == own]
     return 2 * (without.cost - best.cost) - cost - max(tried, default=-math.inf) + 2 * math.log(max(len(tried), 1))
 
