@@ -14,7 +14,7 @@ from worlds import histories, laws, settled, tables
 
 from calibration.discovery import discover
 from calibration.discovery.candidates import Candidate, filled, fit_candidates, start
-from calibration.discovery.notes import NameSupport, NameTest
+from calibration.discovery.notes import CurveOver, NameSupport, NameTest
 from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import augment_with_columns
 from calibration.discovery.search import Search, diagnose
@@ -22,11 +22,13 @@ from calibration.discovery.settings import settings_for
 from calibration.discovery.smooth import FALL, LENGTHS, PRODUCT, SIZES, WIDE, smooth, surface
 from calibration.discovery.standing import (
     _chosen_again,
+    _evidence_over_curves,
     _lacks,
     _root,
     _varies_most,
     _weakest_run,
     cost_of_names,
+    equation,
     evidence_of_names,
     standing,
 )
@@ -156,6 +158,30 @@ def test_cost_of_names_grows_with_the_library_and_their_number():
     assert cost_of_names(SimpleNamespace(free=2, library=range(10)), blind, settings) == pytest.approx(
         2 * math.log(10)
     )
+
+
+def test_effect_and_curve_pay_for_what_was_searched_in_their_equation(monkeypatch):
+    """Of a library of twelve effects three are of the track's equation, of seven curves two."""
+    places = ["track"] * 2 + ["gearbox", "motor"] + ["electrical"] * 8
+    assert [equation(p) for p in places[:4]] == [equation("track")] * 4
+
+    class Library(tuple):
+        names = property(lambda self: [f"e{i}" for i in range(len(self))])
+
+        def __getitem__(self, name):
+            return SimpleNamespace(channel="", balance=places[int(name[1:])])
+
+    space = SimpleNamespace(free=2, library=Library(range(12)))
+    settings, best = SimpleNamespace(slots=4), names_of(0.01 * np.eye(1), 2)
+    best.z[2] = 5.0  # fifty sds
+    curves = [(4.0, CurveOver("track", ("speed",))), (7.0, CurveOver("track", ("slope",)))]
+    curves += [(90.0, CurveOver("electrical", (str(k),))) for k in range(5)]
+    monkeypatch.setattr("calibration.discovery.standing._curves", lambda *_: curves)
+    without = dataclasses.replace(best, cost=best.cost + 20.0)
+    found = _evidence_over_curves(space, best, without, "e0", None, (), settings)
+    own = sum(equation(p) == equation("track") for p in places)
+    of_effect = 2 * 20.0 + 2 * math.log(0.1) - 2 * math.log(own)
+    assert found == pytest.approx(of_effect - (7.0 - 2 * math.log(2)), rel=1e-12)
 
 
 def test_root_is_that_of_what_a_column_explains_beside_others(toy):

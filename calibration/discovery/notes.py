@@ -28,9 +28,9 @@ class CurveOver(NamedTuple):
     variables: tuple[str, ...]
 
 
-#: Evidence by which a smooth curve of an effect's own equation has to be the better explanation [σ²]: of 369 right
-#: names of two campaigns 7 have less than -6, of 6 wrong ones of laws outside the library 3 (docs/lab/findings.md).
-BETTER = 6.0
+#: Evidence by which a smooth curve of an effect's own equation has to be the better explanation [σ²]
+#: (docs/lab/findings.md, "The price of a name").
+BETTER = 5.0
 #: Share of its root that an effect has to keep without any one run: without a row of a table, whose readings may be
 #: wrong by themselves; without a run of a history, hundreds of samples, chance is asked alone.
 KEPT = {"row": 1 / math.sqrt(3), "run": 0.0}
