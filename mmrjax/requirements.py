@@ -331,7 +331,9 @@ def _turn(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
     found, motion, status = circling(here, conditions)
     low = jnp.any(jnp.asarray(_cell(rated, found.signals, point)) < 0)
     turns = jnp.where(jnp.abs(motion.yaw_rate) > 1e-6, motion.yaw_rate, 1e-6)
-    value = motion.yaw_rate if name == "turn_in_place_rad_s" else jnp.abs(motion.speed / turns)
+    rolls = motion.speed**2 + motion.speed_lateral**2
+    # A root of nothing has no derivative.
+    value = motion.yaw_rate if name == "turn_in_place_rad_s" else jnp.sqrt(jnp.maximum(rolls, 1e-24)) / jnp.abs(turns)
     return Found(jnp.asarray(value), jnp.where((status == CONVERGED) & low, CUT_OFF, status))
 
 

@@ -153,11 +153,18 @@ def simulate(
     takes; with --model drive its path over time, on slopes too (docs/turning.md).
     """
     cells = told.beside.model_dump()
+    stated = {column for column, value in cells.items() if value is not None}
+    if runs is not None and stated:
+        options = made.flags(config.OneRun)
+        raise InputError(
+            f"{', '.join(options[column] for column in cells if column in stated)}: got it beside --runs, whose "
+            f"columns state the conditions of each run; state it there, or leave out --runs"
+        )
     given = cells if runs is None else str(runs)
     if told.config.profile is not None:
         from sweeps.commands import missions
 
-        return missions.simulate(told.config, given, {c for c, v in cells.items() if v is not None}, out, force)
+        return missions.simulate(told.config, given, stated, out, force)
     if told.config.turns:
         from sweeps.commands import turn
 

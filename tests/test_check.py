@@ -218,8 +218,8 @@ def test_turns_that_are_asked_for_are_those_that_settle(robot, name, left):
     found = evaluate(robot, point(battery=0.0, charge=24.0, payload=3.0), ratings(robot), name)
     runs = Conditions([0], voltage=24.0, payload=3.0, duty_left=left, duty_right=1.0).resolved(robot)
     reading = steady_batch(robot, runs).reading
-    rate, speed = float(reading["yaw_rate"][0]), float(reading["speed"][0])
-    assert float(found.value) == pytest.approx(rate if left else abs(speed / rate), rel=1e-6)
+    rate, *rolls = (float(reading[name][0]) for name in ("yaw_rate", "speed", "lateral_speed"))
+    assert float(found.value) == pytest.approx(rate if left else abs(math.hypot(*rolls) / rate), rel=1e-6)
     assert int(found.outcome) == CONVERGED
 
 

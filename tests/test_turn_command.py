@@ -8,6 +8,9 @@ import pytest
 from calibration.data import runs as records
 from calibration.data.errors import BadData
 from mmrjax import robots
+from mmrjax.channels import SIDES
+from mmrjax.derived import turn as derived
+from sweeps.commands import simulate
 from sweeps.pages import mission_figures, turn_words
 from sweeps.points.job import showing_turns
 from tests.commands import rows
@@ -17,7 +20,7 @@ from tests.commands import rows
 def test_settled_turn_leaves_its_folder(tmp_path, mmrjax):
     code, out, _ = mmrjax("simulate", "--left", "33", "--right", "15", "--out", str(tmp_path / "run"))
     assert code == 0
-    assert "Turns to the right: a circle of 439 mm radius" in out
+    assert "Turns to the right: a circle of 442 mm radius at 642 mm/s ahead" in out
     folder = tmp_path / "run"
     (row,) = rows(folder / "runs.csv")
     result = json.loads((folder / "result.json").read_text())
@@ -29,7 +32,7 @@ def test_settled_turn_leaves_its_folder(tmp_path, mmrjax):
     turns = rows(folder / "turns.csv")
     rates = np.array([float(t["yaw_rate_rad_s"]) for t in turns[1:]])
     assert abs(rates[0]) < 1e-9 and (np.diff(np.abs(rates)) > 0).all()
-    assert "439 mm radius" in (folder / "report.html").read_text()
+    assert "442 mm radius" in (folder / "report.html").read_text()
 
 
 @pytest.mark.slow
@@ -119,7 +122,7 @@ def test_bad_turns_are_refused_in_a_sentence(tmp_path, mmrjax, case):
     assert not (tmp_path / "run").exists()
 
 
-HEADER = "configuration,supply_voltage_V,payload_kg,slope_deg,"
+HEADER, SIDED = "configuration,supply_voltage_V,payload_kg,slope_deg,", "duty_left,duty_right"
 
 
 def test_tables_take_the_duty_of_either_side(tmp_path):
@@ -147,6 +150,49 @@ def row(**changes):
     return usual | sides | changes
 
 
+def test_radius_is_that_of_the_circle_on_which_the_centre_of_mass_moves():
+    """Beside a braked side it moves aside by a third of how it moves ahead, so its circle is the larger one."""
+    reading = {"yaw_rate": [-2.0, 2.0, 0.0], "speed": [0.3, -0.3, 0.3], "lateral_speed": [0.1, 0.1, 0.0]}
+    reading |= {f"motor_{what}_{side}": np.ones(3) for what in ("speed", "current", "voltage") for side in SIDES}
+    found = derived.columns(robots.nominal(), reading, np.full(3, 0.04))
+    size = 1000 * np.hypot(0.3, 0.1) / 2
+    np.testing.assert_allclose(found["turning_radius_mm"], [-size, -size, np.inf], rtol=1e-12)
+    away = np.hypot(found["centre_x_mm"][:2], found["centre_y_mm"][:2])
+    np.testing.assert_allclose(away, size, rtol=1e-12)
+
+
+def test_runs_of_a_table_whose_sides_are_driven_apart_show_both_sides(tmp_path, mmrjax, monkeypatch):
+    shown = []
+
+    def simulated(folder, robot, *_):
+        shown.extend(c.name for c in robot.channels)
+        raise BadData("enough")
+
+    monkeypatch.setattr(simulate, "_simulated", simulated)
+    path = tmp_path / "turns.csv"
+    for cells, turns in (("33,0,0", False), ("33,0,0,1,0.5", True)):
+        path.write_text(f"{HEADER if turns else HEADER.strip(',')}{SIDED if turns else ''}\n6T2A,{cells}\n")
+        assert mmrjax("simulate", "--runs", path)[0] == 4
+        assert ({"yaw_rate", "motor_current_left", "motor_current_right"} <= set(shown)) == turns
+    table = {"total_current_A": [1.8], "motor_current_left_A": [-1.8], "motor_current_right_A": [0.1]}
+    assert simulate.amperes(robots.nominal(), table) == pytest.approx([1.8])
+
+
+def test_options_of_one_run_are_refused_beside_a_table(tmp_path, mmrjax):
+    path = tmp_path / "turns.csv"
+    path.write_text(f"{HEADER}{SIDED}\n6T2A,33,0,0,1,0.5\n")
+    for more in ((), ("--profile", "patrol", "--battery")):
+        code, _, err = mmrjax("simulate", "--runs", path, "--voltage", "4", "--mass", "12", *more)
+        assert code == 2 and "--voltage, --mass: got it beside --runs" in err
+
+
+def test_a_sweep_refuses_turns_on_a_slope_which_have_no_steady_state(tmp_path, mmrjax):
+    (tmp_path / "plan.toml").write_text(PLAN.replace("[axes]", "slope_deg = 10\n[axes]"))
+    code, _, err = mmrjax("sweep", "plan.toml", "--no-report", "--out", "run")
+    assert code == 2 and "duty_left -1: got a slope of 10 deg for a robot that turns" in err
+    assert not (tmp_path / "run").exists()
+
+
 def test_turns_are_told_in_plain_words():
     from mmrjax import params, robots
 
@@ -164,6 +210,11 @@ def test_turns_are_told_in_plain_words():
     assert "track width" in said() and "track width" not in sloping
     assert "Straight at 200 mm/s" in said(slope_deg=10.0, turning_radius_mm=float("inf"), yaw_rate_rad_s=0.0)
     assert "stalled" in said(status="stalled")
+    assert "track width" not in said(status="not_settled")
+    nothing = {name: float("nan") for name, value in row().items() if isinstance(value, float)}
+    none = turn_words.turn(robot, row(status="not_settled", **nothing), None)
+    assert none.answer.startswith("not_settled: ") and "no steady state" in none.answer
+    assert not none.sides and not none.notes
     assert "parts allow" not in said()
     robot = params.replace(robot, {"6T2A.turning.width": 0.5})
     assert "500 mm between the sides is none that the packaged robot's parts allow, 208 to 278 mm" in said()

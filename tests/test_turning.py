@@ -98,6 +98,14 @@ def test_every_turn_settles(turns):
     assert set(turns[1]) == {"converged"}
 
 
+def test_nothing_is_settled_on_a_slope_where_the_heading_changes(robot, monkeypatch):
+    run = mm.Conditions("6T2A", voltage=33.0, duty_left=1.0, duty_right=0.5, slope_deg=5.0).resolved(robot)
+    motion = turning.motion_of(robot, turning.start(robot, run).at[4].set(0.5))
+    found = balances.turning(robot, run, motion), motion, jnp.asarray(STATUSES.index("converged"))
+    monkeypatch.setattr(turning, "circling", lambda *_: found)
+    assert STATUSES[int(turning.operating_point(robot, run)[0].status)] == "not_settled"
+
+
 def flat(m):
     y = jnp.concatenate([m.current, m.speed_motor, jnp.stack([jnp.asarray(getattr(m, n)) for n in PLANE])])
     return y / jnp.asarray(turning._UNITS)

@@ -36,10 +36,11 @@ def columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray) -> dic
     shafts = {side: np.asarray(reading[f"motor_speed_{side}"]) for side in channels.SIDES}
     rolled = {side: radius * n / float(robot.gearbox.ratio) for side, n in shafts.items()}
     units = float(robot.sides) / 2
+    ahead, left = (-np.asarray(reading["lateral_speed"]) / rate, np.asarray(reading["speed"]) / rate)
     found = {
-        "turning_radius_mm": np.where(np.isnan(rate), np.inf, np.asarray(reading["speed"]) / rate / MM),
-        "centre_x_mm": -np.asarray(reading["lateral_speed"]) / rate / MM,
-        "centre_y_mm": np.asarray(reading["speed"]) / rate / MM,
+        "turning_radius_mm": np.where(np.isnan(rate), np.inf, np.copysign(np.hypot(ahead, left), left) / MM),
+        "centre_x_mm": ahead / MM,
+        "centre_y_mm": left / MM,
         "effective_width_mm": (rolled["right"] - rolled["left"]) / rate / MM,
     }
     for side in channels.SIDES:

@@ -429,6 +429,8 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
         sound &= jnp.isfinite(number)
     conditions = jax.tree.map(lambda x: jnp.where(sound, x, jnp.ones_like(x)), conditions)
     travel, _, status = circling(robot, conditions)
+    # On a slope the heading changes all the time.
+    status = jnp.where(conditions.slope_deg == 0, status, NOT_SETTLED)
     return result_of(robot, travel, jnp.where(sound, status, FAILED)), sound
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from sweeps.console import progress, say
 from sweeps.inputs import beside_robot, load_robot, one_run, read_runs
 from sweeps.pages import posture_words, words
 from sweeps.points import run, scale, uncertainty
+from sweeps.points.job import showing_turns
 from sweeps.results import posture
 from sweeps.skeleton import page
 from sweeps.store import RunFolder, open_folder
@@ -38,6 +40,8 @@ OF_VEHICLE = ("speed",)
 #: Column of the largest current of all motors together in a run over time (not of the supply, which gives the duty's
 #: share of it).
 PEAK = "peak_current_A"
+#: Columns of the currents of the motors of either side, where sides are driven apart.
+_OF_SIDES = tuple(channels.find(f"motor_current_{side}").column for side in channels.SIDES)
 #: Column of the time that a run's current may flow before its windings are at their limit.
 PERMISSIBLE = "permissible_time_s"
 
@@ -60,7 +64,8 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         )
     drawn = None if config.posterior is None else beside_robot(file)
     with open_folder("simulate", config, robot, out, force, runs) as folder:
-        table, histories = _simulated(folder, robot, runs, config)
+        seen = showing_turns(robot, runs.axes)
+        table, histories = _simulated(folder, seen, runs, config)
         table[PERMISSIBLE] = permissible(robot, table)
         stands = posture.postures(robot, runs, run.commanded(robot, runs, config))
         notes = remarks(robot, table)
@@ -69,7 +74,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
             found = uncertainty.intervals(robot, drawn, runs, config, config.posterior, folder)
             table |= found.columns
         print_runs(
-            {key: value[:_SHOWN] for key, value in capabilities.without_idle(robot, table).items()}, robot.channels
+            {key: value[:_SHOWN] for key, value in capabilities.without_idle(robot, table).items()}, seen.channels
         )
         for note in notes:
             say(note)
@@ -88,7 +93,8 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         if PEAK in table:
             further[PEAK] = float(np.nanmax(table[PEAK], initial=0.0))
         result = run.SimulationResult("simulate", config.model, robot, runs, table, further)
-        shown = page("runs", file, model=config.model, runs=table, histories=histories, stands=stands)
+        of_page = dataclasses.replace(file, robot=seen)
+        shown = page("runs", of_page, model=config.model, runs=table, histories=histories, stands=stands)
         return run.leave(folder, config, result, shown)
 
 
@@ -152,7 +158,9 @@ def permissible(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def amperes(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
-    """Size of the current of one motor [A], NaN where no column tells it."""
+    """Size of the current of one motor [A], of sides driven apart the larger; NaN where no column tells it."""
+    if all(column in table for column in _OF_SIDES):
+        return np.asarray(np.max([np.abs(table[column]) for column in _OF_SIDES], axis=0))
     for column, motors in (("total_current_A", float(robot.sides)), ("motor_current_A", 1.0)):
         if column in table:
             return np.asarray(np.abs(np.asarray(table[column])) / motors)
@@ -259,6 +267,8 @@ def print_runs(table: dict[str, np.ndarray], shown: Sequence[Channel]) -> None:
         "configuration": ("configuration", ""), "supply_voltage_V": ("supply voltage [V]", "g"),
         **({} if "supply_voltage_V" in table else {"motor_speed_rpm": ("motor speed [rpm]", ".1f")}),
         "total_mass_kg": ("total mass [kg]", "g"), "slope_deg": ("slope [deg]", "g"),
+        "duty_left": ("duty, left", ".4g"), "duty_right": ("duty, right", ".4g"),
+        "heading_deg": ("heading [deg]", "g"),
         **{c.column: (f"{c.label} [{c.unit}]", f".{c.resolution}f") for c in shown},
         PEAK: ("peak current, all motors [A]", ".1f"), "displacement_m": ("displacement [m]", ".2f"),
         "time_end_s": ("time [s]", ".6g"), "voltage_cell_V": ("voltage of a cell [V]", ".3f"),

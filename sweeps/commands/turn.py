@@ -77,7 +77,8 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         turn = {name: _number(table[name][0]) for name in derived.COLUMNS}
         facts = turn_words.turn(robot, {name: values[0] for name, values in table.items()}, _ended(history))
         say(facts.answer)
-        print_sides(facts.sides)
+        if facts.sides:
+            print_sides(facts.sides)
         for note in facts.notes:
             say(f"- {note}")
         if (stands := posture.postures(robot, runs, asked)) is not None:

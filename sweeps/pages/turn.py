@@ -65,7 +65,6 @@ def write(
         facts=facts,
         about={heading: form.format(row[c]) for c, (heading, form) in conditions(imposed, mass=True).items()},
         settled=history is None,
-        heading=float(row.get("heading_deg", 0.0)),
         **named(file),
     )
 

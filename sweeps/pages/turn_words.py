@@ -41,15 +41,16 @@ def turn(robot: Robot, row: Mapping[str, Any], ended: Mapping[str, float] | None
         row: of the table of runs.
         ended: of a run over time `time_s`, `displacement_m` and `turned_deg` at its end; None: a settled turn.
     """
-    status = str(row["status"])
-    going = status in ("converged", "not_settled")
+    status, known = str(row["status"]), math.isfinite(float(row["yaw_rate_rad_s"]))
+    going = known and status in ("converged", "not_settled")
     answer = _moves(row) if going else f"{status}: {words.STATUSES[status].why}"
     if ended is not None and going:
         answer = (
             f"After {ended['time_s']:g} s: {ended['displacement_m']:.2f} m from the start, turned by "
             f"{ended['turned_deg']:.0f}°. {answer if status == 'converged' else _now(row)}"
         )
-    sides = [(label, *(format(float(row[c.format(side)]), form) for side in SIDES)) for label, c, form in ROWS]
+    rows = ROWS if known else ()
+    sides = [(label, *(f"{float(row[c.format(side)]):z{form}}" for side in SIDES)) for label, c, form in rows]
     return Turn(answer, [(a, b, c) for a, b, c in sides], _notes(robot, row) if going else [])
 
 
@@ -79,9 +80,10 @@ def _moves(row: Mapping[str, Any]) -> str:
     if abs(speed) < SPOT:
         minute = 60 / FULL * abs(rate)
         return f"Turns on the spot to the {_way(row)} at {abs(rate):.2f} rad/s, {minute:.1f} turns a minute."
+    back, ahead = ("backward ", "") if speed < 0 else ("", " ahead")
     return (
-        f"Turns {'backward ' if speed < 0 else ''}to the {_way(row)}: a circle of {abs(radius):.0f} mm radius at "
-        f"{abs(speed):.0f} mm/s and {abs(rate):.2f} rad/s, one turn in {FULL / abs(rate):.1f} s."
+        f"Turns {back}to the {_way(row)}: a circle of {abs(radius):.0f} mm radius at {abs(speed):.0f} mm/s{ahead} "
+        f"and {abs(rate):.2f} rad/s, one turn in {FULL / abs(rate):.1f} s."
     )
 
 
@@ -89,7 +91,7 @@ def _notes(robot: Robot, row: Mapping[str, Any]) -> list[str]:
     notes = []
     own = float(robot.configurations[str(row["configuration"])].turning.width) / MM
     width = float(row["effective_width_mm"])
-    if math.isfinite(width) and not _sloping(row):
+    if math.isfinite(width) and not _sloping(row) and row["status"] == "converged":
         notes.append(
             f"effective track width {width:.0f} mm, {width / own:.2f} times the {own:.0f} mm between the sides: the "
             "difference of the sides' speeds that a turn takes, over what it would take without sliding"

@@ -34,8 +34,10 @@ STATUSES: dict[str, Status] = {
     ),
     "not_settled": Status(
         "not settled",
-        "still accelerating at the end of the run; try a longer --duration",
-        "still gaining speed when the simulated time ended",
+        "still accelerating at the end of the run (try a longer --duration), or a turn that has no steady state, "
+        "which --model drive follows",
+        "still gaining speed when the simulated time ended, or a turn for which no steady state was found, as where "
+        "friction falls with sliding",
     ),
     "battery_empty": Status("battery empty", "the battery has no charge left", "the battery's capacity is used up"),
     "failed": Status("failed", "the solver gave up", "the solver found no answer; please report the conditions"),

@@ -57,7 +57,8 @@ def prepare(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> scal
         raise BadConfiguration(f"{where}, outputs: got {unknown[0]}; {choices(unknown[0], task.attributes, 3)}")
     assert config.chunk is not None
     blocks = Blocks.of(plan.design.shape, config.chunk)
-    _bearable(plan.varied(robot), task, plan)
+    if profile is None and task.run is None:
+        _bearable(plan.varied(robot), task, plan)
     return scale.Job(robot, task, plan, config.outputs, config.storage, blocks, profile)
 
 
@@ -94,8 +95,6 @@ def _bearable(variation: Variation, task: Task, plan: axes.Plan) -> None:
     Raises:
         BadConfiguration: one that it cannot bear.
     """
-    if not task.options:
-        return
     fidelity = fidelities.get(task.model)
     shape = plan.design.shape
     ends = itertools.product(*({0, n - 1} for n in shape[:4]))
