@@ -191,6 +191,15 @@ BAD = {
         r"no settled stretch: what is imposed holds for 0\.\d+ s at most \(rows \d+ to \d+\), and 0\.3 s are asked for; "
         "hold each level longer, state --shortest, or give the log to loop as it is",
     ),
+    "no sign of the duty, levels repeated": (
+        lambda c: (
+            stairs((6.0,) * 6)
+            | {"supply_voltage_V": np.full(1200, 12.0), "duty": np.repeat([0.5, 0.6] * 3, 200)}
+            | {"motor_speed_rpm": np.repeat([1, 1.2, -1, -1.2, 1, 1.2], 200) * (1000 + np.arange(1200) % 3)}
+        ),
+        r"motor_speed_rpm: shows -1001 rpm at 6 V; expected the sign of what is imposed; give duty the sign",
+    ),
+    "nothing imposed": (lambda c: c | {"supply_voltage_V": np.zeros(600)}, r"no settled stretch: idle"),
     "never settles": (
         lambda c: (
             stairs((12.0,), 600) | {"motor_speed_rpm": 300 + 200 * c["time_s"]}
@@ -393,3 +402,10 @@ def test_25_000_rows_are_settled_in_seconds(tmp_path):
 
 def test_every_reason_has_words():
     assert set(words.WHY) == set(settling.REASONS)
+
+
+def test_a_column_without_a_role_may_be_empty_for_a_while(tmp_path):
+    columns = stairs() | {"ambient_C": np.where(np.arange(600) < 250, "", "21.5")}
+    robot = bench(tmp_path, columns)
+    found = settled(tmp_path, robot).table()["ambient_C"]
+    np.testing.assert_array_equal(found, [np.nan, 21.5, 21.5])

@@ -144,7 +144,7 @@ class Settled:
             if name in read or (name == "mode"):
                 continue
             if column.dtype.kind == "f":
-                found[name] = np.array([_digits(np.nanmean(column[s.rows])) for s in kept])
+                found[name] = np.array([_digits(_plain(column[s.rows])) for s in kept])
             else:
                 found[name] = np.array([str(column[s.rows[0]]) for s in kept])
         for signal in self.signals:
@@ -206,13 +206,12 @@ def settle(
             for level in _levels(runs, drives, part, shortest, drift, step):
                 found.append(_settled(runs, signals, drives, level, shortest, drift, step, stuck, inertia or {}))
     scatter = _scatter(runs, found, signals, float(np.max(np.abs(drives))))
-    found = [_wider(s, scatter) for s in found]
     result = Settled(runs, tuple(found), signals, shortest, drift, tuple(gaps), scatter)
     if not result.kept:
         raise BadData(_nothing(result))
-    _check_signs(result)
+    _check_signs(result)  # by sds of their own: repeats whose signs differ widen them
     _check_units(result, rolling or {})
-    return result
+    return dataclasses.replace(result, stretches=tuple(_wider(s, scatter) for s in found))
 
 
 # --- time and channels ----------------------------------------------------------------------------------
@@ -390,7 +389,7 @@ def _settled(
         return out("undriven")
     if end - begin + step < shortest or len(rows) < FEWEST:
         return out("changes" if len(rows) < FEWEST else "short")
-    if abs(imposed) < STILL * float(np.max(np.abs(drives))):
+    if abs(imposed) <= STILL * float(np.max(np.abs(drives))):
         return out("idle")
     for signal in signals:
         if stuck[signal.channel.name][rows].mean() > 0.5:
