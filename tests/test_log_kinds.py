@@ -7,6 +7,7 @@ import pytest
 
 from calibration.data import robot_file, settling
 from calibration.data import runs as records
+from calibration.inference import bases, observers
 from calibration.inference.preparation import prepare
 from sweeps.commands import rig_new
 from sweeps.points import run as points
@@ -107,3 +108,24 @@ def test_the_model_follows_such_a_log_with_the_numbers_that_it_was_made_of(tmp_p
     shown = points.followed(ready.robot, runs, None)
     error = np.std(shown[column] - runs[column])
     assert error < 0.01 * np.ptp(runs[column]) and error > 0.1 * least
+
+
+def test_curves_are_over_the_voltage_at_motors_whose_speed_no_channel_reads(tmp_path, monkeypatch):
+    """Of a servo on PWM the duty's share of the supply; while the circuit is open, the back-EMF of the run itself."""
+    log = {name: column[::2] for name, column in servo(np.random.default_rng(4), levels=(0.9,), hold=0.5).items()}
+    driven = np.arange(len(log["time_s"])) < 15
+    log["duty"] = np.where(driven, log["duty"], 0.0)
+    written(tmp_path, "servo", log)
+    text = (tmp_path / "log.csv").read_text(encoding="utf-8").splitlines()
+    modes = ("mode", *np.where(driven, "voltage", "coast"))
+    (tmp_path / "log.csv").write_text("\n".join(map(",".join, zip(text, modes, strict=True))), encoding="utf-8")
+    robot = robot_file.read(tmp_path / "rig.toml")
+    runs = records.read(tmp_path / "log.csv", robot=robot)
+    observer = observers.Histories.of(runs, robot)
+    seen = {}
+    monkeypatch.setattr(bases, "families", lambda columns, *_: seen.update(columns) or ())
+    observer.bases(dict(runs.columns), np.ones(len(runs), bool), robot)
+    volts = seen["supply_voltage_V"]
+    assert volts[driven] == pytest.approx(0.9 * 6.0)
+    rolls_out = volts[~driven]
+    assert 0 < rolls_out[0] < 0.9 * 6.0 and (np.diff(rolls_out) < 1e-3).all() and rolls_out[-1] < 0.5 * rolls_out[0]

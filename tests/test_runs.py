@@ -50,6 +50,16 @@ def test_a_configuration_that_the_robot_lacks_is_refused_with_those_it_has(tmp_p
         runs.conditions(robot)
 
 
+def test_columns_without_a_name_are_nothing_or_called_by_their_place(tmp_path):
+    plain = records.read(write(tmp_path, f"{HEADER}\n{ROW}\n"))
+    for text in (f"{HEADER},\n{ROW},\n", f"{HEADER}\n{ROW},,\n", f"{HEADER},,\n{ROW}\n"):
+        runs = records.read(write(tmp_path, text))
+        assert runs.unknown == () and set(runs.columns) == set(plain.columns)
+    assert records.read(write(tmp_path, f",{HEADER}\n7,{ROW}\n")).unknown == ("column 1",)
+    with pytest.raises(BadData, match=r"row 1: got 10 cells; the header has 8 columns"):
+        records.read(write(tmp_path, f"{HEADER}\n{ROW},,9\n"))
+
+
 def test_missing_readings_are_nan_and_counted(tmp_path):
     header = HEADER.replace(",motor_speed_rpm", "")
     runs = records.read(write(tmp_path, f"{header}\n6T2A,15,13.1,0,5,2.75,400\n6T2A,15,13.1,0,5,,400\n"))

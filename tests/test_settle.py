@@ -88,6 +88,31 @@ def test_sds_hold_over_random_logs(tmp_path):
     assert kept > 0.8 * levels
 
 
+def test_means_hold_where_starts_take_many_times_the_settled_current(tmp_path):
+    """A motor's current after a step of voltage: I = I_∞ + (I_0 - I_∞) exp(-t / T), speed alike."""
+    R, C, K, dry, lag, z = 1.2, 0.05, 1e-4, 0.02, 0.18, []
+    rng = np.random.default_rng(5)
+    for hold in (120, 150, 200):
+        volts = np.repeat(rng.permutation(np.arange(3.0, 19.0)), hold)
+        speeds = (volts - R * dry / C) / (C + R * K / C)
+        shown = np.empty(len(volts))
+        turns = 0.0
+        for k, target in enumerate(speeds):
+            shown[k] = turns
+            turns = target + (turns - target) * np.exp(-0.01 / lag)
+        columns = {
+            "time_s": np.round(np.arange(len(volts)) / 100, 4),
+            "supply_voltage_V": volts,
+            "total_current_A": (volts - C * shown) / R + 0.01 * rng.standard_normal(len(volts)),
+            "motor_speed_rpm": shown * 30 / np.pi + 3 * rng.standard_normal(len(volts)),
+        }
+        found = settled(tmp_path, bench(tmp_path, columns))
+        assert len(found.kept) > (10 if hold > 120 else 4)
+        truth = [(dry + K * speeds[s.rows[0]]) / C for s in found.kept]
+        z += [(s.mean["total_current"] - x) / s.sd["total_current"] for s, x in zip(found.kept, truth, strict=True)]
+    assert np.sqrt(np.mean(np.square(z))) == pytest.approx(0.9, abs=0.25) and np.abs(z).max() < 3.5
+
+
 def test_a_log_that_is_left_too_early_is_not_settled(tmp_path):
     """The comparison can fail: with a lag of a quarter of the level hardly anything has settled."""
     _, world, robot = made(tmp_path, 6, "tracked", "voltage", lag=0.5)
@@ -166,8 +191,19 @@ BAD = {
         r"no settled stretch: what is imposed holds for 0\.\d+ s at most \(rows \d+ to \d+\), and 0\.3 s are asked for; "
         "hold each level longer, state --shortest, or give the log to loop as it is",
     ),
+    "no sign of the duty, levels repeated": (
+        lambda c: (
+            stairs((6.0,) * 6)
+            | {"supply_voltage_V": np.full(1200, 12.0), "duty": np.repeat([0.5, 0.6] * 3, 200)}
+            | {"motor_speed_rpm": np.repeat([1, 1.2, -1, -1.2, 1, 1.2], 200) * (1000 + np.arange(1200) % 3)}
+        ),
+        r"motor_speed_rpm: shows -1001 rpm at 6 V; expected the sign of what is imposed; give duty the sign",
+    ),
+    "nothing imposed": (lambda c: c | {"supply_voltage_V": np.zeros(600)}, r"no settled stretch: idle"),
     "never settles": (
-        lambda c: c | {"supply_voltage_V": np.full(600, 12.0), "motor_speed_rpm": 300 + 200 * c["time_s"]},
+        lambda c: (
+            stairs((12.0,), 600) | {"motor_speed_rpm": 300 + 200 * c["time_s"]}
+        ),
         r"never settles: at the end of its longest level \(rows 1 to 600\) motor_speed still changes by .* state --drift",
     ),
     "few samples": (lambda c: cut(c, slice(5)), r"5 samples in its longest run; at least 8 are needed"),
@@ -366,3 +402,10 @@ def test_25_000_rows_are_settled_in_seconds(tmp_path):
 
 def test_every_reason_has_words():
     assert set(words.WHY) == set(settling.REASONS)
+
+
+def test_a_column_without_a_role_may_be_empty_for_a_while(tmp_path):
+    columns = stairs() | {"ambient_C": np.where(np.arange(600) < 250, "", "21.5")}
+    robot = bench(tmp_path, columns)
+    found = settled(tmp_path, robot).table()["ambient_C"]
+    np.testing.assert_array_equal(found, [np.nan, 21.5, 21.5])

@@ -53,6 +53,9 @@ def cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], tuple[str, 
     mark = next((m for m in SEPARATORS if m in header and "," not in header), ",")
     rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=mark)]
     rows = [row for row in rows if any(row)]
+    named = max((j + 1 for j, cell in enumerate(rows[0]) if cell), default=0) if rows else 0
+    if not any(any(row[named:]) for row in rows):  # separators at the ends of lines
+        rows = [row[:named] for row in rows]
     if mark == ",":
         return rows, ()
     said = f"{name}: columns are separated by {SEPARATORS[mark]}"

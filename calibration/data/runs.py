@@ -86,7 +86,8 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
     if not rows:
         expected = ", ".join((*layout.required(measured=True, battery=False), *layout.measured_columns))
         raise BadData(f"{name}: the file is empty; expected a header with {expected}")
-    header, capitals = _in_case(name, rows[0], layout, inferred)
+    named = [column or f"column {k}" for k, column in enumerate(rows[0], 1)]
+    header, capitals = _in_case(name, named, layout, inferred)
     repeated = sorted({c for c in header if header.count(c) > 1})
     if repeated:
         raise BadData(f"{name}: column {repeated[0]} stands {header.count(repeated[0])} times; expected once")

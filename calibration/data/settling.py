@@ -144,7 +144,7 @@ class Settled:
             if name in read or (name == "mode"):
                 continue
             if column.dtype.kind == "f":
-                found[name] = np.array([_digits(np.nanmean(column[s.rows])) for s in kept])
+                found[name] = np.array([_digits(_plain(column[s.rows])) for s in kept])
             else:
                 found[name] = np.array([str(column[s.rows[0]]) for s in kept])
         for signal in self.signals:
@@ -206,13 +206,12 @@ def settle(
             for level in _levels(runs, drives, part, shortest, drift, step):
                 found.append(_settled(runs, signals, drives, level, shortest, drift, step, stuck, inertia or {}))
     scatter = _scatter(runs, found, signals, float(np.max(np.abs(drives))))
-    found = [_wider(s, scatter) for s in found]
     result = Settled(runs, tuple(found), signals, shortest, drift, tuple(gaps), scatter)
     if not result.kept:
         raise BadData(_nothing(result))
-    _check_signs(result)
+    _check_signs(result)  # by sds of their own: repeats whose signs differ widen them
     _check_units(result, rolling or {})
-    return result
+    return dataclasses.replace(result, stretches=tuple(_wider(s, scatter) for s in found))
 
 
 # --- time and channels ----------------------------------------------------------------------------------
@@ -390,7 +389,7 @@ def _settled(
         return out("undriven")
     if end - begin + step < shortest or len(rows) < FEWEST:
         return out("changes" if len(rows) < FEWEST else "short")
-    if abs(imposed) < STILL * float(np.max(np.abs(drives))):
+    if abs(imposed) <= STILL * float(np.max(np.abs(drives))):
         return out("idle")
     for signal in signals:
         if stuck[signal.channel.name][rows].mean() > 0.5:
@@ -431,36 +430,44 @@ def _settled(
         )
         if share > drift + SDS * noise:
             return out("accelerates", acting.speed, share)
-    # What changes for certain goes on after the end, of a lag's tail about as much again, and all channels with it.
-    sds = {name: math.hypot(sd, left_over * abs(means[name])) for name, sd in sds.items()}
     for signal in signals:
-        means.setdefault(signal.channel.name, math.nan)
-        sds.setdefault(signal.channel.name, math.nan)
-        drifts.setdefault(signal.channel.name, math.nan)
+        name = signal.channel.name
+        means.setdefault(name, math.nan)
+        # What changes goes on after the end, of a lag's tail about as much again, and all channels with it.
+        sds[name] = math.hypot(sds.get(name, math.nan), left_over * _scale(signal, means[name]))
+        drifts.setdefault(name, math.nan)
     return dataclasses.replace(left, rows=taken, begin=float(time[taken[0]]), mean=means, sd=sds, drift=drifts)
 
 
+def _scale(signal: Signal, mean: float) -> float:
+    """What shares of a channel's change are of [unit]: its mean, at least a tenth of its largest readings."""
+    return max(abs(mean), 0.1 * signal.largest)
+
+
 def _certain(signal: Signal, mean: float, sd: float, change: float) -> float:
-    """What of the change along a stretch is no noise, as a share of the mean."""
+    """What of the change along a stretch is no noise, as a share of `_scale`."""
     if not math.isfinite(mean):
         return 0.0
-    return max(abs(change) - OF_CHANGE * sd, 0.0) / max(abs(mean), 0.1 * signal.largest)
+    return max(abs(change) - OF_CHANGE * sd, 0.0) / _scale(signal, mean)
 
 
 def _to_come(signal: Signal, rows: np.ndarray, mean: float) -> float:
-    """What of the change along a level is still to come at its end, as a share of the mean: of a lag's tail, of which
-    quarters of the level show how fast it fades; 0 where noise hides it."""
+    """What of the change along a level is still to come at its end, as a share of `_scale`: of a lag's tail, of which
+    quarters of the level show how fast it fades; where noise hides the last change, what those before leave of it."""
     quarters = [signal.shown[q] for q in np.array_split(rows, 4)]
     quarters = [q[np.isfinite(q)] for q in quarters]
     if min(map(len, quarters)) < PART:
         return 0.0
-    at = [float(np.mean(q)) for q in quarters]
-    sd = [float(np.std(q)) * math.sqrt(_correlation_time(q - np.mean(q)) / len(q)) for q in quarters[2:]]
-    before, last = at[2] - at[1], at[3] - at[2]
-    if abs(last) < SDS * math.hypot(*sd) or before * last <= 0:
+    first, before, last = np.diff([float(np.mean(q)) for q in quarters]).tolist()
+    place = np.arange(len(quarters[3]))  # the last quarter alone: in those before, a lag's decay is no noise
+    rest = quarters[3] - np.polyval(np.polyfit(place, quarters[3], 1), place)
+    seen = SDS * math.sqrt(2 * _correlation_time(rest) / len(rest)) * float(np.std(rest))
+    earlier, later = (before, last) if abs(last) >= seen else (first, before)
+    if abs(later) < seen or earlier * later <= 0:
         return 0.0
-    fades = min(last / before, 0.9)
-    return abs(last) * fades / (1 - fades) / max(abs(mean), 0.1 * signal.largest)
+    fades = min(later / earlier, 0.9)
+    last = abs(last) if abs(last) >= seen else min(abs(later) * fades, seen)
+    return last * fades / (1 - fades) / _scale(signal, mean)
 
 
 def _size(shown: np.ndarray) -> float:

@@ -46,7 +46,7 @@ from calibration.inference.optimizers import (
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax import balances, channels, fidelities, params
-from mmrjax.channels import RPM, Channel
+from mmrjax.channels import Channel
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
@@ -604,13 +604,10 @@ class Histories(Observer):
         """Curves and windows as of settled runs, over time too, and waves in the angle of a shaft. Over the voltage
         are those over the motors' voltage where that is not the supply's."""
         rows = jax.tree.map(np.asarray, self.of_rows)
+        angle, electromotive = (np.nan_to_num(np.asarray(x)) for x in _turning(self, robot))
         if (rows.duty != 1).any():
-            speed = columns["motor_speed_rpm"] * RPM
-            at_motors = np.where(
-                rows.open > 0.5, float(robot.motor.torque_constant) * speed, rows.voltage * rows.duty
-            )
+            at_motors = np.where(rows.open > 0.5, electromotive, rows.voltage * rows.duty)
             columns = {**columns, "supply_voltage_V": at_motors}
-        angle = np.nan_to_num(np.asarray(_angle(self, robot)))
         which = self.conditions.configuration
         on_tracks = np.broadcast_to(jax.vmap(robot.chassis)(which).on_tracks > 0.5, np.shape(which))
         waves = bases_room.waves(on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots), robot)
@@ -849,8 +846,10 @@ def _readings(robot: Robot, signals: Signals) -> Float[Array, " channels"]:
 
 
 @compiled
-def _angle(observe: Histories, robot: Robot) -> Array:
-    return observe.angle(observe.whole(robot))
+def _turning(observe: Histories, robot: Robot) -> tuple[Array, Array]:
+    """Angle of the driving shaft and back-EMF at every row."""
+    whole = observe.whole(robot)
+    return observe.angle(whole), observe.at_rows(whole).voltage_back
 
 
 @compiled
