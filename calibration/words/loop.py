@@ -403,8 +403,8 @@ def _estimate(found: Estimate) -> str:
 
 
 def alike(found: DiscoveryResult, e: FoundEffect) -> str:
-    """What these data cannot tell from an effect: others (of settled runs also what settles to one of them), and stated
-    values that may be wrong instead."""
+    """What these data cannot tell from an effect: others, of settled runs also what settles to one of them, and
+    stated values that may be wrong instead."""
     settled = [x.name for x in effects.ALL if x.settles_to in e.members and not found.runs.sampled]
     others = ", ".join(
         [
