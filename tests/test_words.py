@@ -485,6 +485,16 @@ def test_verdict_lists_what_cannot_be_told_apart():
     )
 
 
+@pytest.mark.parametrize(("sampled", "said"), [
+    (False, "angle_friction (at 1.5 times its largest plausible size), torque_offset (time histories alone tell that)"),
+    (True, "angle_friction (at 1.5 times its largest plausible size)"),
+])  # fmt: skip
+def test_what_settled_runs_cannot_tell_from_an_effect_is_said_of_them_alone(sampled, said):
+    members = {"directional_friction": SimpleNamespace(size=0.1), "angle_friction": SimpleNamespace(size=1.5)}
+    effect = SimpleNamespace(members=members, stated={})
+    assert loop.alike(SimpleNamespace(runs=SimpleNamespace(sampled=sampled)), effect) == said
+
+
 def test_a_formula_without_terms_says_so():
     assert Formula("", "mark", (), (), 0.0, 9).formula == "none: no term shows in these data"
     assert Formula("ΔU = 1 V", "mark", (1.0,), (0.1,), 3.0, 9).to_json()["formula"] == "ΔU = 1 V"

@@ -13,7 +13,7 @@ from calibration.discovery.settings import FIT, HELD_OUT
 from calibration.inference import bases
 from calibration.inference import blocks as blocks_room
 from calibration.words import fits
-from mmrjax import channels
+from mmrjax import channels, effects
 
 if TYPE_CHECKING:
     from calibration.discovery.clusters import Cluster
@@ -402,11 +402,16 @@ def _estimate(found: Estimate) -> str:
     return f"{found.value:.3g} ± {found.sd:.2g} {found.unit}".rstrip(" -")
 
 
-def alike(e: FoundEffect) -> str:
-    """What these data cannot tell from an effect: other effects, and stated values that may be wrong instead."""
+def alike(found: DiscoveryResult, e: FoundEffect) -> str:
+    """What these data cannot tell from an effect: others, of settled runs also what settles to one of them, and
+    stated values that may be wrong instead."""
+    settled = [x.name for x in effects.ALL if x.settles_to in e.members and not found.runs.sampled]
     others = ", ".join(
-        name + (f" (at {m.size:.2g} times its largest plausible size)" if m.size >= 1 else "")
-        for name, m in list(e.members.items())[1:]
+        [
+            name + (f" (at {m.size:.2g} times its largest plausible size)" if m.size >= 1 else "")
+            for name, m in list(e.members.items())[1:]
+        ]
+        + [f"{name} (time histories alone tell that)" for name in settled if name not in e.members]
     )
     values = " or ".join(stated_value(name, s) for name, s in e.stated.items())
     return ", or ".join(words for words in (others, values) if words)

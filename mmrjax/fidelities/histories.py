@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mmrjax.conditions import Conditions
+from mmrjax.elimination import inverted, solved
 from mmrjax.fidelities.drive import GROUND, MOTOR, moving, rates, start, state_of, units
 from mmrjax.params import Scalar
 from mmrjax.rarely import rarely
@@ -110,7 +111,7 @@ def _stage(robot: Robot, conditions: Conditions, known: Array, guess: Array, h: 
     def newton(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         count, y, _ = state
         matrix, value = _matrix(robot, conditions, y, _GAMMA * h)
-        step = jnp.linalg.solve(matrix, y - known - _GAMMA * h * value)
+        step = solved(matrix, y - known - _GAMMA * h * value)
         # Over a kink of the friction law full steps can swing to and fro for ever.
         whole, part = y - step, y - 0.3 * step
         of_whole, of_part = jnp.max(jnp.abs(left(whole))), jnp.max(jnp.abs(left(part)))
@@ -201,11 +202,11 @@ def respond(
     )
     places = tuple(jnp.where(through.any[:, None], a, b) for a, b in zip(off_rest, stages, strict=True))
 
-    def solved(t: tuple, stage: tuple, span: tuple, passes: Array, turns: Array, now: Conditions) -> tuple:
+    def linear(t: tuple, stage: tuple, span: tuple, passes: Array, turns: Array, now: Conditions) -> tuple:
         """Of each stage, by what matrix a change before the step is multiplied, and what the sources add."""
         held = eqx.combine(now, constant)
         jump = rarely(turns, _jump, (robot, held, stage[1]), jnp.zeros_like(stage[1]))
-        first, second = (jnp.linalg.inv(_matrix(robot, held, y, x)[0]) for y, x in zip(stage, span, strict=True))
+        first, second = (inverted(_matrix(robot, held, y, x)[0]) for y, x in zip(stage, span, strict=True))
         one, two = (x * source(at, y, held) for at, y, x in zip(t, stage, span, strict=True))
 
         def known(d1: Array, dy: Array) -> Array:
@@ -221,7 +222,7 @@ def respond(
 
     def block(dy: Array, inputs: tuple) -> tuple[Array, tuple[Array, ...]]:
         t, stage, span, passes, turns, now, then = inputs
-        one, two = jax.vmap(solved)(t, stage, span, passes, turns, now)
+        one, two = jax.vmap(linear)(t, stage, span, passes, turns, now)
         end, before = jax.lax.scan(lambda dy, step: (after(dy, step), dy), dy, two)
         changes = jax.vmap(after)(before, one), jnp.concatenate([before[1:], end[None]])
         whole = jax.vmap(lambda y, dy, changing: seen(y, dy, eqx.combine(changing, constant)))

@@ -134,7 +134,7 @@ def print_discovery(found: DiscoveryResult) -> None:
         for e in found.effects:
             shown.add_row(
                 said_of.called(found, e), ", or ".join(e.families), said_of.size(e),
-                f"{e.score:.0f}", f"{e.p_value:.2g}", said_of.alike(e) or "-",
+                f"{e.score:.0f}", f"{e.p_value:.2g}", said_of.alike(found, e) or "-",
             )  # fmt: skip
         say(shown)
         say("lowers misfit by: rise of χ² without it, all else refitted; own p: among the strongest of the library")

@@ -61,7 +61,7 @@ def alike(found: DiscoveryResult) -> list[str]:
     """Of each effect, and of a discrepancy without a name, what these data cannot tell from it, in words."""
     curve = [] if found.unnamed is None else [found.unnamed]
     without_name = [", ".join(b for b in c.balances_alike if b != c.balance) for c in curve]
-    return [*(words.alike(e) for e in found.effects), *without_name]
+    return [*(words.alike(found, e) for e in found.effects), *without_name]
 
 
 def findings(found: DiscoveryResult, changed: Mapping[str, Change]) -> list[dict[str, str]]:
@@ -71,7 +71,7 @@ def findings(found: DiscoveryResult, changed: Mapping[str, Change]) -> list[dict
         size = words.size(e)
         if (change := changed.get(e.name)) is not None:
             size += f", which changes the {change.channel.label} by {change.rms:.2g} %"
-        sure, other = words.how_sure(found, e), words.alike(e)
+        sure, other = words.how_sure(found, e), words.alike(found, e)
         listed.append({"name": e.name, "what": ", or ".join(e.families), "size": size, "sure": sure, "alike": other})
     return listed
 

@@ -849,7 +849,7 @@ def _readings(robot: Robot, signals: Signals) -> Float[Array, " channels"]:
 def _turning(observe: Histories, robot: Robot) -> tuple[Array, Array]:
     """Angle of the driving shaft and back-EMF at every row."""
     whole = observe.whole(robot)
-    return observe.angle(whole), observe.at_rows(whole).voltage_back
+    return observe.angle(whole), jnp.asarray(observe.at_rows(whole).voltage_back)
 
 
 @compiled
