@@ -145,7 +145,7 @@ def row(**changes):
     usual = {
         "configuration": "6T2A", "status": "converged", "yaw_rate_rad_s": 0.5, "turning_radius_mm": 400.0,
         "speed_mm_s": 200.0, "effective_width_mm": 365.0, "power_left_W": 5.0, "power_right_W": 5.0,
-        "winding_left_C": 40.0, "winding_right_C": 40.0, "power_supply_W": 10.0, "slope_deg": 0.0,
+        "winding_left_C": 40.0, "winding_right_C": 40.0, "power_supply_W": 10.0, "slope_deg": 0.0, "flags": "",
     }  # fmt: skip
     return usual | sides | changes
 
@@ -211,6 +211,9 @@ def test_turns_are_told_in_plain_words():
     assert "Straight at 200 mm/s" in said(slope_deg=10.0, turning_radius_mm=float("inf"), yaw_rate_rad_s=0.0)
     assert "stalled" in said(status="stalled")
     assert "track width" not in said(status="not_settled")
+    assert "winding_hot: winding hotter than permitted" in said(flags="gearbox_overspeed;winding_hot")
+    hot = turn_words.turn(robot, row(winding_left_C=float("inf"), power_right_W=-0.01), None)
+    assert hot.sides[-2:] == [("electrical power [W]", "5.0", "0.0"), (hot.sides[-1][0], "none settles", "40")]
     nothing = {name: float("nan") for name, value in row().items() if isinstance(value, float)}
     none = turn_words.turn(robot, row(status="not_settled", **nothing), None)
     assert none.answer.startswith("not_settled: ") and "no steady state" in none.answer
