@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+import mmrjax as mm
 from calibration.data import runs as records
 from calibration.data.errors import BadData
 from mmrjax import robots
@@ -184,6 +185,33 @@ def test_options_of_one_run_are_refused_beside_a_table(tmp_path, mmrjax):
     for more in ((), ("--profile", "patrol", "--battery")):
         code, _, err = mmrjax("simulate", "--runs", path, "--voltage", "4", "--mass", "12", *more)
         assert code == 2 and "--voltage, --mass: got it beside --runs" in err
+
+
+@pytest.mark.parametrize(
+    ("told", "said"),
+    [
+        ("motor_speed_left = 800", "motor_speed_left: got it without motor_speed_right; state both"),
+        ("duty = 0.5", "duty: got it beside duty_left and duty_right"),
+    ],
+)
+def test_a_sweep_refuses_what_leaves_open_what_drives_a_side(tmp_path, mmrjax, told, said):
+    (tmp_path / "plan.toml").write_text(PLAN.replace("[axes]", f"{told}\n[axes]"))
+    code, _, err = mmrjax("sweep", "plan.toml", "--no-report", "--out", "run")
+    assert code == 2 and said in err
+
+
+def test_a_robot_that_cannot_turn_is_refused_wherever_it_is_asked_to(tmp_path, mmrjax):
+    (tmp_path / "plan.toml").write_text(PLAN)
+    narrow = "--set", "6T2A.turning.width=0", "--no-report"
+    told = ("sweep", "plan.toml"), ("sensitivity", "--configurations", "6T2A", "--vary", "duty_left=0.5:1")
+    for words in told:
+        code, _, err = mmrjax(*words, *narrow)
+        assert code == 2 and "duty_left: 6T2A.turning.width [m] missing" in err
+
+
+def test_one_imposed_speed_of_two_sides_is_refused():
+    with pytest.raises(mm.UsageError, match="motor_speed_left: got it without motor_speed_right; state both"):
+        mm.simulate(robots.nominal(), mm.Conditions("6T2A", motor_speed_left=800.0))
 
 
 def test_a_sweep_refuses_turns_on_a_slope_which_have_no_steady_state(tmp_path, mmrjax):
