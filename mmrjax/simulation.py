@@ -88,6 +88,7 @@ def simulate(
     _check_battery(robot, conditions)
     if profile is not None:
         return _missions(robot, conditions, profile, start, history)
+    robot = robot.showing_turns() if conditions.turns else robot
     fidelity, traced = fidelities.get(model), has_tracer((robot, conditions))
     if not traced:
         try:

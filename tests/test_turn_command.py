@@ -209,6 +209,14 @@ def test_a_robot_that_cannot_turn_is_refused_wherever_it_is_asked_to(tmp_path, m
         assert code == 2 and "duty_left: 6T2A.turning.width [m] missing" in err
 
 
+def test_results_of_turns_show_both_sides():
+    """Nothing is computed before it is asked for; who travels straight has the columns of before."""
+    robot, sides = robots.nominal(), {"duty_left": 1.0, "duty_right": [0.5, -1.0]}
+    turns, straight = (mm.simulate(robot, mm.Conditions("6T2A", voltage=33.0, **x)) for x in (sides, {}))
+    assert {"yaw_rate", "motor_current_left", "motor_current_right"} <= {c.name for c in turns.channels}
+    assert straight.channels == robot.channels
+
+
 def test_one_imposed_speed_of_two_sides_is_refused():
     with pytest.raises(mm.UsageError, match="motor_speed_left: got it without motor_speed_right; state both"):
         mm.simulate(robots.nominal(), mm.Conditions("6T2A", motor_speed_left=800.0))
