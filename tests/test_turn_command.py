@@ -217,6 +217,12 @@ def test_results_of_turns_show_both_sides():
     assert straight.channels == robot.channels
 
 
+def test_a_surface_of_which_nothing_is_known_is_refused(mmrjax):
+    for more in ((), ("--left", "24", "--right", "10"), ("--model", "drive")):
+        code, _, err = mmrjax("simulate", "--surface", "ice", *more)
+        assert code == 2 and "--surface: got ice, whose friction is not known; allowed: linoleum" in err
+
+
 def test_one_imposed_speed_of_two_sides_is_refused():
     with pytest.raises(mm.UsageError, match="motor_speed_left: got it without motor_speed_right; state both"):
         mm.simulate(robots.nominal(), mm.Conditions("6T2A", motor_speed_left=800.0))
