@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -196,6 +196,16 @@ class Conditions(eqx.Module):
         if which.size and which.min() < 0:
             robot.configurations.index(str(np.unique(self.configuration[which < 0])[0]))
         return dataclasses.replace(self, configuration=jnp.asarray(which))
+
+
+def one_side(stated: Collection[str]) -> str:
+    """What is wrong where conditions of these names impose the speed of one side's motor and not the other's; empty
+    where nothing is."""
+    left, right = (name in stated for name in OF_SIDES[-2:])
+    if left == right or "motor_speed" in stated:
+        return ""
+    known, lacking = OF_SIDES[-2:] if left else OF_SIDES[:-3:-1]
+    return f"{known}: got it without {lacking}; state both"
 
 
 def _number(x: Any, kind: type = float) -> Any:

@@ -116,6 +116,12 @@ class Robot(eqx.Module):
         """Those that its rig's instruments show, in order."""
         return channels.rows(self.rig.channels)
 
+    def showing_turns(self) -> Robot:
+        """With instruments of both sides and of its yaw too."""
+        own = self.rig.channels
+        more = [c.name for c in channels.OF_TURNS if c.settled and c.name not in own]
+        return dataclasses.replace(self, rig=dataclasses.replace(self.rig, channels=(*own, *more)))
+
     @property
     def lacks(self) -> frozenset[str]:
         """Balances that its loads have not."""

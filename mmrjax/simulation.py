@@ -14,7 +14,7 @@ import numpy as np
 
 from mmrjax import channels, fidelities, missions, params, power
 from mmrjax.compiling import compiled
-from mmrjax.conditions import Conditions, indices
+from mmrjax.conditions import Conditions, indices, one_side
 from mmrjax.errors import UsageError, choices
 from mmrjax.fidelities.base import Fidelity, History, Run
 from mmrjax.fidelities.mission import Start
@@ -88,6 +88,7 @@ def simulate(
     _check_battery(robot, conditions)
     if profile is not None:
         return _missions(robot, conditions, profile, start, history)
+    robot = robot.showing_turns() if conditions.turns else robot
     fidelity, traced = fidelities.get(model), has_tracer((robot, conditions))
     if not traced:
         try:
@@ -289,6 +290,8 @@ def _own_mass(own: tuple[Scalar, ...], configuration: jax.Array | np.ndarray, pa
 
 
 def _check_conditions(conditions: Conditions) -> None:
+    if alone := one_side({f.name for f in dataclasses.fields(conditions) if getattr(conditions, f.name) is not None}):
+        raise UsageError(alone)
     ends: dict[int, tuple[float, float]] = {}  # by array: several fields may share one
     for field in dataclasses.fields(conditions):
         value = getattr(conditions, field.name)

@@ -7,7 +7,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from calibration.data import effect_file, posterior, robot_file
+from calibration.data import effect_file, posterior, robot_file, surfaces
 from calibration.data import runs as records
 from calibration.data.columns import IMPOSED, Layout
 from calibration.data.contradictions import misplaced
@@ -15,7 +15,7 @@ from calibration.data.errors import BadConfiguration, choices
 from calibration.data.posterior import Posterior
 from calibration.data.robot_file import RobotFile
 from mmrjax.robot import Robot
-from mmrjax.tables import BENCH
+from mmrjax.tables import BENCH, SURFACES
 from sweeps.config import OneRun, RobotPart
 from sweeps.console import tell
 from sweeps.options import flags
@@ -69,6 +69,22 @@ def check_configurations(robot: Robot, names: tuple[str, ...], where: str) -> No
             raise BadConfiguration(
                 f"{where}: got {name}; the robot has no such configuration; {choices(name, robot.configurations)}"
             )
+
+
+def check_surface(robot: Robot, names: Collection[str], surface: str | None, where: str) -> None:
+    """Refuse a surface of which neither Table 5 nor a configuration of the robot says how it holds.
+
+    Args:
+        names: of the configurations that are simulated.
+
+    Raises:
+        BadConfiguration: says `where`, and which there are.
+    """
+    known = surface is None or surface in SURFACES or not robot.rig.scales_adhesion
+    if not known and not all(surfaces.named(name, str(surface)) in robot.configurations for name in names):
+        raise BadConfiguration(
+            f"{where}: got {surface}, whose friction is not known; {choices(str(surface), SURFACES)}"
+        )
 
 
 def read_runs(
@@ -133,6 +149,7 @@ def one_run(
     if robot.has_ground:
         bench = {"surface": BENCH} if robot.rig.scales_adhesion else {}
         given = {**bench, "payload_kg": 0.0, "slope_deg": 0.0, **given}
+        check_surface(robot, (name,), given.get("surface"), "--surface")
     run = records.single({**given, "configuration": name}, layout)
     if found := misplaced(run, robot):
         _, column, why = found

@@ -471,3 +471,19 @@ def test_posture_of_a_robot_that_states_no_running_gear_is_not_known(robot):
     bare = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, inherits=False))
     with pytest.raises(BadConfiguration, match="step_mm: the robot's file states no running_gear"):
         sheet.refuse(bare, requirements.read("step_mm = 100", "posture.toml"))
+
+
+def test_a_battery_that_the_file_does_not_state_is_no_supply(tmp_path, capsys):
+    assert command(["rig", "new", tmp_path / "rig.toml", "--kind", "wheeled"]) == 0
+    asked = tmp_path / "asked.toml"
+    asked.write_text("mass_kg = 50\nspeed_m_s = 0.5\n")
+    assert command(["check", asked, "--robot", tmp_path / "rig.toml", "--out", tmp_path / "run"]) == 2
+    assert "asked.toml, speed_m_s: the robot's file states no battery" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_a_quantity_does_not_depend_on_is_refused_beside_it(tmp_path, capsys):
+    asked = tmp_path / "asked.toml"
+    asked.write_text("turn_in_place_rad_s = { least = 2, slope_deg = 5 }\n")
+    assert command(["check", asked, "--out", tmp_path / "run"]) == 2
+    assert "slope_deg: yaw rate on the spot does not depend on it; leave it out" in capsys.readouterr().err

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+import mmrjax as mm
 from calibration.data import runs as records
 from calibration.data.errors import BadData
 from mmrjax import robots
@@ -145,7 +146,7 @@ def row(**changes):
     usual = {
         "configuration": "6T2A", "status": "converged", "yaw_rate_rad_s": 0.5, "turning_radius_mm": 400.0,
         "speed_mm_s": 200.0, "effective_width_mm": 365.0, "power_left_W": 5.0, "power_right_W": 5.0,
-        "winding_left_C": 40.0, "winding_right_C": 40.0, "power_supply_W": 10.0, "slope_deg": 0.0,
+        "winding_left_C": 40.0, "winding_right_C": 40.0, "power_supply_W": 10.0, "slope_deg": 0.0, "flags": "",
     }  # fmt: skip
     return usual | sides | changes
 
@@ -186,6 +187,47 @@ def test_options_of_one_run_are_refused_beside_a_table(tmp_path, mmrjax):
         assert code == 2 and "--voltage, --mass: got it beside --runs" in err
 
 
+@pytest.mark.parametrize(
+    ("told", "said"),
+    [
+        ("motor_speed_left = 800", "motor_speed_left: got it without motor_speed_right; state both"),
+        ("duty = 0.5", "duty: got it beside duty_left and duty_right"),
+    ],
+)
+def test_a_sweep_refuses_what_leaves_open_what_drives_a_side(tmp_path, mmrjax, told, said):
+    (tmp_path / "plan.toml").write_text(PLAN.replace("[axes]", f"{told}\n[axes]"))
+    code, _, err = mmrjax("sweep", "plan.toml", "--no-report", "--out", "run")
+    assert code == 2 and said in err
+
+
+def test_a_robot_that_cannot_turn_is_refused_wherever_it_is_asked_to(tmp_path, mmrjax):
+    (tmp_path / "plan.toml").write_text(PLAN)
+    narrow = "--set", "6T2A.turning.width=0", "--no-report"
+    told = ("sweep", "plan.toml"), ("sensitivity", "--configurations", "6T2A", "--vary", "duty_left=0.5:1")
+    for words in told:
+        code, _, err = mmrjax(*words, *narrow)
+        assert code == 2 and "duty_left: 6T2A.turning.width [m] missing" in err
+
+
+def test_results_of_turns_show_both_sides():
+    """Nothing is computed before it is asked for; who travels straight has the columns of before."""
+    robot, sides = robots.nominal(), {"duty_left": 1.0, "duty_right": [0.5, -1.0]}
+    turns, straight = (mm.simulate(robot, mm.Conditions("6T2A", voltage=33.0, **x)) for x in (sides, {}))
+    assert {"yaw_rate", "motor_current_left", "motor_current_right"} <= {c.name for c in turns.channels}
+    assert straight.channels == robot.channels
+
+
+def test_a_surface_of_which_nothing_is_known_is_refused(mmrjax):
+    for more in ((), ("--left", "24", "--right", "10"), ("--model", "drive")):
+        code, _, err = mmrjax("simulate", "--surface", "ice", *more)
+        assert code == 2 and "--surface: got ice, whose friction is not known; allowed: linoleum" in err
+
+
+def test_one_imposed_speed_of_two_sides_is_refused():
+    with pytest.raises(mm.UsageError, match="motor_speed_left: got it without motor_speed_right; state both"):
+        mm.simulate(robots.nominal(), mm.Conditions("6T2A", motor_speed_left=800.0))
+
+
 def test_a_sweep_refuses_turns_on_a_slope_which_have_no_steady_state(tmp_path, mmrjax):
     (tmp_path / "plan.toml").write_text(PLAN.replace("[axes]", "slope_deg = 10\n[axes]"))
     code, _, err = mmrjax("sweep", "plan.toml", "--no-report", "--out", "run")
@@ -211,6 +253,9 @@ def test_turns_are_told_in_plain_words():
     assert "Straight at 200 mm/s" in said(slope_deg=10.0, turning_radius_mm=float("inf"), yaw_rate_rad_s=0.0)
     assert "stalled" in said(status="stalled")
     assert "track width" not in said(status="not_settled")
+    assert "winding_hot: winding hotter than permitted" in said(flags="gearbox_overspeed;winding_hot")
+    hot = turn_words.turn(robot, row(winding_left_C=float("inf"), power_right_W=-0.01), None)
+    assert hot.sides[-2:] == [("electrical power [W]", "5.0", "0.0"), (hot.sides[-1][0], "none settles", "40")]
     nothing = {name: float("nan") for name, value in row().items() if isinstance(value, float)}
     none = turn_words.turn(robot, row(status="not_settled", **nothing), None)
     assert none.answer.startswith("not_settled: ") and "no steady state" in none.answer

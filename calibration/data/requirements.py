@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from calibration.data.errors import BadConfiguration, choices, stated_number, toml_content, toml_text
-from mmrjax.requirements import QUANTITIES, Quantity
+from mmrjax.requirements import AXES, QUANTITIES, Quantity
 from mmrjax.tables import BENCH, CONDITION_LIMITS, SURFACES
 
 SCHEMA = "mmrjax.requirements/1"
@@ -253,6 +253,9 @@ def _requirements(name: str, value: Any, envelope: Envelope, where: str) -> list
     for key in table:
         if key not in known:
             raise BadConfiguration(f"{where}, {_unknown(key, known)}")
+    for key in table:
+        if key in AXES and key not in quantity.axes:
+            raise BadConfiguration(f"{where}, {key}: {quantity.label} does not depend on it; leave it out")
     if not limits:
         raise BadConfiguration(f"{where}: states neither least nor most; expected one of them [{quantity.unit}]")
     if not isinstance(source, str):

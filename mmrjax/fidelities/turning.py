@@ -322,7 +322,7 @@ def circling(robot: Robot, conditions: Conditions) -> tuple[balances.Travel, Pla
     motion, loads, solved = _settled(robot, conditions)
     travel = balances.turning(robot, conditions, motion, loads)
     status = status_keeping(robot, conditions, travel, motion)
-    return travel, motion, jnp.where(solved, status, NOT_SETTLED)
+    return travel, motion, jnp.where(solved | (status == BATTERY_EMPTY), status, NOT_SETTLED)
 
 
 def _size(chassis: Chassis, ahead: Scalar, aside: Scalar, yaw: Scalar) -> Array:

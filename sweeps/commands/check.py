@@ -9,8 +9,11 @@ import numpy as np
 from rich.table import Table
 
 from calibration.data import requirements, robot_file
-from calibration.data.errors import rounded
+from calibration.data.errors import BadConfiguration, rounded
 from calibration.sizing import sheet
+from mmrjax.requirements import CHARGE
+from mmrjax.robot import Robot
+from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import say
 from sweeps.inputs import load_robot
@@ -33,6 +36,7 @@ def check(config: configuration.Check, out: Path | None, force: bool) -> int:
     file = load_robot(config)
     robot = file.robot
     sheet.refuse(robot, asked)
+    _check_charge(robot, asked)
     with open_folder("check", config, robot, out, force) as folder:
         outcomes = sheet.check(robot, asked, changes=config.changes)
         found = CheckResult(asked, robot, outcomes, posture.of_requirements(robot, outcomes))
@@ -46,6 +50,17 @@ def check(config: configuration.Check, out: Path | None, force: bool) -> int:
             solved=words.solved(Counter(o.status for o in found.outcomes)),
             page=page("check", found, file),
         )
+
+
+def _check_charge(robot: Robot, asked: requirements.Requirements) -> None:
+    """Refuse requirements on a battery that the robot's file does not state."""
+    for r in asked.each:
+        depends = CHARGE in r.quantity.axes or r.quantity.group == "endurance"
+        if depends and r.envelope.battery and not capabilities.battery(robot):
+            raise BadConfiguration(
+                f"{asked.source}, {r.name}: the robot's file states no battery; add [battery] to it, or state "
+                "supply_voltage_V in [envelope]"
+            )
 
 
 def _write(folder: RunFolder, config: configuration.Check, found: CheckResult) -> None:

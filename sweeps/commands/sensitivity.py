@@ -137,6 +137,7 @@ def _operating_points(
     for note in notes:
         tell(note)
     names = configurations(stated, robot)
+    imposed.check_turning(robot, ranges, names, "--vary")
     return grid(stated.model_copy(update={"configurations": tuple(dict.fromkeys(names))}), robot, config.battery)
 
 

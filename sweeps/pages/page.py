@@ -159,9 +159,10 @@ def statuses(table: dict[str, np.ndarray]) -> list[dict[str, Any]]:
 
 
 def number(value: Any, form: str = "{:.2f}") -> str:
-    """A number as a page prints it; what is not finite is a dash."""
+    """A number as a page prints it, nothing without a sign; what is not finite is a dash."""
     if isinstance(value, int | float | np.number):
-        return form.format(float(value)) if math.isfinite(float(value)) else "–"
+        text = form.format(float(value)) if math.isfinite(float(value)) else "–"
+        return re.sub(r"^-(?=0\.?0*$)", "", text)
     return str(value)
 
 

@@ -50,8 +50,12 @@ def turn(robot: Robot, row: Mapping[str, Any], ended: Mapping[str, float] | None
             f"{ended['turned_deg']:.0f}°. {answer if status == 'converged' else _now(row)}"
         )
     rows = ROWS if known else ()
-    sides = [(label, *(f"{float(row[c.format(side)]):z{form}}" for side in SIDES)) for label, c, form in rows]
+    sides = [(label, *(_number(float(row[c.format(side)]), form) for side in SIDES)) for label, c, form in rows]
     return Turn(answer, [(a, b, c) for a, b, c in sides], _notes(robot, row) if going else [])
+
+
+def _number(value: float, form: str) -> str:
+    return words.NONE_SETTLES if math.isinf(value) else format(value, f"z{form}")
 
 
 def _sloping(row: Mapping[str, Any]) -> bool:
@@ -111,4 +115,5 @@ def _notes(robot: Robot, row: Mapping[str, Any]) -> list[str]:
             notes.append(f"the {side} motor is driven by the turn: {abs(current):.2f} A brake it{back}")
     if float(row["power_supply_W"]) < 0:
         notes.append("the supply has to take power back")
+    notes += [f"{flag}: {words.FLAGS[flag]}" for flag in str(row["flags"]).split(";") if flag]
     return notes

@@ -106,9 +106,12 @@ def plan(config: Campaign, robot: Robot, where: str) -> Plan:
             f"{where}, voltage: acts without battery only, whose voltage is that of its charge; remove one of them"
         )
     _acting({*fixed, *design.names}, robot, where, surface)
+    which = np.atleast_1d(axes.get(CONFIGURATION, fixed.get(CONFIGURATION, 0.0)))
+    simulated = [robot.configurations.names[int(k)] for k in which]
+    imposed.check_turning(robot, {*fixed, *design.names}, simulated, where)
     if levers := sorted({*fixed, *design.names} & {*LEVERS}):
-        for k in np.atleast_1d(axes.get(CONFIGURATION, fixed.get(CONFIGURATION, 0.0))):
-            if why := without_levers(robot, robot.configurations.names[int(k)]):
+        for name in simulated:
+            if why := without_levers(robot, name):
                 raise BadConfiguration(f"{where}, {levers[0]}: {why}")
     own = AXIS[robot.rig.imposed]
     if not robot.rig.inherits and own not in {*fixed, *design.names} and fixed.get("battery", 0.0) <= 0.5:

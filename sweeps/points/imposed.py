@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 import numpy as np
 
-from calibration.data.columns import Layout
+from calibration.data.columns import SIDES, Layout
+from calibration.data.contradictions import cannot_turn
 from calibration.data.errors import BadConfiguration
 from mmrjax.channels import RPM
+from mmrjax.conditions import OF_TURNS, one_side
 from mmrjax.robot import Robot
 from mmrjax.tables import VOLTAGES_V
 from sweeps import capabilities
@@ -155,3 +157,19 @@ def check_on_ground(robot: Robot, command: str) -> None:
             f"{command}: the robot's load is a shaft, which has no wheels or tracks on a ground; simulate, sweep, "
             "compare, calibrate, loop and sensitivity take it"
         )
+
+
+def check_turning(robot: Robot, stated: Collection[str], names: Iterable[str], where: str) -> None:
+    """Refuse conditions that free a robot to turn which cannot, or that leave open what drives a side.
+
+    Args:
+        stated: names of conditions; names: of the configurations that are simulated.
+    """
+    if not (freed := [name for name in OF_TURNS if name in stated]):
+        return
+    if why := cannot_turn(robot, names):
+        raise BadConfiguration(f"{where}, {freed[0]}: {why}")
+    if why := one_side(stated):
+        raise BadConfiguration(f"{where}, {why}")
+    if "duty" in stated and {*SIDES} <= {*stated}:
+        raise BadConfiguration(f"{where}, duty: got it beside {' and '.join(SIDES)}; expected one of the two")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Collection
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 
 from calibration.data import profiles
 from calibration.data.errors import BadConfiguration, choices
-from mmrjax import __version__, channels, fidelities
+from mmrjax import __version__, fidelities
 from mmrjax.conditions import OF_TURNS
 from mmrjax.profile import Profile
 from mmrjax.robot import Robot
@@ -32,11 +31,7 @@ ASKED = 48
 
 def showing_turns(robot: Robot, conditions: Collection[str]) -> Robot:
     """The robot, with instruments of both sides and of its yaw where conditions of these names free it to turn."""
-    if set(OF_TURNS).isdisjoint(conditions):
-        return robot
-    own = robot.rig.channels
-    more = [c.name for c in channels.OF_TURNS if c.settled and c.name not in own]
-    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, channels=(*own, *more)))
+    return robot if set(OF_TURNS).isdisjoint(conditions) else robot.showing_turns()
 
 
 def prepare(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> scale.Job:

@@ -39,10 +39,12 @@ class CheckResult:
 
     def statement(self) -> str:
         """The sheet in a sentence."""
+        number = len(self.outcomes)
         if not self.missed:
-            return f"All {len(self.outcomes)} requirements are met."
+            return f"All {number} requirements are met." if number > 1 else "The requirement is met."
         each = "; ".join(f"{label(o)} {shortfall(o)}" for o in self.missed)
-        return f"{len(self.missed)} of {len(self.outcomes)} requirements are missed: {each}."
+        verb = "is" if len(self.missed) == 1 else "are"
+        return f"{len(self.missed)} of {number} requirements {verb} missed: {each}."
 
     def to_json(self) -> dict[str, Any]:
         """`result.json`."""
