@@ -364,8 +364,8 @@ def _evidence_over_curves(
         without: the same fit without it; linear: that one, linearised.
     """
     own = _equation(space, effect)
-    there = sum(_equation(space, name) == own for name in space.library.names)
-    cost = _cost_of(space, best, best.active.index(effect), settings) + 2 * math.log(there)
+    offered = sum(_equation(space, name) == own for name in space.library.names)
+    cost = _cost_of(space, best, best.active.index(effect), settings) + 2 * math.log(offered)
     tried = [e for e, over in _curves(space, linear, bases, set()) if equation(over.place) == own]
     return 2 * (without.cost - best.cost) - cost - max(tried, default=-math.inf) + 2 * math.log(max(len(tried), 1))
 
