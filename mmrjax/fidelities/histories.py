@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mmrjax.conditions import Conditions
-from mmrjax.elimination import inverted, solved
 from mmrjax.fidelities.drive import GROUND, MOTOR, moving, rates, start, state_of, units
+from mmrjax.linear_equations import inverted, solved
 from mmrjax.params import Scalar
 from mmrjax.rarely import rarely
 from mmrjax.robot import Robot

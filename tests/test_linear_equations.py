@@ -11,7 +11,7 @@ from test_log_kinds import servo, written
 from calibration.data import runs as records
 from calibration.inference import noise, observers, priors
 from calibration.inference.optimizers import linearised_signed
-from mmrjax.elimination import inverted, solved
+from mmrjax.linear_equations import inverted, solved
 
 #: Primitives that the CPU does by LAPACK.
 LAPACK = r"\b(lu|cholesky|triangular_solve|qr|householder_product|eigh?|svd|schur|tridiagonal_solve)\["
