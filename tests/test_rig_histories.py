@@ -13,6 +13,7 @@ from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration
 from calibration.inference import noise, observers, priors
 from calibration.inference.calibrate import calibrate
+from calibration.inference.linearization import probe
 from calibration.inference.observers.histories import Histories
 from mmrjax import channels, params
 from mmrjax.conditions import Conditions
@@ -183,6 +184,21 @@ def imposed_speed(tmp_path, runs):
     speed = (200 * np.sin(6 * t + run) + 50 * np.sin(14 * t)) / channels.RPM
     columns = {"time_s": t, "run_id": run, "motor_speed_rpm": speed}
     return robot, history(tmp_path, robot, robot, columns, [0.01], 3)
+
+
+def test_a_defect_moves_the_current_of_an_imposed_speed_at_once(tmp_path):
+    """The sum over all knots against the derivative by a constant defect."""
+    robot, runs = imposed_speed(tmp_path, 1)
+    observer, effect = observers.kind(runs).of(runs, robot), probe("track")
+
+    def readings(amplitude):
+        return observer(dataclasses.replace(robot, effects=(dataclasses.replace(effect, amplitude=amplitude),))).reading
+
+    expected = np.asarray(jax.jit(jax.jacfwd(readings))(jnp.asarray(0.0)))[:, 0]
+    found = np.asarray(jax.jit(lambda r: observer.defective(r, (effect,)))(robot))[0, 0]
+    np.testing.assert_allclose(found.sum(0)[:, 0], expected, rtol=1e-7)
+    np.testing.assert_allclose(np.diag(found[:, :, 0]), expected, rtol=1e-7)  # of the knot at each sample alone
+    assert (np.abs(expected) > 0.9).all()  # 1 / (16 × 0.05 N·m/A), over or by an efficiency of 0.8
 
 
 @pytest.mark.slow

@@ -86,9 +86,11 @@ def _in_time(conditions: Conditions) -> tuple[Conditions, Conditions]:
     return eqx.partition(conditions, lambda x: jnp.ndim(x) > 0)
 
 
-def _at_start(robot: Robot, conditions: Conditions) -> Float[Array, " unknowns"]:
+def at_first(robot: Robot, conditions: Conditions) -> tuple[Conditions, Float[Array, " unknowns"]]:
+    """Conditions and state of a run at its first instant."""
     changing, constant = _in_time(conditions)
-    return start(robot, eqx.combine(jax.tree.map(lambda x: x[0], changing), constant))
+    held = eqx.combine(jax.tree.map(lambda x: x[0], changing), constant)
+    return held, start(robot, held)
 
 
 def _matrix(robot: Robot, conditions: Conditions, y: Array, span: Array) -> tuple[Array, Array]:
@@ -141,7 +143,7 @@ def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) 
         return two, (one, two)
 
     steps = (jnp.diff(times), jax.tree.map(lambda x: x[:-1], changing))
-    return jax.lax.scan(step, _at_start(robot, conditions), steps)[1]
+    return jax.lax.scan(step, at_first(robot, conditions)[1], steps)[1]
 
 
 @states.def_jvp
@@ -151,13 +153,13 @@ def _response(primals: tuple, tangents: tuple) -> tuple[tuple[Array, Array], tup
     stages = states(robot, conditions, times)
     begin = None
     if robot.rig.begins is not None:
-        begin = eqx.filter_jvp(lambda r: _at_start(r, conditions), (robot,), (moved,))[1]
+        begin = eqx.filter_jvp(lambda r: at_first(r, conditions)[1], (robot,), (moved,))[1]
 
     def source(_: Array, y: Array, held: Conditions) -> Array:
         change = eqx.filter_jvp(lambda r: rates(r, held, y), (robot,), (moved,))[1]
         return jnp.zeros_like(y) if change is None else change
 
-    return stages, respond(robot, conditions, times, stages, source, lambda y, dy, _: dy, begin)
+    return stages, respond(robot, conditions, times, stages, source, lambda t, y, dy, _: dy, begin)
 
 
 def respond(
@@ -166,7 +168,7 @@ def respond(
     times: Float[Array, " times"],
     stages: tuple[Array, Array],
     source: Callable[[Array, Array, Conditions], Array],
-    seen: Callable[[Array, Array, Conditions], Array],
+    seen: Callable[[Array, Array, Array, Conditions], Array],
     begin: Array | None = None,
 ) -> tuple[Array, Array]:
     """What small changes of the rates do to a run.
@@ -174,7 +176,7 @@ def respond(
     Args:
         conditions, times: as of `histories`; stages: of the run, from `states`.
         source: (time, state, conditions) → change of the rates there, shape (unknowns, ...).
-        seen: (state, its change, conditions) → what is kept of the change, of every stage.
+        seen: (time, state, its change, conditions) → what is kept of the change, of every stage.
         begin: change of the state at the first instant; None: none.
 
     Returns:
@@ -186,8 +188,8 @@ def respond(
     changing, constant = _in_time(conditions)
     count = len(times) - 1
     times, stages, changing = jax.tree.map(_to_whole_blocks(count), (times, stages, changing))
-    of_first = eqx.combine(jax.tree.map(lambda x: x[0], changing), constant)
-    at = jnp.concatenate([_at_start(robot, conditions)[None], stages[1]])
+    of_first, begins_at = at_first(robot, conditions)
+    at = jnp.concatenate([begins_at[None], stages[1]])
     through = _through_rest(robot, of_first, at)
     h = jnp.diff(times)
     # Through rest: Euler's implicit steps to and from it, by the equations as they are off it.
@@ -225,8 +227,8 @@ def respond(
         one, two = jax.vmap(linear)(t, stage, span, passes, turns, now)
         end, before = jax.lax.scan(lambda dy, step: (after(dy, step), dy), dy, two)
         changes = jax.vmap(after)(before, one), jnp.concatenate([before[1:], end[None]])
-        whole = jax.vmap(lambda y, dy, changing: seen(y, dy, eqx.combine(changing, constant)))
-        return end, tuple(map(whole, stage, changes, (now, then)))
+        whole = jax.vmap(lambda t, y, dy, changing: seen(t, y, dy, eqx.combine(changing, constant)))
+        return end, tuple(map(whole, t, stage, changes, (now, then)))
 
     begins, ends = (jax.tree.map(lambda x, s=s: x[s], changing) for s in (slice(-1), slice(1, None)))
     still = jnp.zeros_like(source(times[0], stages[0][0], of_first)) if begin is None else begin
@@ -308,5 +310,5 @@ def histories(robot: Robot, conditions: Conditions, times: Float[Array, " times"
     """
     changing, constant = _in_time(conditions)
     _, nodes = states(robot, conditions, times)
-    ys = jnp.concatenate([_at_start(robot, conditions)[None], nodes])
+    ys = jnp.concatenate([at_first(robot, conditions)[1][None], nodes])
     return jax.vmap(lambda y, now: moving(robot, eqx.combine(now, constant), state_of(robot, y)))(ys, changing)

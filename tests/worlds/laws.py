@@ -51,7 +51,8 @@ class Law:
 
     def grid(self, values: int = 5) -> list[dict[str, float]]:
         """Shapes between their bounds, so many of each."""
-        each = [np.geomspace(*bounds, values).tolist() for bounds in self.shapes.values()]
+        spread = {True: np.geomspace, False: np.linspace}
+        each = [spread[low > 0](low, high, values).tolist() for low, high in self.shapes.values()]
         return [dict(zip(self.shapes, point, strict=True)) for point in itertools.product(*each)]
 
 
@@ -378,8 +379,8 @@ LOGS: dict[str, Law] = {
     "churning": _rig("churning", lambda r: 0.1 * r.torque / r.w_k**2),
     "stribeck_track": _rig("stribeck_track", _output(0.1), shapes=lambda r: {"fade": (0.1, 0.3)},
                            of=lambda s, q: np.exp(-abs(s.w_k) / (q["fade"] * s.fast)) * s.d),
-    "directional_friction": _rig("directional_friction", _output(0.07), either=False),
-    "directional_viscous": Law("directional_viscous", "track", lambda s, q: s.w_k * s.d, lambda r: 0.07 * r.torque / r.w_k, _no_shapes),
+    "directional_friction": _rig("directional_friction", _output(0.07), either=True),
+    "directional_viscous": Law("directional_viscous", "track", lambda s, q: s.w_k * s.d, lambda r: 0.07 * r.torque / r.w_k, _no_shapes, either=True),
     "presliding": _rig("presliding", _output(0.1)),
     "angle_friction": _rig("angle_friction", _output(0.07), shapes=lambda r: _PHASE),
 }  # fmt: skip

@@ -17,6 +17,7 @@ from worlds.histories import runge_kutta, soft_sign, teeth
 from worlds.laws import Term, shaped
 from worlds.rigs import RPM
 from worlds.settled import Sealed, between, remainder, robot_toml, typed
+from worlds.tables import told_apart
 
 IMPOSED = ("voltage", "motor_current", "motor_speed")
 RUNS, ROWS = 4, 200
@@ -144,11 +145,7 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
     count, per = len(members), round(r.every / STEP)
     p = {n: np.repeat([m[n] for m in members], RUNS) for n in r.p}
     inputs = np.tile(r.inputs, (count, 1))
-    every = [
-        dataclasses.replace(t, amplitude=np.where(np.arange(count * RUNS) // RUNS == k, t.amplitude, 0.0))
-        for k, own in enumerate(terms or ())
-        for t in own
-    ]
+    every = _side_by_side(terms or (), count)
     J_w, J_d, C, R, i = p["inertia"], p["rotor"], p["torque_constant"], p["resistance"], r.ratio
 
     def signals(time, y, given, slope):
@@ -213,6 +210,19 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
     return [{n: shown[order[n], k] / CHANNELS[n][1] for n in r.channels} for k in range(count)]
 
 
+def _side_by_side(terms: Sequence[Sequence[Term]], count: int) -> list[Term]:
+    """Terms of each member as few that all have: one of a law, its amplitude and shapes as arrays over columns."""
+    laws_of = {t.name: t.law for own in terms for t in own}
+    every = []
+    for name, law in laws_of.items():
+        own = [next((t for t in x if t.name == name), None) for x in terms]
+        some = next(t for t in own if t is not None)
+        amplitude = np.repeat([0.0 if t is None else t.amplitude for t in own], RUNS)
+        shapes = {k: np.repeat([(t or some).shapes[k] for t in own], RUNS) for k in law.shapes}
+        every.append(Term(name, amplitude, shapes, law))
+    return every
+
+
 def whitened(r: Rig, shown: Mapping[str, np.ndarray]) -> np.ndarray:
     """Readings over their sds, shape (runs, readings)."""
     return np.concatenate([shown[n] / r.sd[n] for n in r.channels], -1)
@@ -243,6 +253,28 @@ def slopes(r: Rig, p: Mapping[str, float], terms: Sequence[Term], also: Sequence
     return every[0], [(x - every[0]) / 1e-2 for x in every[1 : 1 + n]], [x - every[0] for x in every[1 + n :]]
 
 
+def oracle(r: Rig, term: Term, y: np.ndarray, columns: np.ndarray) -> dict[str, Any]:
+    """Library effects that readings without noise could not tell from a term, and what the best other one would leave
+    [σ], each with the amplitude and, of a few, the shapes that explain most of it.
+
+    Args:
+        y: whitened readings without it; columns: slopes by the constants, shape (readings, constants).
+    """
+    tried = []
+    for name, law in LAWS.items():
+        if law.cls and law.needs(r.imposed):
+            at = law.at(r.scale)
+            tried += [Term(name, 0.02 * at.size, shapes, at) for shapes in at.grid(9)]
+    shown = [whitened(r, x) for x in histories(r, [r.p] * (1 + len(tried)), [[term], *([t] for t in tried)])]
+    left, *units = (remainder(np.nan_to_num(x - y, nan=1e3).ravel(), columns) for x in shown)
+    size, apart = float(np.linalg.norm(left)), {}
+    for t, unit in zip(tried, units, strict=True):
+        along = float(left @ unit) / max(float(np.linalg.norm(unit)), 1e-9)
+        if t.law.either or along > 0:
+            apart[t.name] = min(apart.get(t.name, size), float(np.sqrt(max(size**2 - along**2, 0.0))))
+    return told_apart(apart, size, term.law.cls)
+
+
 def case(r: Rig, name: str, sigmas: float, seed: int) -> Case:
     """A case; `name` empty is a clean one. Effects are sized so that a refit of the constants leaves `sigmas`."""
     rng = np.random.default_rng([98, seed])
@@ -260,7 +292,7 @@ def case(r: Rig, name: str, sigmas: float, seed: int) -> Case:
             change = whitened(r, histories(r, [r.p], [[term]])[0]) - y
             left = float(np.linalg.norm(remainder(np.nan_to_num(change, nan=1e3).ravel(), columns)))
         terms = (term,)
-        effects.append(term.label | {"sigmas": left})
+        effects.append(term.label | {"sigmas": left, **oracle(r, term, y, columns)})
     shown = histories(r, [r.p], [terms])[0]
     measured = {n: x + r.sd[n] * rng.standard_normal(x.shape) for n, x in shown.items()}
     column = {"voltage": "supply_voltage_V", "motor_current": "motor_current_A", "motor_speed": "motor_speed_rpm"}

@@ -51,7 +51,7 @@ from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.fidelities.drive import rates, state_of
-from mmrjax.fidelities.histories import GROWTH, LONGEST, STEPS, grid, growth, histories, respond, states
+from mmrjax.fidelities.histories import GROWTH, LONGEST, STEPS, at_first, grid, growth, histories, respond, states
 from mmrjax.params import Scalar
 from mmrjax.rig import Begin, Begins, Rig
 from mmrjax.robot import Robot
@@ -351,21 +351,27 @@ class Histories(Observer):
             before = jnp.concatenate([clock[:1], clock[:-1]])
             after = jnp.concatenate([clock[1:], clock[-1:] + 1.0])
 
-            def source(t: Array, y: Array, held: Conditions) -> Array:
-                slope = jax.jacfwd(lambda a: rates(probed(a), held, y))(none)
+            def hat(t: Array) -> Array:
                 rising = ((t - before) / jnp.maximum(clock - before, 1e-12)).at[0].set(1.0)
                 falling = jnp.where(after > clock, (after - t) / jnp.where(after > clock, after - clock, 1.0), 1.0)
-                hat = real * jnp.clip(jnp.minimum(rising, falling), 0.0, 1.0)
-                return slope[:, :, None] * hat
+                return real * jnp.clip(jnp.minimum(rising, falling), 0.0, 1.0)
 
-            def seen(y: Array, dy: Array, held: Conditions) -> Array:
-                def reading(y: Array) -> Array:
-                    return _readings(robot, balances.moving(robot, held, state_of(robot, y)))
+            def source(t: Array, y: Array, held: Conditions) -> Array:
+                return jax.jacfwd(lambda a: rates(probed(a), held, y))(none)[:, :, None] * hat(t)
 
-                return jnp.tensordot(jax.jacfwd(reading)(y), dy, 1)
+            def seen(t: Array, y: Array, dy: Array, held: Conditions) -> Array:
+                """By the state, and at once: the current follows from torque where the speed is imposed."""
 
+                def reading(y: Array, amplitude: Array) -> Array:
+                    return _readings(robot, balances.moving(probed(amplitude), held, state_of(robot, y)))
+
+                by_state, at_once = jax.jacfwd(reading, (0, 1))(y, none)
+                return jnp.tensordot(by_state, dy, 1) + at_once[:, :, None] * hat(t)
+
+            first, begins = at_first(robot, conditions)
             changed = respond(robot, conditions, times, states(robot, conditions, times), source, seen)[1]
-            whole = jnp.concatenate([jnp.zeros_like(changed[:1]), changed])
+            still = seen(times[0], begins, jnp.zeros_like(source(times[0], begins, first)), first)
+            whole = jnp.concatenate([still[None], changed])
             return jnp.moveaxis(whole[instants], (0, 1), (2, 3))  # probes, knots, samples, channels
 
         instants = self.instant[jnp.where(self.rows_of < 0, 0, self.rows_of)]
