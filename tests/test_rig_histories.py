@@ -192,7 +192,9 @@ def test_a_defect_moves_the_current_of_an_imposed_speed_at_once(tmp_path):
     observer, effect = observers.kind(runs).of(runs, robot), probe("track")
 
     def readings(amplitude):
-        return observer(dataclasses.replace(robot, effects=(dataclasses.replace(effect, amplitude=amplitude),))).reading
+        return observer(
+            dataclasses.replace(robot, effects=(dataclasses.replace(effect, amplitude=amplitude),))
+        ).reading
 
     expected = np.asarray(jax.jit(jax.jacfwd(readings))(jnp.asarray(0.0)))[:, 0]
     found = np.asarray(jax.jit(lambda r: observer.defective(r, (effect,)))(robot))[0, 0]

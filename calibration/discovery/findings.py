@@ -160,9 +160,9 @@ def unnamed(
     f, lacks, happens = found.proposal, None, bases_room.window(where.variable)
     if found.defect is not None:
         lacks = defect(linear, found.balance)
-        x = np.asarray(linear.variable(where.variable if happens is None else happens.axis))
+        x, way = linear.in_travel(where.variable if happens is None else happens.axis)
         turn = 2 * np.pi if where.variable in bases_room.ORDERS else None
-        lacks = Defect(np.interp(x, found.grid, found.curve, period=turn) + lacks.value, lacks.sd)
+        lacks = Defect(way * np.interp(x, found.grid, found.curve, period=turn) + lacks.value, lacks.sd)
     return UnnamedDiscrepancy(
         **dataclasses.asdict(where),
         unit=found.unit,

@@ -44,7 +44,7 @@ class Ratio:
     over: float
 
     def __call__(self, linear: Linearization) -> np.ndarray:
-        x = linear.variable(self.of)
+        x, _ = linear.in_travel(self.of)
         return (np.sin(x) if self.of == "slope" else x) / self.over
 
 
@@ -162,8 +162,9 @@ def propose(linear: Linearization, balance: str, counts: np.ndarray, curve: Smoo
     if not terms:  # all runs alike
         return Proposal("", (), (), (), (), 0.0, 0.0, 0)
     shapes = np.zeros((linear.points, len(terms)))
+    _, way = linear.in_travel(curve.variable)
     for k, value in enumerate(known.values()):
-        shapes[counts, k] = value
+        shapes[counts, k] = way[counts] * value
     a, b = Projection(linear)(signature(linear, balance, shapes))
     scale = np.sqrt(np.maximum(np.diag(a), 0))
     visible = scale > 1e-3 * np.linalg.norm(signature(linear, balance, shapes), axis=0)
@@ -232,13 +233,13 @@ def _while(balance: str, curve: Smooth) -> Proposal:
 def _decay(linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth) -> Proposal:
     """What fades with the time since the start or from run to run: an exponential, its constant from a grid over the
     length of the runs or of the table. A level beside it is left to the base."""
-    t, counts = linear.variable(curve.variable), linear.at_points(counts)
+    (t, way), counts = linear.in_travel(curve.variable), linear.at_points(counts)
     symbol, unit = FADING[curve.variable]
     constants = np.geomspace(0.02, 2.0, 40) * max(float(t[counts].max()), 1e-9)
     best: tuple[float, tuple] = (np.inf, ())
     project, cost = Projection(linear), np.log(3 * counts.sum())
     for tau in constants:
-        a, b = project(signature(linear, balance, np.exp(-t / tau)[:, None] * counts[:, None]))
+        a, b = project(signature(linear, balance, (way * np.exp(-t / tau) * counts)[:, None]))
         if a[0, 0] > 0 and 2 * cost - b[0] ** 2 / a[0, 0] < best[0]:
             best = 2 * cost - b[0] ** 2 / a[0, 0], (tau, b[0] / a[0, 0], a[0, 0] ** -0.5)
     if not best[1]:

@@ -99,7 +99,7 @@ def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarra
     """
     happens = window(variable)
     axis = variable if happens is None else happens.axis
-    x, counts = linear.variable(axis), linear.at_points(counts)
+    (x, way), counts = linear.in_travel(axis), linear.at_points(counts)
     low, high = (0.0, 2 * np.pi) if variable in ORDERS else (float(x[counts].min()), float(x[counts].max()))
     if happens is not None:
         beside = BESIDE * max(happens.high - happens.low, NARROW * (high - low))
@@ -107,7 +107,7 @@ def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarra
     if not high - low > 1e-9 * max(abs(high), abs(low), 1e-9):
         high = low + max(abs(low), 1.0)  # the variable stands still: an offset is all that can be seen
     basis = _basis(variable, x, low, high)
-    a, b = Projection(linear)(signature(linear, balance, basis))
+    a, b = Projection(linear)(signature(linear, balance, way[:, None] * basis))
     size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))
     roots = [np.eye(2)] if variable in ORDERS else [_smoothness(length, happens is not None) for length in LENGTHS]
     best: tuple[float, tuple] = (-np.inf, ())
@@ -163,11 +163,9 @@ def surface(
         counts: whether a row counts, shape (rows,).
     """
     weight = linear.at_points(counts).astype(float)
-    sides = [
-        legendre.legvander(scaled(linear.variable(v), weight), PRODUCT - 1) * np.exp(-FALL * np.arange(PRODUCT))
-        for v in variables
-    ]
-    shapes = (sides[0][:, :, None] * sides[1][:, None, :]).reshape(linear.points, -1)
+    each, ways = zip(*map(linear.in_travel, variables), strict=True)
+    sides = [legendre.legvander(scaled(x, weight), PRODUCT - 1) * np.exp(-FALL * np.arange(PRODUCT)) for x in each]
+    shapes = ways[0][:, None] * (sides[0][:, :, None] * sides[1][:, None, :]).reshape(linear.points, -1)
     columns = signature(linear, balance, shapes)
     a, b = project(columns)
     size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))

@@ -20,6 +20,7 @@ from mmrjax import channels
 from mmrjax.balances import absent
 from mmrjax.channels import Channel
 from mmrjax.effects import UNNAMED
+from mmrjax.effects.curve import SIGNED
 from mmrjax.robot import Robot
 
 #: Balances that carry curves: one for each equation that the channels close, and the ground's, whose defect
@@ -179,8 +180,17 @@ class Scope:
         return cls(balances_of(robot), axes_of(robot))
 
 
+def along(variable: str, x: np.ndarray, way: np.ndarray) -> np.ndarray:
+    """A variable of a curve in the frame of travel, as `mmrjax.effects.curve` takes it; `way`: 1 forward, -1 back."""
+    return x if variable in (*SIGNED, *AXES) else x * way
+
+
 def families(
-    columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot | None = None, scope: Scope | None = None
+    columns: Mapping[str, np.ndarray],
+    weight: np.ndarray,
+    robot: Robot | None = None,
+    scope: Scope | None = None,
+    way: np.ndarray | None = None,
 ) -> Bases:
     """Curves of one variable, and polynomials in all conditions for each configuration, in every balance; and curves
     of what the readings of a channel are off by, over the reading and over what time or order brings.
@@ -189,9 +199,12 @@ def families(
         columns: of the table, with fitted readings; weight: 0 for rows that do not count, shape (rows,), or of points
             (see `Linearization`).
         robot: whose channels and balances can be off; scope: None takes `Scope.of` it.
+        way: of points that may turn back, 1 forward and -1 back, shape (rows,): a curve of one variable is one along the
+            travel, as it is in a robot; None: as told.
     """
     scope = Scope.of(robot) if scope is None else scope
     balances = scope.balances
+    sign = np.ones(len(weight)) if way is None else way
     over: dict[str, tuple[str, np.ndarray]] = {}
     for variable, column in VARIABLES.items():
         if column not in columns or (column in EVERY_AXIS and column not in scope.axes):
@@ -200,8 +213,8 @@ def families(
             # Another variable again in its place: tables of one size share what is compiled.
             over[variable] = next(iter(over.values()))
             continue
-        basis = legendre.legvander(scaled(columns[column], weight), TERMS - 1) * np.exp(-0.35 * np.arange(TERMS))
-        over[variable] = variable, basis
+        x = scaled(along(variable, np.asarray(columns[column]), sign), weight)
+        over[variable] = variable, sign[:, None] * legendre.legvander(x, TERMS - 1) * np.exp(-0.35 * np.arange(TERMS))
     names = [(balance, variable) for variable, _ in over.values() for balance in balances]
     bases = [basis for _, basis in over.values() for _ in balances]
     shown = [

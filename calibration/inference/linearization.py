@@ -208,6 +208,11 @@ class Linearization(eqx.Module):
         """What a curve may be over, by point [SI]: a signal, or what else the observer knows."""
         return np.broadcast_to(np.asarray(getattr(self.signals, name), float), (self.rows,))
 
+    def in_travel(self, variable: str) -> tuple[np.ndarray, np.ndarray]:
+        """What a curve is over and by what it counts, by point: as `mmrjax.effects.curve` takes both along the travel.
+        Settled runs are told as they are."""
+        return self.variable(variable), np.ones(self.points)
+
     def runs(self) -> list[np.ndarray]:
         """Indices of the rows of each run; of settled runs each row is one."""
         return list(np.arange(self.rows)[:, None])

@@ -128,6 +128,13 @@ class HistoriesLinearization(Linearization):
             return bases_room.ORDERS[name][0] * np.asarray(self.angle)
         return np.asarray(self.time) if name == "time" else super().variable(name)
 
+    def in_travel(self, variable: str) -> tuple[np.ndarray, np.ndarray]:
+        x = self.variable(variable)
+        if variable in bases_room.ORDERS:
+            return x, np.ones(self.rows)
+        way = np.asarray(self.signals.direction)
+        return bases_room.along(variable, x, way), way
+
     def turned(self) -> np.ndarray | None:
         return np.asarray(self.angle)
 
@@ -610,7 +617,7 @@ class Histories(Observer):
         """Curves and windows as of settled runs, over time too, and waves in the angle of a shaft. Over the voltage
         are those over the motors' voltage where that is not the supply's."""
         rows = jax.tree.map(np.asarray, self.of_rows)
-        angle, electromotive = (np.nan_to_num(np.asarray(x)) for x in _turning(self, robot))
+        angle, electromotive, way = (np.nan_to_num(np.asarray(x)) for x in _turning(self, robot))
         if (rows.duty != 1).any():
             at_motors = np.where(rows.open > 0.5, electromotive, rows.voltage * rows.duty)
             columns = {**columns, "supply_voltage_V": at_motors}
@@ -618,7 +625,8 @@ class Histories(Observer):
         on_tracks = np.broadcast_to(jax.vmap(robot.chassis)(which).on_tracks > 0.5, np.shape(which))
         waves = bases_room.waves(on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots), robot)
         weight = included.astype(float)
-        return (*bases_room.families(columns, weight, robot), *bases_room.windows(columns, weight, robot), *waves)
+        families = bases_room.families(columns, weight, robot, way=way)
+        return (*families, *bases_room.windows(columns, weight, robot), *waves)
 
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> TimeStatistics:
         names = bases_room.names(bases)
@@ -852,10 +860,11 @@ def _readings(robot: Robot, signals: Signals) -> Float[Array, " channels"]:
 
 
 @compiled
-def _turning(observe: Histories, robot: Robot) -> tuple[Array, Array]:
-    """Angle of the driving shaft and back-EMF at every row."""
+def _turning(observe: Histories, robot: Robot) -> tuple[Array, Array, Array]:
+    """Angle of the driving shaft, back-EMF and direction at every row."""
     whole = observe.whole(robot)
-    return observe.angle(whole), jnp.asarray(observe.at_rows(whole).voltage_back)
+    rows = observe.at_rows(whole)
+    return observe.angle(whole), jnp.asarray(rows.voltage_back), jnp.asarray(rows.direction)
 
 
 @compiled
