@@ -306,7 +306,7 @@ def test_signs_and_times_of_random_logs_are_not_doubted(tmp_path, case):
 
 def test_time_in_milliseconds_is_doubted_where_a_start_shows_it(tmp_path):
     robot = bench(tmp_path, stairs())
-    step = 2 * rig_facts._time_constant(robot)
+    step = 2 * rig_facts.time_constant(robot)
     seconds = np.arange(200) * step / 8
     start = {"supply_voltage_V": np.full(200, 6.0), "motor_speed_rpm": 1000 * (1 - np.exp(-seconds / step))}
     for unit, doubted in ((1.0, False), (1e3, True)):

@@ -182,7 +182,7 @@ def doubtful_time(runs: Runs, robot: Robot) -> str:
     motors take with their load; empty where nothing shows that."""
     if not runs.sampled or robot.rig.imposed != "voltage":
         return ""
-    longest = FAR * _time_constant(robot)
+    longest = FAR * time_constant(robot)
     moving = [c for c in runs.channels if c.zero_at_rest and c.directed and runs.has(c.column)]
     for stretch in (s for run in stretches(runs) for s in run if len(s.rows) >= 4 * RISING):
         time = runs["time_s"][stretch.rows]
@@ -205,7 +205,7 @@ def doubtful_time(runs: Runs, robot: Robot) -> str:
     return ""
 
 
-def _time_constant(robot: Robot) -> float:
+def time_constant(robot: Robot) -> float:
     """Of the speed of the motors with the slowest of their loads J R/k² [s]; infinite where that is not known."""
     motor, sides, found = robot.motor, float(robot.sides), 0.0
     if not (_has(robot, "motor.torque_constant") and _has(robot, "motor.resistance")):

@@ -211,7 +211,7 @@ def doubtful_sign(runs: Runs) -> str:
     return ""
 
 
-def _divided(runs: Runs, shortest: float | None, drift: float, inertia: Mapping[str, float] | None) -> Settled:
+def _divided(runs: Runs, shortest: float | None, drift: float, inertia: Mapping[str, Inertia] | None) -> Settled:
     """Stretches of a log with their means, before they are held against each other."""
     if not runs.sampled:
         raise BadData(f"{runs.source}: column time_s is missing, and a row is a settled run already; give it to loop")
