@@ -245,7 +245,7 @@ _EITHER: tuple[Channel, ...] = (
         sd_share=0.01,
         resolution=4,
         unit_si="N·m",
-        other_units=(("mNm", 1e-3),),
+        other_units=(("mNm", 1e-3), ("kNm", 1e3)),
     ),
     Channel(
         name="winding_temperature",

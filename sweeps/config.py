@@ -235,7 +235,8 @@ class InferencePart(Part):
     noise: str = about(
         "",
         "Sd of current, motor_speed, speed in % or A, rpm, mm/s: current=2%,speed=5mm/s",
-        usual="the file's columns; else calibrate estimates, and loop assumes 2, 0.5, 1 %, halved and doubled",
+        usual="the file's columns; else calibrate estimates; loop estimates from series, as of slopes (0.7 and 1.4 "
+        "times too), and without such assumes 2, 0.5, 1 %, halved and doubled",
     )
     seed: Seed = about(0, "Of everything random")
 

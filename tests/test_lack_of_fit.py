@@ -2,6 +2,7 @@
 tell."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from test_loop_command import mmrjax, written
 from worlds import settled, tables
 
 from calibration.data.runs import Runs
+from calibration.discovery.discover import Sds, of_sds
 from calibration.inference import lack_of_fit
 from calibration.inference.calibrate import calibrate
 from calibration.inference.lack_of_fit import Residuals, adequacy
@@ -127,6 +129,18 @@ def test_noise_of_one_channel_that_is_off_is_said_of_that_channel():
     jacobian[:, 2] *= 3
     (off,) = noise_remarks(dataclasses.replace(made, whitened=whitened, jacobian=jacobian.reshape(270, -1)))
     assert off.channel == "speed" and off.factor == pytest.approx(3.0, rel=0.1)
+
+
+def test_what_is_said_of_sds_beside_an_answer_is_of_what_it_leaves():
+    """Before: 130 times the sds, everywhere; the answer leaves noise, or twice as much as was stated."""
+    noise = SimpleNamespace(word="stated")
+    before = Sds(noise, {}, tuple(noise_remarks(toy(np.random.default_rng(7), noise=130.0))))
+    assert before.remarks[0].factor > 100 and of_sds(before, toy(np.random.default_rng(9))) == ()
+    (off,) = of_sds(before, toy(np.random.default_rng(9), noise=2.0))
+    assert off.factor == pytest.approx(2.0, rel=0.2)
+    changed = dataclasses.replace(before, factors={"speed": 130.0})
+    assert of_sds(changed, toy(np.random.default_rng(9))) == before.remarks
+    assert of_sds(changed, toy(np.random.default_rng(9), noise=1 / 130)) == ()
 
 
 def test_right_sds_and_residuals_with_structure_say_nothing_of_sds():

@@ -248,6 +248,45 @@ def test_a_load_that_drives_its_motors_takes_voltage_from_their_back_emf(tmp_pat
         read(tmp_path, f"{header}-900,-2.11,2\n900,2,2\n1800,11,2\n", unread)
 
 
+TORQUE = "motor_speed_rpm,output_torque_kNm\n900,0.004\n"
+
+
+def of_torque(column="output_torque_Nm", shown="M", factor=1.0):
+    return bench(shown=("output_torque",), columns=((column, shown, factor),))
+
+
+def test_a_unit_in_a_columns_name_is_converted_or_refused(tmp_path):
+    assert read(tmp_path, TORQUE, bench(shown=("output_torque",)))["output_torque_Nm"] == pytest.approx([4.0])
+    for shown in ("torque_kNm", "Torque [kN·m]"):
+        text = TORQUE.replace("output_torque_kNm", shown)
+        for stated in (("output_torque_kNm", shown), ("output_torque_Nm", shown, 1e3)):
+            assert read(tmp_path, text, of_torque(*stated))["output_torque_Nm"] == pytest.approx([4.0])
+        with pytest.raises(
+            BadData, match=r"states kNm in its name, and is read in Nm; state \[columns\] output_torque_kNm"
+        ):
+            read(tmp_path, text, of_torque(shown=shown))
+
+
+def test_a_row_of_units_below_the_header_is_read(tmp_path):
+    robot = of_torque()
+    runs = read(tmp_path, "motor_speed_rpm,M,note\n[rpm],N·m,\n900,4,x\n1800,5,y\n", robot)
+    assert runs["output_torque_Nm"].tolist() == [4.0, 5.0] and "states units" in runs.notes[0]
+    with pytest.raises(
+        BadData, match=r"column M states kNm in the row below the header, .* output_torque_kNm = \"M\""
+    ):
+        read(tmp_path, "motor_speed_rpm,M\nrpm,kN·m\n900,4\n", robot)
+    with pytest.raises(BadData, match=r"motor_speed_rpm states rad_s in the row .*; name it motor_speed_rad_s, or"):
+        read(tmp_path, "motor_speed_rpm,M\nrad/s,Nm\n900,4\n", robot)
+    with pytest.raises(BadData, match=r"M: got lbf in the row of units .*; expected one of Nm, mNm, kNm; correct it"):
+        read(tmp_path, "motor_speed_rpm,M\nrpm,lbf\n900,4\n", robot)
+
+
+@pytest.mark.parametrize("above", ["# made by logger\n# on a bench, of 2 motors\n\n", "# made, by logger\n# "])
+def test_comment_lines_above_the_header_are_passed_over(tmp_path, above):
+    for text in ("motor_speed_rpm,total_current_A\n900,0.4\n", "motor_speed_rpm;total_current_A\n900;0,4\n"):
+        assert read(tmp_path, above + text, bench())["total_current_A"].tolist() == [0.4]
+
+
 @pytest.mark.parametrize("case", REFUSED, ids=list(REFUSED))
 def test_bad_tables_of_rigs_are_refused_in_one_sentence(tmp_path, case):
     make, text, sentence = REFUSED[case]

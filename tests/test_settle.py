@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import time
 
 import numpy as np
 import pytest
 from worlds import rigs
 
-from calibration.data import robot_file, settling
+from calibration.data import rig_facts, robot_file, settling
 from calibration.data import runs as records
 from calibration.data.errors import BadData
 from calibration.words import settle as words
+from sweeps.commands import rig_check
 from sweeps.commands.settle import rolling
 
 
@@ -240,6 +242,11 @@ WRONG = {
         r"rows \d+ to 200, motor_speed_rpm: shows -1080 rpm at 6 V; expected the sign of what is imposed; state "
         r"\[columns\] motor_speed_rpm = \{column = \.\.\., factor = -1\}",
     ),
+    "a current turned round": (
+        dict(total_current_A=lambda x: -x),
+        r"rows \d+ to 200, total_current_A: shows -0\.6 A at 6 V; expected the sign of what is imposed; state "
+        r"\[columns\] total_current_A = \{column = \.\.\., factor = -1\}",
+    ),
     "a voltage without sign": (
         dict(supply_voltage_V=np.abs),
         r"rows \d+ to 600, motor_speed_rpm: shows -1080 rpm at 6 V; expected the sign of what is imposed; give "
@@ -271,6 +278,44 @@ def test_signs_and_units_that_cannot_be_are_said_with_rows_and_remedy(tmp_path, 
     robot = bench(tmp_path, both_ways(**changes), '"total_current", "motor_speed", "output_angle"')
     with pytest.raises(BadData, match=said):
         settled(tmp_path, robot, rolling=rolling(robot))
+
+
+SIGNS = [case for case in WRONG if "sign" in case or "round" in case]
+
+
+@pytest.mark.parametrize("case", ["as it is", *SIGNS])
+def test_rig_check_says_of_a_log_that_signs_are_wrong(tmp_path, monkeypatch, case):
+    changes, said = WRONG.get(case, ({}, ""))
+    bench(tmp_path, both_ways(**changes), '"total_current", "motor_speed", "output_angle"')
+    monkeypatch.setattr(rig_check.foresight, "foresee", lambda runs, robot: None)
+    found = rig_check.examined(tmp_path / "rig.toml", str(tmp_path / "log.csv"))
+    if not said:
+        assert found.doubts == ()
+    else:
+        (doubt,) = found.doubts
+        assert re.search(said, doubt) and doubt in found.remarks()
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_signs_and_times_of_random_logs_are_not_doubted(tmp_path, case):
+    seed, kind, imposed, options = CASES[case]
+    _, _, robot = made(tmp_path, seed, kind, imposed, **options)
+    runs = records.read(tmp_path / "log.csv", robot=robot)
+    assert settling.doubtful_sign(runs) == "" == rig_facts.doubtful_time(runs, robot)
+
+
+def test_time_in_milliseconds_is_doubted_where_a_start_shows_it(tmp_path):
+    robot = bench(tmp_path, stairs())
+    step = 2 * rig_facts.time_constant(robot)
+    seconds = np.arange(200) * step / 8
+    start = {"supply_voltage_V": np.full(200, 6.0), "motor_speed_rpm": 1000 * (1 - np.exp(-seconds / step))}
+    for unit, doubted in ((1.0, False), (1e3, True)):
+        bench(tmp_path, {"time_s": unit * seconds, **start})
+        said = rig_facts.doubtful_time(records.read(tmp_path / "log.csv", robot=robot), robot)
+        assert ("is time_s in milliseconds? then name it time_ms" in said) == doubted == bool(said)
+    drifts = {"time_s": 1e3 * seconds, **start, "motor_speed_rpm": 1000 + 50 * (1 - np.exp(-seconds / step))}
+    bench(tmp_path, drifts)
+    assert rig_facts.doubtful_time(records.read(tmp_path / "log.csv", robot=robot), robot) == ""
 
 
 def test_an_angle_that_is_frozen_is_named_itself(tmp_path):

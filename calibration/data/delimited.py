@@ -38,6 +38,16 @@ def text(name: str, content: bytes) -> tuple[str, tuple[str, ...]]:
     raise BadData(wrong)
 
 
+def below_comments(lines: Sequence[str]) -> list[str]:
+    """Lines of a table, its header first, without those above that begin with #; where no other header stands above
+    the numbers, the last of them is it."""
+    first = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
+    below = list(lines[first:])
+    if first and below and any(map(math.isfinite, map(number, re.split(r"[,;\t]", below[0])))):
+        return [lines[first - 1].lstrip("# "), *below]
+    return below
+
+
 def cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], tuple[str, ...]]:
     """Rows of cells without blanks around them, numbers with points; and sentences on what was read otherwise.
 

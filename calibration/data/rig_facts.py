@@ -6,9 +6,13 @@ import dataclasses
 import math
 from collections.abc import Iterator
 
+import numpy as np
+
 from calibration.data import rig_file
+from calibration.data.courses import stretches
 from calibration.data.errors import rounded
 from calibration.data.robot_file import RobotFile
+from calibration.data.runs import Runs
 from mmrjax import params
 from mmrjax.channels import RPM
 from mmrjax.robot import Robot
@@ -17,6 +21,8 @@ from mmrjax.signals import GRAVITY
 
 #: From this ratio a gearbox has three stages or more; and the efficiency that makers state for those at most.
 STAGES, EFFICIENCY = 100.0, 0.85
+#: How many times its time constant a speed takes that is not that of its motors alone; fewest samples that show it.
+FAR, RISING = 100.0, 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,6 +175,48 @@ def _vehicle(robot: Robot, name: str) -> Iterator[Fact]:
     speed = limit / float(robot.motor.torque_constant) / float(robot.gearbox.ratio) * radius
     odd = _within(speed, 0.005, 15, f"look at {name}.radius, gearbox.ratio and motor.torque_constant")
     yield Fact(f"{name}: speed without load at {rounded(limit)} V", f"{rounded(speed)} m/s", odd)
+
+
+def doubtful_time(runs: Runs, robot: Robot) -> str:
+    """Why a log's time is in milliseconds: speeds rise over samples, at a constant voltage, in far longer than the
+    motors take with their load; empty where nothing shows that."""
+    if not runs.sampled or robot.rig.imposed != "voltage":
+        return ""
+    longest = FAR * time_constant(robot)
+    moving = [c for c in runs.channels if c.zero_at_rest and c.directed and runs.has(c.column)]
+    for stretch in (s for run in stretches(runs) for s in run if len(s.rows) >= 4 * RISING):
+        time = runs["time_s"][stretch.rows]
+        for channel in moving:
+            shown = runs[channel.column][stretch.rows]
+            end = np.nanmedian(shown[len(shown) // 2 :]) - shown[0]
+            if not abs(end) > 0.5 * np.nanmax(np.abs(runs[channel.column])):
+                continue
+            share = (shown - shown[0]) / end
+            rises = np.flatnonzero((share > 0.1) & (share < 0.9))
+            if len(rises) < RISING or np.any(np.diff(rises) > 1) or time[rises[-1]] - time[rises[0]] < longest:
+                continue
+            lasts, column = time[rises[-1]] - time[rises[0]], runs.headings.get("time_s", "time_s")
+            return (
+                f"{runs.source} rows {stretch.rows[rises[0]] + 1} to {stretch.rows[rises[-1]] + 1}: {channel.label} "
+                f"changes over {rounded(lasts)} s at a constant voltage, where these motors take about "
+                f"{rounded(longest / FAR)} s; is {column} in milliseconds? then name it time_ms, or state [columns] "
+                f'time_ms = "{column}"'
+            )
+    return ""
+
+
+def time_constant(robot: Robot) -> float:
+    """Of the speed of the motors with the slowest of their loads J R/k² [s]; infinite where that is not known."""
+    motor, sides, found = robot.motor, float(robot.sides), 0.0
+    if not (_has(robot, "motor.torque_constant") and _has(robot, "motor.resistance")):
+        return math.inf
+    for load in robot.configurations.members:
+        if float(load.torque_gravity if isinstance(load, Shaft) else 0.0) > 0:
+            return math.inf
+        moved = 0.0 if isinstance(load, Shaft) else float(load.mass) * float(load.radius) ** 2 / sides
+        carried = (float(load.inertia) + moved) / float(robot.gearbox.ratio) ** 2
+        found = max(found, float(motor.inertia) + carried)
+    return found * float(motor.resistance) / float(motor.torque_constant) ** 2
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,7 +7,7 @@ import difflib
 import hashlib
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -82,7 +82,8 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
     except OSError as error:
         raise BadData(f"{name}: cannot be read ({error})") from error
     text, encoded = delimited.text(name, content)
-    rows, notes = delimited.cells(name, [line for line in text.splitlines() if line.strip()])
+    lines = delimited.below_comments([line for line in text.splitlines() if line.strip()])
+    rows, notes = delimited.cells(name, lines)
     if not rows:
         expected = ", ".join((*layout.required(measured=True, battery=False), *layout.measured_columns))
         raise BadData(f"{name}: the file is empty; expected a header with {expected}")
@@ -95,6 +96,10 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
         layout = _with_channels(name, header, layout)
     meanings = layout.meanings(name, header)
     _check_header(name, header, meanings, measured, battery, layout)
+    if below := _row_of_units(name, meanings, rows[1:2]):
+        del rows[1]
+        notes = (*notes, f"{name}: the row below the header states units; rows are counted from the next")
+    _check_units(name, meanings, below)
     if len(rows) == 1:
         raise BadData(f"{name}: a header and no rows; expected at least one run")
     for k, row in enumerate(rows[1:], 1):
@@ -407,6 +412,48 @@ def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layou
             )
 
 
+def _row_of_units(name: str, meanings: Sequence[Meaning | None], first: Sequence[Sequence[str]]) -> list[str]:
+    """Units in the first row below the header, by column, empty where it states none; no list where it is a run.
+
+    Raises:
+        BadData: one among units that is none of its column's.
+    """
+    cells = [units.spelled(cell.strip("[]()")) for row in first for cell in row]
+    known = [() if m is None or m.quantity is None else tuple(m.quantity.columns().values()) for m in meanings]
+    if len(cells) != len(meanings) or not any(c and c in each for c, each in zip(cells, known, strict=True)):
+        return []
+    if any(math.isfinite(delimited.number(cell)) for cell in first[0]):
+        return []
+    for cell, meaning, each in zip(cells, meanings, known, strict=True):
+        if meaning is not None and each and cell.strip("-") and cell not in each:
+            allowed = ", ".join(filter(None, each))
+            raise BadData(
+                f"{name}, {meaning.shown}: got {cell} in the row of units below the header; "
+                f"expected {f'one of {allowed}' if allowed else 'none'}; correct it, or remove that row"
+            )
+    return [cell if cell in each else "" for cell, each in zip(cells, known, strict=True)]
+
+
+def _check_units(name: str, meanings: Sequence[Meaning | None], below: Sequence[str]) -> None:
+    """Refuse a column whose own name, or the row of units, states another unit than it is read in."""
+    for j, meaning in enumerate(meanings):
+        if meaning is None or meaning.quantity is None or abs(meaning.factor) != 1.0:
+            continue
+        named = {unit: column for column, unit in meaning.quantity.columns().items()}
+        for stated, where in (
+            (units.at_the_end(meaning.shown, named), "in its name"),
+            (below[j] if below else "", "in the row below the header"),
+        ):
+            if stated and stated != meaning.unit:
+                mapped = meaning.shown not in (meaning.column, named[meaning.unit])
+                remedy = f'state [columns] {named[stated]} = "{meaning.shown}" in the robot\'s file'
+                raise BadData(
+                    f"{name}: column {meaning.shown} states {stated} {where}, and is read in "
+                    f"{meaning.unit or 'shares of 1'}; "
+                    f"{remedy if mapped else f'name it {named[stated]}'}, or correct the unit"
+                )
+
+
 def _cell(where: str, meaning: Meaning, cell: str, layout: Layout, kind: type[InputError] = BadData) -> Any:
     column = meaning.column
 
@@ -442,11 +489,6 @@ FAR = 2.0
 #: What people write where there is no reading.
 NOTHING = ("nan", "na", "n/a", "n.a.", "none", "null", "-", "--", "?", "x", "inf", "-inf")
 _WITH_UNIT = re.compile(r"([+-]?\d*\.?\d+(?:[eE][+-]?\d+)?)\s*([^\d\s.,].*)")
-#: Units as people write them beside numbers, where a column's name has another spelling.
-_UNITS = {
-    "°": "deg", "v": "V", "volt": "V", "volts": "V", "a": "A", "amp": "A", "amps": "A", "ma": "mA", "mv": "mV",
-    "gram": "g", "grams": "g",
-}  # fmt: skip
 
 
 def _hint(meaning: Meaning, cell: str, readings: tuple[str, ...]) -> str:
@@ -474,7 +516,7 @@ def _hint(meaning: Meaning, cell: str, readings: tuple[str, ...]) -> str:
 
 def _unit_hint(value: str, written: str, mine: str, named: Mapping[str, str]) -> str:
     """What to do with a unit beside a number; `mine`: the column's own, `named`: columns by their units."""
-    unit = units.spelled(_UNITS.get(written.lower(), written))
+    unit = units.spelled(written)
     if unit == mine:
         return f"write {value}, the unit stands in the column's name; "
     if unit in named:

@@ -26,6 +26,8 @@ STILL = 0.02
 FINE = 0.005
 #: A sample that comes so many times the usual step after the one before it: samples between are missing.
 GAP = 5.0
+#: Largest change of a mean within a stretch, as a share of it, where none is stated.
+DRIFT = 0.02
 #: Fewest samples of a stretch, and of its parts between which means are compared.
 FEWEST, PART = 8, 3
 #: Sds within which means of parts agree.
@@ -164,7 +166,7 @@ def settle(
     runs: Runs,
     *,
     shortest: float | None = None,
-    drift: float = 0.02,
+    drift: float = DRIFT,
     inertia: Mapping[str, Inertia] | None = None,
     rolling: Mapping[str, Mapping[str, float]] | None = None,
 ) -> Settled:
@@ -186,6 +188,31 @@ def settle(
         BadData: time that does not increase, a channel that shows one number only, no stretch at all, speeds or
             currents without a sign, or speeds and rates of angles in other units than their columns say.
     """
+    result = _divided(runs, shortest, drift, inertia)
+    if not result.kept:
+        raise BadData(_nothing(result))
+    _check_signs(result)  # by sds of their own: repeats whose signs differ widen them
+    _check_units(result, rolling or {})
+    return dataclasses.replace(result, stretches=tuple(_wider(s, result.scatter) for s in result.stretches))
+
+
+def doubtful_sign(runs: Runs) -> str:
+    """Why the sign of a channel of a log is wrong, by what settles in it; empty where nothing shows that it is."""
+    if runs.turns:
+        return ""
+    try:
+        result = _divided(runs, None, DRIFT, None)
+    except BadData:  # what no stretch can be found in
+        return ""
+    try:
+        _check_signs(result)
+    except BadData as error:
+        return str(error)
+    return ""
+
+
+def _divided(runs: Runs, shortest: float | None, drift: float, inertia: Mapping[str, Inertia] | None) -> Settled:
+    """Stretches of a log with their means, before they are held against each other."""
     if not runs.sampled:
         raise BadData(f"{runs.source}: column time_s is missing, and a row is a settled run already; give it to loop")
     each = _in_order(runs)
@@ -206,12 +233,7 @@ def settle(
             for level in _levels(runs, drives, part, shortest, drift, step):
                 found.append(_settled(runs, signals, drives, level, shortest, drift, step, stuck, inertia or {}))
     scatter = _scatter(runs, found, signals, float(np.max(np.abs(drives))))
-    result = Settled(runs, tuple(found), signals, shortest, drift, tuple(gaps), scatter)
-    if not result.kept:
-        raise BadData(_nothing(result))
-    _check_signs(result)  # by sds of their own: repeats whose signs differ widen them
-    _check_units(result, rolling or {})
-    return dataclasses.replace(result, stretches=tuple(_wider(s, scatter) for s in found))
+    return Settled(runs, tuple(found), signals, shortest, drift, tuple(gaps), scatter)
 
 
 # --- time and channels ----------------------------------------------------------------------------------
@@ -632,17 +654,17 @@ def _check_signs(found: Settled) -> None:
         least = {id(s): max(SIGNED * s.sd[channel.name], STILL * signal.largest) for s in found.kept}
         clear = [s for s in found.kept if abs(s.mean[channel.name]) > least[id(s)]]
         back, ahead = ([s for s in clear if way * s.imposed > 0] for way in (-1, 1))
-        turned = channel.zero_at_rest and ahead and all(s.mean[channel.name] < 0 for s in ahead)
+        wrong = [s for s in ahead if s.mean[channel.name] < 0]
+        turned = bool(wrong) and len(wrong) == len(ahead)
         if back and all(s.mean[channel.name] > 0 for s in back) and not turned:
             raise BadData(
                 f"{_shows(found, back[0], channel)}; expected readings with their signs, negative backward; or state "
                 f"[instruments.{channel.name}] signed = false in the rig's file, if it shows magnitude alone"
             )
-        wrong = [s for s in ahead if s.mean[channel.name] < 0]
-        if wrong and channel.zero_at_rest and not pulled:
+        if (turned or (wrong and channel.zero_at_rest)) and not pulled:
             cure = (
                 f"state [columns] {channel.column} = {{column = ..., factor = -1}} in the rig's file"
-                if len(wrong) == len(ahead)
+                if turned
                 else f"give {'duty' if runs.has('duty') else layout.imposed_column} the sign of its direction"
             )
             raise BadData(f"{_shows(found, wrong[0], channel)}; expected the sign of what is imposed; {cure}")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 
 from mmrjax import channels
 
@@ -17,6 +18,11 @@ SHARE = {"": 1.0, "percent": 1e-2}
 #: Of an angle, in degrees; per cent of slope are those of its tangent.
 ANGLE = {"deg": 1.0, "rad": 180 / math.pi}
 PERCENT = "percent"
+#: Units as people write them beside numbers, where a column's name has another spelling.
+WRITTEN = {
+    "°": "deg", "v": "V", "volt": "V", "volts": "V", "a": "A", "amp": "A", "amps": "A", "ma": "mA", "mv": "mV",
+    "gram": "g", "grams": "g", "°c": "C", "1/min": "rpm",
+}  # fmt: skip
 
 
 def of_channel(name: str) -> dict[str, float]:
@@ -27,7 +33,15 @@ def of_channel(name: str) -> dict[str, float]:
 
 def spelled(unit: str) -> str:
     """A unit as the end of a column's name: `km/h` is `km_h`."""
-    return unit.replace("/", "_").replace("%", PERCENT)
+    unit = WRITTEN.get(unit.lower(), unit)
+    return unit.replace("/", "_").replace("%", PERCENT).replace("·", "")
+
+
+def at_the_end(text: str, known: Iterable[str]) -> str | None:
+    """The one of `known` units that a column's name ends with, `torque_kNm` or `Torque [kN·m]`; None of none."""
+    end = re.split(r"[\[(\s]", text.rstrip("])"))[-1]
+    found = [unit for unit in known if unit and re.search(rf"(?:^|[^A-Za-z]){unit}$", spelled(end))]
+    return max(found, key=len, default=None)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -112,7 +112,8 @@ def discover(
     Args:
         runs: settled runs, or time histories from rest.
         robot: its values are the prior means; a mass that the table states takes the place of its own.
-        noise: sds as `noise.parse`; None takes the file's columns, else a usual one is assumed, halved and doubled.
+        noise: sds as `noise.parse`; None takes the file's columns, else what series of conditions show,
+            or where there are none a usual one, halved and doubled.
         stated: parameter → (mean, sd) [SI], priors in place of the fields'.
         library: effects to look for.
         replicates: of the bootstrap; seed: random seed.
@@ -701,6 +702,7 @@ def assemble_result(
     unnamed = None
     if curve is not None and where is not None and beside is not None:
         unnamed = findings.unnamed(curve, where, p, beside.linear, rows)
+    remaining = _residuals(space, runs, ends.linear, seen.after, z)
     said = summary(traced, numbers)
     result = DiscoveryResult(
         verdict=traced.verdict,
@@ -728,7 +730,7 @@ def assemble_result(
         hidden=concealed,
         support=said.support,
         cluster=screened.cluster,
-        residual_clusters=residual_clusters(_residuals(space, runs, ends.linear, seen.after, z), settings.seed),
+        residual_clusters=residual_clusters(remaining, settings.seed),
         before=findings.evidence(left.test, adequate=not left.test.rejected),
         after=findings.evidence(ends.test, adequate=not ends.test.rejected_with_margin),
         chi2=(2 * base.cost, 2 * cost),
@@ -749,8 +751,17 @@ def assemble_result(
         replicates=len(left.test.null.single),
     )
     # What happens for a while is not everywhere alike.
-    of_noise = traced.sds.remarks if traced.sds.factors or not traced.events else ()
+    of_noise = of_sds(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
     return dataclasses.replace(result, remarks=(*of_noise, *remarks(result)))
+
+
+def of_sds(sds: Sds, remaining: Residuals) -> tuple[NoiseOff, ...]:
+    """What to say of sds of which something is said before the answer: by what the answer leaves; that they were
+    changed, where it leaves what they now say."""
+    off = tuple(noise_remarks(remaining, sds.noise.word)) if sds.remarks else ()
+    if sds.factors:
+        return () if off else sds.remarks
+    return off
 
 
 def _gain(space: CandidateSpace, runs: Runs, seen: ReadingsOfRows) -> prediction.Gain | None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from calibration.data import rig_facts
+from calibration.data import rig_facts, settling
 from calibration.data.columns import SUPPLY, Layout
 from calibration.data.errors import BadConfiguration
 from calibration.data.rig_facts import Fact, Origin
@@ -39,6 +39,7 @@ class RigCheck:
         file: that was read; robot: of it; examples: its lines that still hold an example's number.
         origins: of its numbers; facts: that follow from them.
         runs: of the table, None without one; foresight: what it can determine.
+        doubts: of a log over time, a sentence each: signs that are wrong, time in another unit.
     """
 
     file: str
@@ -48,6 +49,7 @@ class RigCheck:
     facts: tuple[Fact, ...]
     runs: Runs | None = None
     foresight: Foresight | None = None
+    doubts: tuple[str, ...] = ()
 
     def understood(self) -> list[str]:
         """What it is, how it is driven and measured, in sentences."""
@@ -82,6 +84,7 @@ class RigCheck:
         if self.examples:
             lines = ", ".join(map(str, self.examples))
             said.append(f"{len(self.examples)} lines still hold the number of an example ({EXAMPLE}): {lines}")
+        said += self.doubts
         said += [f"{fact.what} {fact.value}: {fact.odd}" for fact in self.facts if fact.odd]
         loose = [
             _program(self.robot, o) for o in self.origins if o.why.startswith("the file") and o.sd is None and o.value
@@ -258,7 +261,8 @@ def examined(file: Path, data: str | None, effects: tuple[str, ...] = ()) -> Rig
         return found
     runs = read_runs(data, robot, measured=True, series=True)
     seen = foresight.foresee(runs, robot)
-    return dataclasses.replace(found, runs=runs, foresight=seen)
+    doubts = tuple(filter(None, (settling.doubtful_sign(runs), rig_facts.doubtful_time(runs, robot))))
+    return dataclasses.replace(found, runs=runs, foresight=seen, doubts=doubts)
 
 
 def _table(title: str, *headings: str) -> Table:
