@@ -15,10 +15,12 @@ from calibration.inference import noise, observers, priors
 from calibration.inference.calibrate import calibrate
 from calibration.inference.linearization import probe
 from calibration.inference.observers.histories import Histories
-from mmrjax import channels, params
+from mmrjax import balances, channels, params
 from mmrjax.conditions import Conditions
+from mmrjax.effects import UNNAMED
 from mmrjax.fidelities import histories as integrator
 from mmrjax.rig import Begin, Begins, Rig
+from mmrjax.signals import State
 
 DRIVE = """
 schema = "mmrjax.robot/2"
@@ -201,6 +203,30 @@ def test_a_defect_moves_the_current_of_an_imposed_speed_at_once(tmp_path):
     np.testing.assert_allclose(found.sum(0)[:, 0], expected, rtol=1e-7)
     np.testing.assert_allclose(np.diag(found[:, :, 0]), expected, rtol=1e-7)  # of the knot at each sample alone
     assert (np.abs(expected) > 0.9).all()  # 1 / (16 × 0.05 N·m/A), over or by an efficiency of 0.8
+
+
+def test_curves_of_a_drive_that_reverses_count_along_its_travel(tmp_path):
+    """Its mirror image shows the mirror image of a curve, where it is looked for as where it is in a robot."""
+    robot, runs = imposed_speed(tmp_path, 2)
+    speed = np.repeat(np.linspace(-400, 400, 20)[None], 2, 0)
+    speed[1] = -speed[0]
+    runs = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": speed.ravel() / channels.RPM})
+    observer = observers.kind(runs).of(runs, robot)
+    columns = {**runs.columns, "total_current_A": np.sign(speed.ravel()) + speed.ravel() / 100}
+    bases = observer.bases(columns, np.ones(len(runs), bool), robot)
+    seen = 0
+    for basis in bases:
+        for (place, variable), columns_of in zip(basis.names, np.asarray(basis.columns), strict=True):
+            if variable in ("speed_motor", "current"):
+                both = columns_of.reshape(2, 20, -1)
+                np.testing.assert_allclose(both[0], -both[1], atol=1e-9)
+                assert np.abs(both[0][:, 0]).min() > 0.9, (place, variable)  # a loss as large at any speed
+                seen += 1
+    assert seen >= 2
+    curve = UNNAMED["curve_track_speed_motor"](amplitude=1.0, y1=2.0, y3=-1.0)
+    at = [balances.begin(robot, Conditions(0), State(0.0, way * 300.0, 0.0, 0.0)) for way in (1, -1)]
+    ahead, back = (float(curve.term(robot, s)) for s in at)
+    assert ahead == pytest.approx(-back) and abs(ahead) > 0.1
 
 
 @pytest.mark.slow

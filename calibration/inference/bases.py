@@ -199,8 +199,8 @@ def families(
         columns: of the table, with fitted readings; weight: 0 for rows that do not count, shape (rows,), or of points
             (see `Linearization`).
         robot: whose channels and balances can be off; scope: None takes `Scope.of` it.
-        way: of points that may turn back, 1 forward and -1 back, shape (rows,): a curve of one variable is one along the
-            travel, as it is in a robot; None: as told.
+        way: of points that may turn back, 1 forward and -1 back, shape (rows,): curves of one variable count along
+            the travel, as they do in a robot; None: as told.
     """
     scope = Scope.of(robot) if scope is None else scope
     balances = scope.balances

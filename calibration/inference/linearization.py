@@ -209,8 +209,8 @@ class Linearization(eqx.Module):
         return np.broadcast_to(np.asarray(getattr(self.signals, name), float), (self.rows,))
 
     def in_travel(self, variable: str) -> tuple[np.ndarray, np.ndarray]:
-        """What a curve is over and by what it counts, by point: as `mmrjax.effects.curve` takes both along the travel.
-        Settled runs are told as they are."""
+        """What a curve is over and by what it counts, by point: along the travel, as `effects.curve` takes both.
+        Settled runs are taken as told."""
         return self.variable(variable), np.ones(self.points)
 
     def runs(self) -> list[np.ndarray]:
