@@ -304,7 +304,9 @@ def test_currents_of_a_turn_on_the_spot_do_not_cancel_on_the_page_of_a_mission()
 
 def test_compare_sets_both_sides_and_the_yaw_rate_of_turns_beside_their_readings(tmp_path, mmrjax):
     path, read = tmp_path / "turns.csv", ("motor_current_left_A", "motor_current_right_A", "yaw_rate_rad_s")
-    path.write_text(f"{HEADER}total_mass_kg,{SIDED},{','.join(read)}\n6T2A,24,0,0,25,0.6,1,0.4,1.9,0.7\n")
+    path.write_text(
+        f"{HEADER}total_mass_kg,{SIDED},total_current_A,{','.join(read)}\n6T2A,24,0,0,25,0.6,1,2.3,0.4,1.9,0.7\n"
+    )
     assert mmrjax("compare", path, "--out", tmp_path / "out")[0] == 0
     found = (tmp_path / "out" / "comparison.csv").read_text().splitlines()
     row = dict(zip(*(line.split(",") for line in found), strict=True))
@@ -323,6 +325,11 @@ def test_simulate_in_python_refuses_turns_as_the_command_line_does():
         mm.simulate(mm.nominal(), mm.Conditions("6T2A", duty=0.5, duty_left=1, duty_right=0.5))
 
 
-def test_tables_have_no_negative_zero():
-    straight = mm.simulate(mm.nominal(), mm.Conditions("6T2A", voltage=24, duty_left=-0.0, duty_right=-0.0))
-    assert "-0.0" not in straight.table(["speed_mm_s", "total_current_A", "yaw_rate_rad_s", "duty_left"])
+def test_tables_have_no_negative_zero(monkeypatch):
+    straight = mm.simulate(mm.nominal(), mm.Conditions("6T2A", voltage=24, slope_deg=-1e-6))
+    assert "-0" not in straight.table() and "0.00" in straight.table()
+    said = []
+    monkeypatch.setattr(simulate, "say", said.append)
+    table = {"slope_deg": [-0.0], "speed_mm_s": [-0.01], "status": ["converged"]}
+    simulate.print_runs({name: np.array(values) for name, values in table.items()}, robots.nominal().channels)
+    assert [list(c.cells) for c in said[0].columns][1] == ["0", "0.0", "converged"]
