@@ -198,9 +198,11 @@ class Conditions(eqx.Module):
         return dataclasses.replace(self, configuration=jnp.asarray(which))
 
 
-def one_side(stated: Collection[str]) -> str:
-    """What is wrong where conditions of these names impose the speed of one side's motor and not the other's; empty
-    where nothing is."""
+def sides_contradict(stated: Collection[str]) -> str:
+    """What is wrong where conditions of these names impose the speed of one side's motor and not the other's, or a
+    duty beside those of both sides; empty where nothing is."""
+    if {"duty", *OF_SIDES[:2]} <= {*stated}:
+        return f"duty: got it beside {' and '.join(OF_SIDES[:2])}; expected one of the two"
     left, right = (name in stated for name in OF_SIDES[-2:])
     if left == right or "motor_speed" in stated:
         return ""

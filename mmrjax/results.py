@@ -182,7 +182,7 @@ class Results:
             label, unit, digits = about.get(name, (name.replace("_", " "), "", 3))
             values = content[name][:rows]
             words = values.dtype.kind == "U"
-            body = [str(v) if words else f"{v:.{digits}f}" for v in values]
+            body = [str(v) if words else f"{v:z.{digits}f}" for v in values]
             column = [label, f"[{unit}]" if unit not in ("", "-") else "", *body]
             width = max(map(len, column))
             cells.append([c.ljust(width) if words else c.rjust(width) for c in column])

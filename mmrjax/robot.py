@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -116,10 +116,11 @@ class Robot(eqx.Module):
         """Those that its rig's instruments show, in order."""
         return channels.rows(self.rig.channels)
 
-    def showing_turns(self) -> Robot:
-        """With instruments of both sides and of its yaw too."""
+    def showing_turns(self, columns: Collection[str] | None = None) -> Robot:
+        """With instruments of both sides and of its yaw too; of `columns` those alone that have one there."""
         own = self.rig.channels
-        more = [c.name for c in channels.OF_TURNS if c.settled and c.name not in own]
+        read = [c for c in channels.OF_TURNS if (c.settled if columns is None else c.column in columns)]
+        more = [c.name for c in read if c.name not in own]
         return dataclasses.replace(self, rig=dataclasses.replace(self.rig, channels=(*own, *more)))
 
     @property
@@ -175,3 +176,21 @@ class Robot(eqx.Module):
     def remembering(self) -> tuple[Effect, ...]:
         """Its effects whose term depends on the past of the run, in order."""
         return tuple(effect for effect in self.effects if effect.memory_size is not None)
+
+
+def cannot_turn(robot: Robot, names: Iterable[str]) -> str | None:
+    """Why a robot whose sides are driven apart cannot be computed in these configurations; None where it can."""
+    if not robot.has_ground:
+        return "the robot's load is a shaft, which does not turn over the ground"
+    if float(robot.sides) < 2:
+        return f"got a robot of {float(robot.sides):g} side; expected sides = 2, one motor on each"
+    if robot.rig.imposed == "motor_current":
+        return "the robot's file says that its motors' current is imposed, which says nothing of either side"
+    lacking = [
+        f"{name}.turning.{key} [{unit}]"
+        for name in names
+        if name in robot.configurations
+        for key, unit in (("width", "m"), ("inertia", "kg·m^2"))
+        if not float(getattr(robot.configurations[name].turning, key)) > 0
+    ]
+    return f"{', '.join(lacking)} missing in the robot's file, which a turn needs" if lacking else None

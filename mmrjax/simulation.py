@@ -14,7 +14,7 @@ import numpy as np
 
 from mmrjax import channels, fidelities, missions, params, power
 from mmrjax.compiling import compiled
-from mmrjax.conditions import Conditions, indices, one_side
+from mmrjax.conditions import OF_TURNS, Conditions, indices, sides_contradict
 from mmrjax.errors import UsageError, choices
 from mmrjax.fidelities.base import Fidelity, History, Run
 from mmrjax.fidelities.mission import Start
@@ -22,7 +22,7 @@ from mmrjax.params import Scalar
 from mmrjax.profile import Profile
 from mmrjax.programs import has_tracer
 from mmrjax.results import Results
-from mmrjax.robot import Robot
+from mmrjax.robot import Robot, cannot_turn
 from mmrjax.signals import CODES, Result
 from mmrjax.tables import CONDITION_LIMITS
 
@@ -86,6 +86,7 @@ def simulate(
     conditions = _resolved(robot, conditions)
     _check_conditions(conditions)
     _check_battery(robot, conditions)
+    _check_turning(robot, conditions, profile)
     if profile is not None:
         return _missions(robot, conditions, profile, start, history)
     robot = robot.showing_turns() if conditions.turns else robot
@@ -116,6 +117,18 @@ def _check_battery(robot: Robot, conditions: Conditions) -> None:
         raise UsageError(f"battery.voltage_cutoff: {refused}")
     if remark := power.cutoff_remark(robot.battery):
         warnings.warn(f"battery.voltage_cutoff: {remark}", stacklevel=3)
+
+
+def _check_turning(robot: Robot, conditions: Conditions, profile: Profile | None) -> None:
+    """Refuse to turn a robot that cannot, where its sides are driven apart."""
+    freed = [name for name in OF_TURNS if getattr(conditions, name) is not None]
+    freed += ["profile"] if profile is not None and profile.turns else []
+    if not freed or has_tracer((robot, conditions.configuration)):
+        return
+    if any(np.ndim(x) for x in jax.tree.leaves((robot.sides, robot.configurations))):  # a batch of robots
+        return
+    if why := cannot_turn(robot, [robot.configurations.names[k] for k in np.unique(conditions.configuration)]):
+        raise UsageError(f"{freed[0]}: {why}")
 
 
 def _check_profile(model: str, profile: Any, options: Mapping[str, float | None]) -> None:
@@ -290,8 +303,11 @@ def _own_mass(own: tuple[Scalar, ...], configuration: jax.Array | np.ndarray, pa
 
 
 def _check_conditions(conditions: Conditions) -> None:
-    if alone := one_side({f.name for f in dataclasses.fields(conditions) if getattr(conditions, f.name) is not None}):
-        raise UsageError(alone)
+    stated_names = {f.name for f in dataclasses.fields(conditions) if getattr(conditions, f.name) is not None}
+    if not has_tracer(conditions.duty) and (np.asarray(conditions.duty) == 1).all():  # as where none is stated
+        stated_names.remove("duty")
+    if why := sides_contradict(stated_names):
+        raise UsageError(why)
     ends: dict[int, tuple[float, float]] = {}  # by array: several fields may share one
     for field in dataclasses.fields(conditions):
         value = getattr(conditions, field.name)

@@ -281,7 +281,7 @@ def render(
         return room.render_climb(climb, stated, file, begin, end, slow, force)
     slow = 20.0 if slow is None else slow
     begin = (0.8 if file.suffix == ".png" else 0.0) if begin is None else begin
-    end = begin + 0.1 if end is None else end
+    end = begin + 0.1 if end is None and file.suffix != ".png" else end
     return room.render(told.config, told.beside.model_dump(), file, begin, end, slow, force)
 
 

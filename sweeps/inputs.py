@@ -88,7 +88,7 @@ def check_surface(robot: Robot, names: Collection[str], surface: str | None, whe
 
 
 def read_runs(
-    source: str, robot: Robot, *, measured: bool, series: bool = False, battery: bool = False
+    source: str, robot: Robot, *, measured: bool, series: bool = False, battery: bool = False, of_turns: bool = False
 ) -> records.Runs:
     """Read a table, and say on stderr which of its columns are not used.
 
@@ -97,12 +97,15 @@ def read_runs(
         robot: has the configurations of the table.
         measured: whether readings are needed; series: whether time histories are taken.
         battery: whether the runs are on the battery, see `records.read`.
+        of_turns: whether a table of turns has every channel of either side, and of the yaw, of which it has a column.
 
     Raises:
         BadData: what `records.read` refuses, time histories where none are taken, or a configuration that the
             robot does not have.
     """
     runs = records.read(source, measured=measured, battery=battery, robot=robot)
+    if of_turns and runs.turns:
+        runs = records.read(source, measured=measured, battery=battery, robot=robot.showing_turns(runs.unknown))
     if not series:
         from calibration.inference import observers
 

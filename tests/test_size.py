@@ -20,6 +20,7 @@ from calibration.sizing.design import OBJECTIVES, build, evaluate, task
 from calibration.sizing.options import BELT_STAGE, MOTOR, drives, options
 from mmrjax import params
 from mmrjax.requirements import QUANTITIES
+from sweeps.results.size import verdict
 from tests.commands import command
 from tests.pages import Tables, drawn, outside
 
@@ -229,6 +230,8 @@ def test_what_no_parts_meet_is_left_out_and_said(robot):
     asked = requirements.read("speed_m_s = 0.5\nslope_deg = 20\n[envelope]\nstate_of_charge = [0.1, 1]", "r.toml")
     found = search.size(robot, asked, ("mass",), starts=32, motors=(MOTOR,))
     assert found.unmeetable == ("steepest slope held",) and found.best is not None
+    assert [verdict(f, found.unmeetable) for f in (found.best, *found.motors.values())] == ["meets the others"] * 2
+    assert verdict(found.best, ()) == "meets"
     assert set(found.motors) == {MOTOR} and len(drives((MOTOR,))) == 3
 
 

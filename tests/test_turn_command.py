@@ -1,7 +1,9 @@
 """The command `simulate` of a robot whose sides are driven apart."""
 
+import dataclasses
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from calibration.data.errors import BadData
 from mmrjax import robots
 from mmrjax.channels import SIDES
 from mmrjax.derived import turn as derived
+from mmrjax.errors import UsageError
 from sweeps.commands import simulate
 from sweeps.pages import mission_figures, turn_words
 from sweeps.points.job import showing_turns
@@ -297,3 +300,36 @@ def test_currents_of_a_turn_on_the_spot_do_not_cancel_on_the_page_of_a_mission()
     rows = {"motor_current_A": np.array([0.0, 1.0])}
     np.testing.assert_allclose(mission_figures.of_motors(rows | sides, "motor_current", "_A"), [1.6, 1.0])
     np.testing.assert_allclose(mission_figures.of_motors(rows, "motor_current", "_A"), [0.0, 1.0])
+
+
+def test_compare_sets_both_sides_and_the_yaw_rate_of_turns_beside_their_readings(tmp_path, mmrjax):
+    path, read = tmp_path / "turns.csv", ("motor_current_left_A", "motor_current_right_A", "yaw_rate_rad_s")
+    path.write_text(
+        f"{HEADER}total_mass_kg,{SIDED},total_current_A,{','.join(read)}\n6T2A,24,0,0,25,0.6,1,2.3,0.4,1.9,0.7\n"
+    )
+    assert mmrjax("compare", path, "--out", tmp_path / "out")[0] == 0
+    found = (tmp_path / "out" / "comparison.csv").read_text().splitlines()
+    row = dict(zip(*(line.split(",") for line in found), strict=True))
+    turn = mm.simulate(mm.nominal(), mm.Conditions("6T2A", voltage=24, duty_left=0.6, duty_right=1, total_mass=25))
+    for name, value in zip(read, (0.4, 1.9, 0.7), strict=True):
+        assert float(row[name]) == value
+        assert float(row[f"simulated_{name}"]) == pytest.approx(float(turn.to_dict()[name]), rel=1e-6)
+    assert (row["duty_left"], row["duty_right"]) == ("0.6", "1")
+
+
+def test_simulate_in_python_refuses_turns_as_the_command_line_does():
+    alone = dataclasses.replace(mm.nominal(), sides=jnp.asarray(1.0))
+    with pytest.raises(UsageError, match="duty_left: got a robot of 1 side"):
+        mm.simulate(alone, mm.Conditions("6T2A", duty_left=1, duty_right=0.5))
+    with pytest.raises(UsageError, match="duty: got it beside duty_left and duty_right"):
+        mm.simulate(mm.nominal(), mm.Conditions("6T2A", duty=0.5, duty_left=1, duty_right=0.5))
+
+
+def test_tables_have_no_negative_zero(monkeypatch):
+    straight = mm.simulate(mm.nominal(), mm.Conditions("6T2A", voltage=24, slope_deg=-1e-6))
+    assert "-0" not in straight.table() and "0.00" in straight.table()
+    said = []
+    monkeypatch.setattr(simulate, "say", said.append)
+    table = {"slope_deg": [-0.0], "speed_mm_s": [-0.01], "status": ["converged"]}
+    simulate.print_runs({name: np.array(values) for name, values in table.items()}, robots.nominal().channels)
+    assert [list(c.cells) for c in said[0].columns][1] == ["0", "0.0", "converged"]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import jax.numpy as jnp
 import numpy as np
 
@@ -12,7 +10,7 @@ from calibration.data.columns import HEADING, LEVERS, RPM, SPEED, SUPPLY
 from calibration.data.errors import BadData, number
 from calibration.data.table import Runs
 from mmrjax import params
-from mmrjax.robot import Robot
+from mmrjax.robot import Robot, cannot_turn
 from mmrjax.running_gear import RunningGear
 
 #: Share of the motors' back-EMF below which no voltage turns them at an imposed speed [-], and least back-EMF that
@@ -100,24 +98,6 @@ def misplaced(runs: Runs, robot: Robot) -> tuple[int, str, str] | None:
                 ),
             )
     return None
-
-
-def cannot_turn(robot: Robot, names: Iterable[str]) -> str | None:
-    """Why a robot whose sides are driven apart cannot be computed in these configurations; None where it can."""
-    if not robot.has_ground:
-        return "the robot's load is a shaft, which does not turn over the ground"
-    if float(robot.sides) < 2:
-        return f"got a robot of {float(robot.sides):g} side; expected sides = 2, one motor on each"
-    if robot.rig.imposed == "motor_current":
-        return "the robot's file says that its motors' current is imposed, which says nothing of either side"
-    lacking = [
-        f"{name}.turning.{key} [{unit}]"
-        for name in names
-        if name in robot.configurations
-        for key, unit in (("width", "m"), ("inertia", "kg·m^2"))
-        if not float(getattr(robot.configurations[name].turning, key)) > 0
-    ]
-    return f"{', '.join(lacking)} missing in the robot's file, which a turn needs" if lacking else None
 
 
 def _mass(runs: Runs, robot: Robot) -> None:

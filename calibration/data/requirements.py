@@ -287,7 +287,8 @@ def _limit(value: Any, where: str, quantity: Quantity) -> float | None:
                 f"{where}: got {RATED!r}; expected a number, only {', '.join(RATINGS)} have a rating"
             )
         return None
-    return stated_number(value, where, *STATED, quantity.unit)
+    limits = RANGES["slope_deg"][:2] if quantity.unit == "deg" else STATED
+    return stated_number(value, where, *limits, quantity.unit)
 
 
 def quantity_key(quantity: Quantity) -> str:

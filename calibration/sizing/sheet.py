@@ -12,14 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from calibration.data.contradictions import cannot_stand, cannot_turn
+from calibration.data.contradictions import cannot_stand
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.requirements import STAIRS, TREAD, Envelope, Requirement, Requirements
 from mmrjax import params
 from mmrjax.channels import MM
 from mmrjax.compiling import compiled
 from mmrjax.requirements import AMBIENT, AXES, CHARGE, PAYLOAD, SLOPE, Point, Ratings, evaluate, ratings
-from mmrjax.robot import Robot
+from mmrjax.robot import Robot, cannot_turn
 from mmrjax.signals import CONVERGED, STATUSES
 from mmrjax.tables import adhesion_ratio, lateral_ratio
 

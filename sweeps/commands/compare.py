@@ -34,6 +34,7 @@ HISTORIES, OVER = "drive", {"time_s": "time [s]"}
 #: Conditions that are printed, and their headings.
 HEADINGS = {
     "supply_voltage_V": "U [V]", "motor_speed_rpm": "n [rpm]", "total_mass_kg": "M [kg]", "slope_deg": "slope [deg]",
+    "duty_left": "duty, left", "duty_right": "duty, right", "heading_deg": "heading [deg]",
 }  # fmt: skip
 #: Group → channel → rows, rms_percent, max_percent, rms, unit (of the rms), r2, missing.
 Summary = dict[str, dict[str, dict[str, Any]]]
@@ -42,7 +43,9 @@ Summary = dict[str, dict[str, dict[str, Any]]]
 def compare(config: configuration.Compare, source: str, own_mass: bool, out: Path | None, force: bool) -> int:
     """Simulate the runs of a table, set them beside its readings, leave a run folder; returns the exit code."""
     file = load_robot(config)
-    stated = runs = read_runs(source, file.robot, measured=True, series=True)
+    stated = runs = read_runs(source, file.robot, measured=True, series=True, of_turns=True)
+    if runs.turns:
+        file = dataclasses.replace(file, robot=file.robot.showing_turns(runs.layout.measured_columns))
     if runs.sampled:
         return _over_time(config, file, runs, own_mass, out, force)
     robot = instruments.with_inferred_instruments(file.robot, runs)
@@ -52,10 +55,11 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
     drawn = None if config.posterior is None else beside_robot(file)
     with open_folder("compare", config, robot, out, force, runs) as folder:
         table = run.evaluate(robot, runs, config, folder)
-        comparison, summary = compared(stated, table, robot)
+        sized = stated.turns or stated.layout.crosses_zero
+        comparison, summary = compared(stated, table, robot, sized)
         folder.write_table("comparison.csv", comparison)
         notes = [*missing(comparison, stated.channels), *said]
-        print_comparison(comparison, summary, stated.channels, notes, sized=runs.layout.crosses_zero)
+        print_comparison(comparison, summary, stated.channels, notes, sized=sized)
         if drawn is not None and config.posterior is not None:
             found = uncertainty.intervals(robot, drawn, runs, config, config.posterior, folder)
             uncertainty.say_intervals(table, found)
@@ -115,7 +119,9 @@ def compared(
         sized: whether percent are of a channel's size; None: where readings of the table's layout cross zero.
     """
     crosses_zero = measured.layout.crosses_zero if sized is None else sized
-    table = {key: simulated[key] for key in ("configuration", *measured.layout.axes)}
+    table = {
+        key: simulated[key] for key in ("configuration", *dict.fromkeys((*measured.layout.axes, *measured.axes)))
+    }
     if not measured.layout.complete and measured.has("surface"):
         table["surface"] = measured["surface"]
     nothing = np.full(len(measured), np.nan)

@@ -14,7 +14,6 @@ from rich.table import Table
 from calibration.data import profiles
 from calibration.data import runs as records
 from calibration.data.columns import SUPPLY
-from calibration.data.contradictions import cannot_turn
 from calibration.data.errors import BadConfiguration
 from calibration.data.profiles import ProfileTable
 from mmrjax import balances, channels, ground, missions, outputs
@@ -24,7 +23,7 @@ from mmrjax.fidelities.mission_steps import MARKS
 from mmrjax.missions import JOULE_PER_WH
 from mmrjax.power import COULOMB_PER_MAH
 from mmrjax.profile import PAIRS
-from mmrjax.robot import Robot
+from mmrjax.robot import Robot, cannot_turn
 from mmrjax.signals import FLAGS, STATUSES
 from mmrjax.tables import lateral_ratio
 from sweeps import capabilities

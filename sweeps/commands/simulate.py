@@ -288,7 +288,7 @@ def print_runs(table: dict[str, np.ndarray], shown: Sequence[Channel]) -> None:
             str(v).replace(";", "\n") if not form
             else absent.get(key, "-") if v != v
             else (words.FOR_EVER if key == PERMISSIBLE else words.NONE_SETTLES) if np.isinf(v)
-            else format(v, form)
+            else format(v, f"z{form}")
             for v in table[key]
         ]  # fmt: skip
         if form and key + uncertainty.SD in table:

@@ -18,7 +18,7 @@ from sweeps.console import say
 from sweeps.inputs import load_robot
 from sweeps.pages import words
 from sweeps.results import check as check_result
-from sweeps.results.size import SizeResult, described, missed, objective
+from sweeps.results.size import SizeResult, described, missed, objective, verdict
 from sweeps.skeleton import leave, page
 from sweeps.store import RunFolder, open_folder
 
@@ -83,7 +83,7 @@ def print_size(found: SizeResult) -> None:
     for f in s.motors.values():
         values = [f"{f.objectives[k]:.4g}" if k in f.objectives else "" for k in OBJECTIVES]
         shown.add_row(
-            "meets" if f.feasible else "misses", f.drive.name, f"{f.ratio:.3g}", f"{1000 * f.radius:.1f}",
+            verdict(f, s.unmeetable), f.drive.name, f"{f.ratio:.3g}", f"{1000 * f.radius:.1f}",
             f"{f.in_series} × {f.parallel:.3g} {f.cell.name}", *values,
             ", ".join(f.binds if f.feasible else missed(f)),
         )  # fmt: skip

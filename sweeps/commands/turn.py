@@ -12,7 +12,6 @@ import scipy.optimize
 from rich.table import Table
 
 from calibration.data.columns import SIDES, SUPPLY
-from calibration.data.contradictions import cannot_turn
 from calibration.data.errors import BadConfiguration
 from calibration.data.table import Runs
 from mmrjax import channels, fidelities, outputs
@@ -21,7 +20,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.derived import turn as derived
 from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.rest import voltage_at_rest
-from mmrjax.robot import Robot
+from mmrjax.robot import Robot, cannot_turn
 from sweeps import config as configuration
 from sweeps.console import progress, say
 from sweeps.inputs import load_robot, one_run

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.stats
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.colors import ListedColormap
@@ -94,12 +95,23 @@ def share(values: np.ndarray, output: np.ndarray) -> float:
     return float(np.sum(count * (mean - output.mean()) ** 2) / len(output) / total) if total > 0 else 0.0
 
 
+def by_chance(values: np.ndarray) -> float:
+    """Share of the variance that lies between the bins of a name without effect in one of 100 samples at most [-].
+
+    Of normal outputs the share is then a beta variable; 0 for a single bin, 1 where every value has a bin of its own.
+    """
+    within, between = len(values) - (used := len(np.unique(bins(values)[0]))), used - 1
+    return float(scipy.stats.beta.ppf(0.99, between / 2, within / 2)) if within and between else float(within == 0)
+
+
 def _band(axes: Axes, values: np.ndarray, output: np.ndarray) -> None:
     which, middles = bins(values)
     quantiles = np.array([np.quantile(output[which == k], (0.05, 0.5, 0.95)) for k in range(len(middles))])
     axes.fill_between(middles, quantiles[:, 0], quantiles[:, 2], color=BLUE, alpha=0.2, linewidth=0)
     axes.plot(middles, quantiles[:, 1], color=BLUE)
-    note(axes, f"{100 * share(values, output):.0f} % of the variance")
+    found = share(values, output)
+    if found > by_chance(values):
+        note(axes, f"{100 * found:.0f} % of the variance")
 
 
 def _ticks(axis: Axis, varied: Varied) -> None:

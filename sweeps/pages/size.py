@@ -14,12 +14,12 @@ from calibration.sizing.search import Found
 from sweeps.pages import size_figures
 from sweeps.pages.page import Album, named, render, words_shown
 from sweeps.results.check import label, reached, wanted
-from sweeps.results.size import SizeResult, missed
+from sweeps.results.size import SizeResult, missed, verdict
 
 
 def write(folder: Path, found: SizeResult, file: RobotFile) -> Path:
     """Write `report.html` and `figures/` of a sizing; returns the path of the page."""
-    album, best = Album(folder), found.sizing.best
+    album, best, left_out = Album(folder), found.sizing.best, found.sizing.unmeetable
     most = extent(found.asked)
     charts = {f"as it is: {words_shown(file.name)}": chart(found.robot, found.asked, most)}
     if best is not None:
@@ -41,9 +41,9 @@ def write(folder: Path, found: SizeResult, file: RobotFile) -> Path:
         objectives=", ".join(OBJECTIVES[name][1] for name in found.objectives),
         starts=found.sizing.starts,
         evaluated=f"{found.sizing.evaluated:,}",
-        designs=[] if best is None else [_row(f) for f in (best, *found.sizing.alternatives)],
-        motors=[_row(f) for f in found.sizing.motors.values()],
-        front=[_row(f) for f in found.sizing.front],
+        designs=[] if best is None else [_row(f, left_out) for f in (best, *found.sizing.alternatives)],
+        motors=[_row(f, left_out) for f in found.sizing.motors.values()],
+        front=[_row(f, left_out) for f in found.sizing.front],
         sheet=[
             {
                 "met": o.met,
@@ -57,9 +57,10 @@ def write(folder: Path, found: SizeResult, file: RobotFile) -> Path:
     )
 
 
-def _row(f: Found) -> dict[str, Any]:
+def _row(f: Found, unmeetable: tuple[str, ...]) -> dict[str, Any]:
     return {
-        "feasible": f.feasible,
+        "feasible": f.feasible and not unmeetable,
+        "verdict": verdict(f, unmeetable),
         "motor": f.drive.motor.name,
         "gearbox": f"{f.drive.family}, {f.drive.stages} stage{'s' if f.drive.stages > 1 else ''}",
         "ratio": f"{f.ratio:.4g}",

@@ -8,12 +8,11 @@ from collections.abc import Collection, Iterable
 
 import numpy as np
 
-from calibration.data.columns import SIDES, Layout
-from calibration.data.contradictions import cannot_turn
+from calibration.data.columns import Layout
 from calibration.data.errors import BadConfiguration
 from mmrjax.channels import RPM
-from mmrjax.conditions import OF_TURNS, one_side
-from mmrjax.robot import Robot
+from mmrjax.conditions import OF_TURNS, sides_contradict
+from mmrjax.robot import Robot, cannot_turn
 from mmrjax.tables import VOLTAGES_V
 from sweeps import capabilities
 
@@ -169,7 +168,5 @@ def check_turning(robot: Robot, stated: Collection[str], names: Iterable[str], w
         return
     if why := cannot_turn(robot, names):
         raise BadConfiguration(f"{where}, {freed[0]}: {why}")
-    if why := one_side(stated):
+    if why := sides_contradict(stated):
         raise BadConfiguration(f"{where}, {why}")
-    if "duty" in stated and {*SIDES} <= {*stated}:
-        raise BadConfiguration(f"{where}, duty: got it beside {' and '.join(SIDES)}; expected one of the two")

@@ -58,6 +58,11 @@ class SizeResult:
         }
 
 
+def verdict(found: Found, unmeetable: tuple[str, ...]) -> str:
+    """Whether a design meets the requirements; `unmeetable`: those that no choice of parts meets, left out of it."""
+    return "misses" if not found.feasible else "meets the others" if unmeetable else "meets"
+
+
 def short(found: Found) -> float:
     """By how much a design misses, all margins together [-]."""
     return sum(max(-m, 0.0) for m in found.margins.values())
