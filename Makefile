@@ -27,7 +27,7 @@ test: $(TOOLS)
 quick: $(TOOLS)
 	PYTHONDONTWRITEBYTECODE= $(QUICK) $(PYTEST) -m "not slow"
 
-# Everything: the tests that compile or run for long too, some two hours on two cores.
+# Everything: the tests that compile or run for long too, 70 minutes on two cores.
 test-all: lint
 	PYTHONDONTWRITEBYTECODE= $(QUICK) $(PYTEST)
 
