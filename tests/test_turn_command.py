@@ -310,10 +310,9 @@ def test_compare_sets_both_sides_and_the_yaw_rate_of_turns_beside_their_readings
     assert mmrjax("compare", path, "--out", tmp_path / "out")[0] == 0
     found = (tmp_path / "out" / "comparison.csv").read_text().splitlines()
     row = dict(zip(*(line.split(",") for line in found), strict=True))
-    turn = mm.simulate(mm.nominal(), mm.Conditions("6T2A", voltage=24, duty_left=0.6, duty_right=1, total_mass=25))
-    for name, value in zip(read, (0.4, 1.9, 0.7), strict=True):
-        assert float(row[name]) == value
-        assert float(row[f"simulated_{name}"]) == pytest.approx(float(turn.to_dict()[name]), rel=1e-6)
+    assert [float(row[name]) for name in read] == [0.4, 1.9, 0.7]
+    left, right, yaw_rate = (float(row[f"simulated_{name}"]) for name in read)
+    assert left < 0.5 < right and yaw_rate > 0.3  # to the left, the left track dragged along
     assert (row["duty_left"], row["duty_right"]) == ("0.6", "1")
 
 
