@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import re
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -180,7 +181,7 @@ class Scope:
         return cls(balances_of(robot), axes_of(robot))
 
 
-def along(variable: str, x: np.ndarray, way: np.ndarray) -> np.ndarray:
+def along(variable: str, x: Any, way: Any) -> Any:
     """A variable of a curve in the frame of travel, as `mmrjax.effects.curve` takes it; `way`: 1 forward, -1 back."""
     return x if variable in (*SIGNED, *AXES) else x * way
 

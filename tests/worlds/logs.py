@@ -145,7 +145,7 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
     count, per = len(members), round(r.every / STEP)
     p = {n: np.repeat([m[n] for m in members], RUNS) for n in r.p}
     inputs = np.tile(r.inputs, (count, 1))
-    every = _side_by_side(terms or (), count)
+    every = _side_by_side(terms or ())
     J_w, J_d, C, R, i = p["inertia"], p["rotor"], p["torque_constant"], p["resistance"], r.ratio
 
     def signals(time, y, given, slope):
@@ -210,7 +210,7 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
     return [{n: shown[order[n], k] / CHANNELS[n][1] for n in r.channels} for k in range(count)]
 
 
-def _side_by_side(terms: Sequence[Sequence[Term]], count: int) -> list[Term]:
+def _side_by_side(terms: Sequence[Sequence[Term]]) -> list[Term]:
     """Terms of each member as few that all have: one of a law, its amplitude and shapes as arrays over columns."""
     laws_of = {t.name: t.law for own in terms for t in own}
     every = []

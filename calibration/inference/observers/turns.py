@@ -25,7 +25,7 @@ from calibration.inference.problem import Observation
 from mmrjax import effects, fidelities
 from mmrjax.compiling import compiled
 from mmrjax.effects import Effect
-from mmrjax.effects.curve import IN_TURNS, SIGNED, VARIABLES_ROUND
+from mmrjax.effects.curve import IN_TURNS, VARIABLES_ROUND
 from mmrjax.fidelities.steady import operating_signals
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
@@ -43,12 +43,8 @@ def along(signals: Signals, name: str) -> Float[Array, " points"]:
     Args:
         signals: shape (rows, sides).
     """
-    x = jnp.asarray(getattr(signals, name))
-    if name == "yaw_rate":
-        x = x * signals.direction_turn
-    elif name not in SIGNED:
-        x = x * signals.direction
-    return x.T.ravel()
+    way = signals.direction_turn if name == "yaw_rate" else signals.direction
+    return bases_room.along(name, jnp.asarray(getattr(signals, name)), jnp.asarray(way)).T.ravel()
 
 
 class TurnLinearization(SettledLinearization):
