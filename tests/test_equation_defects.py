@@ -22,18 +22,22 @@ ROWS, COUNT, RANDOM = 12, 3, np.random.default_rng(0)
 SIZES, SEEN = {"voltage": 20.0, "torque_output": 2.0, "speed_theoretical": 0.5}, 200.0
 #: What turns the output, of a gearbox 16 : 1.
 SHAFT = {"torque_electromagnetic": 0.15, "speed_motor": 320.0, "speed_output": 20.0}
+#: Which way each row goes.
+WAY = np.where(np.arange(ROWS) % 3, 1.0, -1.0)
 
 
 def linearised(kind, slopes, defects, **others):
-    """A fit whose rows have defects (equations, sides, rows), by slopes (equations, sides, rows, channels); `others`:
-    sizes of signals."""
+    """A fit whose rows have defects along their way (equations, sides, rows), by slopes (equations, sides, rows,
+    channels); `others`: sizes of signals."""
     sides = slopes.shape[1]
     whole = np.zeros((len(kind.probed), *slopes.shape[1:]))
     for slope, name in zip(slopes, EQUATIONS, strict=True):
         whole[kind.probed.index(name)] = slope
-    residual = -np.einsum("esrc,esr->rc", slopes, defects)
+    residual = -np.einsum("esrc,esr->rc", slopes, WAY * defects)
     shape = (ROWS, sides) if sides > 1 else (ROWS,)
     signals = Signals(**{name: np.full(shape, size) for name, size in (SIZES | SHAFT | others).items()})
+    way = np.broadcast_to(WAY[:, None], shape) if sides > 1 else WAY
+    signals = dataclasses.replace(signals, direction=way)
     scale = np.ones(residual.shape)
     whole = whole if sides > 1 else whole[:, 0]
     return kind(residual.ravel(), np.zeros((residual.size, 1)), np.zeros((residual.size, 0)), whole, scale, signals,

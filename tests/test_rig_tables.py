@@ -9,7 +9,7 @@ import pytest
 from calibration.data import instruments, robot_file, surfaces
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration, BadData
-from calibration.inference import blocks, checks, noise, observers, priors
+from calibration.inference import bases, blocks, checks, noise, observers, priors
 from calibration.inference.calibrate import calibrate
 from calibration.inference.notes import Constant
 from calibration.inference.ranges import check_ranges
@@ -469,6 +469,24 @@ QUICK = {"starts": 2, "profiles": False, "blocks": ["speed", "voltage"]}
 
 def inside(found, true):
     return {n: abs(p.value - true[n]) / p.sd for n, p in found.parameters.items() if n in true}
+
+
+def test_curves_of_runs_both_ways_count_along_the_travel(tmp_path):
+    """Runs in mirror image show a curve in mirror image."""
+    robot = vehicle(imposed="voltage", channels=("total_current", "motor_speed", "speed"))
+    ahead, slope = np.tile([8.0, 12.0, 16.0, 20.0, 24.0], 2), np.repeat([0.0, 6.0], 5)
+    voltage, slope, n = np.concatenate([ahead, -ahead]), np.concatenate([slope, -slope]), len(ahead)
+    conditions = Conditions(0, voltage=voltage, slope_deg=slope)
+    columns = {"configuration": ["rig"] * 2 * n, "supply_voltage_V": voltage, "slope_deg": slope}
+    runs = measured(tmp_path, robot, conditions, columns, share=0.0)
+    observe = observers.kind(runs).of(runs, robot)
+    seen = {**runs.columns, "order": np.tile(np.arange(n), 2)}
+    over = set()
+    for basis in observe.bases(seen, np.ones(2 * n, bool), robot):
+        for (place, variable), shapes in zip(basis.names, np.asarray(basis.columns), strict=True):
+            np.testing.assert_allclose(shapes[:n], -shapes[n:], atol=1e-9, err_msg=f"{place} over {variable}")
+            over.add((bases.window(variable) and "window") or variable)
+    assert {"voltage", "slope", "speed_motor", bases.CONDITIONS, "window"} <= over
 
 
 @pytest.mark.slow

@@ -56,7 +56,7 @@ def toy():
     z = -np.linalg.lstsq(np.vstack([slopes, np.eye(p)]), np.append(readings, np.zeros(p)), rcond=None)[0]
     residual = np.concatenate([readings + slopes @ z, np.zeros(rows), z])
     jacobian = np.concatenate([slopes, np.zeros((rows, p)), np.eye(p)])
-    signals = SimpleNamespace(speed_motor=speed, slope=slope)
+    signals = SimpleNamespace(speed_motor=speed, slope=slope, direction=np.ones(rows))
     arrays = (jnp.asarray(x) for x in (residual, jacobian, np.zeros((3 * rows, 1)), defects, np.ones((rows, 3))))
     linear = SettledLinearization(*arrays, signals, channels=channels.USUAL)
     return SimpleNamespace(linear=linear, readings=readings, slopes=slopes, rows=rows, counts=np.ones(rows, bool))
@@ -87,6 +87,15 @@ def test_evidence_of_a_curve_is_the_largest_marginal_likelihood(toy):
         assert gained(toy, scale * raw @ root) < found.evidence + 1e-6
     others = [smooth(toy.linear, *at, toy.counts) for at in (("slip", "slope"), ("track", "slope"))]
     assert found.evidence > 1.5 * max(o.evidence for o in others) > 0  # what is missing is where it is
+
+
+def test_a_curve_of_rows_in_mirror_image_is_the_same(toy):
+    way = np.where(np.arange(toy.rows) % 2, 1.0, -1.0)
+    signals = SimpleNamespace(speed_motor=way * toy.linear.signals.speed_motor, direction=way)
+    turned = dataclasses.replace(toy.linear, defects=toy.linear.defects * way[:, None], signals=signals)
+    found, wanted = (smooth(linear, "track", "speed_motor", toy.counts) for linear in (turned, toy.linear))
+    assert (found.low, found.high) == (wanted.low, wanted.high) and wanted.evidence > 10
+    assert found.evidence == pytest.approx(wanted.evidence, rel=1e-9)
 
 
 def test_evidence_of_a_surface_is_the_largest_marginal_likelihood(toy):
@@ -249,7 +258,7 @@ def test_amplitude_that_changes_with_a_variable_is_seen_and_one_that_does_not_is
     variables = {"slope": x, "current": current}
     linear = SimpleNamespace(
         readings=2 * rows, rows=rows, at_points=lambda counts: counts,
-        variable=lambda name: variables.get(name, np.ones(rows)),
+        in_travel=lambda place, name: (variables.get(name, np.ones(rows)), np.ones(rows)),
     )  # fmt: skip
     space = SimpleNamespace(
         free=0, included=np.ones(rows, bool), bare=SimpleNamespace(observe=SimpleNamespace(long=False))

@@ -322,10 +322,11 @@ class LoopStages:
 
     def _happening(self, variable: str) -> tuple[dict[str, Any], ...]:
         happens = bases_room.window(variable)
-        if happens is None:
+        if happens is None or self.where is None:
             return ()
         linear = self.left.linear
-        inside = self.screened.base.space.included & linear.of_rows(happens.holds(linear.variable(happens.axis)))
+        x, _ = linear.in_travel(self.where.place, happens.axis)
+        inside = self.screened.base.space.included & linear.of_rows(happens.holds(x))
         rows = [int(k) + 1 for k in np.flatnonzero(inside)]
         return ({"axis": happens.axis, "window": (happens.low, happens.high), "rows": rows},)
 

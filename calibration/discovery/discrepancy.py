@@ -115,13 +115,13 @@ def refined(linear: Linearization, place: str, axis: str, included: np.ndarray) 
     Args:
         included: whether a row counts, shape (rows,).
     """
-    x, included = linear.variable(axis), linear.at_points(included)
+    (x, way), included = linear.in_travel(place, axis), linear.at_points(included)
     at, counts = np.unique(x[included], return_counts=True)
     merged = -(-len(at) // INSTANTS)
     edges = at[::merged]
     index = np.searchsorted(edges, x, side="right") - 1
     shapes = (index[:, None] == np.arange(len(edges))) & included[:, None]
-    a, b = Projection(linear)(bases_room.signature(linear, place, shapes.astype(float)))
+    a, b = Projection(linear)(bases_room.signature(linear, place, way[:, None] * shapes))
     sums = np.zeros((len(edges) + 1,) * 2)
     sums[1:, 1:] = a.cumsum(0).cumsum(1)
     pull = np.append(0.0, b.cumsum())

@@ -158,11 +158,11 @@ def unnamed(
         linear: the fit with the curve, linearised.
     """
     f, lacks, happens = found.proposal, None, bases_room.window(where.variable)
+    x, way = linear.in_travel(found.balance, where.variable if happens is None else happens.axis)
     if found.defect is not None:
         lacks = defect(linear, found.balance)
-        x, way = linear.in_travel(where.variable if happens is None else happens.axis)
         turn = 2 * np.pi if where.variable in bases_room.ORDERS else None
-        lacks = Defect(way * np.interp(x, found.grid, found.curve, period=turn) + lacks.value, lacks.sd)
+        lacks = Defect(np.interp(x, found.grid, found.curve, period=turn) + way * lacks.value, lacks.sd)
     return UnnamedDiscrepancy(
         **dataclasses.asdict(where),
         unit=found.unit,
@@ -175,6 +175,7 @@ def unnamed(
         at=found.grid,
         value=found.curve,
         sd=found.sd,
+        over=None if lacks is None else x[:rows],
         defect=None if lacks is None else lacks.value[:rows],
         defect_sd=None if lacks is None else lacks.sd[:rows],
         proposal=Formula(f.formula, f.mark, f.coefficients, f.sds, f.gain, f.tried),

@@ -43,8 +43,8 @@ class Ratio:
     of: str
     over: float
 
-    def __call__(self, linear: Linearization) -> np.ndarray:
-        x, _ = linear.in_travel(self.of)
+    def __call__(self, linear: Linearization, place: str) -> np.ndarray:
+        x, _ = linear.in_travel(place, self.of)
         return (np.sin(x) if self.of == "slope" else x) / self.over
 
 
@@ -156,13 +156,13 @@ def propose(linear: Linearization, balance: str, counts: np.ndarray, curve: Smoo
     if curve.variable in FADING:
         return _decay(linear, balance, counts, curve)
     counts = linear.at_points(counts)
-    ratios = np.stack([r(linear) for r in RATIOS], 1)
+    ratios = np.stack([r(linear, balance) for r in RATIOS], 1)
     known = dictionary(ratios[counts])
     terms = list(known)
     if not terms:  # all runs alike
         return Proposal("", (), (), (), (), 0.0, 0.0, 0)
     shapes = np.zeros((linear.points, len(terms)))
-    _, way = linear.in_travel(curve.variable)
+    _, way = linear.in_travel(balance, curve.variable)
     for k, value in enumerate(known.values()):
         shapes[counts, k] = way[counts] * value
     a, b = Projection(linear)(signature(linear, balance, shapes))
@@ -233,7 +233,7 @@ def _while(balance: str, curve: Smooth) -> Proposal:
 def _decay(linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth) -> Proposal:
     """What fades with the time since the start or from run to run: an exponential, its constant from a grid over the
     length of the runs or of the table. A level beside it is left to the base."""
-    (t, way), counts = linear.in_travel(curve.variable), linear.at_points(counts)
+    (t, way), counts = linear.in_travel(balance, curve.variable), linear.at_points(counts)
     symbol, unit = FADING[curve.variable]
     constants = np.geomspace(0.02, 2.0, 40) * max(float(t[counts].max()), 1e-9)
     best: tuple[float, tuple] = (np.inf, ())

@@ -135,8 +135,8 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
         p_value: family-wise; score: fall of χ² by the curve [σ²]; score_free_in_each_run: by a wave with a phase
             of its own in each run, None for other curves.
         at: of the variable [SI]; value, sd: of the curve there [unit].
-        defect, defect_sd: of the balance in each row [unit], the curve there and what its fit leaves of the row; None
-            where single rows do not show it.
+        over, defect, defect_sd: in each row the variable of the fit [SI] and what the balance lacks [unit], the curve
+            there and what its fit leaves of the row, both along the travel; None where single rows do not show it.
         proposal: a formula.
     """
 
@@ -150,6 +150,7 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
     at: np.ndarray
     value: np.ndarray
     sd: np.ndarray
+    over: np.ndarray | None
     defect: np.ndarray | None
     defect_sd: np.ndarray | None
     proposal: Formula

@@ -99,7 +99,7 @@ def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarra
     """
     happens = window(variable)
     axis = variable if happens is None else happens.axis
-    (x, way), counts = linear.in_travel(axis), linear.at_points(counts)
+    (x, way), counts = linear.in_travel(balance, axis), linear.at_points(counts)
     low, high = (0.0, 2 * np.pi) if variable in ORDERS else (float(x[counts].min()), float(x[counts].max()))
     if happens is not None:
         beside = BESIDE * max(happens.high - happens.low, NARROW * (high - low))
@@ -163,7 +163,7 @@ def surface(
         counts: whether a row counts, shape (rows,).
     """
     weight = linear.at_points(counts).astype(float)
-    each, ways = zip(*map(linear.in_travel, variables), strict=True)
+    each, ways = zip(*(linear.in_travel(balance, v) for v in variables), strict=True)
     sides = [legendre.legvander(scaled(x, weight), PRODUCT - 1) * np.exp(-FALL * np.arange(PRODUCT)) for x in each]
     shapes = ways[0][:, None] * (sides[0][:, :, None] * sides[1][:, None, :]).reshape(linear.points, -1)
     columns = signature(linear, balance, shapes)

@@ -170,7 +170,7 @@ def _over(place: str, variable: str) -> CurveOver:
 
 
 def _varies(linear: Linearization, variable: str, included: np.ndarray) -> bool:
-    x = linear.variable(variable)[linear.at_points(included)]
+    x = linear.in_travel(bases_room.SHAFTS, variable)[0][linear.at_points(included)]
     return bool(np.all(np.isfinite(x)) and np.ptp(x) > 1e-9 * max(np.max(np.abs(x)), 1e-9))
 
 
@@ -340,7 +340,7 @@ def _varies_most(
     of_row = jacobian[: linear.readings, space.free + best.active.index(effect)].reshape(linear.rows, -1)
     variables = [v for v in (*VARIABLES, "speed") if _varies(linear, v, space.included)]
     for variable in variables:
-        at = linear.variable(variable).reshape(-1, linear.rows).mean(0)
+        at = linear.in_travel(bases_room.SHAFTS, variable)[0].reshape(-1, linear.rows).mean(0)
         x = bases_room.scaled(np.nan_to_num(at), space.included.astype(float))
         changed = np.stack([(of_row * shape[:, None]).ravel() for shape in (x, 2 * x**2 - 1)], 1)
         most = max(most, (_root(jacobian, residual, changed), variable))

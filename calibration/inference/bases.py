@@ -6,7 +6,6 @@ import dataclasses
 import itertools
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -21,7 +20,7 @@ from mmrjax import channels
 from mmrjax.balances import absent
 from mmrjax.channels import Channel
 from mmrjax.effects import UNNAMED
-from mmrjax.effects.curve import SIGNED
+from mmrjax.effects.curve import WAYS, acts_along, in_travel
 from mmrjax.robot import Robot
 
 #: Balances that carry curves: one for each equation that the channels close, and the ground's, whose defect
@@ -181,9 +180,14 @@ class Scope:
         return cls(balances_of(robot), axes_of(robot))
 
 
-def along(variable: str, x: Any, way: Any) -> Any:
-    """A variable of a curve in the frame of travel, as `mmrjax.effects.curve` takes it; `way`: 1 forward, -1 back."""
-    return x if variable in (*SIGNED, *AXES) else x * way
+#: Signals of `effects.curve.WAYS`, by point; and a balance of the shafts.
+Ways = Mapping[str, np.ndarray]
+SHAFTS = "electrical"
+
+
+def forward(points: int) -> Ways:
+    """The ways of travel that never turns back."""
+    return dict.fromkeys(WAYS, np.ones(points))
 
 
 def families(
@@ -191,7 +195,7 @@ def families(
     weight: np.ndarray,
     robot: Robot | None = None,
     scope: Scope | None = None,
-    way: np.ndarray | None = None,
+    ways: Ways | None = None,
 ) -> Bases:
     """Curves of one variable, and polynomials in all conditions for each configuration, in every balance; and curves
     of what the readings of a channel are off by, over the reading and over what time or order brings.
@@ -200,47 +204,55 @@ def families(
         columns: of the table, with fitted readings; weight: 0 for rows that do not count, shape (rows,), or of points
             (see `Linearization`).
         robot: whose channels and balances can be off; scope: None takes `Scope.of` it.
-        way: of points that may turn back, 1 forward and -1 back, shape (rows,): curves of one variable count along
-            the travel, as they do in a robot; None: as told.
+        ways: of each point, shape (rows,); None: all forward.
     """
     scope = Scope.of(robot) if scope is None else scope
     balances = scope.balances
-    sign = np.ones(len(weight)) if way is None else way
-    over: dict[str, tuple[str, np.ndarray]] = {}
+    ways = forward(len(weight)) if ways is None else ways
+    over: dict[str, str] = {}  # a variable, and that which has its place
     for variable, column in VARIABLES.items():
         if column not in columns or (column in EVERY_AXIS and column not in scope.axes):
             continue
-        if variable == "order" and collinearity(columns, weight, scope.axes) > COLLINEAR:
-            # Another variable again in its place: tables of one size share what is compiled.
-            over[variable] = next(iter(over.values()))
-            continue
-        x = scaled(along(variable, np.asarray(columns[column]), sign), weight)
-        over[variable] = variable, sign[:, None] * legendre.legvander(x, TERMS - 1) * np.exp(-0.35 * np.arange(TERMS))
-    names = [(balance, variable) for variable, _ in over.values() for balance in balances]
-    bases = [basis for _, basis in over.values() for _ in balances]
+        # Another variable again in its place: tables of one size share what is compiled.
+        drift = variable == "order" and collinearity(columns, weight, scope.axes) > COLLINEAR
+        over[variable] = next(iter(over)) if drift else variable
+
+    def curve(place: str, variable: str) -> np.ndarray:
+        x, way = in_travel(place, variable, np.asarray(columns[VARIABLES[variable]]), ways.__getitem__)
+        return way[:, None] * legendre.legvander(scaled(x, weight), TERMS - 1) * np.exp(-0.35 * np.arange(TERMS))
+
+    names = [(balance, variable) for variable in over.values() for balance in balances]
     shown = [
         (c.name, v)
         for c in channels_of(robot)
         for v in over
         if (v in AXES or VARIABLES[v] == c.column) and f"curve_{c.name}_{v}" in UNNAMED
     ]
-    new = [n for n in shown if over[n[1]][0] == n[1]]
+    new = [n for n in shown if over[n[1]] == n[1]]
     # As above: what is left out makes room for another of its channel, or of the first that has one.
     read = [n if n in new else next((m for m in new if m[0] == n[0]), new[0]) for n in shown] if new else []
-    spans = [scaled(columns[c], weight) for c in scope.axes]
+    groups = [
+        (names, [curve(*n) for n in names]),
+        ([(b, CONDITIONS) for b in balances], [surface(columns, weight, scope, ways, b) for b in balances]),
+        (read, [curve(*n) for n in read]),
+    ]
+    return tuple(Basis.of(np.stack(b), ns) for ns, b in groups if ns)
+
+
+def surface(
+    columns: Mapping[str, np.ndarray], weight: np.ndarray, scope: Scope, ways: Ways, place: str
+) -> Float[np.ndarray, "points terms"]:
+    """Polynomials in all conditions for each configuration; arguments as of `families`."""
+    of_column = {column: variable for variable, column in VARIABLES.items()} | {CURRENT: "current"}
+    along = (in_travel(place, of_column[c], np.asarray(columns[c]), ways.__getitem__)[0] for c in scope.axes)
+    spans = [scaled(x, weight) for x in along]
     powers = [p for p in itertools.product(range(DEGREE + 1), repeat=len(spans)) if sum(p) <= DEGREE]
     terms = [
         np.prod([a**k for a, k in zip(spans, p, strict=True)], 0) * (columns["configuration"] == name)
         for name in np.unique(columns["configuration"])
         for p in powers
     ]
-    wide = np.stack(terms, 1)
-    groups = [
-        (names, bases),
-        ([(b, CONDITIONS) for b in balances], [wide] * len(balances)),
-        (read, [over[v][1] for _, v in read]),
-    ]
-    return tuple(Basis.of(np.stack(b), ns) for ns, b in groups if ns)
+    return ways[acts_along(place)][:, None] * np.stack(terms, 1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -273,17 +285,23 @@ def window(variable: str) -> Window | None:
 
 
 def windows(
-    columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot | None = None, scope: Scope | None = None
+    columns: Mapping[str, np.ndarray],
+    weight: np.ndarray,
+    robot: Robot | None = None,
+    scope: Scope | None = None,
+    ways: Ways | None = None,
 ) -> Bases:
     """Windows in time (at the same instants of all runs) or in the order of runs, and levels of conditions, in every
     balance and channel; in the order only where the conditions do not tell it.
 
     Args:
         columns: of the table; weight: 0 for rows that do not count, shape (rows,).
-        robot, scope: as of `families`.
+        robot, scope, ways: as of `families`.
     """
     counts = weight > 0
     scope = Scope.of(robot) if scope is None else scope
+    ways = forward(len(weight)) if ways is None else ways
+    facing = {name: np.where(way < 0, -1.0, 1.0) for name, way in ways.items()}  # of what starts from rest, too
     offered: list[tuple[str, np.ndarray, np.ndarray]] = []  # axis, its values, which rows are inside
     axis = next((a for a in AXES if VARIABLES[a] in columns), None)
     if axis is not None:
@@ -300,7 +318,8 @@ def windows(
     for condition, (factor, _) in LEVELS.items():
         if VARIABLES[condition] not in scope.axes:
             continue
-        x = factor * np.asarray(columns[VARIABLES[condition]], float)
+        told = factor * np.asarray(columns[VARIABLES[condition]], float)
+        x, _ = in_travel(SHAFTS, condition, told, facing.__getitem__)
         levels = np.unique(x[counts])
         levels = levels if 2 < len(levels) <= MOST_LEVELS else levels[:0]
         offered += [(condition, x, counts & (x == level)) for level in levels]
@@ -317,7 +336,7 @@ def windows(
     read = [c.name for c in channels_of(robot) if f"curve_{c.name}_order" in UNNAMED]
     return tuple(
         Basis.of(
-            np.stack([s for s, _ in shapes] * len(places))[:, :, None],
+            np.stack([s * ways[acts_along(place)] for place in places for s, _ in shapes])[:, :, None],
             [(place, name) for place in places for _, name in shapes],
         )
         for places in (scope.balances, read)

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from mmrjax import params
 from mmrjax.compiling import compiled
 from mmrjax.effects import Effect
+from mmrjax.effects.curve import in_travel
 from mmrjax.effects.scaled import amplitude_of as amplitude_of
 from mmrjax.effects.scaled import shape_of as shape_of
 from mmrjax.params import Parameter, Scalar, parameter
@@ -208,10 +209,10 @@ class Linearization(eqx.Module):
         """What a curve may be over, by point [SI]: a signal, or what else the observer knows."""
         return np.broadcast_to(np.asarray(getattr(self.signals, name), float), (self.rows,))
 
-    def in_travel(self, variable: str) -> tuple[np.ndarray, np.ndarray]:
-        """What a curve is over and by what it counts, by point: along the travel, as `effects.curve` takes both.
-        Settled runs are taken as told."""
-        return self.variable(variable), np.ones(self.points)
+    def in_travel(self, place: str, variable: str) -> tuple[np.ndarray, np.ndarray]:
+        """What a curve in a place is over [SI] and by what it counts, by point, as `effects.curve` takes both."""
+        x, way = in_travel(place, variable, self.variable(variable), self.variable)
+        return np.asarray(x), np.broadcast_to(way, (self.points,))
 
     def runs(self) -> list[np.ndarray]:
         """Indices of the rows of each run; of settled runs each row is one."""

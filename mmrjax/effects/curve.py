@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -43,10 +44,36 @@ VARIABLES = {
 VARIABLES_ROUND = {"yaw_rate": ("rad/s", 0.0, 4.0), "side": ("-", -1.0, 1.0)}
 IN_TURNS = ("voltage", "current", "speed_motor", "payload", "speed", "order")
 #: Variables that have a sign by themselves; the others count along the motion: of the shafts, or of the turn.
-SIGNED = ("payload", "order", "side")
+SIGNED = ("payload", "time", "order", "side")
 ORDINATES = tuple(f"y{k}" for k in range(6))
 #: Share of the range over which a curve levels out beyond each of its ends.
 LEVEL = 0.05
+
+
+#: Signals that tell which way things go, -1 to 1.
+WAYS = ("direction", "direction_travel", "direction_turn")
+
+
+def acts_along(place: str) -> str:
+    """The signal of `WAYS` along which a discrepancy in a place acts."""
+    return PLACES[place][2]
+
+
+def in_travel(place: str, variable: str, x: Any, way: Callable[[str], Any]) -> tuple[Any, Any]:
+    """A variable of a curve in the frame of travel, and by what the curve counts: a run in mirror image shows a
+    discrepancy in mirror image. What is over none of `VARIABLES`, as a wave, counts as it is.
+
+    Args:
+        x: the variable [its unit], an array of either library; way: gives the signal of `WAYS` of a name.
+    """
+    if variable not in VARIABLES | VARIABLES_ROUND:
+        return x, 1.0
+    counts = way(acts_along(place))
+    if variable in SIGNED:
+        return x, counts
+    ahead = way("direction_turn") if variable == "yaw_rate" else way("direction") if place in ROUND else counts
+    return x * ahead, counts
+
 
 _LAST = len(ORDINATES) - 1
 # Keys's points beyond the ends continue a parabola: y_-1 = 3 y_0 - 3 y_1 + y_2, and one more for y_-2.
@@ -96,9 +123,8 @@ def _size(unit: str, size: float) -> Scalar:
 def _curve(place: str, over: str) -> type[Effect]:
     """The curve of one variable in one balance, or in the readings of one channel."""
     shown = place in READINGS
-    unit, size, along = PLACES[place]
+    unit, size, _ = PLACES[place]
     unit_x, first, last = (VARIABLES | VARIABLES_ROUND)[over]
-    ahead = "direction_turn" if over == "yaw_rate" else "direction" if place in ROUND else along
 
     class Curve(Effect):
         name = f"curve_{place}_{over}"
@@ -133,12 +159,8 @@ def _curve(place: str, over: str) -> type[Effect]:
         y5: Scalar = _ordinate()
 
         def term(self, robot: Robot, signals: Signals) -> Scalar:
-            way = jnp.asarray(getattr(signals, along))
-            # In the frame of travel: a run in mirror image shows the discrepancy in mirror image.
-            if over == "time":
-                x = self.recall(robot, signals)
-            else:
-                x = getattr(signals, over) * (1.0 if over in SIGNED else getattr(signals, ahead))
+            x = self.recall(robot, signals) if over == "time" else getattr(signals, over)
+            x, way = in_travel(place, over, x, lambda name: jnp.asarray(getattr(signals, name)))
             y = jnp.stack(jnp.broadcast_arrays(*(getattr(self, n) for n in ORDINATES)), -1)
             return self.amplitude * jnp.sum(weights(x, self.low, self.high) * y, -1) * way
 

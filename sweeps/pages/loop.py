@@ -202,7 +202,7 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         album.add("laws", lambda: loop_figures.laws(found, table, changed))
     if found.unnamed is not None:
         curve = found.unnamed
-        album.add("curve", lambda: loop_figures.curve(rows_of(found), curve, float(found.robot.sides)))
+        album.add("curve", lambda: loop_figures.curve(curve))
     album.add("ladder", lambda: loop_figures.ladder(found))
     album.add("null", lambda: loop_figures.null(found.before))
     album.add("look_alikes", lambda: loop_figures.look_alikes(found))

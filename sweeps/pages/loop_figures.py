@@ -398,27 +398,20 @@ def base_shift(found: DiscoveryResult) -> Figure:
     return fig
 
 
-def curve(table: dict[str, np.ndarray], found: UnnamedDiscrepancy, sides: float = 2.0) -> Figure:
-    """The defect that has no name, run by run over the variable that shows it, with the smooth curve and its band.
-
-    Args:
-        sides: motors that the total current is of.
-    """
+def curve(found: UnnamedDiscrepancy) -> Figure:
+    """The defect that has no name, run by run over the variable that shows it, with the smooth curve and its band."""
     variable = found.variable if found.window is None else str(found.window["axis"])
-    column, factor, words = VARIABLE_WORDS.get(variable, ("", 1.0, f"phase of the wave, {variable} [rad]"))
-    if variable == "current":
-        one = "motor_current_A" in table and "total_current_A" not in table
-        column, factor = ("motor_current_A", 1.0) if one else (column, 1 / sides)
+    words, scale = VARIABLE_WORDS.get(variable, (f"phase of the wave, {variable} [rad]", 1.0))
     fig, grid = figure(1, 1, 3.4)
     axes = grid[0, 0]
     axes.axhline(0, color=FAINT, lw=0.8)
-    if found.defect is not None and found.defect_sd is not None and column in table:
+    if found.over is not None and found.defect is not None and found.defect_sd is not None:
         finite = np.isfinite(found.defect)
-        axes.errorbar(np.asarray(table[column])[finite] * factor, found.defect[finite], 2 * found.defect_sd[finite],
+        axes.errorbar(found.over[finite] * scale, found.defect[finite], 2 * found.defect_sd[finite],
                       fmt="o", ms=4, color=ORANGE, lw=0.7, label="each run, ±2 sd")  # fmt: skip
-    scale = SHOWN.get(variable, 1.0)
     if found.window is not None:
-        axes.axvspan(float(found.window["low"]), float(found.window["high"]), color="#eeeeee", lw=0, zorder=0)
+        first, last = (float(found.window[end]) * scale for end in ("low", "high"))
+        axes.axvspan(first, last, color="#eeeeee", lw=0, zorder=0)
     low, high = found.value - 1.96 * found.sd, found.value + 1.96 * found.sd
     axes.fill_between(found.at * scale, low, high, color="#cfe3f2", lw=0, label="95 %")
     axes.plot(found.at * scale, found.value, color=GREEN, label="smooth curve")
@@ -427,17 +420,16 @@ def curve(table: dict[str, np.ndarray], found: UnnamedDiscrepancy, sides: float 
     return fig
 
 
-#: Column, factor to the figure's unit, and words of the variable of a curve; factor from SI to that unit.
+#: Words of the variable of a curve, and factor from SI to the unit of the figure.
 VARIABLE_WORDS = {
-    "voltage": ("supply_voltage_V", 1.0, "supply voltage [V]"),
-    "current": ("total_current_A", 0.5, "current of one motor [A]"),
-    "speed_motor": ("motor_speed_rpm", 1.0, "motor speed [rpm]"),
-    "slope": ("slope_deg", 1.0, "slope [deg]"),
-    "payload": ("payload_kg", 1.0, "payload [kg]"),
-    "speed": ("speed_mm_s", 1.0, "speed [mm/s]"),
-    "time": ("time_s", 1.0, "time since the start [s]"),
-    "order": ("order", 1.0, "order of the runs"),
-    "yaw_rate": ("yaw_rate_rad_s", 1.0, "yaw rate [rad/s]"),
-    "side": ("", 1.0, "side: 1 left, -1 right"),
+    "voltage": ("voltage at the motors [V]", 1.0),
+    "current": ("current of one motor [A]", 1.0),
+    "speed_motor": ("motor speed [rpm]", 1 / RPM),
+    "slope": ("slope [deg]", 180 / np.pi),
+    "payload": ("payload [kg]", 1.0),
+    "speed": ("speed [mm/s]", 1 / MM),
+    "time": ("time since the start [s]", 1.0),
+    "order": ("order of the runs", 1.0),
+    "yaw_rate": ("yaw rate [rad/s]", 1.0),
+    "side": ("side: 1 left, -1 right", 1.0),
 }
-SHOWN = {"speed_motor": 1 / RPM, "slope": 180 / np.pi, "speed": 1 / MM}

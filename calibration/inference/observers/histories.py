@@ -50,6 +50,7 @@ from mmrjax.channels import Channel
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
+from mmrjax.effects.curve import WAYS
 from mmrjax.fidelities.drive import rates, state_of
 from mmrjax.fidelities.histories import GROWTH, LONGEST, STEPS, at_first, grid, growth, histories, respond, states
 from mmrjax.params import Scalar
@@ -127,13 +128,6 @@ class HistoriesLinearization(Linearization):
         if name in bases_room.ORDERS:
             return bases_room.ORDERS[name][0] * np.asarray(self.angle)
         return np.asarray(self.time) if name == "time" else super().variable(name)
-
-    def in_travel(self, variable: str) -> tuple[np.ndarray, np.ndarray]:
-        x = self.variable(variable)
-        if variable in bases_room.ORDERS:
-            return x, np.ones(self.rows)
-        way = np.asarray(self.signals.direction)
-        return bases_room.along(variable, x, way), way
 
     def turned(self) -> np.ndarray | None:
         return np.asarray(self.angle)
@@ -617,7 +611,7 @@ class Histories(Observer):
         """Curves and windows as of settled runs, over time too, and waves in the angle of a shaft. Over the voltage
         are those over the motors' voltage where that is not the supply's."""
         rows = jax.tree.map(np.asarray, self.of_rows)
-        angle, electromotive, way = (np.nan_to_num(np.asarray(x)) for x in _turning(self, robot))
+        angle, electromotive, ways = jax.tree.map(lambda x: np.nan_to_num(np.asarray(x)), _turning(self, robot))
         if (rows.duty != 1).any():
             at_motors = np.where(rows.open > 0.5, electromotive, rows.voltage * rows.duty)
             columns = {**columns, "supply_voltage_V": at_motors}
@@ -625,8 +619,8 @@ class Histories(Observer):
         on_tracks = np.broadcast_to(jax.vmap(robot.chassis)(which).on_tracks > 0.5, np.shape(which))
         waves = bases_room.waves(on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots), robot)
         weight = included.astype(float)
-        families = bases_room.families(columns, weight, robot, way=way)
-        return (*families, *bases_room.windows(columns, weight, robot), *waves)
+        told = columns, weight, robot, None, ways
+        return (*bases_room.families(*told), *bases_room.windows(*told), *waves)
 
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> TimeStatistics:
         names = bases_room.names(bases)
@@ -860,11 +854,12 @@ def _readings(robot: Robot, signals: Signals) -> Float[Array, " channels"]:
 
 
 @compiled
-def _turning(observe: Histories, robot: Robot) -> tuple[Array, Array, Array]:
-    """Angle of the driving shaft, back-EMF and direction at every row."""
+def _turning(observe: Histories, robot: Robot) -> tuple[Array, Array, dict[str, Array]]:
+    """Angle of the driving shaft, back-EMF and ways of travel at every row."""
     whole = observe.whole(robot)
     rows = observe.at_rows(whole)
-    return observe.angle(whole), jnp.asarray(rows.voltage_back), jnp.asarray(rows.direction)
+    ways = {name: jnp.broadcast_to(getattr(rows, name), jnp.shape(rows.speed_motor)) for name in WAYS}
+    return observe.angle(whole), jnp.asarray(rows.voltage_back), ways
 
 
 @compiled

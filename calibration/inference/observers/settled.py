@@ -30,7 +30,9 @@ from mmrjax import balances, channels, fidelities
 from mmrjax.compiling import SELDOM, compiled
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
+from mmrjax.effects.curve import WAYS, acts_along
 from mmrjax.fidelities.base import Implicit
+from mmrjax.fidelities.rest import direction
 from mmrjax.fidelities.steady import operating_signals
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
@@ -65,13 +67,13 @@ class SettledLinearization(Linearization):
         """What a defect of a balance changes, of each side; sides that are alike are one."""
         return self.defects[balance].reshape(-1, *self.scale.shape)
 
+    def along_of_sides(self, balance: str) -> np.ndarray:
+        """What a defect that counts along the travel changes, shape (sides, rows, channels)."""
+        way = self.variable(acts_along(balance)).reshape(-1, self.rows)
+        return np.asarray(self.of_sides(self.probed.index(balance))) * way[:, :, None]
+
     def places(self) -> np.ndarray:
         return np.arange(self.rows)
-
-    @classmethod
-    def sense(cls, signals: Signals) -> Array | float:
-        """Along what a defect of each balance is counted, by side and row; 1 in travel, which is forward."""
-        return 1.0
 
 
 def shares(channel: str, sides: int) -> np.ndarray:
@@ -262,7 +264,7 @@ class SettledRuns(Observer):
             return moved.ravel()
 
         signatures = jnp.concatenate([e.each(signature) for e in effects]).T
-        defects = (defects * kind.sense(signals)).reshape(len(probes), *self.shape_sides, rows, count)
+        defects = defects.reshape(len(probes), *self.shape_sides, rows, count)
         return kind(residual, jacobian[:, :size], finite(signatures), defects, scale, signals, channels=shown)
 
     def draws(
@@ -314,7 +316,9 @@ class SettledRuns(Observer):
         weight = included.astype(float)
         if "duty" in columns:  # what the motors get
             columns = {**columns, "supply_voltage_V": columns["supply_voltage_V"] * columns["duty"]}
-        return (*bases_room.families(columns, weight, robot), *bases_room.windows(columns, weight, robot))
+        ways = dict.fromkeys(WAYS, np.asarray(_directions(self, robot)))
+        told = columns, weight, robot, None, ways
+        return (*bases_room.families(*told), *bases_room.windows(*told))
 
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> EquationDefects:
         """As the protocol says: a row's residual (simulated less measured) is split among the defects of the
@@ -323,7 +327,7 @@ class SettledRuns(Observer):
 
 
 def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarray]:
-    """The defects of each row that make its residual r, of each side where sides are driven apart.
+    """The defects along the travel of each row that make its residual r, of each side where sides are driven apart.
 
     The likeliest of r = -S δ + noise of one sd, where δ has the prior sds D^½, the size of what each equation is
     about (rms over the table): δ = -D Sᵀ (S D Sᵀ + 1)⁻¹ r. A defect that the readings of a row hardly show is so next
@@ -332,7 +336,7 @@ def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarra
     """
     assert isinstance(linear, SettledLinearization)
     rows = np.flatnonzero(included)
-    slopes = np.stack([np.asarray(linear.of_sides(linear.probed.index(b)))[:, rows] for b in EQUATIONS])
+    slopes = np.stack([np.asarray(linear.along_of_sides(b))[:, rows] for b in EQUATIONS])
     about = [np.asarray(getattr(linear.signals, name))[rows] for name in EQUATIONS.values()]
     sides, size = slopes.shape[1], np.array([root_mean_square(x) for x in about])
     made, turning, output = (
@@ -348,6 +352,12 @@ def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarra
     found[:, rows] = np.repeat(size, sides)[:, None] * shares[:, :, 0].T
     names = [f"{b}_{side}" for b in EQUATIONS for side in channels.SIDES] if sides > 1 else EQUATIONS
     return dict(zip(names, found, strict=True))
+
+
+@functools.partial(compiled, options=SELDOM)
+def _directions(observe: SettledRuns, robot: Robot) -> Float[Array, " rows"]:
+    """Which way each run goes, 1 or -1."""
+    return jax.vmap(lambda c: direction(robot, c))(observe.conditions)
 
 
 @functools.partial(compiled, options=SELDOM)

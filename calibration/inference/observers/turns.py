@@ -25,7 +25,7 @@ from calibration.inference.problem import Observation
 from mmrjax import effects, fidelities
 from mmrjax.compiling import compiled
 from mmrjax.effects import Effect
-from mmrjax.effects.curve import IN_TURNS, VARIABLES_ROUND
+from mmrjax.effects.curve import IN_TURNS, VARIABLES_ROUND, WAYS
 from mmrjax.fidelities.steady import operating_signals
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
@@ -37,14 +37,13 @@ VARIABLES = (*(v for v in IN_TURNS if v != "order"), *VARIABLES_ROUND)
 ROUND = ("lateral", "yaw")
 
 
-def along(signals: Signals, name: str) -> Float[Array, " points"]:
-    """A signal at every point [SI], counted along the motion: of the shafts, or of the turn.
+def by_point(signals: Signals, name: str) -> Float[Array, " points"]:
+    """A signal at every point [SI].
 
     Args:
         signals: shape (rows, sides).
     """
-    way = signals.direction_turn if name == "yaw_rate" else signals.direction
-    return bases_room.along(name, jnp.asarray(getattr(signals, name)), jnp.asarray(way)).T.ravel()
+    return jnp.broadcast_to(getattr(signals, name), jnp.shape(signals.speed_motor)).T.ravel()
 
 
 class TurnLinearization(SettledLinearization):
@@ -64,18 +63,12 @@ class TurnLinearization(SettledLinearization):
         return np.any(points.reshape(-1, self.rows), axis=0)
 
     def variable(self, name: str) -> np.ndarray:
-        return np.asarray(along(self.signals, name), float)
+        return np.asarray(by_point(self.signals, name), float)
 
     def shown(self, channel: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         of_sides = shapes.reshape(-1, self.rows, shapes.shape[1])
         each = np.stack([shares(name, len(of_sides)) for name in self.channels])
         return super().shown(channel, jnp.tensordot(jnp.asarray(each)[channel], of_sides, 1))
-
-    @classmethod
-    def sense(cls, signals: Signals) -> Array | float:
-        shafts, turn = (jnp.asarray(x).T for x in (signals.direction, signals.direction_turn))
-        sign = {"mass": jnp.ones_like(shafts)} | dict.fromkeys(ROUND, turn)
-        return jnp.stack([sign.get(balance, shafts) for balance in cls.probed])[..., None]
 
 
 class SettledTurns(SettledRuns):
@@ -132,18 +125,18 @@ class SettledTurns(SettledRuns):
         """As the protocol says: in the balances of both sides alike, and round the turn, over what each side does,
         how fast the robot turns, and which side it is."""
         names = [v for v in VARIABLES if v != "voltage" or robot.rig.shows_voltage]
-        seen = _variables(self, robot, tuple(names))
-        points = {bases_room.VARIABLES[v]: np.asarray(seen[v]) for v in names}
+        seen = {n: np.asarray(x) for n, x in _variables(self, robot, (*names, *WAYS)).items()}
+        points = {bases_room.VARIABLES[v]: seen[v] for v in names}
         points |= {c: np.tile(columns[c], 2) for c in ("configuration", "order") if c in columns}
         weight = np.tile(included.astype(float), 2)
         lacking = bases_room.balances_of(robot, (*bases_room.BALANCES, *bases_room.OF_TURNS))
         axes = (bases_room.axes_of(robot)[0], bases_room.VARIABLES["payload"], "yaw_rate", "side")  # what is imposed
-        told = points, weight, robot, bases_room.Scope(lacking, axes)
+        told = points, weight, robot, bases_room.Scope(lacking, axes), {way: seen[way] for way in WAYS}
         return (*bases_room.families(*told), *bases_room.windows(*told))
 
 
 @compiled
 def _variables(observe: SettledTurns, robot: Robot, names: tuple[str, ...]) -> dict[str, Array]:
-    """Variables of curves at every point of a fit."""
+    """Signals at every point of a fit."""
     signals = jax.vmap(lambda c: operating_signals(robot, c))(observe.conditions)
-    return {name: along(signals, name) for name in names}
+    return {name: by_point(signals, name) for name in names}
