@@ -14,6 +14,7 @@ from worlds import histories, laws, settled, tables
 
 from calibration.discovery import discover
 from calibration.discovery.candidates import Candidate, filled, fit_candidates, start
+from calibration.discovery.discrepancy import locate
 from calibration.discovery.notes import CurveOver, NameSupport, NameTest
 from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import augment_with_columns
@@ -22,6 +23,7 @@ from calibration.discovery.settings import settings_for
 from calibration.discovery.smooth import FALL, LENGTHS, PRODUCT, SIZES, WIDE, smooth, surface
 from calibration.discovery.standing import (
     _chosen_again,
+    _curves,
     _evidence_over_curves,
     _lacks,
     _root,
@@ -96,6 +98,31 @@ def test_a_curve_of_rows_in_mirror_image_is_the_same(toy):
     found, wanted = (smooth(linear, "track", "speed_motor", toy.counts) for linear in (turned, toy.linear))
     assert (found.low, found.high) == (wanted.low, wanted.high) and wanted.evidence > 10
     assert found.evidence == pytest.approx(wanted.evidence, rel=1e-9)
+
+
+def test_a_wave_is_weighed_as_curves_are_and_said_where_it_is_the_better_one(toy):
+    """With sine and cosine alone it explains what five terms over the speed take for it by chance."""
+    order = "order 2 of the driving shaft"
+
+    class Turning(SettledLinearization):
+        def variable(self, name):
+            return 2 * self.signals.angle if name in bases.ORDERS else super().variable(name)
+
+    angle = np.linspace(0.0, 30.0, toy.rows)
+    signals = SimpleNamespace(**vars(toy.linear.signals), angle=angle)
+    known = {f.name: getattr(toy.linear, f.name) for f in dataclasses.fields(toy.linear)}
+    of_track = np.asarray(toy.linear.defects)[PROBED.index("track")]
+    missing = (3 * np.sin(2 * angle + 0.4)[:, None] * of_track).ravel()
+    residual = np.concatenate([missing, np.asarray(toy.linear.residual)[len(missing) :]])
+    linear = Turning(**known | {"signals": signals, "residual": residual})
+    offered = (("track", "speed_motor"), ("track", "slope"), ("track", order))
+    found = _curves(SimpleNamespace(included=toy.counts), linear, (SimpleNamespace(names=offered),), set())
+    assert len(found) == 3 and max(found)[1].variables == (order,)
+
+    scores = SimpleNamespace(curve=np.array([9.0, 5.0, 8.5]), explained=np.array([90.0, 50.0, 80.0]))
+    left = SimpleNamespace(scores=scores, linear=linear)
+    where = locate(left, (SimpleNamespace(names=offered),), toy.counts)
+    assert (where.place, where.variable) == ("track", order)
 
 
 def test_evidence_of_a_surface_is_the_largest_marginal_likelihood(toy):

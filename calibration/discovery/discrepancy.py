@@ -73,7 +73,7 @@ def locate(left: Diagnosis, bases: Bases, included: np.ndarray) -> DiscrepancyLo
     over = [j for j in those if names[j][0] == place and names[j][1] != bases_room.CONDITIONS]
     j = k if for_a_while else max(over, key=lambda j: deviate[j])
     if names[j][1] in bases_room.VARIABLES:
-        smoothly = [i for i in over if names[i][1] in bases_room.VARIABLES]
+        smoothly = [i for i in over if bases_room.window(names[i][1]) is None]
         evidence = {i: smooth(left.linear, *names[i], included).evidence for i in smoothly}
         j = max(smoothly, key=lambda i: evidence[i] - INDIRECT * (names[i][1] == "voltage"))
     every = dict.fromkeys(names[i][0] for i in those)

@@ -147,10 +147,12 @@ def _against_curves(
 def _curves(
     space: CandidateSpace, linear: Linearization, bases: Bases, crowded: set[str]
 ) -> list[tuple[float, CurveOver]]:
-    """Evidence of every smooth curve: of one variable in any place, of two in the crowded ones."""
+    """Evidence of every smooth curve and wave: of one variable in any place, of two in the crowded ones."""
     included, offered = space.included, dict.fromkeys(bases_room.names(bases))
     known = [
-        v for v in bases_room.VARIABLES if any(v == over for _, over in offered) and _varies(linear, v, included)
+        v
+        for v in (*bases_room.VARIABLES, *bases_room.ORDERS)
+        if any(v == over for _, over in offered) and _varies(linear, v, included)
     ]
     tried = []
     for place, variable in offered:
