@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from worlds import rigs
 
-from calibration.data import rig_facts, robot_file, settling
+from calibration.data import contradictions, rig_facts, robot_file, settling
 from calibration.data import runs as records
 from calibration.data.errors import BadData
 from calibration.words import settle as words
@@ -316,6 +316,18 @@ def test_time_in_milliseconds_is_doubted_where_a_start_shows_it(tmp_path):
     drifts = {"time_s": 1e3 * seconds, **start, "motor_speed_rpm": 1000 + 50 * (1 - np.exp(-seconds / step))}
     bench(tmp_path, drifts)
     assert rig_facts.doubtful_time(records.read(tmp_path / "log.csv", robot=robot), robot) == ""
+
+
+@pytest.mark.parametrize("moves", [[8.50, 0.42, -0.1743, -9.796, -11.76, -17.17], [0, 190, 400, 620, 830, 1030]])
+def test_a_shaft_that_stands_for_long_may_be_quick_for_a_while(moves):
+    """Through zero from a small angle to a large one; and by more than half a turn a sample."""
+    angle = np.concatenate([np.full(50, float(moves[0])), moves, np.full(50, float(moves[-1]))])
+    columns = {"output_angle_deg": angle, "time_s": 0.01 * np.arange(len(angle))}
+
+    class Log(dict):
+        source, run_names = "log.csv", np.full(len(angle), "a")
+
+    contradictions._angle(Log(columns))
 
 
 def test_an_angle_that_is_frozen_is_named_itself(tmp_path):

@@ -151,6 +151,12 @@ def _time(runs: Runs) -> None:
             )
 
 
+def _beside(step: np.ndarray) -> np.ndarray:
+    """Median of the four steps beside each one: a drive that mostly stands is quick for a while."""
+    wide = np.pad(step, 2, constant_values=np.nan)
+    return np.nanmedian([wide[k : k + len(step)] for k in (0, 1, 3, 4)], axis=0)
+
+
 def _angle(runs: Runs) -> None:
     angle, time, run = runs["output_angle_deg"], runs["time_s"], runs.run_names
     for name in np.unique(run):
@@ -160,7 +166,7 @@ def _angle(runs: Runs) -> None:
         step = np.diff(angle[mine])
         if step.size < 2:
             continue
-        usual = float(np.median(np.abs(step)))
+        usual = np.maximum(np.median(np.abs(step)), _beside(np.abs(step)))
         jumps = np.flatnonzero(
             (np.abs(step) > TURN) & (np.abs(step) < 2 * TURN + UNUSUAL * usual) & (np.abs(step) > UNUSUAL * usual)
         )
@@ -173,7 +179,7 @@ def _angle(runs: Runs) -> None:
         with np.errstate(divide="ignore", invalid="ignore"):
             times = np.abs(angle[mine][1:] / angle[mine][:-1])
         other = np.abs(np.abs(np.log(np.where(times > 0, times, 1.0))) / np.log(RADIAN) - 1) < ALIKE / np.log(RADIAN)
-        mixed = np.flatnonzero(other & (np.abs(step) > UNUSUAL * max(usual, 1.0)))
+        mixed = np.flatnonzero(other & (np.abs(step) > UNUSUAL * np.maximum(usual, 1.0)))
         if mixed.size:
             row, k = int(mine[mixed[0] + 1]), mixed[0]
             was, now = (number(float(f"{x:.4g}")) for x in angle[mine][k : k + 2])
