@@ -92,6 +92,19 @@ def test_speeds_of_both_sides_are_conditions(rig, table):
     assert conditions.turns and conditions.duty_left is None
 
 
+def test_a_table_of_turns_with_channels_of_turns_alone_is_answered_by_the_line_to_write(tmp_path, rig):
+    path = tmp_path / "turns.csv"
+    path.write_text(
+        "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,duty_left,duty_right,yaw_rate_rad_s\n"
+        + "6T2A,33,13.1,0,0,1,0.4,-1.1\n" * 3
+    )
+    with pytest.raises(BadData, match=r"yaw_rate_rad_s: state in the robot's file channels = ") as said:
+        records.read(path, robot=rig('base = "nominal"'))
+    line = said.value.args[0].rpartition("file ")[2]
+    robot = rig(f'base = "nominal"\n{line}')
+    assert [c.name for c in records.read(path, robot=robot).channels] == ["yaw_rate"]
+
+
 def test_yaw_rate_in_degrees_is_converted(rig, table):
     robot = rig(KINEMATIC)
     runs = table(f"{SPEEDS},yaw_rate_deg_s", *[(a, b, np.degrees(w)) for a, b, _, _, w in SOUND], robot=robot)

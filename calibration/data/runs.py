@@ -368,6 +368,10 @@ def _check_header(
     if measured and not any(c in stated for c in layout.measured_columns):
         expected = ", ".join(layout.measured_columns)
         other = _other_names(strange, layout.measured_columns[0])
+        turning = {c.column: c.name for c in channels.OF_TURNS}
+        if found := [c for c in strange if c in turning]:
+            names = ", ".join(f'"{turning[c]}"' for c in found)
+            other = f"; {', '.join(found)}: state in the robot's file channels = [{names}]"
         raise BadData(f"{name}: no column of a channel; expected at least one of {expected}{other}")
     for column in strange:
         close = difflib.get_close_matches(column, [c for c in layout.known() if c not in stated], 1, 0.85)
