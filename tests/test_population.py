@@ -304,7 +304,9 @@ def test_options_of_a_population_that_cannot_be_are_refused(options, says):
 def test_running_gear_is_found_through_the_track_model(tmp_path):
     """Readings of a shaking gear; the population comes near its slip, which the flush gear does not."""
     table = records.read("measured")
-    table = table.where((table["configuration"] == "6T2A") & (table["supply_voltage_V"] == 15))
+    table = table.where(
+        (table["configuration"] == "6T2A") & (table["supply_voltage_V"] == 15) & (table["slope_deg"] % 10 == 0)
+    )
     from mmrjax import params
     from mmrjax.fidelities.track import track_batch
 
@@ -321,7 +323,7 @@ def test_running_gear_is_found_through_the_track_model(tmp_path):
     data = dataclasses.replace(table, columns=columns)
     found = calibrate(
         data, robots.nominal(), model="track", noise="current=2%,motor_speed=0.5%,speed=0.5%", population=48,
-        free=("default", "running_gear.guide_recess", "running_gear.contact_damping"), generations=8,
+        free=("default", "running_gear.guide_recess", "running_gear.contact_damping"), generations=5,
         members=tmp_path / "m.npz",
     )  # fmt: skip
     assert found.errors_after["speed"].rms_percent < 0.6 * found.errors_before["speed"].rms_percent
