@@ -171,7 +171,7 @@ class Histories(Observer):
         knots: rows between which a defect is taken to be linear, a run's last repeated, shape (runs, knots).
         delayed: whether what is imposed may act later than its column says (`Rig.delay`), so that readings are read
             that much earlier between the instants.
-        stages: unknowns of every run at both stages of every step, of the robot that is observed, where they are known.
+        stages: unknowns of every run at both stages of every step, of the robot that is observed; None: not known.
     """
 
     word: ClassVar[str] = "samples"
