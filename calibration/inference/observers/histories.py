@@ -634,6 +634,16 @@ class Histories(Observer):
         )
         return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), found, best)
 
+    def observed(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
+        """What the model says of every row at z, by the program of the searches.
+
+        Args:
+            active: its effects, of a problem with slots.
+        """
+        which = None if active is None else np.asarray(active)[None]
+        evaluate = _evaluator(problem, np.asarray(problem.data.weight)[None], which)
+        return jax.tree.map(lambda x: x[0], evaluate(np.asarray(z)[None], np.zeros(1, int))[2])
+
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
         """Curves and windows as of settled runs, over time too, and waves in the angle of a shaft. Over the voltage
         are those over the motors' voltage where that is not the supply's."""
