@@ -163,7 +163,8 @@ def _known(
 
 @_known.def_jvp
 def _known_response(primals: tuple, tangents: tuple) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    return primals[3], _changed(*primals, tangents[0])
+    robot, conditions, times, stages = primals
+    return stages, _changed(robot, conditions, times, stages, tangents[0])
 
 
 def _changed(

@@ -387,6 +387,7 @@ class Histories(Observer):
 
         instants = self.instant[jnp.where(self.rows_of < 0, 0, self.rows_of)]
         stages = self.following(robot).stages
+        assert stages is not None
         return jnp.moveaxis(jax.vmap(one)(self.conditions, self.times, clock, instants, stages), 0, 1)
 
     def following(self, robot: Robot) -> Histories:
