@@ -269,32 +269,46 @@ CURRENT_STEPS = 4
 
 def _current(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     """Current with which the motors accelerate as the imposed speed does [A]."""
-    return _current_of(robot, conditions, lambda x: _moving(robot, conditions, dataclasses.replace(state, current=x)))
+
+    def at(given: tuple[Robot, Conditions, State], current: Scalar) -> Signals:
+        robot, conditions, state = given
+        return _moving(robot, conditions, dataclasses.replace(state, current=current))
+
+    return _current_of(at, (robot, conditions, state))
 
 
 def _speed_imposed(robot: Robot, conditions: Conditions, chassis: Chassis, signals: Signals) -> Signals:
     """The signals of a side whose motor speed is imposed, its traction known."""
 
-    def at(current: Scalar) -> Signals:
+    def at(given: tuple[Robot, Conditions, Chassis, Signals], current: Scalar) -> Signals:
+        robot, conditions, chassis, signals = given
         total = robot.sides * current * signals.duty
         moved = electrical(robot, conditions, _fill(signals, current=current, total_current=total))
         return gearbox(robot, chassis, motor(robot, moved))
 
-    return at(_current_of(robot, conditions, at))
+    given = robot, conditions, chassis, signals
+    return at(given, _current_of(at, given))
 
 
-def _current_of(robot: Robot, conditions: Conditions, signals: Callable[[Scalar], Signals]) -> Scalar:
-    """Current with which the motors accelerate as the imposed speed does [A], of signals by their current."""
-    asked = 0.0 if conditions.motor_acceleration is None else conditions.motor_acceleration
+def _current_of(signals: Callable[[Any, Scalar], Signals], given: tuple) -> Scalar:
+    """Current with which the motors accelerate as the imposed speed does [A].
 
-    def lacking(current: Scalar) -> Scalar:
-        return signals(current).acceleration_wheel * robot.gearbox.ratio - asked
+    Args:
+        signals: of `given` and a current [A]; given: robot, conditions, and what else they depend on. Derivatives by
+            it are those of the last step alone.
+    """
 
-    current = jnp.zeros_like(jnp.asarray(conditions.motor_speed))
-    for _ in range(CURRENT_STEPS):
-        at = jax.lax.stop_gradient(current)
-        left, rise = jax.jvp(lacking, (at,), (jnp.ones_like(at),))
-        current = at - left / jax.lax.stop_gradient(rise)
+    def lacking(given: tuple, current: Scalar) -> Scalar:
+        robot, conditions, *_ = given
+        asked = 0.0 if conditions.motor_acceleration is None else conditions.motor_acceleration
+        return signals(given, current).acceleration_wheel * robot.gearbox.ratio - asked
+
+    fixed = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, given)
+    current = jnp.zeros_like(jnp.asarray(fixed[1].motor_speed))
+    for step in range(CURRENT_STEPS):
+        left, rise = jax.jvp(lambda x: lacking(fixed, x), (current,), (jnp.ones_like(current),))
+        left = lacking(given, current) if step == CURRENT_STEPS - 1 else left
+        current = current - left / rise
     return current
 
 

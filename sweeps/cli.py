@@ -515,14 +515,21 @@ def _prepared(resolved: Any, no_cache: bool = False) -> Any:
     XLA_FLAGS, be it to nothing, is heeded.
     """
     one_thread = hasattr(resolved, "model") and fidelities.facts(resolved.model).one_thread
-    _start_jax(no_cache, ("--xla_cpu_multi_thread_eigen=false",) * one_thread)
+    options = (f"xla_cpu_small_while_loop_byte_threshold={WHOLE}",) * isinstance(resolved, config.Loop)
+    _start_jax(no_cache, ("--xla_cpu_multi_thread_eigen=false",) * one_thread, options)
     return resolved
 
 
-def _start_jax(no_cache: bool, flags: tuple[str, ...] = ()) -> None:
-    """Import jax with double precision, by flags of XLA, and with the compilation cache unless it is not wanted."""
+#: Up to how many bytes a loop within a program of `loop` is compiled as one function [bytes]. In another one each
+#: turn hands some hundred operations to the executor, which is most of the time of a run over time.
+WHOLE = 1_000_000
+
+
+def _start_jax(no_cache: bool, flags: tuple[str, ...] = (), options: tuple[str, ...] = ()) -> None:
+    """Import jax with double precision, by flags of XLA and options beside that of `SOUND_AT_LEVEL_0`, and with the
+    compilation cache unless it is not wanted."""
     if "jax" not in sys.modules:  # which takes it when it starts
-        flags = SOUND_AT_LEVEL_0, *flags
+        flags = ",".join((SOUND_AT_LEVEL_0, *options)), *flags
     if flags:
         os.environ.setdefault("XLA_FLAGS", " ".join(flags))
     from sweeps import compilation_cache

@@ -15,8 +15,8 @@ from test_implausible import unnamed
 from worlds import settled, tables
 
 from calibration.data import robot_file
-from calibration.discovery import discover, formula
-from calibration.discovery.discrepancy import alike_variables, fit_discrepancy, refined
+from calibration.discovery import discover, discrepancy, formula
+from calibration.discovery.discrepancy import CurveBeside, alike_variables, fit_discrepancy, refined
 from calibration.discovery.projection import defect
 from calibration.discovery.score_tests import diagnosed
 from calibration.discovery.smooth import smooth
@@ -240,3 +240,22 @@ def test_a_window_is_refined_to_its_rows():
     assert (found.low, found.high) == (14, 25) and explained > 60
     half, _ = refined(linear, "track", "order", np.arange(rows) % 2 == 0)
     assert (half.low, half.high) == (15, 25)
+
+
+def test_a_curve_that_several_ask_for_is_fitted_once(monkeypatch):
+    calls = []
+
+    def counted(name, *given):
+        calls.append((name, given))
+        return name
+
+    where = SimpleNamespace(place="track", variable="speed")
+    space, left = SimpleNamespace(included=None), SimpleNamespace(linear="linear")
+    monkeypatch.setattr(discrepancy, "locate", lambda *given: where)
+    monkeypatch.setattr(discrepancy, "fit_discrepancy", lambda *given: counted("curve", *given))
+    monkeypatch.setattr(discrepancy, "diagnosis_beside", lambda *given: counted("diagnosis", *given))
+    beside = CurveBeside(space, "base", left, "bases")
+    assert not calls  # before it is asked for
+    assert [beside.curve, beside.diagnosis, beside.curve, beside.diagnosis] == 2 * ["curve", "diagnosis"]
+    fitted = ("curve", (space, "base", "linear", "track", "speed"))
+    assert calls == [fitted, ("diagnosis", (space, "curve", "bases", left))]

@@ -12,7 +12,7 @@ from mmrjax import params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.drive import drive
-from mmrjax.fidelities.histories import FIRST, LONGEST, grid, histories
+from mmrjax.fidelities.histories import FIRST, LONGEST, grid, histories, states
 
 RUNS = Conditions(
     voltage=np.array([15.0, 33.0, 24.0]),
@@ -106,3 +106,24 @@ def test_repeated_instants_change_nothing():
 def test_run_that_cannot_be_followed_is_not_finite():
     robot = params.replace(robots.nominal(), {"motor.resistance": jnp.asarray(jnp.nan)})
     assert not np.isfinite(seen(robot)).any()
+
+
+def test_known_states_change_neither_values_nor_derivatives():
+    robot, run, times = robots.nominal(), jax.tree.map(lambda x: x[0], RUNS), jnp.asarray(GRID[:60])
+    friction = float(robot.motor.friction_coulomb)
+
+    def current(x, stages=None):
+        at = params.replace(robot, {"motor.friction_coulomb": x})
+        found = histories(at, run, times, stages).current
+        return found, found
+
+    known = jax.jit(lambda: states(robot, run, times))()
+    (slope, value), (slope_known, value_known) = (
+        jax.jit(jax.jacfwd(lambda x, s=s: current(x, s), has_aux=True))(friction) for s in (None, known)
+    )
+    assert np.abs(value).max() > 1 and np.abs(slope).max() > 0.1
+    np.testing.assert_allclose(value_known, value, rtol=1e-12)
+    np.testing.assert_allclose(slope_known, slope, rtol=1e-9, atol=1e-12)
+    # And they are what is followed: those of another run are shown as they are.
+    other = current(friction, jax.tree.map(lambda x: 2 * x, known))[0]
+    np.testing.assert_allclose(other[1:], 2 * value[1:], rtol=1e-12)

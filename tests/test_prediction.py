@@ -9,7 +9,7 @@ from scipy import stats
 
 from calibration.data import robot_file
 from calibration.data.runs import Runs
-from calibration.discovery import prediction
+from calibration.discovery import findings, prediction
 from calibration.discovery.discover import discover
 from calibration.discovery.prediction import Gain, HeldOutScore, scored, smallest
 from mmrjax import channels, robots
@@ -77,6 +77,49 @@ def test_smallest_set_within_one_error_of_the_best_is_chosen(monkeypatch, runs, 
     space = SimpleNamespace(bare=SimpleNamespace(observe=SimpleNamespace(blocks=("slope", "voltage"))))
     found = smallest(space, runs, candidates[0], candidates[1:])
     assert (found is None) if chosen == 0 else (found is candidates[chosen])
+
+
+def test_what_candidates_predict_is_kept_and_not_fitted_again(monkeypatch, runs):
+    candidates = [
+        SimpleNamespace(effects=tuple("abc"[:k]), active=tuple("abc"[:k]), z=np.full(2, k)) for k in range(2)
+    ]
+    shown = {c.effects: {kind: np.full((12, 2), len(c.effects)) for kind in ("slope", "voltage")} for c in candidates}
+    monkeypatch.setattr(
+        prediction,
+        "score_of",
+        lambda space, runs, c: dataclasses.replace(score(np.zeros(12), np.arange(12)), reading=shown[c.effects]),
+    )
+    space = SimpleNamespace(bare=SimpleNamespace(observe=SimpleNamespace(blocks=("slope", "voltage"))))
+    predicted = {}
+    smallest(space, runs, candidates[0], candidates[1:], predicted)
+    assert [predicted[prediction.key(c)] for c in candidates] == [shown[c.effects] for c in candidates]
+    assert (
+        prediction.key(SimpleNamespace(active=(), z=np.ones(2))) not in predicted
+    )  # another fit of the same effects
+
+    @dataclasses.dataclass
+    class Fit:
+        problem: SimpleNamespace
+        z: np.ndarray
+        active: None = None
+
+        def observation(self):
+            return SimpleNamespace(status=np.zeros(12), reading=np.zeros((12, 2)))
+
+    fitted = []
+
+    def held_out(problem, z, masks, active):
+        fitted.append(z[0])
+        return SimpleNamespace(reading=np.full((12, 2), -1.0))
+
+    monkeypatch.setattr(findings, "held_out", held_out)
+    problem = SimpleNamespace(observe=SimpleNamespace(blocks=("slope",), unreachable=lambda status: status > 0))
+    before, after = (Fit(problem, c.z) for c in candidates)
+    known = predicted[prediction.key(candidates[0])]
+    found = findings.readings(runs, np.ones((12, 2)), before, after, known)
+    assert fitted == [1.0]
+    np.testing.assert_array_equal(found.held_out["slope"][0], known["slope"])
+    np.testing.assert_array_equal(found.held_out["slope"][1], -1.0)
 
 
 def test_nothing_is_chosen_where_nothing_can_be_held_out(runs):

@@ -384,7 +384,7 @@ def test_model_holds_what_is_established_and_what_predicts(monkeypatch, adequate
     seen = SimpleNamespace(test=SimpleNamespace(rejected_with_margin=not adequate, null=None))
     asked = []
 
-    def judged(space, base, searched, left, bases, settings, proposed=None, blocks=()):
+    def judged(space, base, searched, left, bases, settings, proposed=None, blocks=(), beside=None):
         those = best if proposed is None else proposed[0]
         asked.append(those.effects)
         evidence = {"x": -20.0}

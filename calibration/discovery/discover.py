@@ -23,7 +23,7 @@ from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, filled, fit_base, fit_candidates, start
 from calibration.discovery.classes import Classes, classes, cosines
-from calibration.discovery.discrepancy import diagnosis_beside, fit_discrepancy, locate
+from calibration.discovery.discrepancy import CurveBeside, locate
 from calibration.discovery.experiments import Proposal, denser, no_menu, separating
 from calibration.discovery.hidden import hidden
 from calibration.discovery.kept import Keep
@@ -49,6 +49,7 @@ from calibration.discovery.notes import (
 )
 from calibration.discovery.outliers import Screening, ahead, screen, screen_beside
 from calibration.discovery.posterior import of_curve, of_fit
+from calibration.discovery.prediction import Predicted
 from calibration.discovery.result import (
     DiscoveryResult,
     FoundEffect,
@@ -272,6 +273,8 @@ class LoopStages:
         where: something is missing, or remains.
         standing: why names that were looked at do not stand, or what was put beside them.
         held_out: the alternatives compared by data held out, where these chose the leader.
+        beside: the curve of what the base leaves, where something is missing.
+        predicted: what fits predict of data held out, as of `prediction.smallest`.
     """
 
     verdict: str
@@ -283,6 +286,8 @@ class LoopStages:
     where: DiscrepancyLocation | None = None
     standing: NameSupport | None = None
     held_out: tuple[HeldOutAlternative, ...] = ()
+    beside: CurveBeside | None = None
+    predicted: Predicted = dataclasses.field(default_factory=dict)
 
     @property
     def members(self) -> tuple[tuple[str, ...], ...]:
@@ -412,10 +417,11 @@ def trace(
         screened = more
 
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
-    where = locate(left, bases, space.included)
-    model, searched, stood = choose(runs, screened, left, searched, settings, progress)
+    beside, predicted = CurveBeside(space, base, left, bases), Predicted()
+    model, searched, stood = choose(runs, screened, left, searched, settings, progress, beside, predicted)
+    stages = functools.partial(LoopStages, beside=beside, predicted=predicted)
     if model is None:
-        return LoopStages("unnamed", screened, left, sds, searched, where=where, standing=stood)
+        return stages("unnamed", screened, left, sds, searched, where=beside.where, standing=stood)
 
     searched = dataclasses.replace(searched, best=model[0], diagnosis=model[1])
     best, after = model
@@ -423,7 +429,7 @@ def trace(
     progress(Step("alike", (best.effects,)))
     alike = classes(space, base, best, searched.ladder, left, settings)
     if not any(named):
-        return LoopStages("unnamed", screened, left, sds, searched, alike, where, standing=stood)
+        return stages("unnamed", screened, left, sds, searched, alike, beside.where, standing=stood)
     compared: tuple[HeldOutAlternative, ...] = ()
     if settings.prefer == HELD_OUT:
         progress(Step("held out"))
@@ -433,11 +439,18 @@ def trace(
     alone = [len(m) + len(v) == 1 for m, v in zip(alike.members, alike.stated, strict=True)]
     verdict = "named" if all(one for one, name in zip(alone, named, strict=True) if name) else "class"
     remains = locate(after, bases, space.included) if after.test.rejected_with_margin else None
-    return LoopStages(verdict, screened, left, sds, searched, alike, remains, standing=stood, held_out=compared)
+    return stages(verdict, screened, left, sds, searched, alike, remains, standing=stood, held_out=compared)
 
 
 def choose(
-    runs: Runs, screened: Screening, left: Diagnosis, searched: Search, settings: Settings, progress: Tell
+    runs: Runs,
+    screened: Screening,
+    left: Diagnosis,
+    searched: Search,
+    settings: Settings,
+    progress: Tell,
+    beside: CurveBeside | None = None,
+    predicted: Predicted | None = None,
 ) -> tuple[tuple[Candidate, Diagnosis] | None, Search, NameSupport]:
     """The effects that belong in the model: those whose names stand by themselves, and those of the smallest set that
     predicts as well as any, but what only stands in for a curve; None for none. With what was searched, and which
@@ -446,7 +459,8 @@ def choose(
     Where the largest set leaves nothing its effects are judged, else those of the set that predicts.
 
     Args:
-        left: what the base leaves.
+        left: what the base leaves; beside: its curve.
+        predicted: takes what fits predict of data held out.
     """
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
     best, after, long = searched.best, searched.diagnosis, space.bare.observe.long
@@ -455,17 +469,18 @@ def choose(
     adequate = not after.test.rejected_with_margin
     kinds = blocks_room.distinct(runs, space.bare.observe.blocks)
     blocks = [mask for by in kinds.values() for mask in by.values()]
-    stood = standing(space, base, searched, left, bases, settings, blocks=blocks) if adequate or long else None
+    asked = functools.partial(standing, space, base, searched, left, bases, settings, blocks=blocks, beside=beside)
+    stood = asked() if adequate or long else None
     if stood is not None and all(stood.established(e) for e in best.effects):
         return (best, after), searched, stood
     few = None
     if not (long and stood is not None and stood.stands):  # refits of histories take long
         progress(Step("held out"))
-        few = prediction.smallest(space, runs, base, path(searched))
+        few = prediction.smallest(space, runs, base, path(searched), predicted)
     if stood is None:
         judged = best if few is None else few
         proposed = judged, after if judged is best else diagnose(space, judged, bases, left.test.null, settings)
-        stood = standing(space, base, searched, left, bases, settings, proposed, blocks)
+        stood = asked(proposed=proposed)
     else:
         proposed = best, after
     names = [e for e in proposed[0].effects if stood.established(e)]
@@ -648,11 +663,11 @@ def assemble_result(
     """The result of a verdict, with what only now is worth its time: errors held out, and the next experiment."""
     screened, left, where, noise = traced.screened, traced.left, traced.where, traced.sds.noise
     space, base, best, ends = screened.base.space, screened.base.candidate, traced.best, traced.ends
-    curve = None
+    curve = beside = None
     if traced.verdict == "unnamed" and where is not None:
         progress(Step("shape"))
-        curve = fit_discrepancy(space, base, left.linear, where.place, where.variable)
-    beside = None if curve is None else diagnosis_beside(space, curve, screened.bases, left)
+        found_curve = traced.beside or CurveBeside(space, base, left, screened.bases)
+        curve, beside = found_curve.curve, found_curve.diagnosis
     observe, rows = space.bare.observe, len(runs)
     numbers = np.arange(1, rows + 1) if numbers is None else numbers
     included = space.included[:rows]
@@ -669,7 +684,8 @@ def assemble_result(
         cost, converged = curve.chi2[1] / 2, curve.converged
 
     progress(Step("errors"))
-    seen = findings.readings(runs, noise.sd, before, after)
+    known = [traced.predicted.get(prediction.key(c)) for c in (base, best)]
+    seen = findings.readings(runs, noise.sd, before, after, known[0], None if best is base else known[1])
     error = lambda simulated: findings.errors(space.bare, simulated, seen.measured, seen.sd, included)  # noqa: E731
     compared = traced.held_out
     if traced.alike is not None and traced.verdict != "unnamed" and not compared and not observe.long:

@@ -7,6 +7,7 @@ parameters; the curve itself is fitted with the base anew.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Sequence
 from typing import ClassVar
@@ -253,6 +254,32 @@ def diagnosis_beside(space: CandidateSpace, found: Discrepancy, bases: Bases, le
     """A look at the fit with a curve, against the thresholds of the base, which `left` has."""
     linear, scores, strongest = diagnosed(found.problem, jnp.asarray(found.z), space.library.scored, bases)
     return Diagnosis(linear, scores, AdequacyTest(strongest, left.test.null, left.test.settings))
+
+
+class CurveBeside:
+    """Where the base leaves something, the smooth curve there and what it leaves, each found when it is first asked
+    for: both the verdict and its result may ask.
+
+    Attributes:
+        where: the place, as `locate` has it.
+    """
+
+    def __init__(self, space: CandidateSpace, base: Candidate, left: Diagnosis, bases: Bases) -> None:
+        """Arguments as of `fit_discrepancy` and `diagnosis_beside`."""
+        self.where = locate(left, bases, space.included)
+        self._given = space, base, left, bases
+
+    @functools.cached_property
+    def curve(self) -> Discrepancy:
+        """The curve, fitted with the base."""
+        space, base, left, _ = self._given
+        return fit_discrepancy(space, base, left.linear, self.where.place, self.where.variable)
+
+    @functools.cached_property
+    def diagnosis(self) -> Diagnosis:
+        """What the fit with the curve leaves."""
+        space, _, left, bases = self._given
+        return diagnosis_beside(space, self.curve, bases, left)
 
 
 def _with_curve(space: CandidateSpace, base: Candidate, curve: Smooth) -> Problem:

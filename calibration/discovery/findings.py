@@ -50,7 +50,8 @@ from calibration.inference.errors import channel_errors
 from calibration.inference.held_out import held_out
 from calibration.inference.identifiability import held_by_prior
 from calibration.inference.linearization import Linearization, amplitude_of, shape_of, shape_scales, shaped
-from calibration.inference.optimizers import linearised, read
+from calibration.inference.observers.histories import Histories
+from calibration.inference.optimizers import linearised
 from calibration.inference.problem import Observation, Problem
 from mmrjax.balances import BALANCES
 from mmrjax.effects import Effect
@@ -356,16 +357,31 @@ class Fitted:
     def observation(self) -> Observation:
         """What it says of every row."""
         problem = self.problem
+        if isinstance(problem.observe, Histories):
+            return problem.observe.observed(problem, self.z, self.active)
         if self.active is not None:
             which = problem.coordinates.with_effects(jnp.asarray(self.active))
             problem = dataclasses.replace(problem, coordinates=which)
-        if problem.observe.long:
-            return read(problem, problem.robot(jnp.asarray(self.z)))
         return linearised(problem, jnp.asarray(self.z), problem.data)[2]
 
 
-def readings(runs: Runs, sd: np.ndarray, before: Fitted, after: Fitted | None) -> ReadingsOfRows:
-    """Fitted and held-out readings, for every kind of block; `after` None is the same as before."""
+#: Kind of block → what a fit predicts of each row that it has not seen, shape (rows, channels).
+HeldOutReadings = dict[str, np.ndarray]
+
+
+def readings(
+    runs: Runs,
+    sd: np.ndarray,
+    before: Fitted,
+    after: Fitted | None,
+    known_before: HeldOutReadings | None = None,
+    known_after: HeldOutReadings | None = None,
+) -> ReadingsOfRows:
+    """Fitted and held-out readings, for every kind of block; `after` None is the same as before.
+
+    Args:
+        known_before, known_after: what of it is known.
+    """
     rows = len(runs)
 
     def seen(fitted: Fitted) -> np.ndarray:
@@ -373,11 +389,16 @@ def readings(runs: Runs, sd: np.ndarray, before: Fitted, after: Fitted | None) -
         lost = fitted.problem.observe.unreachable(np.asarray(found.status))[:rows, None]
         return np.where(lost, np.nan, np.asarray(found.reading)[:rows])
 
+    def unseen(fitted: Fitted, masks: list[np.ndarray]) -> np.ndarray:
+        return held_out(fitted.problem, fitted.z, masks, fitted.active).reading
+
     held, labels = {}, {}
     for kind, by in blocks_room.distinct(runs, before.problem.observe.blocks).items():
         masks = list(by.values())
-        first = held_out(before.problem, before.z, masks, before.active).reading
-        later = first if after is None else held_out(after.problem, after.z, masks, after.active).reading
+        first = unseen(before, masks) if known_before is None else known_before[kind]
+        later = first
+        if after is not None:
+            later = unseen(after, masks) if known_after is None else known_after[kind]
         held[kind], labels[kind] = (first, later), tuple(by)
     stated, fitted = seen(dataclasses.replace(before, z=np.zeros_like(before.z))), seen(before)
     later = fitted if after is None else seen(after)

@@ -35,10 +35,12 @@ class HeldOutScore:
     Attributes:
         by_kind: kind of block → log density of each reading, NaN where none counts; shape (rows, channels).
         blocks: kind of block → index of each row's block, -1 for none.
+        reading: kind of block → what was scored.
     """
 
     by_kind: dict[str, Readings]
     blocks: dict[str, np.ndarray]
+    reading: dict[str, Readings] = dataclasses.field(default_factory=dict)
 
     def gain(self, over: HeldOutScore) -> Gain:
         """How much better it is than another's, over the readings of both."""
@@ -100,6 +102,15 @@ def scored(
     return HeldOutScore(by_kind, blocks)
 
 
+#: `key` of a candidate → kind of block → what it predicts of each row, by a fit that has not seen its block.
+Predicted = dict[tuple[tuple[str, ...], bytes], dict[str, Readings]]
+
+
+def key(candidate: Candidate) -> tuple[tuple[str, ...], bytes]:
+    """By which a fit finds again what it predicts of data held out."""
+    return candidate.active, np.asarray(candidate.z).tobytes()
+
+
 def score_of(space: CandidateSpace, runs: Runs, candidate: Candidate) -> HeldOutScore:
     """Scores of a candidate, fitted anew without each block of every kind."""
     data, rows, kinds = space.equipped.data, len(runs), space.bare.observe.blocks
@@ -109,20 +120,29 @@ def score_of(space: CandidateSpace, runs: Runs, candidate: Candidate) -> HeldOut
         kind: held_out(problem, z, list(by.values()), active).reading
         for kind, by in blocks_room.distinct(runs, kinds).items()
     }
-    return scored(reading, measured, sd, counts, runs, kinds)
+    return dataclasses.replace(scored(reading, measured, sd, counts, runs, kinds), reading=reading)
 
 
-def smallest(space: CandidateSpace, runs: Runs, base: Candidate, path: Sequence[Candidate]) -> Candidate | None:
+def smallest(
+    space: CandidateSpace,
+    runs: Runs,
+    base: Candidate,
+    path: Sequence[Candidate],
+    predicted: Predicted | None = None,
+) -> Candidate | None:
     """The smallest set of effects that predicts as well as the best one, to one standard error (the rule of Breiman,
     Friedman, Olshen and Stone 1984, sec. 3.4.3); None where that is the base, or nothing can be held out.
 
     Args:
         path: candidates by the number of their effects.
+        predicted: takes what each of them predicts of data held out.
     """
     if not blocks_room.distinct(runs, space.bare.observe.blocks):
         return None
     candidates = [base, *path]
     scores = [score_of(space, runs, c) for c in candidates]
+    if predicted is not None:
+        predicted |= {key(c): score.reading for c, score in zip(candidates, scores, strict=True)}
     best = scores[max(range(len(scores)), key=lambda k: scores[k].gain(scores[0]).mean)]
     for candidate, score in zip(candidates, scores, strict=True):
         behind = best.gain(score)

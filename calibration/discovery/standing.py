@@ -19,7 +19,7 @@ import numpy as np
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
-from calibration.discovery.discrepancy import diagnosis_beside, fit_discrepancy, locate
+from calibration.discovery.discrepancy import CurveBeside, locate
 from calibration.discovery.notes import CurveOver, NameSupport, NameTest
 from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import ABSORBED, augment_with_columns, beside_columns, family_columns
@@ -59,6 +59,7 @@ def standing(
     settings: Settings,
     proposed: Proposed | None = None,
     blocks: Sequence[np.ndarray] = (),
+    beside: CurveBeside | None = None,
 ) -> NameSupport:
     """Which effects of the best candidate of a search may be named, or of another that is proposed.
 
@@ -67,6 +68,7 @@ def standing(
 
     Args:
         left: what the base leaves; blocks: masks of rows that are left out in turn, each of shape (rows,).
+        beside: the curve of what the base leaves, where others ask for it too.
     """
     best, after = (searched.best, searched.diagnosis) if proposed is None else proposed
     if best is None or after is None:
@@ -78,7 +80,8 @@ def standing(
     if adequate:
         found = _against_curves(space, base, best, left.linear, bases, settings)
     else:
-        found = _one_curve(space, base, best, left, bases, settings)
+        beside = CurveBeside(space, base, left, bases) if beside is None else beside
+        found = _one_curve(space, best, left, bases, settings, beside)
     fits = dataclasses.replace(searched, ladder=(base, *searched.ladder))
     tests = name_tests(space, best, fits, bases, after, settings, blocks, better)
     if found.stands:
@@ -200,7 +203,7 @@ def _equation(space: CandidateSpace, effect: str) -> str:
 
 
 def _one_curve(
-    space: CandidateSpace, base: Candidate, best: Candidate, left: Diagnosis, bases: Bases, settings: Settings
+    space: CandidateSpace, best: Candidate, left: Diagnosis, bases: Bases, settings: Settings, beside: CurveBeside
 ) -> NameSupport:
     """Whether one curve alone leaves nothing, where the names of a candidate leave something that is beyond doubt."""
     names = bases_room.names(bases)
@@ -208,12 +211,12 @@ def _one_curve(
         found, _ = beside_columns(left.linear, bases, family_columns(left.linear, bases, k), [names[k][0]])
         if not AdequacyTest(found, left.test.null, settings).rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(_over(*names[k]),))
-    where = locate(left, bases, space.included)
+    where = beside.where
     if equation(where.place) in {_equation(space, e) for e in best.effects}:
         # Names mend what a strong curve in their equation leaves at a base fit that it has pulled far away.
-        curve = fit_discrepancy(space, base, left.linear, where.place, where.variable)
-        adequate = not left.test.beyond_doubt("chi2", curve.chi2[1])  # or there is no need to compile a closer look
-        if adequate and not diagnosis_beside(space, curve, bases, left).test.rejected_with_margin:
+        # Beyond doubt there is no need to compile a closer look.
+        adequate = not left.test.beyond_doubt("chi2", beside.curve.chi2[1])
+        if adequate and not beside.diagnosis.test.rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(_over(where.place, where.variable),))
     return NameSupport(True)
 

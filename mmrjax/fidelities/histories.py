@@ -149,8 +149,28 @@ def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) 
 @states.def_jvp
 def _response(primals: tuple, tangents: tuple) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     robot, conditions, times = primals
-    moved = tangents[0]
     stages = states(robot, conditions, times)
+    return stages, _changed(robot, conditions, times, stages, tangents[0])
+
+
+@eqx.filter_custom_jvp
+def _known(
+    robot: Robot, conditions: Conditions, times: Float[Array, " times"], stages: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """What `states` gives, where it is known, with its derivatives."""
+    return stages
+
+
+@_known.def_jvp
+def _known_response(primals: tuple, tangents: tuple) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    robot, conditions, times, stages = primals
+    return stages, _changed(robot, conditions, times, stages, tangents[0])
+
+
+def _changed(
+    robot: Robot, conditions: Conditions, times: Array, stages: tuple[Array, Array], moved: Robot
+) -> tuple[Array, Array]:
+    """Change of a run's states with its robot's parameters, which are `moved` by so much."""
     begin = None
     if robot.rig.begins is not None:
         begin = eqx.filter_jvp(lambda r: at_first(r, conditions)[1], (robot,), (moved,))[1]
@@ -159,7 +179,7 @@ def _response(primals: tuple, tangents: tuple) -> tuple[tuple[Array, Array], tup
         change = eqx.filter_jvp(lambda r: rates(r, held, y), (robot,), (moved,))[1]
         return jnp.zeros_like(y) if change is None else change
 
-    return stages, respond(robot, conditions, times, stages, source, lambda t, y, dy, _: dy, begin)
+    return respond(robot, conditions, times, stages, source, lambda t, y, dy, _: dy, begin)
 
 
 def respond(
@@ -294,7 +314,12 @@ def _jump(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) ->
     return jnp.where(passes, (after - before) / jnp.where(passes, before[MOTOR], 1.0), 0.0)
 
 
-def histories(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) -> Signals:
+def histories(
+    robot: Robot,
+    conditions: Conditions,
+    times: Float[Array, " times"],
+    stages: tuple[Array, Array] | None = None,
+) -> Signals:
     """Signals of one run from standstill (or as `Rig.begins` says) at every instant of a grid; fields have shape
     (times,).
 
@@ -304,11 +329,12 @@ def histories(robot: Robot, conditions: Conditions, times: Float[Array, " times"
         conditions: one run; each field scalar, or of shape (times,): its value at an instant acts from there to the
             next, and is what the signals of that instant are computed with.
         times: from 0 on, as by `grid` [s]; repeated instants are steps of no length.
+        stages: of the run, from `states`, where they are known.
 
     A run that could not be followed is not finite from there on. Friction at rest is smooth: a robot that should
     stand creeps where gravity pulls, below a tenth of V_s.
     """
     changing, constant = _in_time(conditions)
-    _, nodes = states(robot, conditions, times)
+    _, nodes = states(robot, conditions, times) if stages is None else _known(robot, conditions, times, stages)
     ys = jnp.concatenate([at_first(robot, conditions)[1][None], nodes])
     return jax.vmap(lambda y, now: moving(robot, eqx.combine(now, constant), state_of(robot, y)))(ys, changing)

@@ -165,6 +165,7 @@ class Histories(Observer):
         knots: rows between which a defect is taken to be linear, a run's last repeated, shape (runs, knots).
         delayed: whether what is imposed may act later than its column says (`Rig.delay`), so that readings are read
             that much earlier between the instants.
+        stages: unknowns of every run at both stages of every step, of the robot that is observed; None: not known.
     """
 
     word: ClassVar[str] = "samples"
@@ -183,6 +184,7 @@ class Histories(Observer):
     rows_of: Int[Array, "runs samples"]
     knots: Int[Array, "runs knots"]
     delayed: bool = eqx.field(default=False, static=True)
+    stages: tuple[Array, Array] | None = None
 
     @classmethod
     def observes(cls, runs: Runs) -> bool:
@@ -341,7 +343,9 @@ class Histories(Observer):
         falls linearly to 0 at the next ones; an effect `probe` is its amplitude in its balance."""
         clock = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.knots]]
 
-        def one(conditions: Conditions, times: Array, clock: Array, instants: Array) -> Array:
+        def one(
+            conditions: Conditions, times: Array, clock: Array, instants: Array, stages: tuple[Array, Array]
+        ) -> Array:
             def probed(amplitude: Array) -> Robot:
                 put = tuple(eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(probes, amplitude, strict=True))
                 return dataclasses.replace(robot, effects=(*robot.effects, *put))
@@ -370,17 +374,26 @@ class Histories(Observer):
                 return jnp.tensordot(by_state, dy, 1) + at_once[:, :, None] * hat(t)
 
             first, begins = at_first(robot, conditions)
-            changed = respond(robot, conditions, times, states(robot, conditions, times), source, seen)[1]
+            changed = respond(robot, conditions, times, stages, source, seen)[1]
             still = seen(times[0], begins, jnp.zeros_like(source(times[0], begins, first)), first)
             whole = jnp.concatenate([still[None], changed])
             return jnp.moveaxis(whole[instants], (0, 1), (2, 3))  # probes, knots, samples, channels
 
         instants = self.instant[jnp.where(self.rows_of < 0, 0, self.rows_of)]
-        return jnp.moveaxis(jax.vmap(one)(self.conditions, self.times, clock, instants), 0, 1)
+        stages = self.following(robot).stages
+        assert stages is not None
+        return jnp.moveaxis(jax.vmap(one)(self.conditions, self.times, clock, instants, stages), 0, 1)
+
+    def following(self, robot: Robot) -> Histories:
+        """The same for a robot whose runs are then known."""
+        if self.stages is not None:
+            return self
+        stages = jax.vmap(lambda c, t: states(robot, c, t))(self.conditions, self.times)
+        return dataclasses.replace(self, stages=stages)
 
     def whole(self, robot: Robot) -> Signals:
         """Every signal of every run at every instant, shape (runs, instants)."""
-        found = jax.vmap(lambda c, t: histories(robot, c, t))(self.conditions, self.times)
+        found = jax.vmap(lambda c, t, s: histories(robot, c, t, s))(self.conditions, self.times, self.stages)
         return jax.tree.map(lambda x: jnp.broadcast_to(x, self.times.shape), found)
 
     def at_rows(self, whole: Signals) -> Signals:
@@ -486,36 +499,45 @@ class Histories(Observer):
     ) -> HistoriesLinearization:
         """As the protocol says. Effects that keep a memory act by the whole past of a run, so a signature is the
         derivative of the run by the amplitude. All effects are in one run, once for each point of the shapes'
-        grids; those that are there already keep their shape."""
-        residual, jacobian, _ = linearised(problem, z, data)
-        robot = problem.robot(z)
-        have = {e.name for e in robot.effects}
+        grids; those that are there already keep their shape. What else is asked of the fit is by a run of the same
+        robot, so that one program follows all of them."""
+        have = {e.name for e in problem.base.effects}
         added = tuple(e.absent for e in effects if e.effect.name not in have)
-        whole = dataclasses.replace(robot, effects=(*robot.effects, *added))
-        value = {p.name: p.value for p in params.walk(whole)}
+        whole = dataclasses.replace(problem.base, effects=(*problem.base.effects, *added))
+        problem = dataclasses.replace(problem, base=whole)
+        robot = problem.robot(z)
+        value = {p.name: p.value for p in params.walk(robot)}
         sds = jnp.stack([jnp.asarray(e.effect.amplitude) for e in effects])
 
-        def moved(point: Array) -> Array:
-            def readings(a: Array) -> Array:
-                put = {}
-                for k, e in enumerate(effects):
-                    amplitude = f"effects.{e.effect.name}.amplitude"
-                    put[amplitude] = value[amplitude] + a[k] * sds[k]
-                    if e.shape:
-                        shape = f"effects.{e.effect.name}.{e.shape}"
-                        wanted = e.values[jnp.minimum(point, len(e.values) - 1)]
-                        put[shape] = jnp.where(value[amplitude] == 0, wanted, value[shape])
-                robot = params.replace(whole, put)
-                return problem.whitened(self(robot), data)[: data.measured.size]
+        def at(point: Array, a: Array) -> Robot:
+            """With more of each effect, those that are not there with their shapes at a point of the grid; before the
+            first of them as they are."""
+            put = {}
+            for k, e in enumerate(effects):
+                amplitude = f"effects.{e.effect.name}.amplitude"
+                put[amplitude] = value[amplitude] + a[k] * sds[k]
+                if e.shape:
+                    shape = f"effects.{e.effect.name}.{e.shape}"
+                    wanted = e.values[jnp.clip(point, 0, len(e.values) - 1)]
+                    put[shape] = jnp.where((value[amplitude] == 0) & (point >= 0), wanted, value[shape])
+            return params.replace(robot, put)
 
-            return jax.jacfwd(readings)(jnp.zeros(len(effects)))
+        none, points = jnp.zeros(len(effects)), jnp.arange(-1, max(len(e.at) for e in effects))
+        stages = jax.lax.map(lambda point: self.following(at(point, none)).stages, points)
 
-        by_point = jax.lax.map(moved, jnp.arange(max(len(e.at) for e in effects)))
+        def moved(each: tuple[Array, tuple[Array, Array]]) -> Array:
+            point, stages = each
+            known = dataclasses.replace(self, stages=stages)
+            return jax.jacfwd(lambda a: problem.whitened(known(at(point, a)), data)[: data.measured.size])(none)
+
+        by_point = jax.lax.map(moved, (points[1:], jax.tree.map(lambda x: x[1:], stages)))
         parts = [by_point[j, :, k] for k, e in enumerate(effects) for j in range(len(e.at))]
-        defects = self.defective(robot, tuple(probe(b) for b in PROBED))
+        known = dataclasses.replace(self, stages=jax.tree.map(lambda x: x[0], stages))
+        residual, jacobian, _ = linearised(dataclasses.replace(problem, observe=known), z, data)
+        defects = known.defective(robot, tuple(probe(b) for b in PROBED))
         scale = data.weight / data.sd
         defects = jnp.where(self.rows_of[:, None, :, None] < 0, 0.0, defects * scale[self.rows_of][:, None])
-        runs = self.whole(robot)
+        runs = known.whole(robot)
         return HistoriesLinearization(
             residual,
             jacobian,
@@ -606,6 +628,16 @@ class Histories(Observer):
             lambda _: None,
         )
         return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), found, best)
+
+    def observed(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
+        """What the model says of every row at z, by the program of the searches.
+
+        Args:
+            active: its effects, of a problem with slots.
+        """
+        which = None if active is None else np.asarray(active)[None]
+        evaluate = _evaluator(problem, np.asarray(problem.data.weight)[None], which)
+        return jax.tree.map(lambda x: x[0], evaluate(np.asarray(z)[None], np.zeros(1, int))[2])
 
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
         """Curves and windows as of settled runs, over time too, and waves in the angle of a shaft. Over the voltage
