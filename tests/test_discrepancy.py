@@ -233,7 +233,7 @@ def test_a_window_is_refined_to_its_rows():
     jacobian = np.concatenate([slopes, np.eye(p)])
     linear = SettledLinearization(
         *map(jnp.asarray, (residual, jacobian, np.zeros((3 * rows, 1)), defects, np.ones((rows, 3)))),
-        SimpleNamespace(order=np.arange(1.0, rows + 1)),
+        SimpleNamespace(order=np.arange(1.0, rows + 1), direction=np.ones(rows)),
         channels=channels.USUAL,
     )
     found, explained = refined(linear, "track", "order", np.ones(rows, bool))

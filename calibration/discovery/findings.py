@@ -50,8 +50,6 @@ from calibration.inference.errors import channel_errors
 from calibration.inference.held_out import held_out
 from calibration.inference.identifiability import held_by_prior
 from calibration.inference.linearization import Linearization, amplitude_of, shape_of, shape_scales, shaped
-from calibration.inference.observers.histories import Histories
-from calibration.inference.optimizers import linearised
 from calibration.inference.problem import Observation, Problem
 from mmrjax.balances import BALANCES
 from mmrjax.effects import Effect
@@ -356,13 +354,7 @@ class Fitted:
 
     def observation(self) -> Observation:
         """What it says of every row."""
-        problem = self.problem
-        if isinstance(problem.observe, Histories):
-            return problem.observe.observed(problem, self.z, self.active)
-        if self.active is not None:
-            which = problem.coordinates.with_effects(jnp.asarray(self.active))
-            problem = dataclasses.replace(problem, coordinates=which)
-        return linearised(problem, jnp.asarray(self.z), problem.data)[2]
+        return self.problem.observe.observed(self.problem, self.z, self.active)
 
 
 #: Kind of block → what a fit predicts of each row that it has not seen, shape (rows, channels).

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -18,7 +19,7 @@ from calibration.inference.errors import OF_READING, OF_SIZE, percent_error
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.noise import Noise
 from calibration.inference.notes import Note
-from calibration.inference.optimizers import Numbers, Optimum
+from calibration.inference.optimizers import Numbers, Optimum, linearised, read
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
@@ -287,6 +288,19 @@ class Observer(eqx.Module):
             active: set of effects of each member, see `ActiveSet`; None leaves the problem's.
             rivals: whether all search the same optimum, so that some may be given up.
         """
+
+    def observed(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
+        """What the model says of every row at z.
+
+        Args:
+            active: its effects, of a problem with slots.
+        """
+        if active is not None:
+            which = problem.coordinates.with_effects(jnp.asarray(active))
+            problem = dataclasses.replace(problem, coordinates=which)
+        if self.long:
+            return read(problem, problem.robot(jnp.asarray(z)))
+        return linearised(problem, jnp.asarray(z), problem.data)[2]
 
     @abc.abstractmethod
     def bases(self, columns: Mapping[str, np.ndarray], included: Bool[np.ndarray, " rows"], robot: Robot) -> Bases:
