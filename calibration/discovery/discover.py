@@ -449,8 +449,8 @@ def choose(
     searched: Search,
     settings: Settings,
     progress: Tell,
-    beside: CurveBeside | None = None,
-    predicted: Predicted | None = None,
+    beside: CurveBeside,
+    predicted: Predicted,
 ) -> tuple[tuple[Candidate, Diagnosis] | None, Search, NameSupport]:
     """The effects that belong in the model: those whose names stand by themselves, and those of the smallest set that
     predicts as well as any, but what only stands in for a curve; None for none. With what was searched, and which
@@ -664,10 +664,9 @@ def assemble_result(
     screened, left, where, noise = traced.screened, traced.left, traced.where, traced.sds.noise
     space, base, best, ends = screened.base.space, screened.base.candidate, traced.best, traced.ends
     curve = beside = None
-    if traced.verdict == "unnamed" and where is not None:
+    if traced.verdict == "unnamed" and traced.beside is not None:
         progress(Step("shape"))
-        found_curve = traced.beside or CurveBeside(space, base, left, screened.bases)
-        curve, beside = found_curve.curve, found_curve.diagnosis
+        curve, beside = traced.beside.curve, traced.beside.diagnosis
     observe, rows = space.bare.observe, len(runs)
     numbers = np.arange(1, rows + 1) if numbers is None else numbers
     included = space.included[:rows]
