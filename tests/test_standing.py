@@ -407,7 +407,7 @@ def test_model_holds_what_is_established_and_what_predicts(monkeypatch, adequate
     )
     left = SimpleNamespace(test=SimpleNamespace(null=None), scores=None)
     searched = Search((candidate_of("a"), candidate_of("b"), best), best, seen)
-    found, _, stood = discover.choose(None, screened, left, searched, SETTLED.settings, lambda note: None)
+    found, _, stood = discover.choose(None, screened, left, searched, SETTLED.settings, lambda note: None, None, None)
     assert (None if found is None else tuple(sorted(found[0].effects))) == model
     assert asked == [best.effects if adequate or few is None else few.effects]
     if found is not None:
