@@ -39,12 +39,16 @@ def demanded(robot) -> Mission:
     return jax.device_get(simulate_batch(robot, conditions(3), one, None, 512))
 
 
-@pytest.fixture(scope="module")
-def driven(robot) -> Mission:
-    """Duties held, left the slower side, the faster one, and one against the other."""
+def with_duties(robot) -> Mission:
+    """Duties held, left the slower side, the faster one, and one against the other, in steps fine enough for `drive`."""
     duties = ((0.4, 0.9), (0.9, 0.4), (-0.8, 0.8))
     one = several(*(profile([0.0, 0.5, 1.0], duty_left=left, duty_right=right) for left, right in duties))
-    return jax.device_get(simulate_batch(robot, conditions(3), one, None, 512))
+    return jax.device_get(simulate_batch(params.strong(robot), conditions(3), one, None, 512, 1e-7))
+
+
+@pytest.fixture(scope="module")
+def driven(robot) -> Mission:
+    return with_duties(robot)
 
 
 def test_derivative_of_breaking_away_is_there_at_every_current(robot):
@@ -138,8 +142,7 @@ def test_held_duties_are_a_run_of_drive(robot, driven):
     """Of windings that do not warm, whose resistance `drive` leaves as it is."""
     none = dict.fromkeys(("resistance_thermal_winding", "resistance_thermal_housing"), jnp.asarray(1e-9))
     cold = dataclasses.replace(robot, motor=dataclasses.replace(robot.motor, **none))
-    asks = profile([0.0, 0.5, 1.0], duty_left=0.4, duty_right=0.9)
-    found = jax.device_get(simulate_batch(cold, conditions(1), asks, None, 512, 1e-7))
+    found = with_duties(cold)
     at = mm.Conditions(configuration=1, voltage=24.0, duty_left=0.4, duty_right=0.9)
     run = jax.jit(lambda: drive(cold, at, jnp.asarray([0.0, 1.0]), 1e-8))()
     end = jax.tree.map(lambda x: x[-1], run.signals)
