@@ -302,8 +302,9 @@ def test_derivatives_through_stops_and_reversals_match_differences(robot):
         return jnp.stack([total.energy, total.of["path"], per_metre, found.peaks["temperature"]])
 
     x = jnp.ones(len(BY) + 5)
-    value, exact = eqx.filter_jit(lambda x: (outputs(x), jax.jacfwd(outputs)(x)))(x)
-    step, compiled = 1e-3, jax.jit(outputs)
+    exact = eqx.filter_jit(jax.jacfwd(outputs))(x)
+    step, compiled = 1e-3, eqx.filter_jit(outputs)
+    value = compiled(x)
     for k in range(len(x)):
         apart = np.asarray(compiled(x.at[k].add(step))) - np.asarray(compiled(x.at[k].add(-step)))
         # Two parts in 10^4 of a derivative, or of the output where that hardly changes.
@@ -328,9 +329,9 @@ def test_derivatives_by_every_parameter_and_row_match_differences(robot):
         return jnp.stack([found.total.energy / found.total.of["path"], found.peaks["temperature"]])
 
     x, moved = jnp.ones(len(names)), {n: jnp.zeros(ROWS) for n in columns}
-    value = np.asarray(eqx.filter_jit(outputs)(x, moved))
-    by_robot, by_row = eqx.filter_jit(lambda *a: jax.jacfwd(outputs, argnums=(0, 1))(*a))(x, moved)
     compiled, wrong = eqx.filter_jit(outputs), []
+    value = np.asarray(compiled(x, moved))
+    by_robot, by_row = eqx.filter_jit(lambda *a: jax.jacfwd(outputs, argnums=(0, 1))(*a))(x, moved)
 
     def check(what, exact, change, step):
         """At one of three steps: too long ones bend, too short ones show the steps' own rounding."""
