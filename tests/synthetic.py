@@ -69,9 +69,13 @@ class Analyst:
         """The stages of the loop up to its verdict."""
         return discover.trace(runs, robots.nominal(), known(runs), self.settings, self.stated, self.library)
 
+    def result(self, traced: LoopStages, runs: Runs) -> DiscoveryResult:
+        """What the loop makes of its stages."""
+        return discover.assemble_result(traced, runs, None, self.settings, self.library, lambda note: None)
+
     def discover(self, runs: Runs) -> DiscoveryResult:
         """The whole loop."""
-        return discover.assemble_result(self.trace(runs), runs, None, self.settings, self.library, lambda note: None)
+        return self.result(self.trace(runs), runs)
 
 
 def parts(runs: Runs, traced: LoopStages) -> SimpleNamespace:

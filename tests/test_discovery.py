@@ -90,7 +90,7 @@ def test_clean_table_lacks_nothing(clean):
 @pytest.mark.slow
 def test_result_is_that_of_the_stages(clean, churning, looks):
     for at in (clean, churning):
-        found = looks.analyst.discover(at.runs)
+        found = looks.analyst.result(at.traced, at.runs)
         assert found.verdict == at.traced.verdict and found.chi2 == (2 * at.base.cost, 2 * at.traced.best.cost)
         assert tuple(tuple(e.members) for e in found.effects) == at.traced.members
         assert found.before.p_value == at.left.test.p_value and found.before.adequate == (not at.left.test.rejected)
@@ -127,12 +127,16 @@ def test_brush_drop_is_found():
     assert "brush_drop" in members and found.verdict == ("named" if len(members) == 1 else "class")
 
 
-OUTSIDE = ["supply_hunting"], 12.0, 2
+@pytest.fixture(scope="module")
+def outside():
+    """A law that no effect of the library is like, through the stages of the loop."""
+    runs = table(tables.narrow(["supply_hunting"], 12.0, 2))
+    return parts(runs, SETTLED.trace(runs))
 
 
 @pytest.mark.slow
-def test_effect_outside_the_library_gets_no_name():
-    found = SETTLED.trace(table(tables.narrow(*OUTSIDE)))
+def test_effect_outside_the_library_gets_no_name(outside):
+    found = outside.traced
     where = found.where
     assert found.verdict == "unnamed" and found.members == () and found.left.test.rejected
     assert found.searched is not None and not found.standing.stands and found.standing.why
@@ -141,8 +145,8 @@ def test_effect_outside_the_library_gets_no_name():
 
 
 @pytest.mark.slow
-def test_effect_outside_the_library_is_a_curve_in_the_result():
-    found = SETTLED.discover(table(tables.narrow(*OUTSIDE)))
+def test_effect_outside_the_library_is_a_curve_in_the_result(outside):
+    found = SETTLED.result(outside.traced, outside.runs)
     assert found.verdict == "unnamed" and found.effects == () and found.after.adequate
     where = found.unnamed
     assert where.balance == "electrical" and {"electrical", "supply"} <= set(where.balances_alike)

@@ -14,11 +14,9 @@ from worlds import histories
 
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
-from calibration.discovery import discover
 from calibration.discovery.adequacy import AdequacyTest
 from calibration.discovery.discrepancy import fit_discrepancy, locate
 from calibration.discovery.score_tests import bootstrap, diagnosed
-from calibration.discovery.search import search
 from calibration.discovery.settings import settings_for
 from calibration.discovery.standing import standing
 from calibration.inference import bases, noise
@@ -78,15 +76,11 @@ def seen(request, runs):
 
 @pytest.fixture(scope="module")
 def oval():
-    """A bent pulley, twice a turn, which the library does not have: the stages up to the search."""
+    """A bent pulley, twice a turn, which the library does not have: the stages of the loop."""
     runs, label = case("pulley_ovality", sigmas=15.0, seed=7)
-    screened = ANALYST.screened(runs)
-    space, base, bases_ = screened.base.space, screened.base.candidate, screened.bases
-    left = discover.diagnosis_of_base(screened, ANALYST.settings)
-    searched = search(space, base, left, bases_, ANALYST.settings, lambda text: None)
-    return SimpleNamespace(
-        runs=runs, space=space, base=base, bases=bases_, left=left, searched=searched, label=label["effects"][0]
-    )
+    at = parts(runs, ANALYST.trace(runs))
+    at.searched, at.label = at.traced.searched, label["effects"][0]
+    return at
 
 
 # --- verdicts ---------------------------------------------------------------------------------------
@@ -133,7 +127,7 @@ def test_wave_outside_the_library_gets_its_balance_and_order_but_no_name(oval):
 
 @pytest.mark.slow
 def test_wave_without_a_name_is_in_the_result(oval):
-    found = ANALYST.discover(oval.runs)
+    found = ANALYST.result(oval.traced, oval.runs)
     where = locate(oval.left, oval.bases, oval.space.included)
     assert found.verdict == "unnamed" and found.effects == () and found.after.adequate
     assert (found.unnamed.balance, found.unnamed.variable) == (where.balance, where.variable)
