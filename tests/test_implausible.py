@@ -8,7 +8,7 @@ import pytest
 from synthetic import FEW, SETTLED, small, table
 from worlds import laws, settled, tables
 
-from calibration.discovery import discover, findings
+from calibration.discovery import findings
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.search import own_p, search
 from calibration.inference.linearization import amplitude_of
@@ -33,18 +33,22 @@ def steep(p):
 pytestmark = pytest.mark.slow
 
 
-@functools.cache
-def traced():
-    """The stages of the loop on 24 runs of a robot that heats three times as much as is plausible, and those runs."""
-    runs = heated(3.0, steep)
-    return FEW.trace(runs), runs
+#: Who looks at a robot that heats three times as much as is plausible, and at which runs.
+HOT = {"few": (FEW, steep), "many": (SETTLED, settled.table8)}
 
 
 @functools.cache
-def unnamed():
+def traced(looks="few"):
+    """The stages of the loop on them, and those runs."""
+    analyst, grid = HOT[looks]
+    runs = heated(3.0, grid)
+    return analyst.trace(runs), runs
+
+
+@functools.cache
+def unnamed(looks="few"):
     """Their result; made once for all files."""
-    found, runs = traced()
-    return discover.assemble_result(found, runs, None, FEW.settings, FEW.library, lambda text: None)
+    return HOT[looks][0].result(*traced(looks))
 
 
 #: Who looks, and at which runs.
@@ -58,7 +62,7 @@ def looks(request):
 
 @pytest.fixture(scope="module")
 def hot(looks):
-    return traced()[0] if looks is LOOKS["few"] else SETTLED.trace(heated(3.0))
+    return traced("few" if looks is LOOKS["few"] else "many")[0]
 
 
 def listed(traced, cost):

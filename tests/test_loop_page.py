@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from pages import Tables, drawn
 from synthetic import SETTLED, table
-from test_implausible import heated, unnamed
+from test_implausible import unnamed
 from test_loop_command import commanded
-from test_stated_values import made as leads
+from test_stated_values import traced as leads
 from worlds import settled, tables
 
 from calibration.data.writing import finite
@@ -44,8 +44,8 @@ def happening():
 MADE = {
     "churning": lambda: commanded().found,
     "hot": unnamed,
-    "leads": lambda: SETTLED.discover(leads(lead=0.8)),
-    "heated": lambda: SETTLED.discover(heated(3.0)),
+    "leads": lambda: SETTLED.result(*leads("many")),
+    "heated": lambda: unnamed("many"),
     "happening": lambda: SETTLED.discover(happening()),
 }
 CASES = [n if n == "churning" else pytest.param(n, marks=pytest.mark.slow) for n in MADE]

@@ -1,5 +1,6 @@
 """A stated value that may be wrong is listed in the place of an effect, with the value that the data have."""
 
+import functools
 from types import SimpleNamespace
 
 import numpy as np
@@ -69,10 +70,21 @@ def made(resistance=NOMINAL, lead=0.0, grid=settled.table8):
     return table(tables.table_of(c, *settled.readings(c, p, terms), instruments, np.random.default_rng(1)))
 
 
+#: Who looks, and at which runs.
+LOOKS = {"few": (FEW, small), "many": (SETTLED, settled.table8)}
+
+
+@functools.cache
+def traced(looks):
+    """The stages of the loop on runs of a robot with leads, and those runs; made once for all files."""
+    analyst, grid = LOOKS[looks]
+    runs = made(lead=0.8, grid=grid)
+    return analyst.trace(runs), runs
+
+
 @pytest.fixture(scope="module", params=["few", pytest.param("many", marks=pytest.mark.slow)])
 def looks(request):
-    """Who looks, and at which runs."""
-    return {"few": (FEW, small), "many": (SETTLED, settled.table8)}[request.param]
+    return LOOKS[request.param]
 
 
 @pytest.mark.parametrize(
@@ -105,8 +117,7 @@ def test_nothing_is_shifted_where_the_sheet_is_right(looks):
 
 def test_verdict_lists_the_resistance_that_may_be_wrong(looks):
     """Beside the leads, so that no single name is given; its prior is one fifteenth of the shift."""
-    analyst, grid = looks
-    found = analyst.trace(made(lead=0.8, grid=grid))
+    found, _ = traced("few" if looks is LOOKS["few"] else "many")
     assert found.verdict == "class"
     (members,), (stated,) = found.alike.members, found.alike.stated
     assert "series_resistance" in members and [s.name for s in stated] == ["motor.resistance"]
