@@ -52,7 +52,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import WAYS
 from mmrjax.fidelities.drive import rates, state_of
-from mmrjax.fidelities.histories import GROWTH, LONGEST, STEPS, at_first, grid, growth, histories, respond, states
+from mmrjax.fidelities.histories import GROWTH, LONGEST, STEPS, Pace, at_first, grid, histories, pace, respond, states
 from mmrjax.params import Scalar
 from mmrjax.rig import Begin, Begins, Rig
 from mmrjax.robot import Robot
@@ -83,6 +83,8 @@ INRUSH = 2e-3
 LASTING = 0.25
 #: Fewest steps from sample to sample of a run that is driven both ways.
 FINE = 8
+#: The same of one whose speed is imposed, and how many of the usual longest steps one of its steps may be.
+COARSELY, SLOWLY = 2, 4
 #: Change of a speed from the third to the last quarter of a stretch, as a share, from which on it has not settled.
 #: From rest a speed that nears steady travel exponentially and has reached half of it still changes by 0.23.
 STILL = 0.2
@@ -205,9 +207,11 @@ class Histories(Observer):
         mine = [m[np.argsort(runs["time_s"][m], kind="stable")] for m in mine]
         sudden = _changes(runs, mine, robot.rig)
         exact = robot.rig.imposed == "motor_speed"
-        driven = np.zeros(len(run)) if exact else applied(runs)
-        steps = [_longest(runs["time_s"][m], driven[m]) for m in mine]
-        grids = [grid(runs["time_s"][m], changes, h) for m, changes, h in zip(mine, sudden, steps, strict=True)]
+        given = [runs["time_s"][m] for m in mine]
+        driven = [None] * len(mine) if exact else [applied(runs)[m] for m in mine]
+        steps = [_longest(t, d) for t, d in zip(given, driven, strict=True)]
+        after = [_pace(t, robot) for t in given]
+        grids = [grid(*of_run) for of_run in zip(given, sudden, steps, after, strict=True)]
         longest, samples = _common(max(map(len, grids))), max(map(len, mine))
         times = np.stack([np.concatenate([g, np.repeat(g[-1], longest - len(g))]) for g in grids])
         instant = np.array([np.searchsorted(grids[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
@@ -294,7 +298,8 @@ class Histories(Observer):
             said.append(CoarseSteps(float(runs["time_s"].max()), float(step)))
         each = [np.flatnonzero(names == name) for name in np.unique(names)]
         changes = max(len(c) for c in _changes(runs, each, robot.rig)) + 1
-        if growth(float(runs["time_s"].max()), changes) > COARSE * GROWTH:
+        fastest = min((_pace(runs["time_s"][m], robot) for m in each), key=lambda p: p.first)
+        if fastest.growth(float(runs["time_s"].max()), changes) > COARSE * GROWTH:
             said.append(ManyChanges(changes - 1))
         return said
 
@@ -862,15 +867,30 @@ def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) ->
     return bool(np.any(np.abs(after - before) > STILL * np.abs(before + after) / 2))
 
 
-def _longest(time: np.ndarray, driven: np.ndarray) -> float:
+def _apart(time: np.ndarray) -> float:
+    """How far apart samples are [s]."""
+    return float(np.median(np.diff(np.sort(time)))) if len(time) > 1 else 0.0
+
+
+def _pace(time: np.ndarray, robot: Robot) -> Pace:
+    """Of the steps after a change, of a run with samples at these instants [s]."""
+    rise = float(robot.motor.inductance) / float(robot.motor.resistance) if robot.rig.imposed == "voltage" else 0.0
+    return pace(rise, _apart(time))
+
+
+def _longest(time: np.ndarray, driven: np.ndarray | None) -> float:
     """Longest step of a run [s]. Where what drives it changes its sign, friction jumps as the speed passes through
-    zero, within a step, which has to be short beside the time from sample to sample.
+    zero, within a step, which has to be short beside the time from sample to sample; where the speed is imposed only
+    what effects remember is followed.
 
     Args:
-        time: of its samples [s]; driven: what drives it there.
+        time: of its samples [s]; driven: what drives it there; None where its speed is imposed.
     """
-    turns = driven.min() < 0 < driven.max() and len(time) > 1
-    return min(LONGEST, float(np.median(np.diff(time))) / FINE) if turns else LONGEST
+    if len(time) < 2:
+        return LONGEST
+    if driven is None:
+        return min(SLOWLY * LONGEST, _apart(time) / COARSELY)
+    return min(LONGEST, _apart(time) / FINE) if driven.min() < 0 < driven.max() else LONGEST
 
 
 def _common(instants: int) -> int:
