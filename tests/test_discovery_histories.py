@@ -148,7 +148,11 @@ def test_wave_without_a_name_can_be_added_to_the_robot(oval):
     expected = oval.label["amplitude"] * np.exp(1j * oval.label["shapes"]["phase"])
     assert abs(got - expected) < 0.3 * abs(expected) and float(wave.order_shaft) == 2.0
     assert "sin(2 θ_k" in curve.proposal.formula
-    _, _, strongest = diagnosed(curve.problem, jnp.asarray(curve.z), oval.space.library.scored, oval.bases)
+    told = curve.problem, jnp.asarray(curve.z), oval.space.library.scored, oval.bases
+    exact, (linear, _, strongest) = diagnosed(*told), diagnosed(*told, near=oval.left.linear)
+    np.testing.assert_allclose(linear.residual, exact[0].residual, atol=1e-6)
+    for kind in ("single", "curve", "chi2"):  # by signatures of the fit without the curve
+        assert abs(getattr(strongest, kind) - getattr(exact[2], kind)) < 0.3
     after = AdequacyTest(jax.device_get(strongest), oval.left.test.null, ANALYST.settings)
     assert not after.rejected_with_margin and oval.left.test.rejected_with_margin
 

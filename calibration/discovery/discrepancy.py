@@ -252,7 +252,8 @@ def fit_discrepancy(
 
 def diagnosis_beside(space: CandidateSpace, found: Discrepancy, bases: Bases, left: Diagnosis) -> Diagnosis:
     """A look at the fit with a curve, against the thresholds of the base, which `left` has."""
-    linear, scores, strongest = diagnosed(found.problem, jnp.asarray(found.z), space.library.scored, bases)
+    z, effects = jnp.asarray(found.z), space.library.scored
+    linear, scores, strongest = diagnosed(found.problem, z, effects, bases, near=left.linear)
     return Diagnosis(linear, scores, AdequacyTest(strongest, left.test.null, left.test.settings))
 
 

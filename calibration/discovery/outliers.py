@@ -64,10 +64,12 @@ def ahead(
             looked.set()
         bootstrap(space.bare, nothing[: space.free], linear, space.library.scored, bases, 1, settings.seed)
 
-    def fit() -> None:  # needed last: what compiles beside the base fit shares two cores with it
-        looked.wait()
-        if not space.bare.observe.long:
-            search_each(space.equipped, [nothing], [space.weight], [space.library.indices(none)])
+    def fit() -> None:
+        if space.bare.observe.long:
+            space.equipped.observe.at(space.equipped, nothing, space.library.indices(none))
+            return
+        looked.wait()  # needed last: what compiles beside the base fit shares two cores with it
+        search_each(space.equipped, [nothing], [space.weight], [space.library.indices(none)])
 
     def foresee(base: BaseFit) -> None:
         if space.bare.observe.menu and not space.bare.observe.long:

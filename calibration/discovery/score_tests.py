@@ -181,9 +181,20 @@ def strongest(scores: ScoreTable, linear: Linearization) -> Statistics:
 Diagnosed = tuple[Linearization, ScoreTable, Statistics]
 
 
-def diagnosed(problem: Problem, z: Array, effects: tuple[ScoredEffect, ...], bases: Bases) -> Diagnosed:
-    """A fit linearised, what effects and curves could explain of its residual, and the strongest of that."""
-    linear = _linearised(problem, z, effects)
+def diagnosed(
+    problem: Problem, z: Array, effects: tuple[ScoredEffect, ...], bases: Bases, near: Linearization | None = None
+) -> Diagnosed:
+    """A fit linearised, what effects and curves could explain of its residual, and the strongest of that.
+
+    Args:
+        near: of a fit nearby, whose signatures and defects serve for this one where runs are long: a curve moves the
+            residual, and hardly what an effect would add.
+    """
+    if near is None or not problem.observe.long:
+        linear = _linearised(problem, z, effects)
+    else:
+        residual, jacobian, _ = problem.observe.at(problem, z)
+        linear = dataclasses.replace(near, residual=residual, jacobian=jacobian)
     return linear, *_looked_at(linear, bases)
 
 

@@ -295,12 +295,14 @@ class Observer(eqx.Module):
         Args:
             active: its effects, of a problem with slots.
         """
-        if active is not None:
-            which = problem.coordinates.with_effects(jnp.asarray(active))
-            problem = dataclasses.replace(problem, coordinates=which)
-        if self.long:
-            return read(problem, problem.robot(jnp.asarray(z)))
-        return linearised(problem, jnp.asarray(z), problem.data)[2]
+        if not self.long:
+            return self.at(problem, z, active)[2]
+        problem = _with_effects(problem, active)
+        return read(problem, problem.robot(jnp.asarray(z)))
+
+    def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
+        """Residuals, their Jacobian and what the model says of every row at z; arguments as of `observed`."""
+        return linearised(_with_effects(problem, active), jnp.asarray(z), problem.data)
 
     @abc.abstractmethod
     def bases(self, columns: Mapping[str, np.ndarray], included: Bool[np.ndarray, " rows"], robot: Robot) -> Bases:
@@ -318,3 +320,9 @@ class Observer(eqx.Module):
             bases: of curves; included: whether a row of the table counts.
             before, after: what base and proposed robot leave.
         """
+
+
+def _with_effects(problem: Problem, active: Numbers | None) -> Problem:
+    if active is None:
+        return problem
+    return dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(jnp.asarray(active)))

@@ -39,8 +39,10 @@ from calibration.inference.optimizers import (
     Evaluate,
     Numbers,
     Optimum,
+    counted,
     linearised,
     linearised_signed,
+    penalties,
     searches_long,
 )
 from calibration.inference.priors import DELAY
@@ -635,14 +637,14 @@ class Histories(Observer):
         return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), found, best)
 
     def observed(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
-        """What the model says of every row at z, by the program of the searches.
+        return self.at(problem, z, active)[2]
 
-        Args:
-            active: its effects, of a problem with slots.
-        """
+    def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
+        """As the protocol says, by the program of the searches."""
         which = None if active is None else np.asarray(active)[None]
         evaluate = _evaluator(problem, np.asarray(problem.data.weight)[None], which)
-        return jax.tree.map(lambda x: x[0], evaluate(np.asarray(z)[None], np.zeros(1, int))[2])
+        r, jacobian, seen = jax.tree.map(lambda x: x[0], evaluate(np.asarray(z)[None], np.zeros(1, int)))
+        return *counted(r, jacobian, penalties(problem.data)), seen
 
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
         """Curves and windows as of settled runs, over time too, and waves in the angle of a shaft. Over the voltage
