@@ -488,9 +488,16 @@ def test_progress_is_on_stderr_and_stdout_ends_with_the_path(tmp_path):
 
 
 def test_help_is_quick_and_imports_no_jax():
+    def counted():  # processor time of a count, 0.02 s on the machine for which the limit is stated
+        start = time.process_time()
+        sum(1 for _ in range(1_000_000))
+        return time.process_time() - start
+
+    limit = 0.5 * max(1.0, min(counted() for _ in range(3)) / 0.02)
+
     def best(arguments):
         spent = []
-        while len(spent) < 6 and min(spent, default=1.0) >= 0.5:
+        while len(spent) < 6 and min(spent, default=2 * limit) >= limit:
             # processor time: what the tests beside this one take counts little
             start = os.times()
             done = subprocess.run([*MMRJAX, *arguments], capture_output=True, text=True, check=True)
@@ -500,7 +507,7 @@ def test_help_is_quick_and_imports_no_jax():
 
     for command in ([], ["simulate"], ["sweep"], ["compare"], ["reproduce"]):
         spent, text = best([*command, "--help"])
-        assert spent < 0.5
+        assert spent < limit
         assert "Usage" in text
         if command:
             assert f"Example: mmrjax {command[0]}" in text.replace("\n", " ")
