@@ -14,7 +14,6 @@ from calibration.data.errors import BadConfiguration
 from calibration.inference import noise, observers, priors
 from calibration.inference.calibrate import calibrate
 from calibration.inference.linearization import probe
-from calibration.inference.observers import histories as of_histories
 from calibration.inference.observers.histories import Histories
 from mmrjax import balances, channels, params
 from mmrjax.conditions import Conditions
@@ -288,29 +287,22 @@ def test_steps_follow_the_rows_of_a_log_whose_input_changes_at_each(tmp_path, mo
     runs = records.read(table, robot=robot)
     made = observers.kind(runs).of(runs, robot)
     shown = np.asarray(made(robot).reading)
-    monkeypatch.setattr(of_histories, "pace", lambda rise, apart: integrator.Pace())
-    monkeypatch.setattr(integrator.Pace, "growth", lambda self, duration, changes: self.grows)
+    monkeypatch.setattr(integrator, "growth", lambda duration, changes: integrator.GROWTH)
     fine = observers.kind(runs).of(runs, robot)
     exact = np.asarray(fine(robot).reading)
-    assert made.times.size < 25 * len(runs) and 3 * made.times.size < fine.times.size
+    assert made.times.size < 45 * len(runs) and 3 * made.times.size < fine.times.size
     error = np.sqrt(np.mean((shown - exact) ** 2, 0) / np.mean(exact**2, 0))
-    assert (error < 1e-3).all() and (error > 1e-6).all()
+    assert (error < 2e-3).all() and (error > 1e-6).all()
 
 
-def test_a_log_has_the_steps_that_its_samples_need(tmp_path):
-    """Few after a change where samples are too far apart to show how a current rises, and two a sample where the speed
-    is imposed, at which readings without a memory are exact."""
-    path = tmp_path / "rig.toml"
-    rows = [f"{0.02 * k:.2f},{12 if k % 10 < 5 else 6},0,{10 * k}" for k in range(50)]
-    table = tmp_path / "log.csv"
-    taken = {}
-    for imposed, inductance in (("voltage", 1e-2), ("voltage", 1e-4), ("motor_speed", 1e-4)):
-        text = DRIVE.format(imposed=imposed, channels='"total_current"', start="rest") + BENCH
-        path.write_text(text.replace("[motor]", f"[motor]\ninductance = {inductance}"))
-        robot = robot_file.load(str(path))
-        table.write_text("time_s,supply_voltage_V,total_current_A,motor_speed_rpm\n" + "\n".join(rows))
-        taken[imposed, inductance] = Histories.of(records.read(table, robot=robot), robot).times.size
-    assert taken["voltage", 1e-2] > 3 * taken["voltage", 1e-4] and taken["motor_speed", 1e-4] <= 128
+@pytest.mark.parametrize("faster, step", [(1, 0.01), (5, 0.005)])
+def test_a_log_of_an_imposed_speed_has_even_steps(tmp_path, faster, step):
+    """Two a sample, 10 ms at most: readings follow at once from the speed, but what effects remember, so no start or
+    change needs shorter ones."""
+    robot, runs = imposed_speed(tmp_path, 2)  # at 20 Hz
+    runs = dataclasses.replace(runs, columns={**runs.columns, "time_s": runs["time_s"] / faster})
+    steps = np.diff(np.asarray(Histories.of(runs, robot).times), axis=1)
+    np.testing.assert_allclose(steps[steps > 0], step, rtol=1e-9)
 
 
 def test_a_voltage_on_lines_is_the_mean_of_each_step_and_no_jump(tmp_path):
@@ -332,7 +324,7 @@ def test_a_voltage_on_lines_is_the_mean_of_each_step_and_no_jump(tmp_path):
     held = observers.kind(runs).of(
         runs, dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, between_rows="held"))
     )
-    assert held.times.size > made.times.size
+    assert held.times.size > 1.5 * made.times.size
 
 
 @pytest.mark.slow

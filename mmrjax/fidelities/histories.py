@@ -9,7 +9,6 @@ rollout.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
@@ -32,9 +31,6 @@ _GAMMA = 1 - 0.5**0.5
 NEWTON, SOLVED = 30, 1e-9
 #: The first step, its growth with the time since the start [1/s · s], and the longest step [s].
 FIRST, GROWTH, LONGEST = 1e-5, 0.02, 2.5e-3
-#: Samples that are so many time constants of a current apart do not show how it rises. The first step is then this
-#: part of one, and steps grow so [1/s · s].
-SHOWN, OF_RISE, GROWTH_UNSEEN = 10.0, 0.1, 0.25
 #: Most steps of a run that LONGEST may ask for; a longer run has longer steps. And most that short steps after
 #: changes may ask for; where there are more changes, steps grow faster.
 STEPS = 8000
@@ -46,54 +42,30 @@ FEW, EACH = 2000, 22
 BLOCK = 32
 
 
-@dataclasses.dataclass(frozen=True)
-class Pace:
-    """How short the steps of a run are after a change.
-
-    Attributes:
-        first: step after the start and after each change [s]; grows: by how much steps grow with the time since then,
-            at least [1/s · s].
-    """
-
-    first: float = FIRST
-    grows: float = GROWTH
-
-    def growth(self, duration: float, changes: int) -> float:
-        """Growth of steps of a run so long [s] with so many changes, the start among them."""
-        most = min(max(FEW, EACH * changes), STEPS)
-        return max(self.grows, changes * float(np.log(max(LONGEST, duration / STEPS) / self.first)) / most)
-
-
-def pace(rise: float, apart: float) -> Pace:
-    """Where samples are too far `apart` to show how a current rises, steps are as long as still follows it.
-
-    What the rise does to the motion is then right too: at the end of an L-stable step the current has taken the
-    impulse that it takes in truth, to the first order of its time constant.
-
-    Args:
-        rise: time constant L/R of the motors' current, 0 where none rises by itself; apart: samples [s].
-    """
-    return Pace() if apart < SHOWN * rise else Pace(max(FIRST, OF_RISE * rise), GROWTH_UNSEEN)
+def growth(duration: float, changes: int) -> float:
+    """Growth of steps with the time since the last of so many changes, the start among them [1/s · s]."""
+    most = min(max(FEW, EACH * changes), STEPS)
+    return max(GROWTH, changes * float(np.log(max(LONGEST, duration / STEPS) / FIRST)) / most)
 
 
 def grid(
     times: Float[np.ndarray, " times"],
     changes: Sequence[float] | np.ndarray = (),
     longest: float = LONGEST,
-    pace: Pace = Pace(),
+    first: float = FIRST,
 ) -> np.ndarray:
     """Instants from 0 to the last of `times` [s], `times` and `changes` among them.
 
     Args:
         changes: instants at which the motors' supply changes [s]; steps are as short after each as after the start.
-        longest: step, where `STEPS` allow it [s]; pace: of the steps after a change.
+        longest: step, where `STEPS` allow it; first: the step after the start and after each change [s].
     """
     last = float(np.max(times, initial=0.0))
     changes = np.asarray(changes, float)
     begins = np.unique(np.concatenate([[0.0], changes[(changes > 0) & (changes < last)]]))
     times = np.unique(np.concatenate([begins, np.asarray(times, float)]))
     longest = max(longest, last / STEPS)
-    first, grows = pace.first, pace.growth(last, len(begins))
+    grows = growth(last, len(begins))
     knee = max((longest - first) / grows, 0.0)
 
     def clock(t: np.ndarray) -> np.ndarray:  # steps taken up to t: ∫ dt / min(longest, first + grows t)

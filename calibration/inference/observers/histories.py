@@ -54,7 +54,18 @@ from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import WAYS
 from mmrjax.fidelities.drive import rates, state_of
-from mmrjax.fidelities.histories import GROWTH, LONGEST, STEPS, Pace, at_first, grid, histories, pace, respond, states
+from mmrjax.fidelities.histories import (
+    FIRST,
+    GROWTH,
+    LONGEST,
+    STEPS,
+    at_first,
+    grid,
+    growth,
+    histories,
+    respond,
+    states,
+)
 from mmrjax.params import Scalar
 from mmrjax.rig import Begin, Begins, Rig
 from mmrjax.robot import Robot
@@ -212,8 +223,7 @@ class Histories(Observer):
         given = [runs["time_s"][m] for m in mine]
         driven = [None] * len(mine) if exact else [applied(runs)[m] for m in mine]
         steps = [_longest(t, d) for t, d in zip(given, driven, strict=True)]
-        after = [_pace(t, robot) for t in given]
-        grids = [grid(*of_run) for of_run in zip(given, sudden, steps, after, strict=True)]
+        grids = [grid(t, c, h, h if exact else FIRST) for t, c, h in zip(given, sudden, steps, strict=True)]
         longest, samples = _common(max(map(len, grids))), max(map(len, mine))
         times = np.stack([np.concatenate([g, np.repeat(g[-1], longest - len(g))]) for g in grids])
         instant = np.array([np.searchsorted(grids[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
@@ -300,8 +310,7 @@ class Histories(Observer):
             said.append(CoarseSteps(float(runs["time_s"].max()), float(step)))
         each = [np.flatnonzero(names == name) for name in np.unique(names)]
         changes = max(len(c) for c in _changes(runs, each, robot.rig)) + 1
-        fastest = min((_pace(runs["time_s"][m], robot) for m in each), key=lambda p: p.first)
-        if fastest.growth(float(runs["time_s"].max()), changes) > COARSE * GROWTH:
+        if growth(float(runs["time_s"].max()), changes) > COARSE * GROWTH:
             said.append(ManyChanges(changes - 1))
         return said
 
@@ -869,17 +878,6 @@ def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) ->
     return bool(np.any(np.abs(after - before) > STILL * np.abs(before + after) / 2))
 
 
-def _apart(time: np.ndarray) -> float:
-    """How far apart samples are [s]."""
-    return float(np.median(np.diff(np.sort(time)))) if len(time) > 1 else 0.0
-
-
-def _pace(time: np.ndarray, robot: Robot) -> Pace:
-    """Of the steps after a change, of a run with samples at these instants [s]."""
-    rise = float(robot.motor.inductance) / float(robot.motor.resistance) if robot.rig.imposed == "voltage" else 0.0
-    return pace(rise, _apart(time))
-
-
 def _longest(time: np.ndarray, driven: np.ndarray | None) -> float:
     """Longest step of a run [s]. Where what drives it changes its sign, friction jumps as the speed passes through
     zero, within a step, which has to be short beside the time from sample to sample; where the speed is imposed only
@@ -890,9 +888,10 @@ def _longest(time: np.ndarray, driven: np.ndarray | None) -> float:
     """
     if len(time) < 2:
         return LONGEST
+    apart = float(np.median(np.diff(time)))
     if driven is None:
-        return min(SLOWLY * LONGEST, _apart(time) / COARSELY)
-    return min(LONGEST, _apart(time) / FINE) if driven.min() < 0 < driven.max() else LONGEST
+        return min(SLOWLY * LONGEST, apart / COARSELY)
+    return min(LONGEST, apart / FINE) if driven.min() < 0 < driven.max() else LONGEST
 
 
 def _common(instants: int) -> int:
