@@ -52,24 +52,24 @@ def grid(
     times: Float[np.ndarray, " times"],
     changes: Sequence[float] | np.ndarray = (),
     longest: float = LONGEST,
-    first: float = FIRST,
+    grows: float = GROWTH,
 ) -> np.ndarray:
     """Instants from 0 to the last of `times` [s], `times` and `changes` among them.
 
     Args:
         changes: instants at which the motors' supply changes [s]; steps are as short after each as after the start.
-        longest: step, where `STEPS` allow it; first: the step after the start and after each change [s].
+        longest: step, where `STEPS` allow it [s]; grows: by how much steps grow after each, at least [1/s · s].
     """
     last = float(np.max(times, initial=0.0))
     changes = np.asarray(changes, float)
     begins = np.unique(np.concatenate([[0.0], changes[(changes > 0) & (changes < last)]]))
     times = np.unique(np.concatenate([begins, np.asarray(times, float)]))
     longest = max(longest, last / STEPS)
-    grows = growth(last, len(begins))
-    knee = max((longest - first) / grows, 0.0)
+    grows = max(grows, growth(last, len(begins)))
+    knee = max((longest - FIRST) / grows, 0.0)
 
-    def clock(t: np.ndarray) -> np.ndarray:  # steps taken up to t: ∫ dt / min(longest, first + grows t)
-        young = np.log1p(grows * np.minimum(t, knee) / first) / grows
+    def clock(t: np.ndarray) -> np.ndarray:  # steps taken up to t: ∫ dt / min(longest, FIRST + grows t)
+        young = np.log1p(grows * np.minimum(t, knee) / FIRST) / grows
         return young + np.maximum(t - knee, 0.0) / longest
 
     since = begins[np.searchsorted(begins, times, side="right") - 1]  # the change that acts from each instant on
@@ -78,7 +78,7 @@ def grid(
     for k in range(len(times) - 1):
         count = max(1, int(np.ceil(ends[k] - at[k] - 1e-9)))
         wanted = np.linspace(at[k], ends[k], count, endpoint=False)
-        young = first / grows * np.expm1(grows * np.minimum(wanted, at_knee))
+        young = FIRST / grows * np.expm1(grows * np.minimum(wanted, at_knee))
         parts.append(since[k] + young + np.maximum(wanted - at_knee, 0.0) * longest)
         parts[-1][0] = times[k]
     return np.concatenate([*parts, times[-1:]])

@@ -98,6 +98,8 @@ LASTING = 0.25
 FINE = 8
 #: The same of one whose speed is imposed, and how many of the usual longest steps one of its steps may be.
 COARSELY, SLOWLY = 2, 4
+#: By how much its steps grow with the time since its start [1/s · s].
+SOON = 0.25
 #: Change of a speed from the third to the last quarter of a stretch, as a share, from which on it has not settled.
 #: From rest a speed that nears steady travel exponentially and has reached half of it still changes by 0.23.
 STILL = 0.2
@@ -223,7 +225,7 @@ class Histories(Observer):
         given = [runs["time_s"][m] for m in mine]
         driven = [None] * len(mine) if exact else [applied(runs)[m] for m in mine]
         steps = [_longest(t, d) for t, d in zip(given, driven, strict=True)]
-        grids = [grid(t, c, h, h if exact else FIRST) for t, c, h in zip(given, sudden, steps, strict=True)]
+        grids = [grid(t, c, h, SOON if exact else GROWTH) for t, c, h in zip(given, sudden, steps, strict=True)]
         longest, samples = _common(max(map(len, grids))), max(map(len, mine))
         times = np.stack([np.concatenate([g, np.repeat(g[-1], longest - len(g))]) for g in grids])
         instant = np.array([np.searchsorted(grids[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
