@@ -55,7 +55,6 @@ from mmrjax.effects import Effect
 from mmrjax.effects.curve import WAYS
 from mmrjax.fidelities.drive import rates, state_of
 from mmrjax.fidelities.histories import (
-    FIRST,
     GROWTH,
     LONGEST,
     STEPS,
