@@ -99,7 +99,6 @@ def informing(data: Data) -> np.ndarray:
 
 def counted(r: Array, jacobian: Array, held: slice) -> tuple[Array, Array]:
     """Residuals and Jacobian as they count: penalties only where they are positive."""
-    r, jacobian = jnp.asarray(r), jnp.asarray(jacobian)
     counts = jnp.ones(r.shape, bool).at[held].set(r[held] > 0)
     return jnp.where(counts, r, 0.0), jnp.where(counts[:, None], jacobian, 0.0)
 

@@ -54,17 +54,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import WAYS
 from mmrjax.fidelities.drive import rates, state_of
-from mmrjax.fidelities.histories import (
-    GROWTH,
-    LONGEST,
-    STEPS,
-    at_first,
-    grid,
-    growth,
-    histories,
-    respond,
-    states,
-)
+from mmrjax.fidelities.histories import GROWTH, LONGEST, STEPS, at_first, grid, growth, histories, respond, states
 from mmrjax.params import Scalar
 from mmrjax.rig import Begin, Begins, Rig
 from mmrjax.robot import Robot
@@ -221,8 +211,8 @@ class Histories(Observer):
         mine = [m[np.argsort(runs["time_s"][m], kind="stable")] for m in mine]
         sudden = _changes(runs, mine, robot.rig)
         exact = robot.rig.imposed == "motor_speed"
-        given = [runs["time_s"][m] for m in mine]
-        driven = [None] * len(mine) if exact else [applied(runs)[m] for m in mine]
+        given, drives = [runs["time_s"][m] for m in mine], None if exact else applied(runs)
+        driven = [None if drives is None else drives[m] for m in mine]
         steps = [_longest(t, d) for t, d in zip(given, driven, strict=True)]
         grids = [grid(t, c, h, SOON if exact else GROWTH) for t, c, h in zip(given, sudden, steps, strict=True)]
         longest, samples = _common(max(map(len, grids))), max(map(len, mine))
@@ -654,7 +644,7 @@ class Histories(Observer):
         which = None if active is None else np.asarray(active)[None]
         evaluate = _evaluator(problem, np.asarray(problem.data.weight)[None], which)
         r, jacobian, seen = jax.tree.map(lambda x: x[0], evaluate(np.asarray(z)[None], np.zeros(1, int)))
-        return *counted(r, jacobian, penalties(problem.data)), seen
+        return *counted(jnp.asarray(r), jnp.asarray(jacobian), penalties(problem.data)), seen
 
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
         """Curves and windows as of settled runs, over time too, and waves in the angle of a shaft. Over the voltage
