@@ -33,6 +33,9 @@ def for_equations(x: T) -> T:
 
 #: Options of XLA for programs over a few hundred points: compiled in three quarters of the time, no slower to run.
 SMALL = {"xla_cpu_use_fusion_emitters": False}
+#: The same with few optimizations, for runs over time: half of that time again, no slower to run (0.91 s for 1.06 an
+#: evaluation of two searches with the library, four runs of 3072 steps).
+OVER_TIME = {**SMALL, "xla_backend_optimization_level": 1}
 #: The same for programs that run a few times each, with few optimizations: none where that is sound, as from the
 #: command line (the loop on `measured` with nothing kept then takes 63 s of processor time, 78 at level 1).
 SELDOM = {**SMALL, "xla_backend_optimization_level": 0 if SOUND_AT_LEVEL_0 in os.environ.get("XLA_FLAGS", "") else 1}

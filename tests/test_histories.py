@@ -12,7 +12,7 @@ from mmrjax import params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.drive import drive
-from mmrjax.fidelities.histories import FIRST, LONGEST, grid, histories, states
+from mmrjax.fidelities.histories import FIRST, LONGEST, followed, grid, histories
 
 RUNS = Conditions(
     voltage=np.array([15.0, 33.0, 24.0]),
@@ -112,12 +112,12 @@ def test_known_states_change_neither_values_nor_derivatives():
     robot, run, times = robots.nominal(), jax.tree.map(lambda x: x[0], RUNS), jnp.asarray(GRID[:60])
     friction = float(robot.motor.friction_coulomb)
 
-    def current(x, stages=None):
+    def current(x, known=None):
         at = params.replace(robot, {"motor.friction_coulomb": x})
-        found = histories(at, run, times, stages).current
+        found = histories(at, run, times, known).current
         return found, found
 
-    known = jax.jit(lambda: states(robot, run, times))()
+    known = jax.jit(lambda: followed(robot, run, times))()
     (slope, value), (slope_known, value_known) = (
         jax.jit(jax.jacfwd(lambda x, s=s: current(x, s), has_aux=True))(friction) for s in (None, known)
     )

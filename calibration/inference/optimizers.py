@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from calibration.inference.normal_equations import half_solved, solved
 from calibration.inference.problem import MISSING, Data, Observation, Problem
-from mmrjax.compiling import SELDOM, SMALL, compiled
+from mmrjax.compiling import OVER_TIME, SELDOM, SMALL, compiled
 from mmrjax.robot import Robot
 
 #: Predicted decrease of the objective below which a point is an optimum: in ½σ² (the step left is then below
@@ -456,17 +456,17 @@ def _first_step(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Obser
 
 @functools.partial(compiled, options=SELDOM)
 def _counting(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
-    return counted(*_known(r, jacobian, data), penalties(data))
+    return counted(*computed(r, jacobian, data), penalties(data))
 
 
-def _known(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
+def computed(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
     """Residuals and Jacobian; a row of that which is not finite counts as a reading that could not be computed."""
     counts = jnp.concatenate([data.weight.ravel() > 0, jnp.ones(data.measured.shape[0] + jacobian.shape[1], bool)])
     known = jnp.all(jnp.isfinite(jacobian), axis=1)
     return jnp.where(known, r, MISSING * counts), jnp.where(known[:, None], jacobian, 0.0)
 
 
-@compiled
+@functools.partial(compiled, options=OVER_TIME)
 def linearised_signed(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
     """`linearised` of a rollout with the signs of penalties, and their slopes where they are negative too.
 
@@ -475,7 +475,7 @@ def linearised_signed(problem: Problem, z: Z, data: Data) -> tuple[Array, Array,
     """
 
     r, jacobian, seen = _evaluated(problem, data, no_pin(z.size))(z)
-    return *_known(r, jacobian, data), seen
+    return *computed(r, jacobian, data), seen
 
 
 def evaluated(problem: Problem, z: Z, data: Data) -> Array:
@@ -627,7 +627,7 @@ def searches(
     return jax.vmap(search)(starts)
 
 
-@compiled
+@functools.partial(compiled, options=OVER_TIME)
 def read(problem: Problem, robot: Robot) -> Observation:
     """What the model says of every row of the problem for any robot, compiled."""
     return problem.observe(robot)

@@ -10,6 +10,7 @@ rollout.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -24,6 +25,8 @@ from mmrjax.params import Scalar
 from mmrjax.rarely import rarely
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
+
+T = TypeVar("T")
 
 _GAMMA = 1 - 0.5**0.5
 #: Most Newton steps of a stage, which starts where the last one ended, and what its equations may leave in the
@@ -96,15 +99,22 @@ def at_first(robot: Robot, conditions: Conditions) -> tuple[Conditions, Float[Ar
     return held, start(robot, held)
 
 
-def _matrix(robot: Robot, conditions: Conditions, y: Array, span: Array) -> tuple[Array, Array]:
-    """I - span ∂f/∂y, and f."""
+class Followed(eqx.Module):
+    """A run that is known, and its equations made linear along it: what a change of its rates does to it.
 
-    def f(y: Array) -> tuple[Array, Array]:
-        value = rates(robot, conditions, y)
-        return value, value
+    A change at the end of a step is `carries` times the change before it, and `gains` times the change of the rates
+    at each stage.
 
-    jacobian, value = jax.jacfwd(f, has_aux=True)(y)
-    return jnp.eye(y.shape[0], dtype=y.dtype) - span * jacobian, value
+    Attributes:
+        states: unknowns at both stages of every step, the second its end, shape (steps, 2, unknowns).
+        places: where the equations are made linear, of the same shape; clock: when [s], shape (steps, 2).
+    """
+
+    states: Float[Array, "steps 2 unknowns"]
+    places: Float[Array, "steps 2 unknowns"]
+    clock: Float[Array, "steps 2"]
+    carries: Float[Array, "steps unknowns unknowns"]
+    gains: Float[Array, "steps 2 unknowns unknowns"]
 
 
 def _stage(robot: Robot, conditions: Conditions, known: Array, guess: Array, h: Array) -> Array:
@@ -115,13 +125,12 @@ def _stage(robot: Robot, conditions: Conditions, known: Array, guess: Array, h: 
 
     def newton(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         count, y, _ = state
-        matrix, value = _matrix(robot, conditions, y, _GAMMA * h)
-        step = solved(matrix, y - known - _GAMMA * h * value)
+        matrix, value = jax.jacfwd(lambda y: (left(y),) * 2, has_aux=True)(y)
+        step = solved(matrix, value)
         # Over a kink of the friction law full steps can swing to and fro for ever.
-        whole, part = y - step, y - 0.3 * step
-        of_whole, of_part = jnp.max(jnp.abs(left(whole))), jnp.max(jnp.abs(left(part)))
-        y = jnp.where(of_part < of_whole, part, whole)
-        return count + 1, y, jnp.minimum(of_part, of_whole)
+        tried = y - jnp.array([0.3, 1.0], y.dtype)[:, None] * step
+        over = jnp.max(jnp.abs(jax.vmap(left)(tried)), 1)
+        return count + 1, jnp.where(over[0] < over[1], tried[0], tried[1]), jnp.min(over)
 
     def going(state: tuple[Array, Array, Array]) -> Array:
         return (state[0] < NEWTON) & (state[2] > SOLVED)
@@ -130,50 +139,85 @@ def _stage(robot: Robot, conditions: Conditions, known: Array, guess: Array, h: 
     return jnp.where(error <= SOLVED, y, jnp.nan)
 
 
-@eqx.filter_custom_jvp
-def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) -> tuple[Array, Array]:
-    """Unknowns of one run from standstill at both stages of every step, shape (steps, unknowns) each.
+def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) -> Float[Array, "steps 2 unknowns"]:
+    """Unknowns of one run from standstill at both stages of every step.
 
     Args: as of `histories`.
     """
     changing, constant = _in_time(conditions)
 
-    def step(y: Array, inputs: tuple[Array, Conditions]) -> tuple[Array, tuple[Array, Array]]:
+    def step(y: Array, inputs: tuple[Array, Conditions]) -> tuple[Array, Array]:
         h, now = inputs
         held = eqx.combine(now, constant)
-        one = _stage(robot, held, y, y, h)
-        two = _stage(robot, held, y + (1 - _GAMMA) / _GAMMA * (one - y), one, h)
-        return two, (one, two)
+
+        def stage(given: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
+            found = _stage(robot, held, *given, h)
+            return (y + (1 - _GAMMA) / _GAMMA * (found - y), found), found
+
+        both = jax.lax.scan(stage, (y, y), length=2)[1]
+        return both[1], both
 
     steps = (jnp.diff(times), jax.tree.map(lambda x: x[:-1], changing))
     return jax.lax.scan(step, at_first(robot, conditions)[1], steps)[1]
 
 
-@states.def_jvp
-def _response(primals: tuple, tangents: tuple) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    robot, conditions, times = primals
-    stages = states(robot, conditions, times)
-    return stages, _changed(robot, conditions, times, stages, tangents[0])
+def followed(
+    robot: Robot, conditions: Conditions, times: Float[Array, " times"], known: Array | None = None
+) -> Followed:
+    """A run and its equations made linear along it.
+
+    Args: as of `histories`; known: its states, where they are.
+    """
+    found = states(robot, conditions, times) if known is None else known
+    changing, constant = _in_time(conditions)
+    of_first, begins_at = at_first(robot, conditions)
+    at = jnp.concatenate([begins_at[None], found[:, 1]])
+    through = _through_rest(robot, of_first, at)
+    h = jnp.diff(times)
+    # Through rest: Euler's implicit steps to and from it, by the equations as they are off it.
+    shares = jnp.stack([through.before, 1 - through.before], 1)
+    spans = jnp.where(through.any[:, None], shares, _GAMMA) * h[:, None]
+    clock = jnp.stack([times[:-1] + jnp.where(through.any, through.before, _GAMMA) * h, times[1:]], 1)
+    late = jnp.stack([through.before <= 0, through.before < 1], 1)
+    off_rest = jnp.where(late[:, :, None], at[1:, None], at[:-1, None])
+    places = jnp.where(through.any[:, None, None], off_rest, found)
+
+    def linear(given: tuple[Array, Array, Array, Array, Conditions]) -> tuple[Array, Array]:
+        places, spans, passes, turns, now = given
+        held = eqx.combine(now, constant)
+
+        def inverse(y: Array, span: Array) -> Array:
+            slope = jax.jacfwd(lambda y: rates(robot, held, y))(y)
+            return inverted(jnp.eye(y.shape[0], dtype=y.dtype) - span * slope)
+
+        first, second = jax.vmap(inverse)(places, spans)
+        jump = rarely(turns, _jump, (robot, held, places[1]), jnp.zeros_like(places[1]))
+        one = jnp.eye(len(first), dtype=first.dtype)
+        # What the second stage starts from, by the first stage and by the change before the step.
+        by_first = jnp.where(passes, one + jump[:, None] * one[MOTOR], (1 - _GAMMA) / _GAMMA * one)
+        before = jnp.where(passes, 0.0, 1 - (1 - _GAMMA) / _GAMMA) * one
+        gains = jnp.stack([spans[0] * second @ by_first @ first, spans[1] * second])
+        return second @ (by_first @ first + before), gains
+
+    each = places, spans, through.any, through.turns, jax.tree.map(lambda x: x[:-1], changing)
+    blocks = jax.lax.map(jax.vmap(linear), _in_blocks(each))
+    carries, gains = _of_steps(blocks, len(h))
+    return Followed(found, places, clock, carries, gains)
 
 
 @eqx.filter_custom_jvp
-def _known(
-    robot: Robot, conditions: Conditions, times: Float[Array, " times"], stages: tuple[Array, Array]
-) -> tuple[Array, Array]:
-    """What `states` gives, where it is known, with its derivatives."""
-    return stages
+def _ends(
+    robot: Robot, conditions: Conditions, times: Float[Array, " times"], known: Array, along: Followed | None
+) -> Array:
+    """Unknowns at the end of every step, of states that are known, with their derivatives by the robot."""
+    return known[:, 1]
 
 
-@_known.def_jvp
-def _known_response(primals: tuple, tangents: tuple) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    robot, conditions, times, stages = primals
-    return stages, _changed(robot, conditions, times, stages, tangents[0])
-
-
-def _changed(
-    robot: Robot, conditions: Conditions, times: Array, stages: tuple[Array, Array], moved: Robot
-) -> tuple[Array, Array]:
-    """Change of a run's states with its robot's parameters, which are `moved` by so much."""
+@_ends.def_jvp
+def _response(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    """With a robot's parameters, which are moved."""
+    (robot, conditions, times, known, along), moved = primals, tangents[0]
+    along = followed(robot, conditions, times, known) if along is None else along
     begin = None
     if robot.rig.begins is not None:
         begin = eqx.filter_jvp(lambda r: at_first(r, conditions)[1], (robot,), (moved,))[1]
@@ -182,89 +226,65 @@ def _changed(
         change = eqx.filter_jvp(lambda r: rates(r, held, y), (robot,), (moved,))[1]
         return jnp.zeros_like(y) if change is None else change
 
-    return respond(robot, conditions, times, stages, source, lambda t, y, dy, _: dy, begin)
+    return known[:, 1], respond(conditions, along, source, lambda t, y, dy, _: dy, begin)
 
 
 def respond(
-    robot: Robot,
     conditions: Conditions,
-    times: Float[Array, " times"],
-    stages: tuple[Array, Array],
+    along: Followed,
     source: Callable[[Array, Array, Conditions], Array],
     seen: Callable[[Array, Array, Array, Conditions], Array],
     begin: Array | None = None,
-) -> tuple[Array, Array]:
+) -> Array:
     """What small changes of the rates do to a run.
 
     Args:
-        conditions, times: as of `histories`; stages: of the run, from `states`.
+        conditions: as of `histories`; along: the run.
         source: (time, state, conditions) → change of the rates there, shape (unknowns, ...).
-        seen: (time, state, its change, conditions) → what is kept of the change, of every stage.
+        seen: (time, state, its change, conditions) → what is kept of the change at the end of every step.
         begin: change of the state at the first instant; None: none.
 
-    Returns:
-        What is kept of the first and of the second stage of every step; the second is the step's end.
-
-    A step's change is linear in the one before it: matrices and sources of a block's steps are computed side by side,
-    and one after another is left only a product a step.
+    Sources of a block's steps are computed side by side; one after another is left only a product a step.
     """
     changing, constant = _in_time(conditions)
-    count = len(times) - 1
-    times, stages, changing = jax.tree.map(_to_whole_blocks(count), (times, stages, changing))
-    of_first, begins_at = at_first(robot, conditions)
-    at = jnp.concatenate([begins_at[None], stages[1]])
-    through = _through_rest(robot, of_first, at)
-    h = jnp.diff(times)
-    # Through rest: Euler's implicit steps to and from it, by the equations as they are off it.
-    spans = (
-        jnp.where(through.any, through.before * h, _GAMMA * h),
-        jnp.where(through.any, (1 - through.before) * h, _GAMMA * h),
-    )
-    clock = times[:-1] + jnp.where(through.any, through.before, _GAMMA) * h
-    off_rest = (
-        jnp.where((through.before > 0)[:, None], at[:-1], at[1:]),
-        jnp.where((through.before < 1)[:, None], at[1:], at[:-1]),
-    )
-    places = tuple(jnp.where(through.any[:, None], a, b) for a, b in zip(off_rest, stages, strict=True))
 
-    def linear(t: tuple, stage: tuple, span: tuple, passes: Array, turns: Array, now: Conditions) -> tuple:
-        """Of each stage, by what matrix a change before the step is multiplied, and what the sources add."""
+    def added(given: tuple[Array, Array, Array, Conditions]) -> Array:
+        """By the sources of a step, at its end."""
+        clock, places, gains, now = given
         held = eqx.combine(now, constant)
-        jump = rarely(turns, _jump, (robot, held, stage[1]), jnp.zeros_like(stage[1]))
-        first, second = (inverted(_matrix(robot, held, y, x)[0]) for y, x in zip(stage, span, strict=True))
-        one, two = (x * source(at, y, held) for at, y, x in zip(t, stage, span, strict=True))
+        both = jax.vmap(lambda t, y: source(t, y, held))(clock, places)
+        return jnp.tensordot(gains, both, ((0, 2), (0, 1)))
 
-        def known(d1: Array, dy: Array) -> Array:
-            turned = d1 + jnp.tensordot(jump, d1[MOTOR], 0)
-            return jnp.where(passes, turned, dy + (1 - _GAMMA) / _GAMMA * (d1 - dy))
+    def after(dy: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+        dy = jnp.tensordot(step[0], dy, 1) + step[1]
+        return dy, dy
 
-        d1 = jnp.tensordot(first, one, 1)
-        d2 = jnp.tensordot(second, known(d1, jnp.zeros_like(d1)) + two, 1)
-        return (first, d1), (second @ known(first, jnp.eye(len(first), dtype=first.dtype)), d2)
-
-    def after(dy: Array, step: tuple[Array, Array]) -> Array:
-        return jnp.tensordot(step[0], dy, 1) + step[1]
-
-    def block(dy: Array, inputs: tuple) -> tuple[Array, tuple[Array, ...]]:
-        t, stage, span, passes, turns, now, then = inputs
-        one, two = jax.vmap(linear)(t, stage, span, passes, turns, now)
-        end, before = jax.lax.scan(lambda dy, step: (after(dy, step), dy), dy, two)
-        changes = jax.vmap(after)(before, one), jnp.concatenate([before[1:], end[None]])
+    def block(dy: Array, inputs: tuple) -> tuple[Array, Array]:
+        (clock, places, carries, gains), now, then = inputs
+        last, changes = jax.lax.scan(after, dy, (carries, jax.vmap(added)((clock, places, gains, now))))
         whole = jax.vmap(lambda t, y, dy, changing: seen(t, y, dy, eqx.combine(changing, constant)))
-        return end, tuple(map(whole, t, stage, changes, (now, then)))
+        return last, whole(clock[:, 1], places[:, 1], changes, then)
 
-    begins, ends = (jax.tree.map(lambda x, s=s: x[s], changing) for s in (slice(-1), slice(1, None)))
-    still = jnp.zeros_like(source(times[0], stages[0][0], of_first)) if begin is None else begin
-    given = (clock, times[1:]), places, spans, through.any, through.turns, begins, ends
-    blocks = jax.tree.map(lambda x: x.reshape(-1, BLOCK, *x.shape[1:]), given)
-    kept = jax.lax.scan(block, still, blocks)[1]
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], kept)
+    of_first = eqx.combine(jax.tree.map(lambda x: x[0], changing), constant)
+    still = jnp.zeros_like(source(along.clock[0, 0], along.places[0, 0], of_first)) if begin is None else begin
+    now, then = (jax.tree.map(lambda x, s=s: x[s], changing) for s in (slice(-1), slice(1, None)))
+    given = (along.clock, along.places, along.carries, along.gains), now, then
+    return _of_steps(jax.lax.scan(block, still, _in_blocks(given))[1], len(along.clock))
 
 
-def _to_whole_blocks(steps: int) -> Callable[[Array], Array]:
-    """Lengthens a run by as many steps of no length."""
-    more = -steps % BLOCK
-    return lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], more, 0)])
+def _in_blocks(of_steps: T) -> T:
+    """What is known of each step, of blocks of steps; the last block is filled with the last step."""
+
+    def filled(x: Array) -> Array:
+        x = jnp.concatenate([x, jnp.repeat(x[-1:], -len(x) % BLOCK, 0)])
+        return x.reshape(-1, BLOCK, *x.shape[1:])
+
+    return jax.tree.map(filled, of_steps)
+
+
+def _of_steps(blocks: T, count: int) -> T:
+    """The same of each of so many steps."""
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], blocks)
 
 
 class _Through(eqx.Module):
@@ -321,7 +341,7 @@ def histories(
     robot: Robot,
     conditions: Conditions,
     times: Float[Array, " times"],
-    stages: tuple[Array, Array] | None = None,
+    known: Followed | None = None,
 ) -> Signals:
     """Signals of one run from standstill (or as `Rig.begins` says) at every instant of a grid; fields have shape
     (times,).
@@ -332,12 +352,13 @@ def histories(
         conditions: one run; each field scalar, or of shape (times,): its value at an instant acts from there to the
             next, and is what the signals of that instant are computed with.
         times: from 0 on, as by `grid` [s]; repeated instants are steps of no length.
-        stages: of the run, from `states`, where they are known.
+        known: the run, from `followed`, where it is known.
 
     A run that could not be followed is not finite from there on. Friction at rest is smooth: a robot that should
     stand creeps where gravity pulls, below a tenth of V_s.
     """
     changing, constant = _in_time(conditions)
-    _, nodes = states(robot, conditions, times) if stages is None else _known(robot, conditions, times, stages)
+    found = states(jax.lax.stop_gradient(robot), conditions, times) if known is None else known.states
+    nodes = _ends(robot, conditions, times, found, known)
     ys = jnp.concatenate([at_first(robot, conditions)[1][None], nodes])
     return jax.vmap(lambda y, now: moving(robot, eqx.combine(now, constant), state_of(robot, y)))(ys, changing)

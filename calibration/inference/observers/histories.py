@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
+import functools
 import operator
 import re
 import threading
@@ -39,6 +40,7 @@ from calibration.inference.optimizers import (
     Evaluate,
     Numbers,
     Optimum,
+    computed,
     counted,
     linearised,
     linearised_signed,
@@ -49,12 +51,23 @@ from calibration.inference.priors import DELAY
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax import balances, channels, fidelities, params
 from mmrjax.channels import Channel
-from mmrjax.compiling import compiled
+from mmrjax.compiling import OVER_TIME, compiled
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import WAYS
 from mmrjax.fidelities.drive import rates, state_of
-from mmrjax.fidelities.histories import GROWTH, LONGEST, STEPS, at_first, grid, growth, histories, respond, states
+from mmrjax.fidelities.histories import (
+    GROWTH,
+    LONGEST,
+    STEPS,
+    Followed,
+    at_first,
+    followed,
+    grid,
+    growth,
+    histories,
+    respond,
+)
 from mmrjax.params import Scalar
 from mmrjax.rig import Begin, Begins, Rig
 from mmrjax.robot import Robot
@@ -171,7 +184,7 @@ class Histories(Observer):
         knots: rows between which a defect is taken to be linear, a run's last repeated, shape (runs, knots).
         delayed: whether what is imposed may act later than its column says (`Rig.delay`), so that readings are read
             that much earlier between the instants.
-        stages: unknowns of every run at both stages of every step, of the robot that is observed; None: not known.
+        known: the runs of the robot that is observed; None: not known.
     """
 
     word: ClassVar[str] = "samples"
@@ -190,7 +203,7 @@ class Histories(Observer):
     rows_of: Int[Array, "runs samples"]
     knots: Int[Array, "runs knots"]
     delayed: bool = eqx.field(default=False, static=True)
-    stages: tuple[Array, Array] | None = None
+    known: Followed | None = None
 
     @classmethod
     def observes(cls, runs: Runs) -> bool:
@@ -350,9 +363,7 @@ class Histories(Observer):
         falls linearly to 0 at the next ones; an effect `probe` is its amplitude in its balance."""
         clock = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.knots]]
 
-        def one(
-            conditions: Conditions, times: Array, clock: Array, instants: Array, stages: tuple[Array, Array]
-        ) -> Array:
+        def one(conditions: Conditions, clock: Array, instants: Array, along: Followed) -> Array:
             def probed(amplitude: Array) -> Robot:
                 put = tuple(eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(probes, amplitude, strict=True))
                 return dataclasses.replace(robot, effects=(*robot.effects, *put))
@@ -381,26 +392,26 @@ class Histories(Observer):
                 return jnp.tensordot(by_state, dy, 1) + at_once[:, :, None] * hat(t)
 
             first, begins = at_first(robot, conditions)
-            changed = respond(robot, conditions, times, stages, source, seen)[1]
-            still = seen(times[0], begins, jnp.zeros_like(source(times[0], begins, first)), first)
+            changed = respond(conditions, along, source, seen)
+            still = seen(clock[0], begins, jnp.zeros_like(source(clock[0], begins, first)), first)
             whole = jnp.concatenate([still[None], changed])
             return jnp.moveaxis(whole[instants], (0, 1), (2, 3))  # probes, knots, samples, channels
 
         instants = self.instant[jnp.where(self.rows_of < 0, 0, self.rows_of)]
-        stages = self.following(robot).stages
-        assert stages is not None
-        return jnp.moveaxis(jax.vmap(one)(self.conditions, self.times, clock, instants, stages), 0, 1)
+        known = self.following(robot).known
+        assert known is not None
+        return jnp.moveaxis(jax.vmap(one)(self.conditions, clock, instants, known), 0, 1)
 
     def following(self, robot: Robot) -> Histories:
         """The same for a robot whose runs are then known."""
-        if self.stages is not None:
+        if self.known is not None:
             return self
-        stages = jax.vmap(lambda c, t: states(robot, c, t))(self.conditions, self.times)
-        return dataclasses.replace(self, stages=stages)
+        known = jax.vmap(lambda c, t: followed(robot, c, t))(self.conditions, self.times)
+        return dataclasses.replace(self, known=known)
 
     def whole(self, robot: Robot) -> Signals:
         """Every signal of every run at every instant, shape (runs, instants)."""
-        found = jax.vmap(lambda c, t, s: histories(robot, c, t, s))(self.conditions, self.times, self.stages)
+        found = jax.vmap(lambda c, t, k: histories(robot, c, t, k))(self.conditions, self.times, self.known)
         return jax.tree.map(lambda x: jnp.broadcast_to(x, self.times.shape), found)
 
     def at_rows(self, whole: Signals) -> Signals:
@@ -513,34 +524,39 @@ class Histories(Observer):
         whole = dataclasses.replace(problem.base, effects=(*problem.base.effects, *added))
         problem = dataclasses.replace(problem, base=whole)
         robot = problem.robot(z)
-        value = {p.name: p.value for p in params.walk(robot)}
         sds = jnp.stack([jnp.asarray(e.effect.amplitude) for e in effects])
 
-        def at(point: Array, a: Array) -> Robot:
-            """With more of each effect, those that are not there with their shapes at a point of the grid; before the
-            first of them as they are."""
-            put = {}
+        def at(point: Array, x: Array) -> Robot:
+            """At coordinates, with more of each effect; those that are not there have their shapes at a point of the
+            grid."""
+            robot, more, put = problem.robot(x[: z.size]), x[z.size :], {}
+            value = {p.name: p.value for p in params.walk(robot)}
             for k, e in enumerate(effects):
                 amplitude = f"effects.{e.effect.name}.amplitude"
-                put[amplitude] = value[amplitude] + a[k] * sds[k]
+                put[amplitude] = value[amplitude] + more[k] * sds[k]
                 if e.shape:
                     shape = f"effects.{e.effect.name}.{e.shape}"
-                    wanted = e.values[jnp.clip(point, 0, len(e.values) - 1)]
-                    put[shape] = jnp.where((value[amplitude] == 0) & (point >= 0), wanted, value[shape])
+                    wanted = e.values[jnp.minimum(point, len(e.values) - 1)]
+                    put[shape] = jnp.where(value[amplitude] == 0, wanted, value[shape])
             return params.replace(robot, put)
 
-        none, points = jnp.zeros(len(effects)), jnp.arange(-1, max(len(e.at) for e in effects))
-        stages = jax.lax.map(lambda point: self.following(at(point, none)).stages, points)
+        wide, points = jnp.concatenate([z, jnp.zeros(len(effects))]), max(len(e.at) for e in effects)
 
-        def moved(each: tuple[Array, tuple[Array, Array]]) -> Array:
-            point, stages = each
-            known = dataclasses.replace(self, stages=stages)
-            return jax.jacfwd(lambda a: problem.whitened(known(at(point, a)), data)[: data.measured.size])(none)
+        def along(_: Followed, point: Array) -> tuple[Followed | None, tuple[Array, Array]]:
+            known = self.following(at(point, wide))
+            posed = dataclasses.replace(problem, observe=known)
+            return known.known, posed.linearised(lambda x: at(point, x), wide, data)[:2]
 
-        by_point = jax.lax.map(moved, (points[1:], jax.tree.map(lambda x: x[1:], stages)))
-        parts = [by_point[j, :, k] for k, e in enumerate(effects) for j in range(len(e.at))]
-        known = dataclasses.replace(self, stages=jax.tree.map(lambda x: x[0], stages))
-        residual, jacobian, _ = linearised(dataclasses.replace(problem, observe=known), z, data)
+        # Runs of many steps are large: kept are those at the first point, the last that is looked at.
+        one = jax.eval_shape(lambda: self.following(at(jnp.asarray(0), wide)).known)
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), one)
+        first, (r, slopes) = jax.lax.scan(along, nothing, jnp.arange(points), reverse=True)
+        size, shown = z.size, data.measured.size
+        parts = [slopes[j, :shown, size + k] for k, e in enumerate(effects) for j in range(len(e.at))]
+        residual = jnp.concatenate([r[0], z - data.centre])
+        jacobian = jnp.concatenate([slopes[0, :, :size], jnp.eye(size)])
+        residual, jacobian = counted(*computed(residual, jacobian, data), penalties(data))
+        known = dataclasses.replace(self, known=first)
         defects = known.defective(robot, tuple(probe(b) for b in PROBED))
         scale = data.weight / data.sd
         defects = jnp.where(self.rows_of[:, None, :, None] < 0, 0.0, defects * scale[self.rows_of][:, None])
@@ -897,7 +913,7 @@ def _readings(robot: Robot, signals: Signals) -> Float[Array, " channels"]:
     return jnp.stack([shown[name] for name in channels.names(robot.channels)], -1)
 
 
-@compiled
+@functools.partial(compiled, options=OVER_TIME)
 def _turning(observe: Histories, robot: Robot) -> tuple[Array, Array, dict[str, Array]]:
     """Angle of the driving shaft, back-EMF and ways of travel at every row."""
     whole = observe.whole(robot)
@@ -906,7 +922,7 @@ def _turning(observe: Histories, robot: Robot) -> tuple[Array, Array, dict[str, 
     return observe.angle(whole), jnp.asarray(rows.voltage_back), ways
 
 
-@compiled
+@functools.partial(compiled, options=OVER_TIME)
 def _over_delays(problem: Problem, z: Array, data: Data, scanned: Array, values: Array) -> tuple[Array, Array]:
     observe: Histories = problem.observe  # type: ignore[assignment]
 
@@ -964,7 +980,7 @@ def _evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Ev
     return evaluate
 
 
-@compiled
+@functools.partial(compiled, options=OVER_TIME)
 def _evaluate(
     problem: Problem, z: Numbers, weights: Numbers, active: Numbers | None
 ) -> tuple[Array, Array, Observation]:
