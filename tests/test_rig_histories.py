@@ -326,7 +326,8 @@ def test_a_voltage_on_lines_is_the_mean_of_each_step_and_no_jump(tmp_path):
     held = observers.kind(runs).of(
         runs, dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, between_rows="held"))
     )
-    assert held.times.size > 1.5 * made.times.size
+    jumps = np.asarray(held.times)[0]
+    assert jumps[np.searchsorted(jumps, 0.1) + 1] - 0.1 < 2 * integrator.FIRST < 0.1 * (times[after + 1] - times[after])
 
 
 @pytest.mark.slow
@@ -353,7 +354,7 @@ def test_what_is_imposed_is_held_or_goes_on_lines_between_rows(tmp_path):
     linear, few = shown("linear", 0.02)
     held, many = shown("held", 0.02)
     assert np.abs(linear - exact).max() < 2e-3 * np.abs(exact).max()
-    assert np.abs(held - exact).max() > 10 * np.abs(linear - exact).max() and few < 0.7 * many
+    assert np.abs(held - exact).max() > 10 * np.abs(linear - exact).max() and few < many
 
 
 def test_between_rows_is_one_of_two_words_and_is_written(tmp_path):

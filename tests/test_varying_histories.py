@@ -153,7 +153,7 @@ def test_grid_is_fine_after_every_change_and_bounded():
     for begin in (0.0, *changes):
         assert step[np.searchsorted(found, begin)] <= 1.5 * FIRST
     np.testing.assert_array_equal(grid(times), grid(times, [0.0, 2.5]))  # a change outside is none
-    before = grid(times)
+    before = grid(times, grows=growth(times.max(), 4))  # of the start and three changes
     np.testing.assert_array_equal(found[found < 0.5], before[before < 0.5])
     # one change a sample: no more steps than a long run may have, besides its samples
     often = np.arange(1, 4000) * 0.005

@@ -40,7 +40,7 @@ STEPS = 8000
 #: As many of those as a few changes may ask for, and beyond that each of them: steps then grow by a quarter of the
 #: time since a change, which makes for errors of a thousandth of a current's rms (inputs at 50 and 200 Hz, L / R of
 #: 0.2 and 2 ms).
-FEW, EACH = 2000, 22
+FEW, EACH = 280, 22
 #: Steps of a run whose equations are made linear side by side.
 BLOCK = 32
 
@@ -54,35 +54,39 @@ def growth(duration: float, changes: int) -> float:
 def grid(
     times: Float[np.ndarray, " times"],
     changes: Sequence[float] | np.ndarray = (),
-    longest: float = LONGEST,
+    longest: float | Float[np.ndarray, " intervals"] = LONGEST,
     grows: float = GROWTH,
 ) -> np.ndarray:
     """Instants from 0 to the last of `times` [s], `times` and `changes` among them.
 
     Args:
         changes: instants at which the motors' supply changes [s]; steps are as short after each as after the start.
-        longest: step, where `STEPS` allow it [s]; grows: by how much steps grow after each, at least [1/s · s].
+        longest: step, where `STEPS` allow it [s]; an array: of each interval between `times`.
+        grows: by how much steps grow after each change, at least [1/s · s].
     """
     last = float(np.max(times, initial=0.0))
     changes = np.asarray(changes, float)
     begins = np.unique(np.concatenate([[0.0], changes[(changes > 0) & (changes < last)]]))
-    times = np.unique(np.concatenate([begins, np.asarray(times, float)]))
-    longest = max(longest, last / STEPS)
+    given, times = times, np.unique(np.concatenate([begins, np.asarray(times, float)]))
+    longest = np.maximum(longest, last / STEPS)
+    if longest.ndim:
+        longest = longest[np.clip(np.searchsorted(given, times[:-1], side="right") - 1, 0, len(longest) - 1)]
     grows = max(grows, growth(last, len(begins)))
-    knee = max((longest - FIRST) / grows, 0.0)
+    knee = np.maximum((longest - FIRST) / grows, 0.0)
 
     def clock(t: np.ndarray) -> np.ndarray:  # steps taken up to t: ∫ dt / min(longest, FIRST + grows t)
         young = np.log1p(grows * np.minimum(t, knee) / FIRST) / grows
         return young + np.maximum(t - knee, 0.0) / longest
 
     since = begins[np.searchsorted(begins, times, side="right") - 1]  # the change that acts from each instant on
-    at, ends, at_knee = clock(times - since), clock(times[1:] - since[:-1]), clock(np.asarray(knee))
+    at, ends, at_knee = clock((times - since)[:-1]), clock(times[1:] - since[:-1]), clock(knee)
+    longest, at_knee = np.broadcast_to(longest, len(at)), np.broadcast_to(at_knee, len(at))
     parts = []
     for k in range(len(times) - 1):
         count = max(1, int(np.ceil(ends[k] - at[k] - 1e-9)))
         wanted = np.linspace(at[k], ends[k], count, endpoint=False)
-        young = FIRST / grows * np.expm1(grows * np.minimum(wanted, at_knee))
-        parts.append(since[k] + young + np.maximum(wanted - at_knee, 0.0) * longest)
+        young = FIRST / grows * np.expm1(grows * np.minimum(wanted, at_knee[k]))
+        parts.append(since[k] + young + np.maximum(wanted - at_knee[k], 0.0) * longest[k])
         parts[-1][0] = times[k]
     return np.concatenate([*parts, times[-1:]])
 

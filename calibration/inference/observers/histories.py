@@ -96,8 +96,12 @@ ON_LINES = ("voltage", "motor_current", "duty")
 INRUSH = 2e-3
 #: A stretch of unchanged conditions so long may show steady travel [s].
 LASTING = 0.25
-#: Fewest steps from sample to sample of a run that is driven both ways.
-FINE = 8
+#: Fewest steps from sample to sample of a run that is driven both ways; where a voltage is imposed, as it passes
+#: through rest: while a speed is below this share of its largest, and before that for so long [s] and for so many of
+#: the rig's delay.
+FINE, SLOW, EARLIER, DELAYED = 16, 0.1, 0.03, 2.0
+#: How many of the usual longest steps one may be elsewhere.
+FAST = 2
 #: The same of one whose speed is imposed, and how many of the usual longest steps one of its steps may be.
 COARSELY, SLOWLY = 2, 4
 #: By how much its steps grow with the time since its start [1/s · s].
@@ -224,9 +228,7 @@ class Histories(Observer):
         mine = [m[np.argsort(runs["time_s"][m], kind="stable")] for m in mine]
         sudden = _changes(runs, mine, robot.rig)
         exact = robot.rig.imposed == "motor_speed"
-        given, drives = [runs["time_s"][m] for m in mine], None if exact else applied(runs)
-        driven = [None if drives is None else drives[m] for m in mine]
-        steps = [_longest(t, d) for t, d in zip(given, driven, strict=True)]
+        given, steps = [runs["time_s"][m] for m in mine], _longest(runs, mine, robot.rig)
         grids = [grid(t, c, h, SOON if exact else GROWTH) for t, c, h in zip(given, sudden, steps, strict=True)]
         longest, samples = _common(max(map(len, grids))), max(map(len, mine))
         times = np.stack([np.concatenate([g, np.repeat(g[-1], longest - len(g))]) for g in grids])
@@ -885,20 +887,48 @@ def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) ->
     return bool(np.any(np.abs(after - before) > STILL * np.abs(before + after) / 2))
 
 
-def _longest(time: np.ndarray, driven: np.ndarray | None) -> float:
-    """Longest step of a run [s]. Where what drives it changes its sign, friction jumps as the speed passes through
-    zero, within a step, which has to be short beside the time from sample to sample; where the speed is imposed only
-    what effects remember is followed.
+def _longest(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[np.ndarray]:
+    """Longest step after each row of each run but its last [s].
+
+    Where the speed is imposed only what effects remember is followed. Where what drives a run changes its sign,
+    friction jumps as the speed passes through zero, within a step, which has to be short beside the time from sample
+    to sample: where the table's speeds are low or change their sign, and as much earlier as the rig's delay may be.
+    Where it shows no speed, and where a current is imposed, after which speeds bend more sharply, all along.
 
     Args:
-        time: of its samples [s]; driven: what drives it there; None where its speed is imposed.
+        each: rows of each run in the order of time.
     """
-    if len(time) < 2:
-        return LONGEST
-    apart = float(np.median(np.diff(time)))
-    if driven is None:
-        return min(SLOWLY * LONGEST, apart / COARSELY)
-    return min(LONGEST, apart / FINE) if driven.min() < 0 < driven.max() else LONGEST
+    exact = rig.imposed == "motor_speed"
+    speeds = runs.measured()[:, [c.zero_at_rest and c.directed and c.settled for c in runs.channels]]
+    driven = None if exact else applied(runs)
+    early, found = DELAYED * np.max(np.asarray(rig.delay)) + EARLIER, []
+    for rows in each:
+        apart = np.diff(runs["time_s"][rows])
+        usual = float(np.median(apart)) if len(apart) else np.inf
+        if driven is None:
+            longest = np.full(len(apart), min(SLOWLY * LONGEST, usual / COARSELY))
+        elif driven[rows].min() < 0 < driven[rows].max():
+            slow = _slow(speeds[rows]) | (rig.imposed != "voltage")
+            before = int(np.ceil(early / usual))
+            slow = np.convolve(slow, np.ones(before + 1))[before:] > 0
+            longest = np.where(slow, min(LONGEST, usual / FINE), FAST * LONGEST)
+        else:
+            longest = np.full(len(apart), LONGEST)
+        found.append(longest)
+    return found
+
+
+def _slow(speeds: np.ndarray) -> np.ndarray:
+    """Whether a run may pass through rest between each of its rows and the next; all along where nothing is shown.
+
+    Args:
+        speeds: readings that are 0 at rest, shape (rows, channels).
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
+        far = np.abs(speeds) > SLOW * np.nanmax(np.abs(speeds), 0, initial=0.0)
+    ways = np.where(far, np.sign(speeds), 0.0)
+    return ~np.any((ways[1:] == ways[:-1]) & (ways[1:] != 0), 1)
 
 
 def _common(instants: int) -> int:
