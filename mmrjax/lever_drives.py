@@ -115,7 +115,7 @@ def swing(
     """
     limits = drive.constant * rate + drive.resistance * drive.current_limit * jnp.array([[-1.0], [1.0]])
     least, most = jnp.maximum(least, limits[0]), jnp.minimum(most, limits[1])
-    kept = drive.inertia / step
+    kept = drive.inertia * (1 / step)
     stiff = kept + drive.constant**2 / drive.resistance + drive.viscous
 
     end, way, sign = _PIECES.T

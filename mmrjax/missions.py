@@ -258,7 +258,7 @@ def simulate_batch(
     profile: Profile,
     start: Start | None = None,
     keep: int = 0,
-    tolerance: float = TOLERANCE,
+    tolerance: Scalar = TOLERANCE,
 ) -> Mission:
     """Missions of a batch in one call, compiled; see `batch`.
 

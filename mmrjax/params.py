@@ -69,9 +69,13 @@ def parameter(
 
 
 def as_float(value: Any) -> Any:
-    """A number as a float array; anything that is already an array passes."""
-    # Anything that is already an array (or a tracer, or a placeholder of a tree transformation) passes.
-    return jnp.asarray(value, dtype=float) if isinstance(value, int | float) else value
+    """A number as a float array; anything that is already an array passes, without a weak type."""
+    if isinstance(value, int | float):
+        return jnp.asarray(value, dtype=float)
+    # A weakly typed array, as of `jnp.asarray(0.5)`, would be another program to compile of every function. A tracer
+    # or a placeholder of a tree transformation passes.
+    weak = isinstance(value, jax.Array) and not isinstance(value, jax.core.Tracer) and value.weak_type
+    return jnp.asarray(value, value.dtype) if weak else value
 
 
 @dataclasses.dataclass(frozen=True)

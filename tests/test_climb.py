@@ -19,7 +19,8 @@ from mmrjax.signals import GRAVITY
 from mmrjax.tables import PITCH_TOOTH
 
 ROBOT = nominal()
-SIZE = 4  # points of every terrain here, so that one program serves them
+SIZE = 4  # points of every terrain of the first second, so that one program serves them
+MEMBERS, POINTS = 12, 6  # of every batch of whole climbs, for the same reason
 
 
 def batch(runs, robot=ROBOT, **options):
@@ -77,7 +78,9 @@ def test_parts_of_a_run_follow_on_each_other_and_end_with_it(monkeypatch, durati
     parts = []
 
     def part(robot, conditions, ground, sequence, state, first, step, steps, samples):
-        parts.append((float(first), steps * step, samples))
+        # as numbers, each would have a program of its own
+        assert all(isinstance(x, jax.Array) for x in (step, steps))
+        parts.append((float(first), float(steps * step), samples))
         return state, jnp.zeros((1, samples))
 
     running = None, None, climb.Progress(jnp.array([climb._RUNNING]), *[jnp.zeros(1)] * 4)
@@ -88,6 +91,22 @@ def test_parts_of_a_run_follow_on_each_other_and_end_with_it(monkeypatch, durati
     ends = first + sample * samples
     assert first[0] == 0 and first[1:] == pytest.approx(ends[:-1]) and np.all(sample * samples <= 1 + 2 * sample)
     assert duration - 1e-9 <= ends[-1] <= duration + len(parts) * sample[0]
+
+
+def test_samples_have_all_their_steps_each_at_its_time(monkeypatch):
+    run = system(ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.flat(), still(0.5, 0.3))
+    motion, energy, progress = climb.begin(run)
+    passed = jax.eval_shape(lambda: climb.advance(run, motion, 0.0, energy)[2])
+    passed = jax.tree.map(lambda x: jnp.zeros(x.shape), passed)
+
+    def turned(run, motion, time, energy):
+        motion = dataclasses.replace(motion, q=motion.q.at[climb.SHAFT].add(1.0))
+        return motion, energy, dataclasses.replace(passed, time=time, motion=motion)
+
+    monkeypatch.setattr(climb, "advance", turned)
+    (motion, *_), record = climb.sampled(run, (motion, energy, progress), 0.5, jnp.asarray(3), 2)
+    assert motion.q[climb.SHAFT] == 6 and record.motion.q[:, climb.SHAFT].tolist() == [3, 6]
+    assert np.asarray(record.time) == pytest.approx(0.5 + climb.STEP * np.array([2, 5]))
 
 
 def test_tracks_of_levers_lose_what_table_3_says_at_their_own_speed():
@@ -129,25 +148,53 @@ def test_a_positive_voltage_raises_either_lever():
     assert np.asarray(swung.voltage) == pytest.approx([6.0, -6.0])
 
 
+def whole_climbs(runs, **options):
+    """A batch of whole climbs, its last run repeated up to the members that all of these have."""
+    return batch([*runs, *runs[-1:] * (MEMBERS - len(runs))], **options)
+
+
+#: Onto steps about the largest, beside the climbs whose verdicts are known: a batch takes as long as its slowest.
+HEIGHTS = 0.105 + 1e-3 * np.arange(5)
+HOLDS = {"adhesion": 4.0}
+WHOLE = [
+    (terrain.step(0.05, size=POINTS), 45, -8.4, 12),
+    (terrain.step(0.08, size=POINTS), 60, 180, 8, HOLDS),
+    (terrain.step(0.12, size=POINTS), 60, 180, 8, HOLDS),
+    (terrain.step(0.25, size=POINTS), 45, 180, 12),
+    (terrain.step(0.25, size=POINTS), 60, 180, 0.5, {"payload": 8.0}),
+    (terrain.gap(0.6), 0, 0, 12),
+    (terrain.gap(0.2), 0, 0, 12),
+    *((terrain.step(height, size=POINTS), 60, 180, 8, HOLDS) for height in HEIGHTS),
+]
+VERDICTS = ["over", "over", "tips", "slides", "stalls", "tips", "over"]  # into the wide gap head first
+STEPS = 1e-4, 5e-5
+
+
+@functools.cache
+def ended(step):
+    return whole_climbs(WHOLE, duration=14.0, step=step)
+
+
 @pytest.mark.slow
 def test_verdicts_of_whole_climbs_and_their_energy_and_half_the_step():
-    runs = [
-        (terrain.step(0.05, size=6), 45, -8.4, 12),
-        (terrain.step(0.08, size=6), 60, 180, 8, {"adhesion": 4.0}),
-        (terrain.step(0.12, size=6), 60, 180, 8, {"adhesion": 4.0}),
-        (terrain.step(0.25, size=6), 45, 180, 12),
-        (terrain.step(0.25, size=6), 60, 180, 0.5, {"payload": 8.0}),
-        (terrain.gap(0.6), 0, 0, 12),
-        (terrain.gap(0.2), 0, 0, 12),
-    ]  # of six points each; a batch takes as long as the slowest of them
-    verdicts = ["over", "over", "tips", "slides", "stalls", "tips", "over"]  # into the wide gap head first
-    for step in (1e-4, 5e-5):
-        found = batch(runs, duration=14.0, step=step)
-        assert found.names == verdicts
-        for k in range(len(runs)):
+    for step in STEPS:
+        found = ended(step)
+        assert found.names[: len(VERDICTS)] == VERDICTS
+        for k in range(len(VERDICTS)):
             left, come, _ = energy_left(found.record, k)
             running = (found.record.time[k] > 0.4) & (found.record.time[k] < found.ended[k])
             assert np.abs(left[running] / come[running]).max() < 1e-3, k
+
+
+@pytest.mark.slow
+def test_largest_step_is_the_same_to_a_millimetre_with_half_the_step_of_time():
+    largest = []
+    for step in STEPS:
+        over = [name == "over" for name in ended(step).names[len(VERDICTS) :]]
+        assert len(over) == len(HEIGHTS)
+        assert over == sorted(over, reverse=True) and any(over) and not all(over), over
+        largest.append(HEIGHTS[sum(over) - 1])
+    assert abs(largest[0] - largest[1]) < 1.01e-3
 
 
 def test_how_a_run_ends_is_read_off_its_motion():
@@ -327,27 +374,6 @@ def test_polyline_of_constant_slope_is_tilted_gravity():
 
 
 @pytest.mark.slow
-def test_largest_step_of_a_nose_up_robot_is_that_of_statics():
-    """Slow, on a ground that holds: the centre of mass has to come over the edge under the belt. The tail stands on
-    grousers, the edge lies between two of them."""
-    gear = ROBOT.running_gear
-    outer, inner = float(ROBOT.radius_pulley + gear.grouser_height), float(ROBOT.radius_pulley)
-    front = np.radians(60.0)
-    conditions = Conditions(0, voltage=4.0).resolved(ROBOT)
-    run = system(ROBOT, conditions, terrain.flat(), still(front, np.pi))
-    q = jnp.zeros(6).at[4].set(front).at[5].set(0.0)
-    matrix, *_ = climb.inertia(run, q, jnp.zeros(6))
-    ahead = float(-matrix[1, 2] / matrix[0, 0]) + float(gear.wheelbase) / 2
-    up = float(matrix[0, 2] / matrix[0, 0])
-    theta = np.radians(np.linspace(5, 70, 400))
-    height = outer - inner * np.cos(theta) + (ahead - (up + inner) * np.tan(theta)) * np.sin(theta)
-    limit = height.max()
-    # a grouser more or less under the edge, and the way that the robot is at
-    runs = [(terrain.step(limit + d, size=SIZE), 60, 180, 4, {"adhesion": 4.0}) for d in (-0.006, 0.008)]
-    assert batch(runs, duration=14.0, step=2e-4).names == ["over", "tips"]
-
-
-@pytest.mark.slow
 def test_level_ground_is_travelled_as_settled_balances_have_it():
     """With the share of its load on the guide that its belt has: the same laws, but for the ripple of its grousers.
 
@@ -395,19 +421,43 @@ def test_pairs_of_the_paper_s_full_model_are_counted_on_the_belts_of_its_geometr
     assert tips == 56 and near.sum() == tips + 2  # and the wheels, which bear where there are no tracks
 
 
+@jax.jit
+def lowest(run, q):
+    """Least gap of all contacts [m]."""
+    return jnp.min(footing.footing(run.shape, run.terrain, q, 0 * q).gap)
+
+
 def leant(run, pitch):
     """Coordinates at a pitch, nose up, with the tail on the lower ground and the robot against the edge of a step."""
     q = climb.stand(run).q.at[2].set(-pitch)
-    gap = jax.jit(
-        lambda x, z: jnp.min(footing.footing(run.shape, run.terrain, q.at[0].set(x).at[1].set(z), 0 * q).gap)
-    )
-    z = 1.0 - float(gap(-1.5, 1.0))
+
+    def gap(x, z):
+        return float(lowest(run, q.at[0].set(x).at[1].set(z)))
+
+    z = 1.0 - gap(-1.5, 1.0)
     far, near = -1.5, 0.5
     for _ in range(40):
         middle = (far + near) / 2
-        free = float(gap(middle, z + 1e-4)) > 0
+        free = gap(middle, z + 1e-4) > 0
         far, near = (middle, near) if free else (far, middle)
     return q.at[0].set(far).at[1].set(z - 2e-5)
+
+
+def nose_up():
+    """Largest step of a robot with its front levers raised, whose centre of mass has to come over the edge under the
+    belt [m]. The tail stands on grousers, the edge lies between two of them."""
+    gear = ROBOT.running_gear
+    outer, inner = float(ROBOT.radius_pulley + gear.grouser_height), float(ROBOT.radius_pulley)
+    front = np.radians(60.0)
+    conditions = Conditions(0, voltage=4.0).resolved(ROBOT)
+    run = system(ROBOT, conditions, terrain.flat(), still(front, np.pi))
+    q = jnp.zeros(6).at[4].set(front).at[5].set(0.0)
+    matrix, *_ = climb.inertia(run, q, jnp.zeros(6))
+    ahead = float(-matrix[1, 2] / matrix[0, 0]) + float(gear.wheelbase) / 2
+    up = float(matrix[0, 2] / matrix[0, 0])
+    theta = np.radians(np.linspace(5, 70, 400))
+    height = outer - inner * np.cos(theta) + (ahead - (up + inner) * np.tan(theta)) * np.sin(theta)
+    return height.max()
 
 
 @pytest.mark.slow
@@ -417,7 +467,7 @@ def test_static_limits_of_steps_and_gaps_are_those_of_the_dynamics():
     flush = float(np.degrees(static_limits.flush(ROBOT)))
     runs, starts = [], []
     for payload in (0.0, 8.0):
-        of = {"adhesion": 4.0, "payload": payload}
+        of = HOLDS | {"payload": payload}
         side = posture.outline(
             ROBOT, Conditions(0, payload=payload, levers_front_deg=180.0, levers_rear_deg=flush).resolved(ROBOT)
         )
@@ -425,33 +475,27 @@ def test_static_limits_of_steps_and_gaps_are_those_of_the_dynamics():
         high = static_limits.step(dataclasses.replace(side, belt=ROBOT.radius_pulley))
         assert 1e3 * float(low.height) == pytest.approx({0.0: 232, 8.0: 203}[payload], abs=1)
         for height in (float(low.height) - 0.004, float(high.height) + 0.006):
-            ground = terrain.step(height, size=6)
+            ground = terrain.step(height, size=POINTS)
             run = system(
                 ROBOT, Conditions(0, voltage=4.0, **of).resolved(ROBOT), ground, still(np.pi, np.radians(flush))
             )
             runs.append((ground, 180, flush, 4, of))
             starts.append(leant(run, float(low.pitch) - np.radians(4.0)))
+    # a grouser more or less under the edge of a step that it drives up to nose up, and the way that the robot is at
+    grounds = [(terrain.step(nose_up() + d, size=POINTS), 60.0, 180.0) for d in (-0.006, 0.008)]
     # what bridges on both sides of the centre of mass does not fall in; a nose that does may still catch the far edge
     for front, widths in ((180.0, (0.144, 0.21)), (flush, (0.346, 0.38))):
-        for width in widths:
-            ground = terrain.gap(width)
-            runs.append((ground, front, front, 4, {"adhesion": 4.0}))
-            run = system(ROBOT, Conditions(0, voltage=4.0).resolved(ROBOT), ground, still(*[np.radians(front)] * 2))
-            starts.append(climb.stand(run).q)
-    zero = np.zeros(len(runs))
-    start = climb.Motion(jnp.stack(starts), jnp.zeros((len(runs), 6)), *map(jnp.asarray, (zero, zero, zero)))
-    found = batch(runs, duration=16.0, step=2e-4, start=start)
-    over = [name == "over" for name in found.names]
-    assert over == [True, False] * 4, found.names
-
-
-@pytest.mark.slow
-def test_largest_step_is_the_same_to_a_millimetre_with_half_the_step_of_time():
-    heights = 0.105 + 1e-3 * np.arange(5)
-    runs = [(terrain.step(h, size=SIZE), 60, 180, 8, {"adhesion": 4.0}) for h in heights]
-    largest = []
-    for step in (1e-4, 5e-5):
-        over = [name == "over" for name in batch(runs, duration=14.0, step=step, record=False).names]
-        assert over == sorted(over, reverse=True) and any(over) and not all(over), over
-        largest.append(heights[sum(over) - 1])
-    assert abs(largest[0] - largest[1]) < 1.01e-3
+        grounds += [(terrain.gap(width), front, front) for width in widths]
+    for ground, front, rear in grounds:
+        run = system(
+            ROBOT, Conditions(0, voltage=4.0).resolved(ROBOT), ground, still(np.radians(front), np.radians(rear))
+        )
+        runs.append((ground, front, rear, 4, HOLDS))
+        starts.append(climb.stand(run).q)
+    starts += starts[-1:] * (MEMBERS - len(starts))
+    zero = np.zeros(len(starts))
+    start = climb.Motion(jnp.stack(starts), jnp.zeros((len(starts), 6)), *map(jnp.asarray, (zero, zero, zero)))
+    found = whole_climbs(runs, duration=16.0, step=2e-4, start=start)
+    over = [name == "over" for name in found.names[: len(runs)]]
+    assert over == [True, False] * 5, found.names
+    assert found.names[5] == "tips"

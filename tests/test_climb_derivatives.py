@@ -67,7 +67,9 @@ def test_derivatives_are_the_limits_of_finite_differences_with_contacts_at_the_e
     pitch = found.climb.record.motion.q[0, :, 2]
     assert found.climb.names == ["unfinished"] and np.ptp(pitch) > 0.1  # it climbs
     moves = np.diag([1e-6, 1e-5])  # with ten times as much a grouser of the step's edge bears earlier
-    beside = jax.vmap(given)(jnp.concatenate([values + moves, values - moves]))
+    rows = jnp.concatenate([values + moves, values - moves])
+    # as many as the slopes take, whose program serves them too
+    beside = jax.vmap(given)(jnp.resize(rows, (len(values) * room.BESIDE, len(values))))
     batch = climb.climb_batch(*beside, **options)
     each = [jax.tree.map(lambda x, k=k: x[k], (beside.robot, beside.terrain)) for k in range(4)]
     ends = [room.outputs_of_run(*of, batch, k) for k, of in enumerate(each)]

@@ -12,7 +12,7 @@ import mmrjax as mm
 from mmrjax import missions, params
 from mmrjax.fidelities import mission_straight
 from mmrjax.fidelities.drive import drive
-from mmrjax.fidelities.mission import Mission, Start, Totals, initial_unknowns, mission
+from mmrjax.fidelities.mission import TOLERANCE, Mission, Start, Totals, initial_unknowns, mission
 from mmrjax.fidelities.mission_steps import BREAKS_AWAY, events_of
 from mmrjax.missions import simulate_batch
 from mmrjax.profile import profile
@@ -31,12 +31,17 @@ def several(*profiles):
     return jax.tree.map(lambda *x: jnp.stack(x), *profiles)
 
 
+def demanding(robot, run: mm.Conditions, *asks, tolerance: float = TOLERANCE) -> Mission:
+    """Three missions that demand a speed and a yaw rate in five rows: what is asked so has one program."""
+    return jax.device_get(simulate_batch(robot, run, several(*asks), None, 512, jnp.asarray(tolerance)))
+
+
 @pytest.fixture(scope="module")
 def demanded(robot) -> Mission:
     """Speed with a yaw rate of 0, of 0.5 and -0.5 rad/s."""
     rates = ([0.0] * 5, [0, 0.5, 0.5, 0, 0], [0, -0.5, -0.5, 0, 0])
-    one = several(*(profile(ROWS, MODES, yaw_rate=rate, **RAMP) for rate in rates))
-    return jax.device_get(simulate_batch(robot, conditions(3), one, None, 512))
+    run = conditions(3, payload=np.zeros(3)).resolved(robot)
+    return demanding(robot, run, *(profile(ROWS, MODES, yaw_rate=rate, **RAMP) for rate in rates))
 
 
 def with_duties(robot) -> Mission:
@@ -156,16 +161,27 @@ def test_derivatives_of_a_turn_match_differences(robot):
     """Of energy and of what it turns by, by parameters of the robot and by speed and yaw rate that are demanded."""
     names = ("motor.resistance", "6T2A.turning.width", "6T2A.turning.lateral", "6T2A.ground.friction.static")
     base = {p.name: float(p.value) for p in params.walk(robot) if p.name in names}
-    asks = profile([0.0, 0.4, 1.0], "speed", demand=[0.0, 0.3, 0.3], yaw_rate=[0.0, 0.6, 0.6], linear=True)
-    one = jax.tree.map(lambda x: x[0], conditions(1, configuration=np.zeros(1, int)).resolved(robot))
+    held = dict(demand=[0.0, 0.3, 0.3, 0.3, 0.3], yaw_rate=[0.0, 0.6, 0.6, 0.6, 0.6], linear=True)
+    asks = profile([0.0, 0.4, 0.6, 0.8, 1.0], "speed", **held)
+    own = conditions(3, configuration=np.zeros(3, int), payload=np.zeros(3)).resolved(robot)
+    one = jax.tree.map(lambda x: x[0], own)
+
+    def changed(x):
+        of = params.replace(robot, {name: value * x[k] for k, (name, value) in enumerate(base.items())})
+        return of, dataclasses.replace(asks, demand=asks.demand * x[-2], yaw_rate=asks.yaw_rate * x[-1])
+
+    def of_total(total):
+        return jnp.stack([total.energy, total.of["turned"]], axis=-1)
 
     def outputs(x):
-        changed = params.replace(robot, {name: value * x[k] for k, (name, value) in enumerate(base.items())})
-        asked = dataclasses.replace(asks, demand=asks.demand * x[-2], yaw_rate=asks.yaw_rate * x[-1])
-        total = mission(changed, one, asked, tolerance=1e-8).total
-        return jnp.stack([total.energy, total.of["turned"]])
+        of, asked = changed(x)
+        return of_total(mission(of, one, asked, tolerance=1e-8).total)
 
-    x, compiled, step = jnp.ones(len(base) + 2), jax.jit(outputs), 1e-3
+    def compiled(x):
+        of, asked = changed(x)
+        return of_total(demanding(of, own, *[asked] * 3, tolerance=1e-8).total)[0]
+
+    x, step = jnp.ones(len(base) + 2), 1e-3
     exact, value = np.asarray(jax.jit(jax.jacfwd(outputs))(x)), np.asarray(compiled(x))
     assert len(base) == len(names) and np.abs(exact).min(axis=0).max() > 1e-3
     for k in range(len(x)):
@@ -179,17 +195,20 @@ def test_derivatives_of_a_turn_match_differences(robot):
 
 @pytest.mark.slow
 def test_sweep_of_missions_has_the_numbers_of_both_sides(robot, mmrjax, tmp_path):
-    (tmp_path / "turn.csv").write_text("time_s,speed_mm_s,yaw_rate_rad_s\n0,300,0.8\n0.5,300,0\n")
+    (tmp_path / "turn.csv").write_text(
+        '# between_rows = "linear"\ntime_s,speed_mm_s,yaw_rate_rad_s\n0,0,0\n0.2,300,0.8\n0.4,300,0.8\n0.5,300,0\n0.6,0,0\n'
+    )
     (tmp_path / "plan.toml").write_text(
         'profile = "turn.csv"\nmodel = "drive"\nreport = false\noutputs = ["energy_Wh", "turned_deg"]\n'
-        "[conditions]\nvoltage = 24\n[axes]\npayload = [0, 4]\n"
+        "[conditions]\nvoltage = 24\n[axes]\npayload = [0, 4, 8]\n"
     )
     code, _, err = mmrjax("sweep", "plan.toml", "--out", "run")
     assert code == 0, err
     store = zarr.open_group(tmp_path / "run" / "results.zarr", mode="r")
-    asks = profile([0.0, 0.5], "speed", demand=[0.3, 0.3], yaw_rate=[0.8, 0.0])
-    own = conditions(2, configuration=np.zeros(2, int), payload=np.array([0.0, 4.0])).resolved(robot)
-    found = missions.columns(missions.numbers(robot, own, missions.batch(robot, own, asks)))
+    of = dict(demand=[0.0, 0.3, 0.3, 0.3, 0.0], yaw_rate=[0.0, 0.8, 0.8, 0.0, 0.0], linear=True)
+    asks = profile([0.0, 0.2, 0.4, 0.5, 0.6], "speed", **of)
+    own = conditions(3, configuration=np.zeros(3, int), payload=np.array([0.0, 4.0, 8.0])).resolved(robot)
+    found = missions.columns(missions.numbers(robot, own, demanding(robot, own, *[asks] * 3)))
     for name in ("energy_Wh", "turned_deg"):
         np.testing.assert_allclose(store[name][:], found[name], rtol=1e-9)
     assert store["turned_deg"][0] > 1

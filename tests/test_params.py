@@ -91,6 +91,17 @@ def test_parameters_have_no_weak_types(robot_with_effects):
     changed = params.replace(robot_with_effects, {p.name: 1.0 for p in params.walk(robot_with_effects)})
     for tree in (robot_with_effects, changed):
         assert not any(leaf.weak_type for leaf in jax.tree.leaves(tree))
+    given = jnp.asarray(0.7)  # as users give them
+    replaced = params.replace(robot_with_effects, {"motor.resistance": given, "effects.windage.amplitude": given})
+    replaced = dataclasses.replace(replaced, battery=dataclasses.replace(replaced.battery, resistance=given))
+    assert given.weak_type and not any(leaf.weak_type for leaf in jax.tree.leaves(replaced))
+
+    @jax.jit
+    def traced(x):
+        assert params.replace(robot_with_effects, {"motor.resistance": x}).motor.resistance is x
+        return x
+
+    assert traced(given) == given
 
 
 def test_spec_is_frozen(robot):

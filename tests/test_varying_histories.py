@@ -181,22 +181,31 @@ def test_runs_are_those_of_missions(simulated):
     assert (runs["speed_mm_s"] < -100).any() and (runs["total_current_A"] < -1).any()
 
 
-@pytest.mark.slow
-def test_derivatives_of_a_varying_run_are_differences(observer, monkeypatch):
-    monkeypatch.setattr(
-        "mmrjax.fidelities.histories.SOLVED", 1e-12
-    )  # else differences of runs are no finer than 1e-5
+@pytest.fixture(scope="module")
+def of_values(observer):
+    """Names of parameters, their values, the readings by values, and those of several values, compiled."""
     known = {p.name: float(p.value) for p in params.walk(robots.nominal())}
     names = [*TRUTH, "motor.inertia", "motor.inductance", "6T2A.ground.friction.static"]
-    theta = jnp.asarray([TRUTH.get(n, known[n]) for n in names])
 
     def readings(x):
         return observer(params.replace(robots.nominal(), dict(zip(names, x, strict=True)))).reading
 
+    several = jax.jit(lambda xs: jax.lax.map(readings, xs))
+    return names, jnp.asarray([TRUTH.get(n, known[n]) for n in names]), readings, several
+
+
+@pytest.fixture
+def solved(monkeypatch):
+    """Steps solved further: differences of runs are no finer than 1e-5 else."""
+    monkeypatch.setattr("mmrjax.fidelities.histories.SOLVED", 1e-12)
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_varying_run_are_differences(of_values, solved):
+    names, theta, readings, several = of_values
     slopes = np.asarray(jax.jit(jax.jacfwd(readings))(theta))
     step = DIFFERENCE * theta
-    at = jax.jit(lambda xs: jax.lax.map(readings, xs))
-    up, down = (np.asarray(at(theta + s * jnp.diag(step))) for s in (1, -1))
+    up, down = (np.asarray(several(theta + s * jnp.diag(step))) for s in (1, -1))
     for k, name in enumerate(names):
         expected = (up[k] - down[k]) / (2 * float(step[k]))
         scale = np.abs(expected).max(0)
@@ -206,22 +215,14 @@ def test_derivatives_of_a_varying_run_are_differences(observer, monkeypatch):
 
 
 @pytest.mark.slow
-def test_derivative_of_a_varying_run_along_one_direction_is_a_difference(observer, monkeypatch):
+def test_derivative_of_a_varying_run_along_one_direction_is_a_difference(of_values, solved):
     """All of these parameters at once, by shares drawn at random."""
-    monkeypatch.setattr("mmrjax.fidelities.histories.SOLVED", 1e-12)
-    known = {p.name: float(p.value) for p in params.walk(robots.nominal())}
-    names = [*TRUTH, "motor.inertia", "motor.inductance", "6T2A.ground.friction.static"]
-    theta = jnp.asarray([TRUTH.get(n, known[n]) for n in names])
+    names, theta, readings, several = of_values
     along = theta * np.random.default_rng(6).uniform(0.3, 1.0, len(names)) * np.array([1, -1, 1, -1, 1, 1])
-
-    def readings(share):
-        return observer(
-            params.replace(robots.nominal(), dict(zip(names, theta + share * along, strict=True)))
-        ).reading
-
-    slope = np.asarray(jax.jit(lambda t: jax.jvp(readings, (t,), (jnp.ones(()),))[1])(jnp.asarray(0.0)))
-    at = jax.jit(readings)
-    expected = np.asarray(at(DIFFERENCE) - at(-DIFFERENCE)) / (2 * DIFFERENCE)
+    slope = np.asarray(jax.jit(lambda x: jax.jvp(readings, (x,), (along,))[1])(theta))
+    ends = jnp.resize(theta + DIFFERENCE * along * np.array([[1.0], [-1.0]]), (len(names), len(names)))
+    up, down, *_ = np.asarray(several(ends))  # as many as the differences above have, whose program it is
+    expected = (up - down) / (2 * DIFFERENCE)
     assert (np.abs(slope - expected).max(0) < DERIVATIVES * np.abs(expected).max(0)).all() and slope.any(0).all()
 
 
@@ -246,22 +247,23 @@ def test_only_what_changes_has_a_value_an_instant(observer, runs):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("balance", ["electrical", "track"])
-def test_defects_of_all_knots_are_a_constant_defect(observer, balance):
+def test_defects_of_all_knots_are_a_constant_defect(observer):
     """Their linear response, through changes of conditions, against the derivative by an amplitude."""
-    robot, effect = robots.nominal(), probe(balance)
+    robot, effects = robots.nominal(), tuple(probe(balance) for balance in ("electrical", "track"))
 
-    def readings(amplitude):
-        with_it = dataclasses.replace(effect, amplitude=amplitude)
-        return observer(dataclasses.replace(robot, effects=(with_it,))).reading
+    def readings(amplitudes):
+        put = tuple(dataclasses.replace(e, amplitude=a) for e, a in zip(effects, amplitudes, strict=True))
+        return observer(dataclasses.replace(robot, effects=put)).reading
 
-    expected = np.asarray(jax.jit(jax.jacfwd(readings))(jnp.asarray(0.0)))
-    found = np.asarray(jax.jit(lambda r: observer.defective(r, (effect,)))(robot))[0].sum(1)
+    derivative = np.asarray(jax.jit(jax.jacfwd(readings))(jnp.zeros(len(effects))))
+    defects = np.asarray(jax.jit(lambda r: observer.defective(r, effects))(robot))
     rows = np.asarray(observer.rows_of)
-    got = np.zeros_like(expected)
-    got[rows[rows >= 0]] = found[rows >= 0]
-    np.testing.assert_allclose(got, expected, rtol=1e-7, atol=1e-9 * np.abs(expected).max())
-    assert (np.abs(expected).max(0) > 0).all()
+    for k in range(len(effects)):
+        found, expected = defects[k].sum(1), derivative[..., k]
+        got = np.zeros_like(expected)
+        got[rows[rows >= 0]] = found[rows >= 0]
+        np.testing.assert_allclose(got, expected, rtol=1e-7, atol=1e-9 * np.abs(expected).max())
+        assert (np.abs(expected).max(0) > 0).all()
 
 
 def test_one_supply_voltage_is_said_only_where_the_duty_is_one_too(runs):

@@ -394,13 +394,14 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
     after = Motion(motion.q + step * v, v, current, motion.discharge + step * charge, drawn)
 
     pair = run.drive
-    geared = (pair.constant * swung.current - pair.inertia * led / step - swung.torque) @ middle[LED]
+    # (1 / step) is what a compiler makes of a division by a constant: a step that is an argument gives the same bits
+    geared = (pair.constant * swung.current - pair.inertia * led * (1 / step) - swung.torque) @ middle[LED]
     off, along = at.off @ gained, at.along @ gained
     normal = at.force - at.damped * off
     friction = pulled.force - rises * along - pulled.force / jnp.maximum(at.force, 1e-9) * at.damped * off
     motor = ratio * middle[SHAFT]
     drive = signals.torque_motor - signals.torque_idle
-    mesh = drive - rotor * ratio * gained[SHAFT] / step
+    mesh = drive - rotor * ratio * gained[SHAFT] * (1 / step)
     own = signals.torque_load - signals.torque_track_loss - (pulled.load - pulled.guide * radius)
     rise = current - signals.current
     mean, resistance = signals.current + rise / 2, robot.motor.resistance
@@ -547,20 +548,20 @@ def clearance(axle: Scalar, gear: RunningGear, angles: Float[Array, " levers"]) 
     return axle + gear.lever_length * jnp.sin(angles) - gear.levers.roller
 
 
-def sampled(run: System, state: Any, first: Scalar, steps: int, samples: int) -> tuple[Any, Passed]:
+def sampled(run: System, state: Any, first: Scalar, steps: Scalar, samples: int) -> tuple[Any, Passed]:
     """A part of a run of so many `samples` of so many `steps`, from time `first` [s]: its end and its record."""
 
     def sample(state: Any, k: Array) -> tuple[Any, Passed]:
         motion, energy, progress = state
 
-        def small(carry: Any, j: Array) -> tuple[Any, None]:
+        def small(j: Array, carry: Any) -> Any:
             *after, passed = advance(run, carry[0], first + (k * steps + j) * run.step, carry[1])
             base = jnp.maximum(passed.base, carry[2].base)
-            return (*after, dataclasses.replace(passed, base=base)), None
+            return (*after, dataclasses.replace(passed, base=base))
 
         nothing = jax.eval_shape(lambda: advance(run, motion, first, energy)[2])
         nothing = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf, x.dtype), nothing)
-        (after, spent, passed), _ = jax.lax.scan(small, (motion, energy, nothing), jnp.arange(steps))
+        after, spent, passed = jax.lax.fori_loop(0, steps, small, (motion, energy, nothing))
         ended = progress.verdict != _RUNNING
         after, progress = _judged(run, motion, passed, after, progress)
         kept = jax.tree.map(lambda new, old: jnp.where(ended, old, new), spent, energy)
@@ -609,7 +610,7 @@ def _alike(robot: Robot) -> int | None:
 
 @compiled
 def _begin(
-    robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, step: float, motion: Motion | None
+    robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, step: Scalar, motion: Motion | None
 ) -> Any:
     def one(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, motion: Motion | None) -> Any:
         return begin(system(robot, conditions, terrain, sequence, step), motion)
@@ -619,7 +620,7 @@ def _begin(
 
 def _part(
     robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any, first: Scalar,
-    step: float, steps: int, samples: int,
+    step: Scalar, steps: Scalar, samples: int,
 ) -> tuple[Any, Passed]:  # fmt: skip
     def one(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any) -> Any:
         return sampled(system(robot, conditions, terrain, sequence, step), state, first, steps, samples)
@@ -657,11 +658,12 @@ def climb_batch(
         progress: told the share of the time that is done.
     """
     parts, samples, steps = divided(duration, step, sample, part)
-    state = _begin(robot, conditions, terrain, sequence, step, start)
+    interval, each = jnp.asarray(step, float), jnp.asarray(steps)  # arrays: one program for all lengths of a step
+    state = _begin(robot, conditions, terrain, sequence, interval, start)
     kept: list[Passed] = []
     for k in range(parts):
         first = jnp.asarray(k * samples * steps * step)
-        state, passed = _compiled(robot, conditions, terrain, sequence, state, first, step, steps, samples)
+        state, passed = _compiled(robot, conditions, terrain, sequence, state, first, interval, each, samples)
         verdict = np.asarray(state[2].verdict)
         last = passed if record else jax.tree.map(lambda x: x[:, -1:], passed)
         kept = [*(kept if record else []), jax.device_get(last)]

@@ -127,14 +127,14 @@ def climb_derivatives(
     """One climb and the derivatives of `OUTPUTS` by the `values` of which its robot, conditions, terrain and sequence
     are made, with slopes over `widths` to both sides. The other arguments are those of `climb_batch`."""
     directions = jnp.eye(len(values))
-    run, turned = _along(given, values, directions)
-    begun = functools.partial(_initial, step=step)
-    state, moved = _along(begun, run, turned)
     parts, samples, steps = climb.divided(duration, step, sample, part)
+    interval, each = jnp.asarray(step, float), jnp.asarray(steps)
+    run, turned = _along(given, values, directions)
+    state, moved = _along(functools.partial(_initial, step=interval), run, turned)
     records: list[Any] = []
     for k in range(parts):
         first = jnp.asarray(k * samples * steps * step)
-        (state, record), (moved, changed) = _part((run, state), (turned, moved), first, step, steps, samples)
+        (state, record), (moved, changed) = _part((run, state), (turned, moved), first, interval, each, samples)
         records.append(jax.device_get((record, changed)))
         if progress is not None:
             progress((k + 1) / parts / 2)
@@ -160,8 +160,8 @@ def climb_derivatives(
         *more, duration=duration, step=step, sample=sample, part=part,
         progress=None if progress is None else lambda share: progress((1 + share) / 2),
     )  # fmt: skip
-    each = (jax.tree.map(lambda x, k=k: x[k], (more.robot, more.terrain)) for k in range(len(beside)))
-    others = [outputs_of_run(robot, terrain, batch, k) for k, (robot, terrain) in enumerate(each)]
+    single = (jax.tree.map(lambda x, k=k: x[k], (more.robot, more.terrain)) for k in range(len(beside)))
+    others = [outputs_of_run(robot, terrain, batch, k) for k, (robot, terrain) in enumerate(single)]
     slope, sd = {}, {}
     for name in found:
         y = np.array([float(other[name]) for other in others]).reshape(-1, BESIDE)
@@ -199,16 +199,16 @@ def _along(function: Callable[[Any], Any], at: Any, directions: Any) -> tuple[An
     return eqx.combine(found, arrays, further[-1]), changed
 
 
-def _initial(run: Given, step: float) -> Any:
+def _initial(run: Given, step: Scalar) -> Any:
     return climb.begin(climb.system(*run, step))
 
 
-def _sampled(at: tuple[Given, Any], first: Scalar, step: float, steps: int, samples: int) -> Any:
+def _sampled(at: tuple[Given, Any], first: Scalar, step: Scalar, steps: Scalar, samples: int) -> Any:
     run, state = at
     return climb.sampled(climb.system(*run, step), state, first, steps, samples)
 
 
 @functools.partial(compiled, options=SELDOM)
-def _part(at: Any, directions: Any, first: Scalar, step: float, steps: int, samples: int) -> Any:
+def _part(at: Any, directions: Any, first: Scalar, step: Scalar, steps: Scalar, samples: int) -> Any:
     along = functools.partial(_sampled, first=first, step=step, steps=steps, samples=samples)
     return _along(along, at, directions)

@@ -199,7 +199,7 @@ def mission(
     profile: Profile,
     start: Start | None = None,
     *,
-    tolerance: float = TOLERANCE,
+    tolerance: Scalar = TOLERANCE,
     most_steps: int = MOST_STEPS,
     keep: int = 0,
 ) -> Mission:

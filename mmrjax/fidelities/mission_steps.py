@@ -265,7 +265,7 @@ def follow(
     otherwise: Conditions,
     segment: Profile,
     carry: Carry,
-    tolerance: float,
+    tolerance: Scalar,
     most: int,
 ) -> Carry:
     """One segment: steps until its end, or until the mission has."""
