@@ -207,6 +207,27 @@ def test_bytes_that_are_no_text_are_refused(tmp_path):
             records.read(tmp_path / "runs.csv")
 
 
+@pytest.mark.parametrize(
+    ("rows", "says"),
+    [
+        ("15;13,1;0;0;2,75;4.800;422", r"motor_speed_rpm: got 4\.800 beside 13,1 in total_mass_kg; expected decimal"),
+        ("15;13.1;0;0;2.75;4,800;422", "motor_speed_rpm: got 4,800 beside 13.1 in total_mass_kg; expected decimal"),
+        (
+            "15;13;0;0;3;4.800;422\n6T2A;5;13;0;0;3;950;92",
+            r"motor_speed_rpm: got 4\.800 beside whole numbers below a thousand; .* nothing between thousands",
+        ),
+    ],
+)
+def test_marks_between_thousands_are_refused_and_not_read_as_decimals(tmp_path, rows, says):
+    with pytest.raises(BadData, match=rf"runs\.csv, {says}"):
+        records.read(written(tmp_path, f"{HEADER.replace(',', ';')}\n6T2A;{rows}\n"))
+
+
+def test_three_decimals_everywhere_are_no_thousands(tmp_path):
+    text = f"{HEADER}\n6T2A,15.000,13.100,0.000,0.000,2.750,480.125,422.000\n".replace(",", ";")
+    assert records.read(written(tmp_path, text))["motor_speed_rpm"] == 480.125
+
+
 def test_commas_and_points_in_one_column_are_refused(tmp_path):
     text = f"{HEADER}\n{ROW}\n6T2A,33,21.1,8,0,3.2,11590,970\n".replace(",", ";").replace("2.75", "2,75")
     with pytest.raises(
