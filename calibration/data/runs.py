@@ -20,6 +20,7 @@ from calibration.data.columns import (
     DEFAULTS,
     DRIVEN,
     DUTY,
+    SIDES,
     SPEED,
     SPEEDS,
     SUPPLY,
@@ -320,10 +321,11 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
         against = np.flatnonzero(forward & (readings < -doubt))
         if against.size:
             at = int(against[0])
+            alike = "" if channel not in channels.OF_TURNS else f"; a turn has {' and '.join(layout.sides)} too"
             raise BadData(
                 f"{name} row {at + 1}, {channel.column}: got {number(readings[at])} at {number(imposed[at])} {unit}; "
-                "nothing drives the motors there, so expected a reading with the sign of what is imposed, the "
-                "same in every row"
+                "nothing else drives the motors there, so expected a reading with the sign of what is imposed, the "
+                f"same in every row{alike}"
             )
         if wrong.size:
             at = int(wrong[0])
@@ -413,6 +415,13 @@ def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layou
             raise BadData(
                 f"{name}: column {column}: the sides are called left and right; name it {meant}, or state [columns] "
                 f'{meant} = "{column}" in the robot\'s file'
+            )
+        side = next((side for side in channels.SIDES if side in words(column)), None)
+        turns = set(SIDES) <= set(known.values()) and not stated.isdisjoint(c.column for c in channels.OF_TURNS)
+        if side and turns and not stated & set(SIDES) and column.endswith("V"):
+            raise BadData(
+                f"{name}: column {column}: a table states shares of the supply's voltage, duty_left and "
+                f"duty_right, so duty_{side} = {column} / {SUPPLY}"
             )
 
 
