@@ -100,8 +100,12 @@ def test_every_line_of_a_template_that_is_commented_out_reads(tmp_path, kind):
     """Each example line, and the table that it stands in, is valid where its comment sign is taken away."""
     lines = rig_new.template(kind).splitlines()
     tables = {"# [columns]", "# [rig]"}
+    stance = (
+        lines.index("# [rover.turning]") if "# [rover.turning]" in lines else len(lines)
+    )  # to the end, as a whole
+    read(tmp_path, "\n".join(x.removeprefix("# ") if j >= stance else x for j, x in enumerate(lines)))
     for k, line in enumerate(lines):
-        if not line.startswith("# ") or " = " not in line or "OURS" in line:
+        if not line.startswith("# ") or " = " not in line or "OURS" in line or k > stance:
             continue
         key = line[2:].split(" = ")[0]
         if not key.isidentifier() or key in ("drum_radius_mm",):
@@ -283,6 +287,18 @@ def test_wheels_lose_nothing_that_is_not_stated_and_tracks_have_to_state_it(tmp_
     assert float(friction.dynamic) == pytest.approx(0.4)
     with pytest.raises(BadConfiguration, match=r"rover\.track\.loss_coulomb \[N·m\] is missing"):
         read(tmp_path, ROVER.replace('load = "vehicle"', 'movers = "tracks"'))
+
+
+def test_a_robot_that_turns_states_its_wheelbase_and_is_written_with_it(tmp_path):
+    turns = f"{ROVER}[rover.turning]\nwidth = 0.3\ninertia = 0.2\n"
+    with pytest.raises(BadConfiguration, match=r"running_gear\.wheelbase \[m\] is missing, which a robot with base"):
+        read(tmp_path, turns)
+    usual = float(read(tmp_path, ROVER).running_gear.wheelbase)  # an example's
+    robot = read(tmp_path, f"{turns}[running_gear]\nwheelbase = {usual}\n")
+    assert same(again(tmp_path, robot), robot)
+    (tmp_path / "turns.toml").write_text(f"{turns}[running_gear]\nwheelbase = 0.4\n", encoding="utf-8")
+    (height,) = [o for o in rig_facts.origins(robot_file.parse(tmp_path / "turns.toml")) if "centre_height" in o.name]
+    assert "an example's" in height.why
 
 
 def without(text, *keys):
