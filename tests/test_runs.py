@@ -228,6 +228,16 @@ def test_three_decimals_everywhere_are_no_thousands(tmp_path):
     assert records.read(written(tmp_path, text))["motor_speed_rpm"] == 480.125
 
 
+def test_copies_of_rows_are_said(tmp_path):
+    other = ROW.replace("4800", "4801")
+    plain = records.read(written(tmp_path, f"{HEADER}\n{ROW}\n{other}\n"))
+    copied = records.read(written(tmp_path, f"{HEADER},run_id\n{ROW},a\n{other},b\n{ROW},c\n{other},d\n{other},e\n"))
+    assert (
+        plain.notes == ()
+        and "runs.csv: rows 1 and 3 have the same conditions and readings, and so 1 more; " in copied.notes[0]
+    )
+
+
 def test_commas_and_points_in_one_column_are_refused(tmp_path):
     text = f"{HEADER}\n{ROW}\n6T2A,33,21.1,8,0,3.2,11590,970\n".replace(",", ";").replace("2.75", "2,75")
     with pytest.raises(
@@ -297,8 +307,8 @@ def test_capitals_of_columns_and_configurations_are_taken_and_said(tmp_path):
 
 def test_what_a_table_lacks_is_said_before_it_is_used(tmp_path):
     header = f"{HEADER.replace(',motor_speed_rpm', '')},run_id"
-    rows = [ROW.replace(",4800", "") + f",{run}" for run in "abac"]
-    rows[1] = rows[1].replace("2.75", "")
+    rows = [ROW.replace(",4800", "").replace("2.75", f"2.7{k}") + f",{run}" for k, run in enumerate("abac")]
+    rows[1] = rows[1].replace("2.71", "")
     found = records.read(written(tmp_path, "\n".join([header, *rows])), robot=robots.nominal())
     assert found.notes == (
         "runs.csv: 1 of 4 cells of total_current_A are empty, the first in row 2; they weigh nothing",
