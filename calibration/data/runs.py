@@ -217,11 +217,11 @@ def _lacks(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterato
                 "nothing"
             )
     alike: dict[tuple[Any, ...], list[int]] = {}
-    told = [values.tolist() for column, values in columns.items() if column not in ("run_id", *WHEN)]
+    settled = [] if set(TIME) & set(columns) else [c for c in columns if c not in ("run_id", *WHEN)]
+    told = [columns[column].tolist() for column in settled]
     for row, cells in enumerate(zip(*told, strict=True), 1):
         alike.setdefault(cells, []).append(row)
-    copied = [] if set(TIME) & set(columns) else [rows for rows in alike.values() if len(rows) > 1]
-    if copied:
+    if copied := [rows for rows in alike.values() if len(rows) > 1]:
         others = f", and so {len(copied) - 1} more" if len(copied) > 1 else ""
         yield (
             f"{name}: rows {' and '.join(map(str, copied[0][:2]))} have the same conditions and readings{others}; "
