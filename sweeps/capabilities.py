@@ -23,7 +23,8 @@ OF_TRAVEL = (
 #: Those of the heat of a winding, which a rig has where its file states how heat leaves it.
 OF_HEAT = (
     "winding_settled_C", "permissible_time_s", "winding_temperature_C", "housing_temperature_C", "winding_peak_C",
-    "winding_end_C", "housing_end_C",
+    "winding_end_C", "housing_end_C", "winding_left_C", "winding_right_C", "winding_peak_left_C",
+    "winding_peak_right_C", "winding_temperature_left_C", "winding_temperature_right_C",
 )  # fmt: skip
 _THERMAL = ("resistance_thermal_winding", "resistance_thermal_housing")
 

@@ -18,8 +18,8 @@ from mmrjax import effects, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.rig import Instrument
-from mmrjax.signals import GRAVITY
-from sweeps.commands import rig_new
+from mmrjax.signals import FLAGS, GRAVITY
+from sweeps.commands import rig_check, rig_new
 
 KINDS = tuple(rig_new.KINDS)
 
@@ -299,6 +299,17 @@ def test_a_robot_that_turns_states_its_wheelbase_and_is_written_with_it(tmp_path
     (tmp_path / "turns.toml").write_text(f"{turns}[running_gear]\nwheelbase = 0.4\n", encoding="utf-8")
     (height,) = [o for o in rig_facts.origins(robot_file.parse(tmp_path / "turns.toml")) if "centre_height" in o.name]
     assert "an example's" in height.why
+
+
+@pytest.mark.parametrize(("limit", "flagged"), [("", False), ("temperature_limit = 125.0\n", True)])
+def test_no_winding_is_too_hot_for_a_rig_that_states_no_limit(tmp_path, limit, flagged):
+    """Also where none would settle: at 30 A of 1 ohm."""
+    robot = read(tmp_path, ROVER.replace("[motor]\n", f"[motor]\n{limit}").replace("mass = 4.0", "mass = 80.0"))
+    seen = steady_batch(robot, Conditions(voltage=np.array([40.0]), slope_deg=np.array([20.0])))
+    assert not np.isfinite(float(seen.winding_settled[0]))
+    assert bool(int(seen.flags[0]) >> FLAGS.index("winding_hot") & 1) == flagged
+    said = " ".join(rig_check.examined(tmp_path / "rig.toml", None).remarks())
+    assert ("held against an example's motor.resistance_thermal_winding" in said) == flagged
 
 
 def without(text, *keys):

@@ -259,6 +259,8 @@ def test_turns_are_told_in_plain_words():
     assert "winding_hot: winding hotter than permitted" in said(flags="gearbox_overspeed;winding_hot")
     hot = turn_words.turn(robot, row(winding_left_C=float("inf"), power_right_W=-0.01), None)
     assert hot.sides[-2:] == [("electrical power [W]", "5.0", "0.0"), (hot.sides[-1][0], "none settles", "40")]
+    unknown = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, inherits=False))  # how its heat leaves
+    assert [side[0] for side in turn_words.turn(unknown, row(), None).sides] == [side[0] for side in hot.sides[:-1]]
     nothing = {name: float("nan") for name, value in row().items() if isinstance(value, float)}
     none = turn_words.turn(robot, row(status="not_settled", **nothing), None)
     assert none.answer.startswith("not_settled: ") and "no steady state" in none.answer
