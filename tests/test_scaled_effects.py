@@ -78,6 +78,15 @@ def test_every_effect_of_a_rigs_size_is_read_again_as_it_was_written(tmp_path, k
     assert off_library  # else there would be nothing to state
 
 
+def test_effects_of_turns_of_a_rigs_size_are_read_again_as_they_were_written(tmp_path):
+    """The loop writes them into the robot of a table of turns, which every command takes."""
+    robot, *_ = rig("wheeled", "voltage", tmp_path)
+    library = {name: scaled(kind, (3.0, 1.0, 2.0)) for name, kind in effects.OF_TURNS.items()}
+    whole = with_all(robot, library, 0.5)
+    robot_file.write(whole, tmp_path / "robot.toml")
+    assert library and eqx.tree_equal(whole.effects, robot_file.read(tmp_path / "robot.toml").effects)
+
+
 def test_a_robot_with_effects_of_its_size_is_compared_and_swept(tmp_path, mmrjax):
     robot, _, library = rig("bench", "voltage", tmp_path)
     some = {name: library[name] for name in list(library)[:4]}

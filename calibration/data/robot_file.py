@@ -167,7 +167,8 @@ def parse(path: Path, library: Library = effects.BY_NAME, notes: list[str] | Non
     tables = {name: table for name, table in present.items() if isinstance(table, dict)}
     acting = {name: table.pop("configurations") for name, table in tables.items() if "configurations" in table}
     factors = {name: table.pop(FACTORS) for name, table in tables.items() if FACTORS in table}
-    of_size = {name: _of_size(library, name, value, path.name) for name, value in factors.items()}
+    of_turns = {**effects.OF_TURNS, **library}
+    of_size = {name: _of_size(of_turns, name, value, path.name) for name, value in factors.items()}
     robot = with_effects(robot, tuple(present), {**library, **of_size}, acting, where=path.name)
     parameters = dict(_flatten(content))
     robot = rig_file.with_priors(change(robot, parameters, where=path.name, notes=notes), sds, path.name)
