@@ -65,7 +65,7 @@ def test_missing_readings_are_nan_and_counted(tmp_path):
     runs = records.read(write(tmp_path, f"{header}\n6T2A,15,13.1,0,5,2.75,400\n6T2A,15,13.1,0,5,,400\n"))
     np.testing.assert_array_equal(np.isnan(runs.measured()), [[False, True, False], [True, True, False]])
     assert runs.missing() == [
-        "total_current_A: 1 of 2 readings are missing (rows 2)",
+        "total_current_A: 1 of 2 readings are missing (row 2)",
         "motor_speed_rpm: no readings; what they would show is not fitted",
     ]
     assert np.isnan(runs.deviations()).all()

@@ -20,6 +20,7 @@ from calibration.data.writing import finite
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.foresight import Foresight
 from mmrjax import channels
+from mmrjax.channels import Channel
 from mmrjax.motor import UNLIMITED
 from mmrjax.robot import Robot
 from mmrjax.shaft import Shaft
@@ -116,7 +117,7 @@ class RigCheck:
                     "signed": instrument.signed,
                     "quantum": None if instrument.quantum is None else instrument.quantum / channel.factor,
                     "unit": channel.unit,
-                    "sd": usual if self.foresight is None else self.foresight.noise[k],
+                    "sd": usual if self.foresight is None else _source(self.foresight.noise[k], channel),
                 }
             )
         return found
@@ -206,6 +207,15 @@ class RigCheck:
             "data": runs,
             "statement": self.statement(),
         }
+
+
+def _source(word: str, channel: Channel) -> str:
+    """Where the sd of a channel comes from, in words."""
+    every = {
+        "columns": "of the table", "series": "estimated by how readings scatter along series of rows",
+        "assumed": f"assumed, {100 * channel.sd_share:g} %, as {channel.sd_column} is no column",
+    }  # fmt: skip
+    return every.get(word, word)
 
 
 def _program(robot: Robot, origin: Origin) -> str:
