@@ -487,9 +487,7 @@ def test_rig_check_says_what_a_table_can_determine(mmrjax, bench):
 def test_rig_check_of_data_says_the_same_in_words(mmrjax, bench):
     code, out, _ = mmrjax("rig", "check", "my-rig.toml", "runs.csv")
     assert code == 0 and "total_current_A, yours total_current_mA" in out
-    assert re.search(
-        r"total_current .*signed +(assumed, 2 %, as total_curr|estimated by how readings)", out
-    )
+    assert re.search(r"total_current .*signed +(assumed, 2 %, as total_curr|estimated by how readings)", out)
     assert "gearbox.efficiency_load" in out and "not determined" in out
     assert "room: without a role" in out and "add output_torque to channels" in out
 
