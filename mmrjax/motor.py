@@ -14,6 +14,7 @@ _SHEET = "maker's sheet of RE30 310007 (24 V, 60 W)"
 ALPHA = 0.00393  # temperature coefficient of copper's resistance at 20 °C [1/K], IEC 60028 (1925)
 #: Temperature for which makers state the resistance of a winding [°C].
 TEMPERATURE_REFERENCE = 25.0
+UNLIMITED = 1e9  # of a limit that nobody states, in its unit
 _LONG = 1e6  # s, many of a motor's time constants
 
 

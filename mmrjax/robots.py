@@ -10,7 +10,7 @@ from mmrjax.chassis import Chassis
 from mmrjax.contact import Friction
 from mmrjax.gearbox import Gearbox
 from mmrjax.ground import Ground
-from mmrjax.motor import Motor
+from mmrjax.motor import UNLIMITED, Motor
 from mmrjax.power import Battery
 from mmrjax.rig import Rig
 from mmrjax.robot import Configurations, Robot
@@ -88,7 +88,6 @@ _NOTHING = {
     "gearbox.efficiency_load": 1.0,
     "gearbox.ratio": 1.0,
 }
-_UNLIMITED = 1e9
 
 
 def blank(configurations: Configurations, sides: float = 1.0, rig: Rig | None = None) -> Robot:
@@ -98,8 +97,8 @@ def blank(configurations: Configurations, sides: float = 1.0, rig: Rig | None = 
     Args:
         configurations: its loads; sides: motors driven alike; rig: how it is driven and measured.
     """
-    motor = dataclasses.replace(Motor(), speed_limit=_UNLIMITED, temperature_limit=_UNLIMITED)
-    gearbox = dataclasses.replace(Gearbox(), speed_limit=_UNLIMITED, torque_limit=None)
+    motor = dataclasses.replace(Motor(), speed_limit=UNLIMITED, temperature_limit=UNLIMITED)
+    gearbox = dataclasses.replace(Gearbox(), speed_limit=UNLIMITED, torque_limit=None)
     rig = dataclasses.replace(rig or Rig(), inherits=False)
     return params.replace(Robot(Battery(), motor, gearbox, configurations, sides=sides, rig=rig), _NOTHING)
 

@@ -7,6 +7,7 @@ import numpy as np
 from calibration.data import rig_file
 from calibration.data.robot_file import RobotFile
 from mmrjax import params
+from mmrjax.channels import SIDES
 from mmrjax.motor import Motor
 from mmrjax.power import Battery
 from mmrjax.robot import Robot
@@ -23,7 +24,7 @@ OF_TRAVEL = (
 #: Those of the heat of a winding, which a rig has where its file states how heat leaves it.
 OF_HEAT = (
     "winding_settled_C", "permissible_time_s", "winding_temperature_C", "housing_temperature_C", "winding_peak_C",
-    "winding_end_C", "housing_end_C",
+    "winding_end_C", "housing_end_C", "winding_left_C", "winding_right_C",
 )  # fmt: skip
 _THERMAL = ("resistance_thermal_winding", "resistance_thermal_housing")
 
@@ -68,7 +69,7 @@ def idle_columns(robot: Robot) -> set[str]:
     if not robot.shows_travel:
         found |= {*OF_TRAVEL}
     if not thermal(robot):
-        found |= {*OF_HEAT}
+        found |= {*OF_HEAT, *(f"{column.removesuffix('_C')}_{side}_C" for column in OF_HEAT for side in SIDES)}
     if not battery(robot):
         found |= {"voltage_cell_V"}
     return found

@@ -178,7 +178,7 @@ def test_stated_noise_comes_before_columns_and_columns_before_estimates(measured
     ("text", "says"),
     [
         ("amps=2%", "--noise amps=2%: no such channel; .*allowed: current, motor_speed, speed"),
-        ("current=2", "--noise current=2: expected a positive number with % or A, e.g. current=2%"),
+        ("current=2", "--noise current=2: expected a positive number with % or A or mA, e.g. current=2%"),
         ("speed=-1%", "expected a positive number"),
         ("speed=5rpm", "with % or mm/s"),
     ],
@@ -188,13 +188,19 @@ def test_noise_refuses(text, says):
         noise.parse(text, channels.usual())
 
 
+def test_noise_is_in_any_unit_of_its_channel():
+    shown = tuple(channels.find(name) for name in ("total_current", "yaw_rate"))
+    found = noise.parse("current=40mA,yaw_rate=0.6deg/s", shown)
+    assert found == {0: (pytest.approx(0.04), False), 1: (pytest.approx(np.radians(0.6)), False)}
+
+
 def test_too_few_rows_are_refused(measured):
     two = measured.where(np.array([0, 5]))
     with pytest.raises(
         BadData, match=r"2 rows of 3 channels cannot fit 6 parameters and estimate 3 noise levels; at least 4"
     ):
         quick(two)
-    with pytest.raises(BadData, match=r"1 rows of 3 channels cannot fit 6 parameters; at least 2 rows"):
+    with pytest.raises(BadData, match=r"1 row of 3 channels cannot fit 6 parameters; at least 2 rows"):
         quick(measured.where(np.array([0])), noise="current=2%,motor_speed=1%,speed=1%")
 
 

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import jsonschema
 import numpy as np
 import pytest
+from matplotlib.text import Text
 from pages import Tables, drawn
 from synthetic import SETTLED, table
 from test_implausible import unnamed
@@ -22,8 +23,10 @@ from calibration.discovery.notes import Asked, NameSupport, NameTest, RuledOut
 from calibration.discovery.result import Alternative, Estimate, HiddenEffect, Resolved, StatedValue
 from calibration.inference.identifiability import HELD
 from calibration.words import loop as words
+from mmrjax import channels
 from sweeps.commands import loop as room
 from sweeps.pages import loop as loop_page
+from sweeps.pages import loop_figures
 from sweeps.pages import page as page_room
 
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "loop.schema.json").read_text("utf-8"))
@@ -38,6 +41,23 @@ def happening():
     off = (columns["order"] >= 30) & (columns["order"] <= 44)
     columns["speed_mm_s"] = columns["speed_mm_s"] - 12.0 * off
     return table(columns)
+
+
+def test_the_legend_of_errors_hides_no_title():
+    shown = tuple(
+        channels.find(n) for n in ("motor_current_left", "motor_current_right", "yaw_rate", "output_torque")
+    )
+    rows = {when: {c.name: {"rms_percent": 1.0} for c in shown} for when in (0, 1)}
+    fig = loop_figures.errors(SimpleNamespace(channels=shown, errors=rows, errors_held_out={"slope": rows}))
+    fig.canvas.draw()
+    legend = [*fig.legends, *(a.get_legend() for a in fig.axes if a.get_legend())]
+    assert len(legend) == 1
+    for axes in fig.axes:
+        title = max(
+            (t for t in axes.findobj(Text) if t.get_text() in {c.label for c in shown}),
+            key=lambda t: len(t.get_text()),
+        )
+        assert not legend[0].get_window_extent().overlaps(title.get_window_extent())
 
 
 #: A case → its result. The first two are of 24 runs and share their programs; the command has made the first.

@@ -210,6 +210,12 @@ def test_file_of_another_schema_is_refused(tmp_path):
         room.read(tmp_path / room.FILE)
 
 
+def test_draws_of_which_some_never_settle_have_no_spread_and_warn_of_nothing():
+    some = np.array([[np.inf] * 3, [40.0, np.inf, 50.0]])
+    found = uncertainty._summary({"winding_settled_C": some}, np.ones((2, 3), bool))
+    assert np.isnan(found["winding_settled_C_sd"]).all()
+
+
 @pytest.mark.parametrize(("value", "sd", "most", "said"), [
     (4.1932, 0.0612, 3, "4.193 ± 0.061"), (5243.2, 12.3, 1, "5243 ± 12"), (2.0, 0.0, 2, "2.00 ± 0.00"),
     (0.5, 0.000012, 3, "0.500 ± 0.000"),

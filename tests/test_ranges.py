@@ -12,6 +12,7 @@ from worlds import tables
 from calibration.data import runs as records
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
+from calibration.inference import ranges
 from calibration.inference.notes import SlopesIn
 from calibration.inference.ranges import check_ranges
 from mmrjax import params, robots
@@ -32,6 +33,13 @@ WRONG = {
 @pytest.fixture(scope="module")
 def runs():
     return table(tables.narrow(seed=4))
+
+
+def test_rounding_errors_are_nothing_that_a_robot_could_show():
+    """Yaw rates of a robot that pulls aside at equal duties, and goes straight in simulation, are in no wrong unit."""
+    yaw = np.array([0.02, -0.01])
+    assert ranges._factor(yaw, np.array([[1e-18, 0.0]])) == 1.0
+    assert ranges._factor(yaw, np.array([[1e-4, 1e-4]])) == pytest.approx(150.0)
 
 
 @pytest.fixture(scope="module")

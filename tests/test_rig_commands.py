@@ -204,6 +204,16 @@ REFUSED = {
         "bench", False, ["simulate", "--voltage", "9", "--model", "track"], r"--model track: the robot's load is a shaft",
     ),
     "resonance": ("bench", False, ["resonance"], r"resonance: the robot's load is a shaft"),
+    "requirements": ("bench", False, ["check"], r"check: the robot's load is a shaft, which has no wheels"),
+    "the paper's figures": ("bench", False, ["reproduce"], r"reproduce: the robot's load is a shaft"),
+    "steepest slope": (
+        "bench", False, ["sensitivity", "--voltages", "9", "--outputs", "steepest_slope"],
+        r"--outputs steepest_slope: the robot's load is a shaft, which stands on no ground",
+    ),
+    "a stance": (
+        "wheeled", False, ["sensitivity", "--voltages", "9", "--outputs", "pitch"],
+        r"--outputs pitch: the robot's file states no running_gear",
+    ),
     "a pendulum's sensitivity": (
         "pendulum", False, ["sensitivity", "--voltages", "3"], r"--model steady: arm .* has no steady state",
     ),

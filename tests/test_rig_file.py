@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 
 import equinox as eqx
@@ -18,8 +19,8 @@ from mmrjax import effects, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.rig import Instrument
-from mmrjax.signals import GRAVITY
-from sweeps.commands import rig_new
+from mmrjax.signals import FLAGS, GRAVITY
+from sweeps.commands import rig_check, rig_new
 
 KINDS = tuple(rig_new.KINDS)
 
@@ -100,8 +101,12 @@ def test_every_line_of_a_template_that_is_commented_out_reads(tmp_path, kind):
     """Each example line, and the table that it stands in, is valid where its comment sign is taken away."""
     lines = rig_new.template(kind).splitlines()
     tables = {"# [columns]", "# [rig]"}
+    stance = (
+        lines.index("# [rover.turning]") if "# [rover.turning]" in lines else len(lines)
+    )  # to the end, as a whole
+    read(tmp_path, "\n".join(x.removeprefix("# ") if j >= stance else x for j, x in enumerate(lines)))
     for k, line in enumerate(lines):
-        if not line.startswith("# ") or " = " not in line or "OURS" in line:
+        if not line.startswith("# ") or " = " not in line or "OURS" in line or k > stance:
             continue
         key = line[2:].split(" = ")[0]
         if not key.isidentifier() or key in ("drum_radius_mm",):
@@ -285,6 +290,29 @@ def test_wheels_lose_nothing_that_is_not_stated_and_tracks_have_to_state_it(tmp_
         read(tmp_path, ROVER.replace('load = "vehicle"', 'movers = "tracks"'))
 
 
+def test_a_robot_that_turns_states_its_wheelbase_and_is_written_with_it(tmp_path):
+    turns = f"{ROVER}[rover.turning]\nwidth = 0.3\ninertia = 0.2\n"
+    with pytest.raises(BadConfiguration, match=r"running_gear\.wheelbase \[m\] is missing, which a robot with base"):
+        read(tmp_path, turns)
+    usual = float(read(tmp_path, ROVER).running_gear.wheelbase)  # an example's
+    robot = read(tmp_path, f"{turns}[running_gear]\nwheelbase = {usual}\n")
+    assert same(again(tmp_path, robot), robot)
+    (tmp_path / "turns.toml").write_text(f"{turns}[running_gear]\nwheelbase = 0.4\n", encoding="utf-8")
+    (height,) = [o for o in rig_facts.origins(robot_file.parse(tmp_path / "turns.toml")) if "centre_height" in o.name]
+    assert "an example's" in height.why
+
+
+@pytest.mark.parametrize(("limit", "flagged"), [("", False), ("temperature_limit = 125.0\n", True)])
+def test_no_winding_is_too_hot_for_a_rig_that_states_no_limit(tmp_path, limit, flagged):
+    """Also where none would settle: at 30 A of 1 ohm."""
+    robot = read(tmp_path, ROVER.replace("[motor]\n", f"[motor]\n{limit}").replace("mass = 4.0", "mass = 80.0"))
+    seen = steady_batch(robot, Conditions(voltage=np.array([40.0]), slope_deg=np.array([20.0])))
+    assert not np.isfinite(float(seen.winding_settled[0]))
+    assert bool(int(seen.flags[0]) >> FLAGS.index("winding_hot") & 1) == flagged
+    said = " ".join(rig_check.examined(tmp_path / "rig.toml", None).remarks())
+    assert ("held against an example's motor.resistance_thermal_winding" in said) == flagged
+
+
 def without(text, *keys):
     return "\n".join(line for line in text.splitlines() if line.partition(" =")[0] not in keys)
 
@@ -459,6 +487,7 @@ def test_rig_check_says_what_a_table_can_determine(mmrjax, bench):
 def test_rig_check_of_data_says_the_same_in_words(mmrjax, bench):
     code, out, _ = mmrjax("rig", "check", "my-rig.toml", "runs.csv")
     assert code == 0 and "total_current_A, yours total_current_mA" in out
+    assert re.search(r"total_current .*signed +(assumed, 2 %, as total_curr|estimated by how readings)", out)
     assert "gearbox.efficiency_load" in out and "not determined" in out
     assert "room: without a role" in out and "add output_torque to channels" in out
 

@@ -65,7 +65,7 @@ def test_missing_readings_are_nan_and_counted(tmp_path):
     runs = records.read(write(tmp_path, f"{header}\n6T2A,15,13.1,0,5,2.75,400\n6T2A,15,13.1,0,5,,400\n"))
     np.testing.assert_array_equal(np.isnan(runs.measured()), [[False, True, False], [True, True, False]])
     assert runs.missing() == [
-        "total_current_A: 1 of 2 readings are missing (rows 2)",
+        "total_current_A: 1 of 2 readings are missing (row 2)",
         "motor_speed_rpm: no readings; what they would show is not fitted",
     ]
     assert np.isnan(runs.deviations()).all()
@@ -207,6 +207,37 @@ def test_bytes_that_are_no_text_are_refused(tmp_path):
             records.read(tmp_path / "runs.csv")
 
 
+@pytest.mark.parametrize(
+    ("rows", "says"),
+    [
+        ("15;13,1;0;0;2,75;4.800;422", r"motor_speed_rpm: got 4\.800 beside 13,1 in total_mass_kg; expected decimal"),
+        ("15;13.1;0;0;2.75;4,800;422", "motor_speed_rpm: got 4,800 beside 13.1 in total_mass_kg; expected decimal"),
+        (
+            "15;13;0;0;3;4.800;422\n6T2A;5;13;0;0;3;950;92",
+            r"motor_speed_rpm: got 4\.800 beside whole numbers below a thousand; .* nothing between thousands",
+        ),
+    ],
+)
+def test_marks_between_thousands_are_refused_and_not_read_as_decimals(tmp_path, rows, says):
+    with pytest.raises(BadData, match=rf"runs\.csv, {says}"):
+        records.read(written(tmp_path, f"{HEADER.replace(',', ';')}\n6T2A;{rows}\n"))
+
+
+def test_three_decimals_everywhere_are_no_thousands(tmp_path):
+    text = f"{HEADER}\n6T2A,15.000,13.100,0.000,0.000,2.750,480.125,422.000\n".replace(",", ";")
+    assert records.read(written(tmp_path, text))["motor_speed_rpm"] == 480.125
+
+
+def test_copies_of_rows_are_said(tmp_path):
+    other = ROW.replace("4800", "4801")
+    plain = records.read(written(tmp_path, f"{HEADER}\n{ROW}\n{other}\n"))
+    copied = records.read(written(tmp_path, f"{HEADER},run_id\n{ROW},a\n{other},b\n{ROW},c\n{other},d\n{other},e\n"))
+    assert (
+        plain.notes == ()
+        and "runs.csv: rows 1 and 3 have the same conditions and readings, and so 1 more; " in copied.notes[0]
+    )
+
+
 def test_commas_and_points_in_one_column_are_refused(tmp_path):
     text = f"{HEADER}\n{ROW}\n6T2A,33,21.1,8,0,3.2,11590,970\n".replace(",", ";").replace("2.75", "2,75")
     with pytest.raises(
@@ -276,8 +307,8 @@ def test_capitals_of_columns_and_configurations_are_taken_and_said(tmp_path):
 
 def test_what_a_table_lacks_is_said_before_it_is_used(tmp_path):
     header = f"{HEADER.replace(',motor_speed_rpm', '')},run_id"
-    rows = [ROW.replace(",4800", "") + f",{run}" for run in "abac"]
-    rows[1] = rows[1].replace("2.75", "")
+    rows = [ROW.replace(",4800", "").replace("2.75", f"2.7{k}") + f",{run}" for k, run in enumerate("abac")]
+    rows[1] = rows[1].replace("2.71", "")
     found = records.read(written(tmp_path, "\n".join([header, *rows])), robot=robots.nominal())
     assert found.notes == (
         "runs.csv: 1 of 4 cells of total_current_A are empty, the first in row 2; they weigh nothing",

@@ -6,6 +6,7 @@ import json
 import re
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import jsonschema
@@ -17,6 +18,7 @@ from calibration.data import posterior as posteriors
 from calibration.data import robot_file
 from calibration.inference import priors
 from calibration.inference.posterior import of_coordinates
+from calibration.sensitivity import information
 from calibration.sensitivity import inputs as room
 from calibration.sensitivity.analyse import analyse
 from calibration.sensitivity.local import inert, local
@@ -27,6 +29,7 @@ from calibration.sensitivity.result import Points
 from calibration.sensitivity.study import Study
 from mmrjax import params
 from mmrjax.fidelities.steady import steady_batch
+from sweeps.pages import sensitivity as page
 from tests.commands import rows as table
 from tests.pages import Tables
 
@@ -258,6 +261,24 @@ def test_other_methods_have_indices_of_their_own(mmrjax, tmp_path, method, keys)
     if method == "derivative":
         compared = document["comparison"]["speed"]
         assert compared["upper_holds"] and compared["lower_holds"]
+
+
+def test_a_share_of_a_reading_of_zero_tells_nothing():
+    told = information.fisher(np.ones((1, 2, 1)), np.array([[0.0, 2.0]]))
+    np.testing.assert_array_equal(told, [[[0.25]]])
+
+
+def test_an_output_that_nothing_changes_has_no_figures(tmp_path, monkeypatch):
+    """A yaw rate beside straight travel: one without bars leaves no room for its axes."""
+    drawn, shares = [], {"speed": np.array([0.4, 0.6]), "yaw_rate": np.zeros(2)}
+    monkeypatch.setattr(page.Album, "add", lambda self, name, make: drawn.append(name))
+    monkeypatch.setattr(page, "render", lambda *_, **told: told["sections"])
+    for name in ("_sentence", "_pairs", "_inputs", "_ranges", "_bounds", "_next_runs", "named"):
+        monkeypatch.setattr(page, name, lambda *_: {})
+    one = {"studied": np.array([True]), "value": np.zeros(1), "row": SimpleNamespace(label=""), "second": None}
+    outputs = {k: SimpleNamespace(overall_share=v, convergence=None, **one) for k, v in shares.items()}
+    sections = page.write(tmp_path, SimpleNamespace(outputs=outputs, next_runs=None, method="local"), None)
+    assert drawn == ["overview", "tornado_speed", "indices_speed"] and [s["drawn"] for s in sections] == [True, False]
 
 
 def test_schema_can_fail():

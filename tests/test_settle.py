@@ -366,7 +366,7 @@ def test_missing_samples_divide_a_level_and_are_said(tmp_path):
     robot = bench(tmp_path, cut(columns, np.r_[0:300, 400:600]))
     found = settled(tmp_path, robot)
     assert found.gaps == (299,) and len(found.kept) == 2
-    assert words.remarks(found, 12)[0].startswith("samples are missing after 1 rows (300); no stretch goes across")
+    assert words.remarks(found, 12)[0].startswith("samples are missing after row 300; no stretch goes across")
 
 
 def test_days_between_rows_are_a_gap(tmp_path):

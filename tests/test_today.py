@@ -12,7 +12,7 @@ from calibration.data.errors import BadConfiguration, BadData
 from mmrjax import robots, signals
 from mmrjax.fidelities.drive import drive_batch
 from sweeps.commands.simulate import PEAK, remarks
-from sweeps.pages import history_figures, words
+from sweeps.pages import figure_style, history_figures, words
 from sweeps.pages import runs as runs_page
 from tests.commands import rows as table
 
@@ -395,3 +395,10 @@ def test_a_film_begins_at_the_start_and_a_start_that_still_gains_speed_is_done(m
     )
     code, out, _ = mmrjax("render", "start.gif", "--slope", 10, "--duration", 0.1)
     assert (code, drawn) == (0, [0.0]) and "not_settled" in out
+
+
+def test_a_run_without_current_is_drawn():
+    """Nothing drives its motors: no scale of nothing."""
+    time = np.linspace(0.0, 1.0, 30)
+    still = history_figures.Start("run 1", "6T2A", "stalled", time, *3 * [0 * time], stages=None)
+    figure_style.svg(history_figures.from_standstill([still]))

@@ -15,7 +15,9 @@ from mmrjax.channels import SIDES
 from mmrjax.derived import turn as derived
 from mmrjax.errors import UsageError
 from sweeps.commands import simulate
-from sweeps.pages import mission_figures, turn_words
+from sweeps.pages import mission_figures, turn, turn_words
+from sweeps.pages.figure_style import svg
+from sweeps.points.imposed import UNLIMITED
 from sweeps.points.job import showing_turns
 from tests.commands import rows
 
@@ -259,6 +261,8 @@ def test_turns_are_told_in_plain_words():
     assert "winding_hot: winding hotter than permitted" in said(flags="gearbox_overspeed;winding_hot")
     hot = turn_words.turn(robot, row(winding_left_C=float("inf"), power_right_W=-0.01), None)
     assert hot.sides[-2:] == [("electrical power [W]", "5.0", "0.0"), (hot.sides[-1][0], "none settles", "40")]
+    unknown = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, inherits=False))  # how its heat leaves
+    assert [side[0] for side in turn_words.turn(unknown, row(), None).sides] == [side[0] for side in hot.sides[:-1]]
     nothing = {name: float("nan") for name, value in row().items() if isinstance(value, float)}
     none = turn_words.turn(robot, row(status="not_settled", **nothing), None)
     assert none.answer.startswith("not_settled: ") and "no steady state" in none.answer
@@ -332,3 +336,24 @@ def test_tables_have_no_negative_zero(monkeypatch):
     table = {"slope_deg": [-0.0], "speed_mm_s": [-0.01], "status": ["converged"]}
     simulate.print_runs({name: np.array(values) for name, values in table.items()}, robots.nominal().channels)
     assert [list(c.cells) for c in said[0].columns][1] == ["0", "0.0", "converged"]
+
+
+def test_a_path_between_places_that_turn_is_an_arc():
+    """A quarter of a circle of 2 m, and a metre straight on, from three rows."""
+    x, y, yaw = np.array([0.0, 2.0, 2.0]), np.array([0.0, 2.0, 3.0]), np.array([0.0, np.pi / 2, np.pi / 2])
+    ahead, aside = turn.arcs(x, y, yaw)
+    np.testing.assert_allclose(np.hypot(ahead[:-1], aside[:-1] - 2.0), 2.0, rtol=1e-12)
+    assert np.max(np.diff(aside[:-1])) < 0.11 and (ahead[-1], aside[-1], len(ahead)) == (2.0, 3.0, 34)
+
+
+def test_a_mission_of_which_no_heat_is_known_is_laid_out():
+    """What is said in the place of temperatures leaves room for the curves, and no title runs into the next figure."""
+    time = np.linspace(0.0, 24.0, 9)
+    names = ("theoretical_speed_mm_s", "demanded_speed_mm_s", "slope_deg", "source_voltage_V", "motor_current_left_A")
+    rows = {name: time for name in (*names, "motor_current_right_A", "duty_left", "duty_right")}
+    rows |= {"time_s": time, "slope_deg": 0 * time, "state_of_charge": np.nan * time}
+    fig = mission_figures.course(rows, 12.0, UNLIMITED, False, 2.0)
+    svg(fig)
+    assert all(axes.get_position().width > 0.2 for axes in fig.axes)
+    first, second = (axes.title.get_window_extent() for axes in fig.axes[2:4])
+    assert not first.overlaps(second)

@@ -105,6 +105,38 @@ def test_a_table_of_turns_with_channels_of_turns_alone_is_answered_by_the_line_t
     assert [c.name for c in records.read(path, robot=robot).channels] == ["yaw_rate"]
 
 
+@pytest.mark.parametrize(
+    ("sides", "says"),
+    [
+        (
+            "left_V,right_V",
+            "column left_V: a table states shares of the supply's voltage, .* duty_left = left_V / supply",
+        ),
+        ("voltage_right_V,voltage_left_V", "column voltage_right_V: .* so duty_right = voltage_right_V / supply"),
+        (
+            "U_1,U_2",
+            "row 2, motor_current_left_A: got -2 at 24 V; nothing else .*; a turn has duty_left and duty_right too",
+        ),
+    ],
+)
+def test_a_table_of_turns_without_what_drives_the_sides_is_told_what_to_add(rig, table, sides, says):
+    rows = [(24, 5, 10, 3.0, 9.0, 0.3), (24, 2, 10, -2.0, 9.0, 0.6)]
+    with pytest.raises(BadData, match=says):
+        table(f"supply_voltage_V,{sides},{READ}", *rows, robot=rig(DRIVEN))
+
+
+@pytest.mark.parametrize(
+    ("row", "got"),
+    [
+        ((0, 1, 0.4), "supply_voltage_V 0, duty_left 1, duty_right 0.4"),
+        ((24, 0, 0), "supply_voltage_V 24, duty_left 0, duty_right 0"),
+    ],
+)
+def test_a_turn_that_nothing_drives_is_refused(rig, table, row, got):
+    with pytest.raises(BadData, match=rf"turns\.csv row 2: got {got}; nothing drives either side"):
+        table(f"supply_voltage_V,duty_left,duty_right,{SPEEDS}", (24, 0, 1, 0, 900), (*row, 0, 0), robot=rig(DRIVEN))
+
+
 def test_yaw_rate_in_degrees_is_converted(rig, table):
     robot = rig(KINEMATIC)
     runs = table(f"{SPEEDS},yaw_rate_deg_s", *[(a, b, np.degrees(w)) for a, b, _, _, w in SOUND], robot=robot)

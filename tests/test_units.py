@@ -29,3 +29,11 @@ def test_units_of_conditions_are_those_by_hand():
     assert units.MASS == {"kg": 1.0, "g": 0.001} and units.SHARE == {"": 1.0, "percent": 0.01}
     assert set(units.ANGLE) == {"deg", "rad"} and units.ANGLE["deg"] == 1.0
     assert units.ANGLE["rad"] == pytest.approx(57.29577951308232)
+
+
+@pytest.mark.parametrize(
+    ("written", "column"),
+    [("U/min", "rpm"), ("1/min", "rpm"), ("min-1", "rpm"), ("°/s", "deg_s"), ("Nmm", "mNm"), ("N·m", "Nm"), ("%", "percent")],
+)  # fmt: skip
+def test_units_as_people_write_them_are_those_of_columns(written, column):
+    assert units.spelled(written) == column

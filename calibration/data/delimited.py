@@ -15,6 +15,8 @@ SEPARATORS = {";": "semicolons", "\t": "tabs"}
 #: Bytes that no text has.
 _CONTROLS = re.compile(rb"[\0-\x08\x0e-\x1f]")
 _COMMA, _POINT = (re.compile(rf"[+-]?\d*{mark}\d+(?:[eE][+-]?\d+)?") for mark in (",", r"\."))
+#: What may be a number of thousands with a mark between, and one below a thousand without.
+_THOUSANDS, _BELOW = re.compile(r"[+-]?[1-9]\d{0,2}[,.]\d{3}"), re.compile(r"[+-]?[1-9]\d{0,2}")
 
 
 def text(name: str, content: bytes) -> tuple[str, tuple[str, ...]]:
@@ -57,7 +59,7 @@ def cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], tuple[str, 
         name: of the file, for messages; lines: of the file, its header first.
 
     Raises:
-        BadData: a column that has decimal commas and points.
+        BadData: a column that has decimal commas and points, or marks that may stand between thousands.
     """
     header = lines[0] if lines else ""
     mark = next((m for m in SEPARATORS if m in header and "," not in header), ",")
@@ -69,22 +71,34 @@ def cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], tuple[str, 
     if mark == ",":
         return rows, ()
     said = f"{name}: columns are separated by {SEPARATORS[mark]}"
-    comma: dict[int, str] = {}
-    point: dict[int, str] = {}
+    comma: dict[int, list[str]] = {}
+    point: dict[int, list[str]] = {}
+    whole: set[int] = set()
     for row in rows[1:]:
         for j, cell in enumerate(row):
             if _COMMA.fullmatch(cell):
-                comma.setdefault(j, cell)
+                comma.setdefault(j, []).append(cell)
                 row[j] = cell.replace(",", ".")
             elif _POINT.fullmatch(cell):
-                point.setdefault(j, cell)
+                point.setdefault(j, []).append(cell)
+            elif _BELOW.fullmatch(cell):
+                whole.add(j)
+    wanted = "expected decimal commas or points, one of them in a column, and nothing between thousands"
     for j in comma.keys() & point.keys():
-        column = rows[0][j] if j < len(rows[0]) else "a column"
-        raise BadData(
-            f"{name}, {column}: got {comma[j]} and {point[j]}; expected decimal commas or points, one of them in a "
-            "column, and nothing between thousands"
-        )
+        raise BadData(f"{name}, {_column(rows, j)}: got {comma[j][0]} and {point[j][0]}; {wanted}")
+    for marked, other in ((point, comma), (comma, point)):
+        for j, written in marked.items():
+            if (other or j in whole) and all(map(_THOUSANDS.fullmatch, written)):
+                beside = ", ".join(f"{cells[0]} in {_column(rows, k)}" for k, cells in list(other.items())[:1])
+                raise BadData(
+                    f"{name}, {_column(rows, j)}: got {written[0]} beside "
+                    f"{beside or 'whole numbers below a thousand'}; {wanted}"
+                )
     return rows, (f"{said}, and numbers have decimal commas; read so" if comma else f"{said}; read so",)
+
+
+def _column(rows: list[list[str]], j: int) -> str:
+    return rows[0][j] if j < len(rows[0]) else "a column"
 
 
 def number(cell: str) -> float:

@@ -244,6 +244,7 @@ def origins(file: RobotFile) -> list[Origin]:
         head, _, rest = p.name.partition(".")
         mine = head in robot.configurations
         shown = p.name in stated or mine or p.name.startswith(("motor.friction", "gearbox."))
+        shown |= p.name == rig_file.CENTRE and rig_file.WHEELBASE in stated
         assumed = not robot.rig.inherits and (
             p.name == "motor.inertia" or (p.name == "motor.inductance" and "motor.resistance" in stated)
         )
@@ -262,6 +263,8 @@ def origins(file: RobotFile) -> list[Origin]:
 def _default(name: str, rest: str) -> str:
     if name == "motor.inductance":
         return rig_file.WINDING_WHY
+    if name == rig_file.CENTRE:
+        return rig_file.CENTRE_WHY
     if name in rig_file.DEFAULTS:
         return rig_file.DEFAULTS[name][1]
     if rest == rig_file.DYNAMIC:

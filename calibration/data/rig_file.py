@@ -63,6 +63,10 @@ VEHICLE: dict[str, tuple[float, str]] = {
     "turning.rule": (1.0, "not stated: assumed, friction against the sliding"),
     "turning.inertia": (0.0, "not stated: only a robot that turns needs it"),
 }
+#: What a vehicle that states how wide it is, and so may turn, has to state beside that.
+WIDTH, WHEELBASE = "turning.width", "running_gear.wheelbase"
+#: The same of what an example has where nothing is stated.
+CENTRE, CENTRE_WHY = "running_gear.centre_height", "not stated: an example's; in turns it moves load"
 #: Those of VEHICLE that tracks have to state.
 _OF_TRACKS = ("track.loss_coulomb",)
 DYNAMIC = "ground.friction.dynamic"

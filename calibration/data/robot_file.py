@@ -167,7 +167,8 @@ def parse(path: Path, library: Library = effects.BY_NAME, notes: list[str] | Non
     tables = {name: table for name, table in present.items() if isinstance(table, dict)}
     acting = {name: table.pop("configurations") for name, table in tables.items() if "configurations" in table}
     factors = {name: table.pop(FACTORS) for name, table in tables.items() if FACTORS in table}
-    of_size = {name: _of_size(library, name, value, path.name) for name, value in factors.items()}
+    of_turns = {**effects.OF_TURNS, **library}
+    of_size = {name: _of_size(of_turns, name, value, path.name) for name, value in factors.items()}
     robot = with_effects(robot, tuple(present), {**library, **of_size}, acting, where=path.name)
     parameters = dict(_flatten(content))
     robot = rig_file.with_priors(change(robot, parameters, where=path.name, notes=notes), sds, path.name)
@@ -203,6 +204,9 @@ def _without_parameters(
     missing = [name for name in rig_file.needed(rig) if name not in given]
     if not found.travels and "speed" in rig.channels:
         missing += [f"{name}.radius" for name in found.by_name if f"{name}.radius" not in given]
+    turns = any(given.get(f"{name}.{rig_file.WIDTH}") for name in found.by_name)
+    if turns and rig_file.WHEELBASE not in given:
+        missing.append(rig_file.WHEELBASE)
     rig_file.refuse_missing([*missing, *found.missing], known, where, given)
     return robot, sds, found.linear
 
@@ -455,7 +459,9 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
             line = f"{FACTORS} = {list(type(effect).factors)}  # sd, shape, limits: times the library's"
             tables[f"effects.{effect.name}"].append(line)
     start = {p.name: float(p.value) for p in params.walk(nothing)}
-    needed, always = rig_file.needed(robot.rig), (*(f"{name}." for name in robot.configurations), "effects.")
+    turns = any(p.name.endswith(rig_file.WIDTH) and float(p.value) > 0 for p in params.walk(robot))
+    needed = (*rig_file.needed(robot.rig), *([rig_file.WHEELBASE] if turns else []))
+    always = (*(f"{name}." for name in robot.configurations), "effects.")
     for parameter in params.walk(robot):
         head_, _, key = parameter.name.rpartition(".")
         spec, value = parameter.spec, float(parameter.value)

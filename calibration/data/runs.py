@@ -20,6 +20,7 @@ from calibration.data.columns import (
     DEFAULTS,
     DRIVEN,
     DUTY,
+    SIDES,
     SPEED,
     SPEEDS,
     SUPPLY,
@@ -144,10 +145,8 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
     _check_deviations(name, columns, layout.channels)
     if battery and layout.imposed == "voltage":
         columns[SUPPLY] = np.full(len(rows) - 1, np.nan)
-    elif (
-        measured and not set(TIME) <= set(columns) and not set(layout.sides) & set(columns)
-    ):  # a history may stop, and go on forwards against its motors
-        _check_signs(name, columns, layout)
+    elif measured and not set(TIME) <= set(columns):  # a history may stop, and go on forwards against its motors
+        (_check_turns if set(layout.sides) & set(columns) else _check_signs)(name, columns, layout)
     if not any(column in columns for column in WHEN):
         columns["order"] = np.arange(1.0, len(rows))
     unknown = tuple(c for c, meaning in zip(header, meanings, strict=True) if meaning is None)
@@ -204,7 +203,7 @@ def _configurations_in_case(name: str, cells: list[str], layout: Layout) -> tupl
 
 
 def _lacks(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
-    """Sentences on channels and readings that a table lacks, and on names of runs that name several rows."""
+    """Sentences on channels and readings that a table lacks, on copies of rows and on names of several."""
     for channel in layout.channels:
         if channel.column not in columns:
             if layout.complete:
@@ -217,6 +216,17 @@ def _lacks(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterato
                 f"{name}: {count} cells of {channel.column} are empty, the first in row {empty[0] + 1}; they weigh "
                 "nothing"
             )
+    alike: dict[tuple[Any, ...], list[int]] = {}
+    settled = [] if set(TIME) & set(columns) else [c for c in columns if c not in ("run_id", *WHEN)]
+    told = [columns[column].tolist() for column in settled]
+    for row, cells in enumerate(zip(*told, strict=True), 1):
+        alike.setdefault(cells, []).append(row)
+    if copied := [rows for rows in alike.values() if len(rows) > 1]:
+        others = f", and so {len(copied) - 1} more" if len(copied) > 1 else ""
+        yield (
+            f"{name}: rows {' and '.join(map(str, copied[0][:2]))} have the same conditions and readings{others}; "
+            "remove copies, which make results look surer than they are"
+        )
     if "run_id" in columns and not set(TIME) & set(columns):
         runs, times = np.unique(columns["run_id"], return_counts=True)
         several = times > 1
@@ -320,10 +330,11 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
         against = np.flatnonzero(forward & (readings < -doubt))
         if against.size:
             at = int(against[0])
+            alike = "" if channel not in channels.OF_TURNS else f"; a turn has {' and '.join(layout.sides)} too"
             raise BadData(
                 f"{name} row {at + 1}, {channel.column}: got {number(readings[at])} at {number(imposed[at])} {unit}; "
-                "nothing drives the motors there, so expected a reading with the sign of what is imposed, the "
-                "same in every row"
+                "nothing else drives the motors there, so expected a reading with the sign of what is imposed, the "
+                f"same in every row{alike}"
             )
         if wrong.size:
             at = int(wrong[0])
@@ -413,6 +424,13 @@ def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layou
             raise BadData(
                 f"{name}: column {column}: the sides are called left and right; name it {meant}, or state [columns] "
                 f'{meant} = "{column}" in the robot\'s file'
+            )
+        side = next((side for side in channels.SIDES if side in words(column)), None)
+        turns = set(SIDES) <= set(known.values()) and not stated.isdisjoint(c.column for c in channels.OF_TURNS)
+        if side and turns and not stated & set(SIDES) and column.endswith("V"):
+            raise BadData(
+                f"{name}: column {column}: a table states shares of the supply's voltage, duty_left and "
+                f"duty_right, so duty_{side} = {column} / {SUPPLY}"
             )
 
 
@@ -550,6 +568,15 @@ def _check_sides(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
     if stated and set(columns) & {"duty", "mode"}:
         beside = min(set(columns) & {"duty", "mode"})
         raise BadData(f"{name}: column {beside} beside {stated[0]}, which says how either side is driven; keep one")
+
+
+def _check_turns(name: str, columns: dict[str, np.ndarray], layout: Layout) -> None:
+    """Refuse rows in which nothing drives either side."""
+    supply = columns[SUPPLY] if layout.imposed == "voltage" else 1.0
+    idle = np.flatnonzero(np.max(np.abs([columns[c] for c in layout.sides]), 0) * supply == 0)
+    if idle.size:
+        got = ", ".join(f"{c} {number(columns[c][idle[0]])}" for c in (layout.imposed_column, *layout.sides))
+        raise BadData(f"{name} row {idle[0] + 1}: got {got}; nothing drives either side; remove the row")
 
 
 def _check_mass(name: str, columns: dict[str, np.ndarray]) -> None:

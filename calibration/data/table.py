@@ -140,7 +140,8 @@ class Runs:
                 said.append(f"{channel.column}: no readings; what they would show is not fitted")
             elif lost.size:
                 rows = ", ".join(str(r + 1) for r in lost[:8]) + (", ..." if lost.size > 8 else "")
-                said.append(f"{channel.column}: {lost.size} of {len(self)} readings are missing (rows {rows})")
+                rows = f"row{'s' * (lost.size > 1)} {rows}"
+                said.append(f"{channel.column}: {lost.size} of {len(self)} readings are missing ({rows})")
         return said
 
     def configurations(self, robot: Robot) -> np.ndarray:

@@ -21,7 +21,8 @@ PERCENT = "percent"
 #: Units as people write them beside numbers, where a column's name has another spelling.
 WRITTEN = {
     "°": "deg", "v": "V", "volt": "V", "volts": "V", "a": "A", "amp": "A", "amps": "A", "ma": "mA", "mv": "mV",
-    "gram": "g", "grams": "g", "°c": "C", "1/min": "rpm",
+    "gram": "g", "grams": "g", "°c": "C", "1/min": "rpm", "u/min": "rpm",
+    "r/min": "rpm", "min-1": "rpm", "°/s": "deg/s", "nmm": "mNm", "n·mm": "mNm",
 }  # fmt: skip
 
 

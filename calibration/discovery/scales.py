@@ -62,7 +62,7 @@ AT_THE_OUTPUT = ("track", "ground", "slip")
 SLIPPERY = 16.0
 #: The library's sds are those of one robot whose parts are known; of a rig known by its file alone any effect may be
 #: so many times as large a share of its balance. With 1, 5 of 26 random rigs with an effect of at most three ordinary
-#: sizes got no name for its size (benchmarks/rigs.py).
+#: sizes got no name for its size (benchmarks/rigs.py). Its mass was on scales: half of a robot is not missing there.
 UNKNOWN = 4.0
 #: Most that an instrument is taken to be off by, as a share of what its channel shows (rms): beyond it whoever reads
 #: it would know; 47 A on readings of 114 A are no ammeter's offset.
@@ -175,7 +175,8 @@ def _sized(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple[Robot,
         factor = _ratio(_size(whole(*mine)), _size(whole(*theirs)))
     elif amplitude.spec.unit != "-":
         factor = _ratio(_unit_share(effect, *theirs), _unit_share(grown, *mine))
-    factor *= SLIPPERY if kind.balance == "slip" and amplitude.spec.unit == "-" else UNKNOWN
+    slips = kind.balance == "slip" and amplitude.spec.unit == "-"
+    factor *= SLIPPERY if slips else 1.0 if kind.balance == "mass" else UNKNOWN
     limits = factor
     if kind.balance != "sensor":
         own, rated = (_unit_share(grown, mine[0], s) for s in (mine[1], _rated(*mine)))

@@ -55,11 +55,11 @@ def _enough(runs: Runs, names: Sequence[str], noise: Noise) -> None:
     also = f" and estimate {levels} noise levels" if levels else ""
     cure = "fix some with --fix, or state --noise" if levels else "fix some with --fix"
     whole = readings == len(runs) * shown
-    have = f"{len(runs)} rows of {shown} channels" if whole else f"{readings} readings in {len(runs)} rows"
+    rows = f"{len(runs)} row{'s' * (len(runs) > 1)}"
+    have = f"{rows} of {shown} channels" if whole else f"{readings} readings in {rows}"
     least = f"{needed} rows" if whole else f"{needed * shown} readings"
-    raise BadData(
-        f"{runs.source}: {have} cannot fit {len(names)} parameters{also}; at least {least} are needed, or {cure}"
-    )
+    what = f"cannot fit {len(names)} parameters{also}" if names else "cannot be fitted"
+    raise BadData(f"{runs.source}: {have} {what}; at least {least} are needed{f', or {cure}' if names else ''}")
 
 
 def _stuck(runs: Runs) -> None:

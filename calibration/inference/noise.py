@@ -85,15 +85,18 @@ def parse(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float, bool]
         k = known[name]
         channel = shown[k]
         match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*(%|[^\d\s.]+)\s*", value)
-        form = f"expected a positive number with % or {channel.unit}, e.g. {name}=2% or {name}=0.1{channel.unit}"
+        sizes = {channel.unit: channel.factor, **dict(channel.other_units)}
+        form = (
+            f"expected a positive number with % or {' or '.join(sizes)}, e.g. {name}=2% or {name}=0.1{channel.unit}"
+        )
         try:
             size = float(match[1]) if match else math.nan
         except ValueError:
             size = math.nan
-        if match is None or not size > 0 or math.isinf(size) or match[2] not in ("%", channel.unit):
+        if match is None or not size > 0 or math.isinf(size) or match[2] not in ("%", *sizes):
             raise BadConfiguration(f"--noise {part.strip()}: {form}")
         relative = match[2] == "%"
-        found[k] = (size / 100 if relative else size * channel.factor, relative)
+        found[k] = (size / 100 if relative else size * sizes[match[2]], relative)
     return found
 
 

@@ -29,6 +29,8 @@ FRICTION = (0.1, 1.0, 4.0)
 OF_TORQUE = ("total_current", "motor_current", "output_torque", "winding_temperature")
 #: Readings smaller than this share of the channel's largest tell no factor.
 SMALL = 0.05
+#: What a robot could show is nothing, below this share of the readings: the yaw rate of one that goes straight.
+NOTHING = 1e-9
 #: A slope in other units than degrees: of one of those [deg]; how well the current has to follow it.
 SLOPES = {"radians": 180 / math.pi, "percent": math.degrees(0.01)}
 FOLLOWS = 0.9
@@ -104,7 +106,7 @@ def _factor(measured: np.ndarray, possible: np.ndarray) -> float:
         return 1.0
     size = np.abs(possible[:, finite])
     low, high = np.nanmin(size, 0), np.nanmax(size, 0)
-    tells = high > SMALL * np.nanmax(high)
+    tells = high > max(SMALL * np.nanmax(high), NOTHING * np.max(np.abs(measured[finite])))
     if not tells.any():  # a channel that steady travel does not show
         return 1.0
     low, high, x = low[tells], high[tells], np.abs(measured[finite][tells])

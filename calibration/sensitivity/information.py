@@ -34,7 +34,8 @@ def fisher(jacobian: np.ndarray, sd: np.ndarray) -> np.ndarray:
         jacobian: of its readings by the scores, shape (runs, channels, inputs), NaN where there is no reading.
         sd: of the readings, shape (runs, channels).
     """
-    whitened = jacobian / sd[..., None]
+    with np.errstate(divide="ignore", invalid="ignore"):  # a share of a reading of zero tells nothing
+        whitened = jacobian / sd[..., None]
     whitened = np.where(np.isfinite(whitened), whitened, 0.0)
     return np.einsum("rci,rcj->rij", whitened, whitened)
 

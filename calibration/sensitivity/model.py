@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from calibration.data.contradictions import cannot_stand
 from calibration.data.errors import BadConfiguration, choices
 from mmrjax import channels, derived, fidelities
 from mmrjax import outputs as table_of_outputs
@@ -74,7 +75,7 @@ def chosen_outputs(words: tuple[str, ...], robot: Robot) -> tuple[OutputRow, ...
     """The outputs of these names, the usual ones for none; `start` stands for all of the start.
 
     Raises:
-        BadConfiguration: an unknown name; lists the choices.
+        BadConfiguration: an unknown name; lists the choices; one of a ground or stance that the robot lacks.
     """
     known, found = known_outputs(robot), []
     start = tuple(d.name for d in derived.TABLE if d.module.endswith(".start"))
@@ -82,7 +83,11 @@ def chosen_outputs(words: tuple[str, ...], robot: Robot) -> tuple[OutputRow, ...
         for name in start if word == "start" else (word,):
             if name not in known:
                 raise BadConfiguration(f"--outputs {name}: no such output; {choices(name, [*known, 'start'])}")
-            found.append(known[name])
+            if (row := known[name]) in derived.OF_GROUND and not robot.has_ground:
+                raise BadConfiguration(f"--outputs {name}: the robot's load is a shaft, which stands on no ground")
+            if row in derived.OF_POSTURE and (why := cannot_stand(robot)):
+                raise BadConfiguration(f"--outputs {name}: {why}")
+            found.append(row)
     return tuple(dict.fromkeys(found))
 
 

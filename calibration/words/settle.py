@@ -57,7 +57,7 @@ def remarks(found: Settled, fewest: int) -> list[str]:
     said = []
     if found.gaps:
         rows = ", ".join(str(k + 1) for k in found.gaps[:5]) + (", ..." if len(found.gaps) > 5 else "")
-        said.append(f"samples are missing after {len(found.gaps)} rows ({rows}); no stretch goes across")
+        said.append(f"samples are missing after row{'s' * (len(found.gaps) > 1)} {rows}; no stretch goes across")
     for signal in found.signals:
         if len(signal.angle):
             said.append(

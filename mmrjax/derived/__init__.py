@@ -51,6 +51,9 @@ TABLE: tuple[Derived, ...] = (
     Derived("highest_step", "highest_step_mm", "mm", 1e-3, "highest step of the posture", _POSTURE, 1),
     Derived("best_step", "best_step_mm", "mm", 1e-3, "highest step in any posture", _POSTURE, 1),
 )
+#: Those of a stance, and of a robot on a ground.
+OF_POSTURE = tuple(d for d in TABLE if d.module == _POSTURE)
+OF_GROUND = (*OF_POSTURE, *(d for d in TABLE if d.module == _SLOPE))
 
 
 def names() -> tuple[str, ...]:

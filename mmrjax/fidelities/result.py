@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from mmrjax import balances, ground
+from mmrjax.motor import UNLIMITED
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED, FLAGS, REVERSES, ROLLS_BACK, Result, Signals, quotient
@@ -26,7 +27,8 @@ def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
     power_gear = sides * signals.torque_gear * signals.speed_wheel
     power_ground = sides * signals.traction * signals.speed
     temperature = robot.motor.temperature_settled(signals.current)
-    over = {**exceeded(robot, signals), "winding_hot": temperature > robot.motor.temperature_limit}
+    limit = robot.motor.temperature_limit
+    over = {**exceeded(robot, signals), "winding_hot": (temperature > limit) & (limit < UNLIMITED)}  # settled or not
     flags = mask(over)
     return Result(
         reading=balances.sensor(robot, signals),

@@ -18,6 +18,7 @@ from sweeps import config as configuration
 from sweeps.console import say
 from sweeps.inputs import load_robot
 from sweeps.pages import words
+from sweeps.points import imposed
 from sweeps.results import posture
 from sweeps.results.check import CheckResult, changed, corner, label, limit, reached, wanted
 from sweeps.skeleton import leave, page
@@ -35,6 +36,7 @@ def check(config: configuration.Check, out: Path | None, force: bool) -> int:
     asked = requirements.load(Path(config.requirements))
     file = load_robot(config)
     robot = file.robot
+    imposed.check_on_ground(robot, "check")
     sheet.refuse(robot, asked)
     _check_charge(robot, asked)
     with open_folder("check", config, robot, out, force) as folder:

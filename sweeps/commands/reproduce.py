@@ -12,6 +12,7 @@ from sweeps import config as configuration
 from sweeps.console import tell
 from sweeps.inputs import load_robot
 from sweeps.paper import data, report
+from sweeps.points import imposed
 from sweeps.skeleton import leave
 from sweeps.store import open_folder
 
@@ -20,6 +21,7 @@ def reproduce(config: configuration.Reproduce, out: Path | None, force: bool) ->
     """Write the paper's figures and tables for a robot into a run folder; returns the exit code."""
     file = load_robot(config)
     robot = file.robot
+    imposed.check_on_ground(robot, "reproduce")
     runs = records.read("measured")
     gear = "track.guide_share" in fidelities.facts(config.model).computes
     with open_folder("reproduce", config, robot, out, force) as folder:

@@ -20,8 +20,11 @@ from calibration.data.writing import finite
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.foresight import Foresight
 from mmrjax import channels
+from mmrjax.channels import Channel
+from mmrjax.motor import UNLIMITED
 from mmrjax.robot import Robot
 from mmrjax.shaft import Shaft
+from sweeps import capabilities
 from sweeps.config import RobotPart
 from sweeps.console import say
 from sweeps.inputs import load_robot, read_runs
@@ -91,6 +94,11 @@ class RigCheck:
         ]
         if loose and not self.robot.rig.inherits:
             said.append(f"without ±, so with the program's: {', '.join(loose)}")
+        if not capabilities.thermal(self.robot) and self.robot.motor.temperature_limit < UNLIMITED:
+            said.append(
+                "motor.temperature_limit is stated, and not how the windings' heat leaves: it is held against an "
+                "example's motor.resistance_thermal_winding and motor.resistance_thermal_housing; state yours"
+            )
         if self.robot.motor.voltage_limit is None and self.robot.rig.imposed == "voltage":
             said.append("motor.voltage_limit is not stated: experiments are proposed up to what a table used")
         return said
@@ -109,7 +117,7 @@ class RigCheck:
                     "signed": instrument.signed,
                     "quantum": None if instrument.quantum is None else instrument.quantum / channel.factor,
                     "unit": channel.unit,
-                    "sd": usual if self.foresight is None else self.foresight.noise[k],
+                    "sd": usual if self.foresight is None else _source(self.foresight.noise[k], channel),
                 }
             )
         return found
@@ -199,6 +207,15 @@ class RigCheck:
             "data": runs,
             "statement": self.statement(),
         }
+
+
+def _source(word: str, channel: Channel) -> str:
+    """Where the sd of a channel comes from, in words."""
+    every = {
+        "columns": "of the table", "series": "estimated by how readings scatter along series of rows",
+        "assumed": f"assumed, {100 * channel.sd_share:g} %, as {channel.sd_column} is no column",
+    }  # fmt: skip
+    return every.get(word, word)
 
 
 def _program(robot: Robot, origin: Origin) -> str:

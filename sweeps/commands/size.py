@@ -17,6 +17,7 @@ from sweeps import config as configuration
 from sweeps.console import say
 from sweeps.inputs import load_robot
 from sweeps.pages import words
+from sweeps.points import imposed
 from sweeps.results import check as check_result
 from sweeps.results.size import SizeResult, described, missed, objective, verdict
 from sweeps.skeleton import leave, page
@@ -31,6 +32,7 @@ def size(config: configuration.Size, out: Path | None, force: bool) -> int:
     asked = requirements.load(Path(config.requirements))
     file = load_robot(config)
     robot = file.robot
+    imposed.check_on_ground(robot, "size")
     objectives = config.pareto or (config.objective,)
     for name in objectives:
         if name not in OBJECTIVES:

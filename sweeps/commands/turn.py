@@ -21,6 +21,7 @@ from mmrjax.derived import turn as derived
 from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.rest import voltage_at_rest
 from mmrjax.robot import Robot, cannot_turn
+from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import progress, say
 from sweeps.inputs import load_robot, one_run
@@ -59,7 +60,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         if settled:
             batch, swept = _with_others(robot, asked)
             turns = {**_duties(swept), **_columns(robot, shown, swept, batch)}
-            folder.write_table("turns.csv", turns)
+            folder.write_table("turns.csv", capabilities.without_idle(robot, turns))
             first, history = jax.tree.map(lambda x: x[:1], batch), None
         else:
             fidelity = fidelities.get(config.model)

@@ -150,7 +150,7 @@ def _current(axes: Axes, start: Start, colour: str) -> None:
     top = max(1.75 * float(run.max()), 0.1)
     cut = peak > top
     axes.plot(start.time, np.minimum(start.current, 1.2 * top), color=colour)
-    axes.set(xlim=(0, last), ylim=(min(0.0, 1.1 * float(start.current.min())), top if cut else 1.3 * peak))
+    axes.set(xlim=(0, last), ylim=(min(0.0, 1.1 * float(start.current.min())), top if cut else 1.3 * max(peak, 1e-3)))
     axes.set(xlabel="time [s]", ylabel="total current [A]")
     _stages(axes, start)
     if cut:

@@ -231,7 +231,7 @@ def errors(found: DiscoveryResult) -> Figure:
         axes.grid(axis="y", visible=False)
         axes.set_title(channel.label)
         axes.set_xlabel("rms error [%]")
-    grid[0, -1].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2)
+    fig.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
     return fig
 
 

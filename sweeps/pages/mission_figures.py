@@ -46,7 +46,7 @@ def course(rows: Mapping[str, np.ndarray], cycle: float | None, limit: float, li
         axes[0].set_title(f"{title}: speed" + (" and slope" if np.any(rows.get("slope_deg", 0.0)) else ""))
         _speed(axes[0], time, shown, linear, legend=first)
         sizes = ", sizes of both sides" if "duty_left" in rows else ""
-        axes[1].set_title(f"current of all motors, and duty of the driver{sizes}")
+        axes[1].set_title(f"current of all motors, and duty{sizes}" if first else "current, and duty")
         _current(axes[1], time, shown, sides, legend=first)
         unlimited = limit >= UNLIMITED or "housing_temperature_C" not in rows
         beyond = (
@@ -148,7 +148,7 @@ def _near(rows: Mapping[str, np.ndarray], limit: float) -> bool:
 
 def _temperatures(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], limit: float, legend: bool) -> None:
     if "housing_temperature_C" not in rows:
-        note(axes, "the robot's file does not state how heat leaves the windings (motor.resistance_thermal_...)")
+        note(axes, "not known: the robot's file does not\nstate how heat leaves the windings")
         axes.set_yticks([])
         return
     axes.plot(time, rows["winding_temperature_C"], color=VERMILION, lw=1.4, label="winding")

@@ -36,7 +36,7 @@ def stands(found: Postures) -> str:
     """How the first run stands and what geometry allows it, in a sentence or two."""
     one, most = {c: values[0] for c, values in found.table.items()}, found.over.step_mm.max()
     return (
-        f"posture: pitch {one['pitch_deg']:.1f}°, on {one['contact_mm']:.0f} mm, which bear {one['bears']}; tips on "
+        f"posture: pitch {one['pitch_deg']:z.1f}°, on {one['contact_mm']:.0f} mm, which bear {one['bears']}; tips on "
         f"slopes of {one['tips_back_deg']:.1f}° uphill, {one['tips_forward_deg']:.1f}° downhill, "
         f"{one['tips_aside_deg']:.1f}° across. Its geometry allows steps up to {one['highest_step_mm']:.0f} mm and "
         f"gaps up to {one['widest_gap_mm']:.0f} mm; the highest step in any posture is {most:.0f} mm "

@@ -31,7 +31,7 @@ def write(folder: Path, found: SensitivityResult, file: RobotFile) -> Path:
     album.add("overview", partial(sensitivity_figures.overview, found))
     sections = []
     for name, study in found.outputs.items():
-        has_numbers = bool(study.studied.any()) and bool(np.isfinite(study.value).any())
+        has_numbers = bool(study.studied.any()) and bool(np.isfinite(study.value).any()) and _decided(study)
         pairs = _pairs(study, found)
         if has_numbers:
             album.add(f"tornado_{name}", partial(sensitivity_figures.tornado, study, found))
@@ -67,10 +67,15 @@ def write(folder: Path, found: SensitivityResult, file: RobotFile) -> Path:
     )
 
 
+def _decided(study: OutputStudy) -> bool:
+    """Whether any input changes an output at all."""
+    return bool(study.overall_share.max(initial=0.0) > 0)
+
+
 def _sentence(study: OutputStudy, found: SensitivityResult) -> str:
     """What decides an output, with its own spread."""
     share, row = study.overall_share, study.row
-    if not share.max(initial=0.0) > 0:
+    if not _decided(study):
         return "No number at any of these operating points, or nothing changes it."
     top = sensitivity_figures.ranked(share, 3)
     who = ", ".join(f"{found.names[k]} {100 * share[k]:.0f} %" for k in top)

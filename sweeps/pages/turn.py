@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 SIDES = (("left", BLUE), ("right", VERMILION))
 #: Settled turns of a larger radius are drawn as an arc of so many lengths of the robot.
 ARC = 20.0
+#: A path bends by no more between two points that are drawn [rad].
+BEND = 0.05
 
 
 def write(
@@ -117,13 +120,32 @@ def circle(robot: Robot, row: Mapping[str, Any]) -> Figure:
     return fig
 
 
+def arcs(
+    x: np.ndarray, y: np.ndarray, yaw: np.ndarray
+) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
+    """A path between places, each stretch at a speed and yaw rate of its own: an arc; steps of a run may be long.
+
+    Args:
+        x, y: places [m]; yaw: there, counted on over a turn [rad]; shape (rows,).
+    """
+    place, turned = x + 1j * y, np.diff(yaw)
+    pieces = np.ceil(np.abs(turned) / BEND).clip(1, 100).astype(int)
+    k = np.repeat(np.arange(len(pieces)), pieces)
+    share = (np.arange(len(k)) - np.repeat(np.cumsum(pieces) - pieces, pieces)) / pieces[k]
+    bent = np.where(pieces[k] > 1, turned[k], BEND)  # else share is 0 and any will do
+    between = place[k] + np.diff(place)[k] * np.expm1(1j * share * bent) / np.expm1(1j * bent)
+    whole = np.append(between, place[-1])
+    return whole.real, whole.imag
+
+
 def path(robot: Robot, row: Mapping[str, Any], x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> Figure:
     """A path from above, the robot at its beginning and its end, and between."""
     finite = np.isfinite(x)
     x, y, yaw = x[finite], y[finite], yaw[finite]
     fig, grid = figure(1, 1, 4.6)
     axes = grid[0, 0]
-    axes.plot(-y, x, color=BLUE)
+    ahead, aside = arcs(x, y, yaw)
+    axes.plot(-aside, ahead, color=BLUE)
     for k, color in ((0, FAINT), (len(x) // 2, FAINT), (len(x) - 1, INK)):
         _outline(axes, robot, row, x[k], y[k], yaw[k], color)
     _plan(axes)

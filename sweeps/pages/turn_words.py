@@ -10,6 +10,7 @@ from typing import Any
 from mmrjax.channels import MM, SIDES
 from mmrjax.robot import Robot
 from mmrjax.turning import BETWEEN, OVER
+from sweeps import capabilities
 from sweeps.pages import words
 
 FULL = 2 * math.pi  # rad a turn
@@ -49,7 +50,8 @@ def turn(robot: Robot, row: Mapping[str, Any], ended: Mapping[str, float] | None
             f"After {ended['time_s']:g} s: {ended['displacement_m']:.2f} m from the start, turned by "
             f"{ended['turned_deg']:.0f}°. {answer if status == 'converged' else _now(row)}"
         )
-    rows = ROWS if known else ()
+    idle = capabilities.idle_columns(robot)
+    rows = [r for r in ROWS if known and r[1].format(SIDES[0]) not in idle]
     sides = [(label, *(_number(float(row[c.format(side)]), form) for side in SIDES)) for label, c, form in rows]
     return Turn(answer, [(a, b, c) for a, b, c in sides], _notes(robot, row) if going else [])
 

@@ -80,8 +80,9 @@ def _summary(columns: dict[str, np.ndarray], counts: np.ndarray) -> dict[str, np
     found: dict[str, np.ndarray] = {}
     for column, values in columns.items():
         x = np.where(enough[:, None], np.where(counts, values, np.nan), 0.0)
-        low, high = np.nanquantile(x, QUANTILES, axis=1)
-        spread = np.nanstd(x, 1, ddof=1)
+        with np.errstate(invalid="ignore"):  # of windings that settle at no temperature
+            low, high = np.nanquantile(x, QUANTILES, axis=1)
+            spread = np.nanstd(x, 1, ddof=1)
         found |= {
             column + end: np.where(enough, value, np.nan)
             for end, value in ((SD, spread), (LOWER, low), (UPPER, high))
