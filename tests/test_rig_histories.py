@@ -307,6 +307,30 @@ def test_a_log_of_an_imposed_speed_soon_has_even_steps(tmp_path, faster, step):
     assert np.sum(steps > 0) - np.sum(late) < 2 * 50
 
 
+@pytest.mark.parametrize("imposed", ["voltage", "motor_current"])
+def test_steps_are_short_where_a_drive_passes_through_rest(tmp_path, imposed):
+    """Of a voltage; of a current, and where no speed is shown, all along."""
+    text = DRIVE.format(imposed=imposed, channels='"motor_speed"', start="rest") + BENCH
+    (tmp_path / "rig.toml").write_text(text.replace('delay = "0 ± 0.05"', "delay = 0.02"))
+    robot = robot_file.load(str(tmp_path / "rig.toml"))
+    t, column = np.arange(0, 2, 0.02), {"voltage": "supply_voltage_V", "motor_current": "motor_current_A"}[imposed]
+    speed = 2000 * np.clip((1.5 - t) / 0.3, -1, 1) * np.minimum(t / 0.2, 1)  # through rest at 1.5 s
+    rows = [f"{a:.2f},{8 if a < 1.2 else -8},{s:.1f}" for a, s in zip(t, speed, strict=True)]
+    (tmp_path / "log.csv").write_text(f"time_s,{column},motor_speed_rpm\n" + "\n".join(rows))
+    runs = records.read(tmp_path / "log.csv", robot=robot)
+
+    def longest(runs, begin, end):
+        times = np.asarray(Histories.of(runs, robot).times)[0]
+        inside = (times[:-1] >= begin - 1e-9) & (times[1:] <= end + 1e-9)
+        return np.diff(times)[inside].max()
+
+    fine, usual = 0.02 / 16, 0.005 if imposed == "voltage" else 0.02 / 16
+    assert longest(runs, 1.4, 1.54) == pytest.approx(fine)  # from 0.07 s before a tenth of the largest speed on
+    assert longest(runs, 0.6, 1.2) == longest(runs, 1.7, 1.98) == pytest.approx(usual)
+    hidden = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": np.full(len(t), np.nan)})
+    assert longest(hidden, 0.6, 1.2) == pytest.approx(fine)
+
+
 def test_a_voltage_on_lines_is_the_mean_of_each_step_and_no_jump(tmp_path):
     """The means of all steps make up the integral of the broken line; nothing else than what is imposed is on lines."""
     text = DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + BENCH
@@ -327,7 +351,9 @@ def test_a_voltage_on_lines_is_the_mean_of_each_step_and_no_jump(tmp_path):
         runs, dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, between_rows="held"))
     )
     jumps = np.asarray(held.times)[0]
-    assert jumps[np.searchsorted(jumps, 0.1) + 1] - 0.1 < 2 * integrator.FIRST < 0.1 * (times[after + 1] - times[after])
+    assert (
+        jumps[np.searchsorted(jumps, 0.1) + 1] - 0.1 < 2 * integrator.FIRST < 0.1 * (times[after + 1] - times[after])
+    )
 
 
 @pytest.mark.slow
