@@ -68,9 +68,8 @@ def grid(
     changes = np.asarray(changes, float)
     begins = np.unique(np.concatenate([[0.0], changes[(changes > 0) & (changes < last)]]))
     given, times = times, np.unique(np.concatenate([begins, np.asarray(times, float)]))
-    longest = np.maximum(longest, last / STEPS)
-    if longest.ndim:
-        longest = longest[np.clip(np.searchsorted(given, times[:-1], side="right") - 1, 0, len(longest) - 1)]
+    longest = np.broadcast_to(np.maximum(longest, last / STEPS), max(len(given) - 1, 1))
+    longest = longest[np.clip(np.searchsorted(given, times[:-1], side="right") - 1, 0, len(longest) - 1)]
     grows = max(grows, growth(last, len(begins)))
     knee = np.maximum((longest - FIRST) / grows, 0.0)
 
@@ -80,7 +79,6 @@ def grid(
 
     since = begins[np.searchsorted(begins, times, side="right") - 1]  # the change that acts from each instant on
     at, ends, at_knee = clock((times - since)[:-1]), clock(times[1:] - since[:-1]), clock(knee)
-    longest, at_knee = np.broadcast_to(longest, len(at)), np.broadcast_to(at_knee, len(at))
     parts = []
     for k in range(len(times) - 1):
         count = max(1, int(np.ceil(ends[k] - at[k] - 1e-9)))
@@ -200,8 +198,8 @@ def followed(
         # What the second stage starts from, by the first stage and by the change before the step.
         by_first = jnp.where(passes, one + jump[:, None] * one[MOTOR], (1 - _GAMMA) / _GAMMA * one)
         before = jnp.where(passes, 0.0, 1 - (1 - _GAMMA) / _GAMMA) * one
-        gains = jnp.stack([spans[0] * second @ by_first @ first, spans[1] * second])
-        return second @ (by_first @ first + before), gains
+        kept = by_first @ first
+        return second @ (kept + before), jnp.stack([spans[0] * second @ kept, spans[1] * second])
 
     each = places, spans, through.any, through.turns, jax.tree.map(lambda x: x[:-1], changing)
     blocks = jax.lax.map(jax.vmap(linear), _in_blocks(each))
