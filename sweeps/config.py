@@ -13,6 +13,7 @@ from pydantic_core import PydanticCustomError
 
 from calibration.data.columns import CONDITIONS, SIDES
 from calibration.data.errors import BadConfiguration, choices, toml_content, toml_text
+from calibration.data.thinning import ROWS
 from mmrjax import channels, fidelities
 from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
 
@@ -237,6 +238,9 @@ class InferencePart(Part):
         "Sd of current, motor_speed, speed in % or A, rpm, mm/s: current=2%,speed=5mm/s",
         usual="the file's columns; else calibrate estimates; loop estimates from series, as of slopes (0.7 and 1.4 "
         "times too), and without such assumes 2, 0.5, 1 %, halved and doubled",
+    )
+    rows: Annotated[int, Field(ge=100, le=1_000_000)] = about(
+        ROWS, "Rows of a log over time from which on readings are used of fewer, evenly in time"
     )
     seed: Seed = about(0, "Of everything random")
 

@@ -35,6 +35,7 @@ class Runs:
         layout: what its columns mean for the robot that it is of, and its channels.
         notes: sentences on how the file was read, and what it lacks.
         headings: what the file calls the columns that it has, by their names here.
+        log: that these rows were chosen from, with all that drives its runs, see `thinning`; None: all are here.
     """
 
     source: str
@@ -45,6 +46,7 @@ class Runs:
     layout: Layout = dataclasses.field(default_factory=Layout)
     notes: tuple[str, ...] = ()
     headings: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    log: Runs | None = None
 
     def __len__(self) -> int:
         return len(self.columns["configuration"])
@@ -107,6 +109,11 @@ class Runs:
     def sampled(self) -> bool:
         """Whether a row is a sample of a run."""
         return all(self.has(column) for column in TIME)
+
+    @property
+    def whole(self) -> Runs:
+        """The log that its rows were chosen from, or itself."""
+        return self if self.log is None else self.log
 
     @property
     def run_names(self) -> np.ndarray:

@@ -112,6 +112,14 @@ class NeverGrips(Note):
     share: float
 
 
+class Thinned(Note):
+    """A log of so many rows of which fewer are read."""
+
+    source: str
+    rows: int
+    kept: int
+
+
 class CoarseSteps(Note):
     """Histories so long [s] that their steps [s] do not resolve waves of a shaft."""
 

@@ -108,6 +108,8 @@ SAID: dict[type, str | Callable[[Any], str]] = {
     notes.Constant: constant,
     notes.EndsEarly: ends_early,
     notes.NeverGrips: never_grips,
+    notes.Thinned: "{source}: readings of {kept} of {rows} rows are used, evenly in time, and what drives the runs "
+    "in all of them; --rows uses more or fewer, and settle uses all",
     notes.CoarseSteps: coarse_steps,
     notes.ManyChanges: "a run's supply changes {changes} times: inrushes after a change are followed in fewer steps "
     "than that of a start; cut the runs where the current of an inrush matters",

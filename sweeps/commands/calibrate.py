@@ -27,7 +27,7 @@ def calibrate(
     0 done; 3 done, but the search or a fit without a block did not converge, or the solver failed at a row.
     """
     robot = load_robot(config).robot
-    runs = read_runs(source, robot, measured=True, series=True)
+    runs = read_runs(source, robot, measured=True, series=True, most=config.rows)
     stated = priors.parse_priors(config.prior)
     with open_folder("calibrate", config, robot, out, force, runs) as folder, pulse(tell, "fitting") as heard:
         found = run(

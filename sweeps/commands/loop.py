@@ -49,7 +49,7 @@ def loop(
     """
     began = time.monotonic()
     robot = load_robot(config).robot
-    runs = read_runs(source, robot, measured=True, series=True)
+    runs = read_runs(source, robot, measured=True, series=True, most=config.rows)
     stated = priors.parse_priors(config.prior)
     replicates = max(config.replicates, fewest_replicates(observers.kind(runs)))
 

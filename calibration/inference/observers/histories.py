@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from calibration.data.courses import Stretch, applied, divided, stretches
+from calibration.data.courses import Stretch, applied, changing, divided, stretches
 from calibration.data.errors import BadConfiguration, BadData, number
 from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
@@ -32,7 +32,7 @@ from calibration.inference.details import Memory, Strongest, TimeSide, TimeStati
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
 from calibration.inference.normal_equations import solved
-from calibration.inference.notes import CoarseSteps, ManyChanges, Note, StopsOnSlope
+from calibration.inference.notes import CoarseSteps, ManyChanges, Note, StopsOnSlope, Thinned
 from calibration.inference.observers import settled_ends
 from calibration.inference.observers.base import Observer, SearchPolicy
 from calibration.inference.optimizers import (
@@ -102,6 +102,9 @@ LASTING = 0.25
 FINE, SLOW, EARLIER, DELAYED = 16, 0.1, 0.03, 2.0
 #: How many of the usual longest steps one may be elsewhere.
 FAST = 2
+#: Of a log that is thinned, to one of so many rows or fewer: how many steps there are at least between readings, and
+#: by how much they grow with the time since a condition changed, at most [1/s · s].
+SPARSE, BETWEEN, LATER = 1.5, 4, 0.05
 #: The same of one whose speed is imposed, and how many of the usual longest steps one of its steps may be.
 COARSELY, SLOWLY = 2, 4
 #: By how much its steps grow with the time since its start [1/s · s].
@@ -223,21 +226,31 @@ class Histories(Observer):
                 f"{runs.source}: time histories of a robot that turns are simulated, and not fitted; give its "
                 "settled turns, one a row, without time_s"
             )
-        names, first, run = np.unique(runs.run_names, return_index=True, return_inverse=True)
-        mine = [np.flatnonzero(run == k) for k in range(len(names))]
-        mine = [m[np.argsort(runs["time_s"][m], kind="stable")] for m in mine]
-        sudden = _changes(runs, mine, robot.rig)
-        exact = robot.rig.imposed == "motor_speed"
-        given, steps = [runs["time_s"][m] for m in mine], _longest(runs, mine, robot.rig)
-        grids = [grid(t, c, h, SOON if exact else GROWTH) for t, c, h in zip(given, sudden, steps, strict=True)]
+        whole, exact = runs.whole, robot.rig.imposed == "motor_speed"
+        linear = robot.rig.between_rows == "linear"
+        names, run = np.unique(runs.run_names, return_inverse=True)
+        mine = [_in_order(runs, name) for name in names]
+        every = [_in_order(whole, name) for name in names]
+        given = [runs["time_s"][m] for m in mine]
+        # Of rows of the log without a reading here those count at which what drives a run changes.
+        noted = [
+            np.isin(whole["time_s"][rows], t) | exact | linear | _differs(whole, rows)
+            for rows, t in zip(every, given, strict=True)
+        ]
+        usual = [float(np.median(np.diff(t))) if len(t) > 1 else np.inf for t in given]
+        steps = _longest(whole, every, robot.rig, usual)
+        steps = [np.minimum.reduceat(h, np.flatnonzero(n)[:-1]) for h, n in zip(steps, noted, strict=True)]
+        grids = [
+            grid(whole["time_s"][rows[n]], c, h, SOON if exact else GROWTH)
+            for rows, n, c, h in zip(every, noted, _changes(whole, every, robot.rig), steps, strict=True)
+        ]
         longest, samples = _common(max(map(len, grids))), max(map(len, mine))
         times = np.stack([np.concatenate([g, np.repeat(g[-1], longest - len(g))]) for g in grids])
         instant = np.array([np.searchsorted(grids[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
         rows = np.stack([np.concatenate([m, np.full(samples - len(m), -1)]) for m in mine])
         most = min(samples, KNOTS, max(8, int(KNOT_STEPS / times.size)))
         knots = np.stack([_knots(m, most) for m in mine])
-        linear = robot.rig.between_rows == "linear"
-        conditions = _in_time(runs.conditions(robot), first, mine, runs["time_s"], times, ON_LINES if linear else ())
+        conditions = _in_time(whole.conditions(robot), every, whole["time_s"], times, ON_LINES if linear else ())
         if robot.rig.begins is not None:
             order = [robot.rig.begins.names.index(begin_name(str(n))) for n in names]
             conditions = eqx.tree_at(lambda c: c.begin, conditions, jnp.asarray(order), is_leaf=lambda x: x is None)
@@ -272,7 +285,10 @@ class Histories(Observer):
                         f"{number(np.ptp(own))} kg beside its payload; within a run it may change as payload_kg does"
                     )
         _check_signs(runs)
-        return _stops(runs)
+        thinned: list[Note | str] = []
+        if runs.log is not None:
+            thinned.append(Thinned(runs.source, len(runs.log), len(runs)))
+        return [*thinned, *_stops(runs)]
 
     @classmethod
     def with_initial_states(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
@@ -314,8 +330,8 @@ class Histories(Observer):
         step = runs["time_s"].max() / STEPS
         if step > 2 * LONGEST:
             said.append(CoarseSteps(float(runs["time_s"].max()), float(step)))
-        each = [np.flatnonzero(names == name) for name in np.unique(names)]
-        changes = max(len(c) for c in _changes(runs, each, robot.rig)) + 1
+        each = [_in_order(runs.whole, name) for name in np.unique(names)]
+        changes = max(len(c) for c in _changes(runs.whole, each, robot.rig)) + 1
         if growth(float(runs["time_s"].max()), changes) > COARSE * GROWTH:
             said.append(ManyChanges(changes - 1))
         return said
@@ -724,7 +740,6 @@ def _changes(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[np.ndarray]:
     coasts = runs["mode"] == "coast" if runs.has("mode") else np.zeros(len(runs), bool)
     found = []
     for rows in each:
-        rows = rows[np.argsort(time[rows], kind="stable")]
         far = (np.abs(np.diff(volts[rows])) > INRUSH * np.abs(volts[rows]).max()) & (rig.between_rows == "held")
         found.append(time[rows[1:]][far | (coasts[rows][1:] != coasts[rows][:-1])])
     return found
@@ -732,7 +747,6 @@ def _changes(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[np.ndarray]:
 
 def _in_time(
     of_rows: Conditions,
-    first: np.ndarray,
     each: list[np.ndarray],
     time: np.ndarray,
     times: np.ndarray,
@@ -741,7 +755,7 @@ def _in_time(
     """Conditions of runs, from those of rows: of shape (runs,), those that change within one (runs, instants).
 
     Args:
-        of_rows: shape (rows,); first: a row of each run; each: rows of each run in the order of time.
+        of_rows: shape (rows,); each: rows of each run in the order of time.
         time: of rows; times: instants of each run [s].
         on_lines: fields that go on straight lines from row to row: their mean over the step from each instant on.
     """
@@ -752,7 +766,7 @@ def _in_time(
             for rows, t in zip(each, times, strict=True)
         ]
     )
-    conditions = jax.tree.map(lambda x: x[first], of_rows)
+    conditions = jax.tree.map(lambda x: x[np.array([rows[0] for rows in each])], of_rows)
     for name in CHANGING:
         x = getattr(of_rows, name)
         if x is not None and any(np.ptp(np.asarray(x)[rows]) > 0 for rows in each):
@@ -887,33 +901,49 @@ def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) ->
     return bool(np.any(np.abs(after - before) > STILL * np.abs(before + after) / 2))
 
 
-def _longest(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[np.ndarray]:
+def _in_order(runs: Runs, name: str) -> np.ndarray:
+    """Rows of a run in the order of time."""
+    rows = np.flatnonzero(runs.run_names == name)
+    return rows[np.argsort(runs["time_s"][rows], kind="stable")]
+
+
+def _differs(runs: Runs, rows: np.ndarray) -> np.ndarray:
+    """Whether a condition at a row of a run is another than at the row before it."""
+    some = [runs[c][rows][1:] != runs[c][rows][:-1] for c in changing(runs)]
+    return np.append(False, np.any(some, 0))
+
+
+def _longest(runs: Runs, each: list[np.ndarray], rig: Rig, usual: list[float]) -> list[np.ndarray]:
     """Longest step after each row of each run but its last [s].
 
     Where the speed is imposed only what effects remember is followed. Where what drives a run changes its sign,
-    friction jumps as the speed passes through zero, within a step, which has to be short beside the time from sample
-    to sample: where the table's speeds are low or change their sign, and as much earlier as the rig's delay may be.
+    friction jumps as the speed passes through zero, within a step, which has to be short beside the time from reading
+    to reading: where the table's speeds are low or change their sign, and as much earlier as the rig's delay may be.
     Where it shows no speed, and where a current is imposed, after which speeds bend more sharply, all along.
 
     Args:
-        each: rows of each run in the order of time.
+        each: rows of each run in the order of time; usual: time between the readings of each that are used [s].
     """
     exact = rig.imposed == "motor_speed"
     speeds = runs.measured()[:, [c.zero_at_rest and c.directed and c.settled for c in runs.channels]]
     driven = None if exact else applied(runs)
     early, found = DELAYED * np.max(np.asarray(rig.delay)) + EARLIER, []
-    for rows in each:
+    for rows, wait in zip(each, usual, strict=True):
         apart = np.diff(runs["time_s"][rows])
-        usual = float(np.median(apart)) if len(apart) else np.inf
+        row = float(np.median(apart)) if len(apart) else np.inf
+        both_ways = driven is not None and driven[rows].min() < 0 < driven[rows].max()
+        longest = np.full(len(apart), (FAST if both_ways else 1) * LONGEST)
         if driven is None:
-            longest = np.full(len(apart), min(SLOWLY * LONGEST, usual / COARSELY))
-        elif driven[rows].min() < 0 < driven[rows].max():
+            longest[:] = min(SLOWLY * LONGEST, wait / COARSELY)
+        elif wait > row * SPARSE:
+            time, differs = runs["time_s"][rows], _differs(runs, rows)
+            since = time - time[np.maximum.accumulate(np.where(differs, np.arange(len(rows)), 0))]
+            longest = np.maximum(longest, np.minimum(LATER * since[:-1], wait / BETWEEN))
+        if both_ways:
             slow = _slow(speeds[rows]) | (rig.imposed != "voltage")
-            before = int(np.ceil(early / usual))
+            before = int(np.ceil(early / row))
             slow = np.convolve(slow, np.ones(before + 1))[before:] > 0
-            longest = np.where(slow, min(LONGEST, usual / FINE), FAST * LONGEST)
-        else:
-            longest = np.full(len(apart), LONGEST)
+            longest[slow] = min(LONGEST, wait / FINE)
         found.append(longest)
     return found
 

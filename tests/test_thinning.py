@@ -1,0 +1,115 @@
+"""Logs with many rows: readings of some of them are used, and what drives the runs in all of them."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from calibration.data.runs import Runs
+from calibration.data.thinning import FIRST, thinned
+from calibration.inference.noise import inferred
+from calibration.inference.notes import Thinned
+from calibration.inference.observers import Histories
+from calibration.words.notes import sentence
+from mmrjax import robots
+
+EVERY, ROWS = 0.01, 300
+
+
+def log(runs=2, rows=ROWS, voltage=None):
+    """Runs of a robot, the rows of all in one random order, with readings that are numbers of their rows."""
+    rng = np.random.default_rng(3)
+    time = np.tile(EVERY * np.arange(rows), runs)
+    stairs = np.repeat(rng.uniform(10.0, 30.0, -(-rows // 37)), 37)[:rows]
+    mixed = rng.permutation(rows * runs)
+    columns = {
+        "run_id": np.repeat([f"run{k}" for k in range(runs)], rows),
+        "time_s": time,
+        "configuration": np.full(rows * runs, "6T2A"),
+        "supply_voltage_V": np.tile(stairs if voltage is None else voltage, runs),
+        "slope_deg": np.zeros(rows * runs),
+        "payload_kg": np.zeros(rows * runs),
+        "total_current_A": time,
+        "motor_speed_rpm": 100.0 * time,
+        "speed_mm_s": 10.0 * time,
+    }
+    return Runs("log.csv", {name: values[mixed] for name, values in columns.items()})
+
+
+def test_of_few_rows_all_are_read():
+    runs = log()
+    assert thinned(runs, len(runs)) is runs
+    settled = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "time_s"})
+    assert thinned(settled, 10) is settled
+
+
+def test_rows_are_taken_evenly_of_each_run():
+    runs = log()
+    some = thinned(runs, 100)
+    assert some.log is runs and some.whole is runs and runs.whole is runs
+    for name in ("run0", "run1"):
+        time = np.sort(some["time_s"][some.run_names == name])
+        np.testing.assert_allclose(time[:FIRST], EVERY * np.arange(FIRST), atol=1e-12)
+        np.testing.assert_allclose(time[FIRST:-1], EVERY * np.arange(6, ROWS - 1, 6), atol=1e-12)
+        assert time[-1] == pytest.approx(EVERY * (ROWS - 1))
+    np.testing.assert_array_equal(some["total_current_A"], some["time_s"])
+
+
+def test_channels_that_are_read_by_turns_are_all_kept():
+    """A speed at every third row, a current at the rows after: steps of six rows would meet one of them alone."""
+    runs = log(1)
+    row = np.round(runs["time_s"] / EVERY).astype(int)
+    columns = dict(runs.columns)
+    columns["motor_speed_rpm"] = np.where(row % 3 == 0, columns["motor_speed_rpm"], np.nan)
+    columns["total_current_A"] = np.where(row % 3 == 1, columns["total_current_A"], np.nan)
+    columns["speed_mm_s"] = np.full(len(row), np.nan)
+    some = thinned(dataclasses.replace(runs, columns=columns), 50)
+    read = np.isfinite(some.measured()).sum(0)
+    assert abs(read[0] - read[1]) <= 2 and read[:2].min() >= len(some) // 2 - FIRST and read[2] == 0
+
+
+DRIVES = {"a staircase": None, "a noisy voltage": 20.0 + np.random.default_rng(5).standard_normal(ROWS)}
+
+
+def held(observed, at):
+    """The voltage that acts at instants of the one run."""
+    times = np.asarray(observed.times[0])
+    return np.asarray(observed.conditions.voltage[0])[np.searchsorted(times, at, side="right") - 1]
+
+
+@pytest.mark.parametrize("drive", DRIVES)
+def test_what_drives_a_run_is_that_of_the_log(drive):
+    whole = log(1, voltage=DRIVES[drive])
+    some = thinned(whole, 40)
+    every, few, alone = (
+        Histories.of(x, robots.nominal()) for x in (whole, some, dataclasses.replace(some, log=None))
+    )
+    between = EVERY * (np.arange(ROWS - 1) + 0.5)
+    np.testing.assert_array_equal(held(few, between), held(every, between))
+    assert (held(alone, between) != held(every, between)).mean() > 0.05
+    steps = [int((np.diff(np.asarray(o.times)) > 0).sum()) for o in (every, few)]
+    assert steps[1] < (0.7 if drive == "a staircase" else 1.01) * steps[0] and len(few.run) == len(some) < 50
+    np.testing.assert_allclose(few.time, some["time_s"], atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("drive", DRIVES)
+def test_a_run_shows_what_it_shows_in_the_whole_log(drive):
+    """Its readings are those of the whole log at the same rows, to what its longer steps make."""
+    whole, robot = log(1, voltage=DRIVES[drive]), robots.nominal()
+    some = thinned(whole, 40)
+    shown = [np.asarray(jax.jit(lambda o: o(robot).reading)(Histories.of(x, robot))) for x in (whole, some)]
+    at = [int(np.flatnonzero(whole["time_s"] == t)[0]) for t in some["time_s"]]
+    off = np.abs(shown[1] - shown[0][at]) / np.abs(shown[0]).max(0)
+    assert off.max() < 2e-3
+
+
+def test_that_a_log_is_thinned_is_said():
+    runs = log()
+    some = thinned(runs, 100)
+    said = [
+        n for x in (some, runs) for n in Histories.check(x, inferred(x, Histories.sizes(x))) if type(n) is Thinned
+    ]
+    assert said == [Thinned("log.csv", len(runs), len(some))]
+    assert f"{len(some)} of {len(runs)} rows" in sentence(said[0])
