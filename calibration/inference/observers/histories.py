@@ -237,8 +237,7 @@ class Histories(Observer):
             np.isin(whole["time_s"][rows], t) | exact | linear | _differs(whole, rows)
             for rows, t in zip(every, given, strict=True)
         ]
-        usual = [float(np.median(np.diff(t))) if len(t) > 1 else np.inf for t in given]
-        steps = _longest(whole, every, robot.rig, usual)
+        steps = _longest(whole, every, robot.rig, _usual(runs))
         steps = [np.minimum.reduceat(h, np.flatnonzero(n)[:-1]) for h, n in zip(steps, noted, strict=True)]
         grids = [
             grid(whole["time_s"][rows[n]], c, h, SOON if exact else GROWTH)
@@ -327,10 +326,12 @@ class Histories(Observer):
                         'without time_s; a rig\'s file may say start = "measured" or "free"'
                     )
         said: list[Note | str] = []
-        step = runs["time_s"].max() / STEPS
-        if step > 2 * LONGEST:
-            said.append(CoarseSteps(float(runs["time_s"].max()), float(step)))
         each = [_in_order(runs.whole, name) for name in np.unique(names)]
+        step = runs["time_s"].max() / STEPS
+        if robot.rig.imposed != "motor_speed":
+            step = max(step, *(h.max(initial=0.0) for h in _longest(runs.whole, each, robot.rig, _usual(runs))))
+        if step > FAST * LONGEST:
+            said.append(CoarseSteps(float(runs["time_s"].max()), float(step)))
         changes = max(len(c) for c in _changes(runs.whole, each, robot.rig)) + 1
         if growth(float(runs["time_s"].max()), changes) > COARSE * GROWTH:
             said.append(ManyChanges(changes - 1))
@@ -905,6 +906,12 @@ def _in_order(runs: Runs, name: str) -> np.ndarray:
     """Rows of a run in the order of time."""
     rows = np.flatnonzero(runs.run_names == name)
     return rows[np.argsort(runs["time_s"][rows], kind="stable")]
+
+
+def _usual(runs: Runs) -> list[float]:
+    """The usual time from row to row of each run, in the order of their names [s]."""
+    times = [runs["time_s"][_in_order(runs, name)] for name in np.unique(runs.run_names)]
+    return [float(np.median(np.diff(t))) if len(t) > 1 else np.inf for t in times]
 
 
 def _differs(runs: Runs, rows: np.ndarray) -> np.ndarray:
