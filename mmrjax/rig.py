@@ -23,6 +23,15 @@ IMPOSED = ("voltage", "motor_speed", "motor_current")
 BETWEEN = ("held", "linear")
 
 
+def on_line(first: Array, second: Array, share: Array) -> Array:
+    """Values a share of the way from first ones to second ones, shape (*share.shape, ...).
+
+    An instant itself takes nothing of the one after it, which may be no number.
+    """
+    share = jnp.reshape(share, (*jnp.shape(share), *[1] * (first.ndim - jnp.ndim(share))))
+    return first + share * (jnp.where((share < 1e-9) & jnp.isnan(second), first, second) - first)
+
+
 @dataclasses.dataclass(frozen=True)
 class Instrument:
     """What is known of the instrument of a channel.
@@ -152,16 +161,18 @@ class Rig(eqx.Module):
             The values at `at` - delay, of that shape first: on the straight line between the instants about it, held
             before the first and after the last.
         """
+        k, share = self.before(times, at)
+        if not jnp.issubdtype(values.dtype, jnp.inexact):
+            return values[k]
+        return on_line(values[k], values[k + 1], share)
+
+    def before(self, times: Float[Array, " times"], at: Scalar | Float[Array, "..."]) -> tuple[Array, Array]:
+        """Which of `times` is the last before what happens at `at`, as in `late`, and how far on the way to the next
+        one that is [-]."""
         wanted = at - self.delay
         k = jnp.clip(jnp.searchsorted(times, wanted, side="right") - 1, 0, times.shape[0] - 2)
         gap = times[k + 1] - times[k]
-        share = jnp.clip(jnp.where(gap > 0, (wanted - times[k]) / jnp.where(gap > 0, gap, 1.0), 0.0), 0.0, 1.0)
-        if not jnp.issubdtype(values.dtype, jnp.inexact):
-            return values[k]
-        share = jnp.reshape(share, (*jnp.shape(share), *[1] * (values.ndim - 1)))
-        # An instant itself takes nothing of the one after it, which may be no number.
-        after = jnp.where((share < 1e-9) & jnp.isnan(values[k + 1]), values[k], values[k + 1])
-        return values[k] + share * (after - values[k])
+        return k, jnp.clip(jnp.where(gap > 0, (wanted - times[k]) / jnp.where(gap > 0, gap, 1.0), 0.0), 0.0, 1.0)
 
     def clock(self, times: Float[Array, " times"]) -> Array:
         """Instants of the tables' clock [s] at which a run is shown that is known at `times` since what is imposed

@@ -83,6 +83,7 @@ SAMPLES = [
     ),
     (
         of_fit.CoarseSteps(90.0, 0.03),
+        of_fit.Thinned("log.csv", 25000, 3600),
         "runs of 90 s are followed in steps of 30 ms: waves of a shaft faster than some ten steps are not resolved; cut "
         "the runs to look for them",
     ),

@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.drive import GROUND, MOTOR, moving, rates, start, state_of, units
@@ -344,9 +344,10 @@ def histories(
     conditions: Conditions,
     times: Float[Array, " times"],
     known: Followed | None = None,
+    at: Int[Array, " places"] | None = None,
 ) -> Signals:
-    """Signals of one run from standstill (or as `Rig.begins` says) at every instant of a grid; fields have shape
-    (times,).
+    """Signals of one run from standstill (or as `Rig.begins` says) at instants of a grid; fields have shape (times,),
+    or (places,).
 
     Args:
         robot: its parameters may be tracers; derivatives by them, and by nothing else, are forward and exact
@@ -355,6 +356,7 @@ def histories(
             next, and is what the signals of that instant are computed with.
         times: from 0 on, as by `grid` [s]; repeated instants are steps of no length.
         known: the run, from `followed`, where it is known.
+        at: indices of the instants that are wanted; None: every one.
 
     A run that could not be followed is not finite from there on. Friction at rest is smooth: a robot that should
     stand creeps where gravity pulls, below a tenth of V_s.
@@ -363,4 +365,6 @@ def histories(
     found = states(jax.lax.stop_gradient(robot), conditions, times) if known is None else known.states
     nodes = _ends(robot, conditions, times, found, known)
     ys = jnp.concatenate([at_first(robot, conditions)[1][None], nodes])
+    if at is not None:
+        ys, changing = jax.tree.map(lambda x: x[at], (ys, changing))
     return jax.vmap(lambda y, now: moving(robot, eqx.combine(now, constant), state_of(robot, y)))(ys, changing)

@@ -69,7 +69,7 @@ from mmrjax.fidelities.histories import (
     respond,
 )
 from mmrjax.params import Scalar
-from mmrjax.rig import Begin, Begins, Rig
+from mmrjax.rig import Begin, Begins, Rig, on_line
 from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED, FAILED, Signals, State
 
@@ -419,7 +419,9 @@ class Histories(Observer):
         instants = self.instant[jnp.where(self.rows_of < 0, 0, self.rows_of)]
         known = self.following(robot).known
         assert known is not None
-        return jnp.moveaxis(jax.vmap(one)(self.conditions, clock, instants, known), 0, 1)
+        # One run after another: each is wide by its knots, and large.
+        found = jax.lax.map(lambda of_run: one(*of_run), (self.conditions, clock, instants, known))
+        return jnp.moveaxis(found, 0, 1)
 
     def following(self, robot: Robot) -> Histories:
         """The same for a robot whose runs are then known."""
@@ -507,12 +509,23 @@ class Histories(Observer):
         return True  # they begin at rest
 
     def __call__(self, robot: Robot) -> Observation:
-        whole = self.whole(robot)
-        if self.delayed:
-            every = jax.vmap(jax.vmap(lambda s: _readings(robot, s)))(whole)
-            reading = self.late(every, robot.rig)
-        else:
-            reading = jax.vmap(lambda s: _readings(robot, s))(self.at_rows(whole))
+        def of_run(
+            conditions: Conditions, times: Array, known: Followed | None, instants: Array, time: Array
+        ) -> Array:
+            """Readings of a run's rows."""
+
+            def shown(at: Array) -> Array:
+                return jax.vmap(lambda s: _readings(robot, s))(histories(robot, conditions, times, known, at))
+
+            if not self.delayed:
+                return shown(instants)
+            before, share = robot.rig.before(times, time)
+            both = shown(jnp.concatenate([before, before + 1]))
+            return on_line(*jnp.split(both, 2), share)
+
+        places = self.instant[self.rows_of], self.time[self.rows_of]
+        of_runs = jax.vmap(of_run)(self.conditions, self.times, self.known, *places)
+        reading = _by_row(of_runs, self.rows_of, len(self.run))
         followed = jnp.all(jnp.isfinite(reading), 1)
         status = jnp.where(followed, CONVERGED, FAILED)
         return Observation(reading, jnp.zeros(self.run.shape), status, jnp.zeros_like(status))
