@@ -77,13 +77,17 @@ SAMPLES = [
         "its priors; record until the speed is steady",
     ),
     (
+        of_fit.Thinned("log.csv", 25000, 3600),
+        "log.csv: readings of 3600 of 25000 rows are used, evenly in time, and what drives the runs in all of them; "
+        "--rows uses more or fewer, and settle uses all",
+    ),
+    (
         of_fit.NeverGrips(("a",), 0.31),
         "run a never grips: in the end the robot travels at 31% of the speed of its movers, so what the ground holds "
         "before it slides is not measured there",
     ),
     (
         of_fit.CoarseSteps(90.0, 0.03),
-        of_fit.Thinned("log.csv", 25000, 3600),
         "runs of 90 s are followed in steps of 30 ms: waves of a shaft faster than some ten steps are not resolved; cut "
         "the runs to look for them",
     ),
