@@ -111,10 +111,12 @@ class Basis(eqx.Module):
         return dataclasses.replace(self, variables=())
 
     def signatures(self, linear: Linearization) -> Float[Array, "families readings terms"]:
-        """Change of the whitened readings by every family's columns."""
+        """Change of the whitened readings by every family's columns, one after the other: of histories each takes a
+        copy of a balance's defects."""
         of_channels = in_readings(self.places[0])
         known, change = (linear.channels, linear.shown) if of_channels else (linear.probed, linear.columns)
-        return jax.vmap(change)(jnp.asarray([known.index(place) for place in self.places]), self.columns)
+        places = jnp.asarray([known.index(place) for place in self.places])
+        return jax.lax.map(lambda family: change(*family), (places, self.columns))
 
 
 Bases = tuple[Basis, ...]

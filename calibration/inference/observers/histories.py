@@ -521,7 +521,7 @@ class Histories(Observer):
                 return shown(instants)
             before, share = robot.rig.before(times, time)
             both = shown(jnp.concatenate([before, before + 1]))
-            return on_line(*jnp.split(both, 2), share)
+            return on_line(both[: len(time)], both[len(time) :], share)
 
         places = self.instant[self.rows_of], self.time[self.rows_of]
         of_runs = jax.vmap(of_run)(self.conditions, self.times, self.known, *places)
