@@ -69,7 +69,11 @@ def test_channels_that_are_read_by_turns_are_all_kept():
     assert abs(read[0] - read[1]) <= 2 and read[:2].min() >= len(some) // 2 - FIRST and read[2] == 0
 
 
-DRIVES = {"a staircase": None, "a noisy voltage": 20.0 + np.random.default_rng(5).standard_normal(ROWS)}
+DRIVES = {
+    "a staircase": None,
+    "a noisy voltage": 20.0 + np.random.default_rng(5).standard_normal(ROWS),
+    "a slow ramp": np.linspace(15.0, 20.0, ROWS),
+}
 
 
 def held(observed, at):
@@ -87,6 +91,8 @@ def test_what_drives_a_run_is_that_of_the_log(drive):
     )
     between = EVERY * (np.arange(ROWS - 1) + 0.5)
     np.testing.assert_array_equal(held(few, between), held(every, between))
+    done = [float(np.asarray(o.conditions.voltage[0])[:-1] @ np.diff(np.asarray(o.times[0]))) for o in (every, few)]
+    assert done[1] == pytest.approx(done[0], rel=1e-12)
     assert (held(alone, between) != held(every, between)).mean() > 0.05
     steps = [int((np.diff(np.asarray(o.times)) > 0).sum()) for o in (every, few)]
     assert steps[1] < (0.7 if drive == "a staircase" else 1.01) * steps[0] and len(few.run) == len(some) < 50
