@@ -533,7 +533,7 @@ def search_long(
 Evaluate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, Observation]]
 
 
-@functools.partial(jax.jit, static_argnames=("held_from", "held_to"))
+@functools.partial(compiled, options=SELDOM)
 def _steps(
     at: Progress, found: tuple[Array, Array, Any], data: Data, weights: Array, held_from: int, held_to: int
 ) -> tuple[Progress, Optimum]:
