@@ -228,7 +228,9 @@ def test_a_wave_is_of_the_runs_that_pass_two_of_it_wherever_they_end():
     angle, rows, found = waves_of(7.0)
     wave = found["order 2 of the driving shaft"]
     for k, mine in enumerate(rows):
-        np.testing.assert_allclose(wave[mine, 2 * k : 2 * k + 2].T, [np.cos(2 * angle[mine]), np.sin(2 * angle[mine])])
+        np.testing.assert_allclose(
+            wave[mine, 2 * k : 2 * k + 2].T, [np.cos(2 * angle[mine]), np.sin(2 * angle[mine])]
+        )
         assert not np.delete(wave[mine], [2 * k, 2 * k + 1], 1).any()
 
 

@@ -134,7 +134,9 @@ class Turning(SettledLinearization):
 
 
 @pytest.mark.parametrize(
-    ("law", "named"), [(lambda a: np.ones_like(a), True), (lambda a: np.sin(2 * a + 0.5), False)], ids=["same", "wave"]
+    ("law", "named"),
+    [(lambda a: np.ones_like(a), True), (lambda a: np.sin(2 * a + 0.5), False)],
+    ids=["same", "wave"],
 )
 def test_a_constant_is_weighed_against_waves_of_which_runs_show_a_piece(law, named):
     """Runs that come back before a quarter turn: over these an order of the shaft is a constant and some more."""
