@@ -203,3 +203,47 @@ def test_families_that_fill_up_repeat_others():
             for j in same:
                 np.testing.assert_array_equal(columns[j], columns[k])
     assert len(set(names(found))) < len(names(found))
+
+
+# --- waves of a shaft -----------------------------------------------------------------------------------
+
+
+def back_and_forth(turn, runs=3, samples=100):
+    """Angles of runs that go ahead and come back, each somewhat further, and the rows of each."""
+    rows = np.arange(runs * samples).reshape(runs, samples)
+    way = np.sin(np.linspace(0.0, np.pi, samples))
+    return np.concatenate([turn * (1 + 0.1 * k) * way for k in range(runs)]), rows
+
+
+def waves_of(turn):
+    """Order of the shaft → columns of its wave in one balance, of runs that turn so far [rad] and come back."""
+    angle, rows = back_and_forth(turn)
+    (basis,) = bases.waves(np.zeros(angle.size, bool), angle, rows, rows)
+    every = {n: np.asarray(c) for n, c in zip(basis.names, basis.columns, strict=True)}
+    return angle, rows, {v: c for (place, v), c in every.items() if place == "track"}
+
+
+def test_a_wave_is_of_the_runs_that_pass_two_of_it_wherever_they_end():
+    """Runs that come back end where they began; each has a phase of its own, in columns of its own."""
+    angle, rows, found = waves_of(7.0)
+    wave = found["order 2 of the driving shaft"]
+    for k, mine in enumerate(rows):
+        np.testing.assert_allclose(
+            wave[mine, 2 * k : 2 * k + 2].T, [np.cos(2 * angle[mine]), np.sin(2 * angle[mine])]
+        )
+        assert not np.delete(wave[mine], [2 * k, 2 * k + 1], 1).any()
+
+
+def test_pieces_of_a_wave_have_one_phase_in_all_runs():
+    """A piece with a phase of its own is any level and trend of a run; no name is held against what can be anything."""
+    angle, _, found = waves_of(1.2)
+    assert set(found) == {f"order {k} of the driving shaft" for k in (1, 2, 3)}
+    for k in (1, 2, 3):
+        wave = found[f"order {k} of the driving shaft"]
+        np.testing.assert_allclose(wave[:, :2].T, [np.cos(k * angle), np.sin(k * angle)])
+        assert not wave[:, 2:].any()
+
+
+def test_a_shaft_that_stands_has_no_waves():
+    angle, rows = back_and_forth(0.0)
+    assert bases.waves(np.zeros(angle.size, bool), angle, rows, rows) == ()

@@ -125,6 +125,63 @@ def test_a_wave_is_weighed_as_curves_are_and_said_where_it_is_the_better_one(toy
     assert (where.place, where.variable) == ("track", order)
 
 
+class Turning(SettledLinearization):
+    """Rows at which a shaft has turned by `signals.angle`."""
+
+    def variable(self, name):
+        orders = {word: order for word, (order, _) in bases.ORDERS.items()}
+        return orders[name] * self.signals.angle if name in orders else super().variable(name)
+
+
+@pytest.mark.parametrize(
+    ("law", "named"),
+    [(lambda a: np.ones_like(a), True), (lambda a: np.sin(2 * a + 0.5), False)],
+    ids=["same", "wave"],
+)
+def test_a_constant_is_weighed_against_waves_of_which_runs_show_a_piece(law, named):
+    """Runs that come back before a quarter turn: over these an order of the shaft is a constant and some more."""
+    rng, samples, p = np.random.default_rng(5), 60, 2
+    t = np.linspace(0.0, 1.0, samples)
+    angle = np.concatenate([(0.6 + 0.4 * k) * np.sin(np.pi * t) ** 2 for k in range(3)])
+    speed = np.concatenate([(0.6 + 0.4 * k) * np.pi * np.sin(2 * np.pi * t) for k in range(3)])
+    rows, n = np.arange(3 * samples).reshape(3, samples), 3 * samples
+    waves = bases.waves(np.zeros(n, bool), angle, rows, rows)
+    only = np.array([1.0, 0.0, 0.0])
+    defects = np.zeros((len(PROBED), n, 3))
+    defects[PROBED.index("track")] = only
+    slopes = (np.stack([np.tanh(speed), speed], 1)[:, None] * only[:, None]).reshape(3 * n, p)
+    constant = np.outer(np.ones(n), only).ravel()
+    readings = np.outer(1.5 * law(angle) + rng.standard_normal(n), only).ravel()
+
+    def fit(a):
+        long = np.concatenate([a, np.eye(a.shape[1])])
+        e = np.append(readings, np.zeros(a.shape[1]))
+        z = -np.linalg.lstsq(long, e, rcond=None)[0]
+        return z, 0.5 * float(np.sum((e + long @ z) ** 2)), np.linalg.inv(long.T @ long)
+
+    z, cost, _ = fit(slopes)
+    whole, least, posterior = fit(np.concatenate([slopes, constant[:, None]], 1))
+    residual = np.concatenate([readings + slopes @ z, np.zeros(n), z])
+    jacobian = np.concatenate([slopes, np.zeros((n, p)), np.eye(p)])
+    signals = SimpleNamespace(speed_motor=speed, direction=np.tanh(speed), angle=angle)
+    arrays = (jnp.asarray(x) for x in (residual, jacobian, np.zeros((3 * n, 1)), defects, np.ones((n, 3))))
+    linear = Turning(*arrays, signals, channels=channels.USUAL)
+    without = dataclasses.replace(names_of(np.eye(0), p), cost=cost)
+    best = dataclasses.replace(names_of(posterior[p:, p:], p), cost=least, z=np.append(whole, np.zeros(7)))
+    assert 2 * (cost - least) > 20.0  # the constant explains much either way
+
+    class Library(tuple):
+        names = property(lambda self: list(self))
+
+        def __getitem__(self, name):
+            return SimpleNamespace(channel="", balance="track")
+
+    space = SimpleNamespace(free=p, library=Library(["e0"]), included=np.ones(n, bool))
+    offered = (*waves, SimpleNamespace(names=(("track", "speed_motor"),)))
+    found = _evidence_over_curves(space, best, without, "e0", linear, offered, SimpleNamespace(slots=4))
+    assert NameTest("e0", 9.0, 3.3, (), found).stands == named
+
+
 def test_evidence_of_a_surface_is_the_largest_marginal_likelihood(toy):
     found = surface(toy.linear, "track", ("speed_motor", "slope"), toy.counts, Projection(toy.linear))
     assert found.evidence == pytest.approx(gained(toy, found.columns), rel=1e-6)

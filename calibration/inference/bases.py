@@ -384,7 +384,9 @@ def waves(
 ) -> Bases:
     """Waves of the orders that the samples of histories resolve, in every balance.
 
-    A wave has its own amplitude and phase in each run: how the parts stood at its start is not known.
+    A wave has its own amplitude and phase in each run that holds two of it: how the parts stood at its start is not
+    known. Where none does, a run shows a piece of a wave, and pieces of a phase each are any level and trend of
+    each run; then they are of one amplitude and phase, as if all runs began at a mark.
 
     Args:
         on_tracks: whether each row's run is on tracks; angle: of the driving shaft [rad]; shape (rows,).
@@ -394,18 +396,21 @@ def waves(
     """
     bases, words = [], []
     for word, (order, belted) in ORDERS.items():
-        wave = np.zeros((len(angle), 2 * len(rows)))
+        wave, pieces = np.zeros((2, len(angle), 2 * len(rows)))
         for k, row in enumerate(rows):
             mine = row[row >= 0]
             if len(mine) < 8 or (belted and not on_tracks[mine[0]]):
                 continue
             turned = order * angle[mine]
-            step = np.diff(order * angle[knots[k]])
-            if turned[-1] - turned[0] < 4 * np.pi or np.median(step[step > 0]) > RESOLVED:
+            step = np.abs(np.diff(order * angle[knots[k]]))
+            if not step.any() or np.median(step[step > 0]) > RESOLVED:
                 continue
-            wave[mine, 2 * k], wave[mine, 2 * k + 1] = np.cos(turned), np.sin(turned)
-        if wave.any():
-            bases.append(wave)
+            shape = np.stack([np.cos(turned), np.sin(turned)], 1)
+            pieces[mine, :2] = shape
+            if np.ptp(turned) >= 4 * np.pi:
+                wave[mine, 2 * k : 2 * k + 2] = shape
+        if pieces.any():
+            bases.append(wave if wave.any() else pieces)
             words.append(word)
     if not words:
         return ()

@@ -585,6 +585,7 @@ def searches_long(
         if len(fresh):
             begun = jax.device_get(jax.vmap(begin_at)(jnp.asarray(ahead), jax.tree.map(np.zeros_like, found)))
             at = begun if at is None else jax.tree.map(lambda old, new: _put(old, fresh, new[fresh]), at, begun)  # noqa: B023
+        assert at is not None  # the first searches are fresh
         at, ends = jax.device_get(_steps(at, found, data, weights[mine.member], held.start, held.stop))
         ahead, seen = at.ahead, at.found[2]
         small = 0.1 * (DECREMENT + DECREMENT_SHARE * ends.cost)
