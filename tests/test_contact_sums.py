@@ -180,7 +180,9 @@ def forward():
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(contact_sums, "linearize", scaled)
-            return tuple(eqx.filter_jvp(lambda *a, s=s: _stepped(*a, s), at, moved)[1] for s in (advance, _as_computed))
+            return tuple(
+                eqx.filter_jvp(lambda *a, s=s: _stepped(*a, s), at, moved)[1] for s in (advance, _as_computed)
+            )
 
     return lambda at, moved, factor=1.0: both(at, moved, jnp.asarray(factor))
 
