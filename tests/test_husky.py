@@ -70,7 +70,7 @@ def test_base_of_the_loop_fits_currents_as_calibrate_does(robot, runs):
 @pytest.mark.slow
 def test_third_of_the_table_has_the_effective_width_of_its_wheels(robot, runs):
     """The difference of the wheels' speeds over the yaw rate is 0.75 to 0.85 m."""
-    found = calibrate(runs.where(np.arange(len(runs)) % 3 == 0), robot, starts=1, profiles=False, blocks=())
+    found = calibrate(runs.where(np.arange(len(runs)) % 3 == 0), robot, starts=1, blocks=())
     ratio = next(p for name, p in found.parameters.items() if name.endswith("turning.lateral"))
     width, length = 0.555, 0.512
     assert found.converged and not ratio.held_by_prior

@@ -116,7 +116,7 @@ def test_histories_of_turns_are_refused(robot, of_world, tmp_path):
 
 @pytest.mark.slow
 def test_truth_of_a_second_implementation_is_found(robot, of_world):
-    found = calibrate(of_world, robot, noise=NOISE, profiles=False)
+    found = calibrate(of_world, robot, noise=NOISE)
     assert found.converged and found.adequacy.p_value > 0.01
     for name, true in TRUE.items():
         estimate = found.parameters[f"6T2A.{name}"]

@@ -158,8 +158,7 @@ def test_sides_that_are_not_alike_are_found(tmp_path):
     mass = float(robot.configurations["6T2A"].mass)
     table = written(tmp_path / "turns.csv", "6T2A", mass, {name: seen[name] for name in SHOWN})
     free = [f"effects.{name}.amplitude" for name in ("side_friction", "side_torque")] + ["6T2A.turning.lateral"]
-    runs = records.read(table, robot=robot)
-    found = calibrate(runs, robot, free=free, noise=NOISE, starts=1, profiles=False, blocks=())
+    found = calibrate(records.read(table, robot=robot), robot, free=free, noise=NOISE, starts=1, blocks=())
     friction, torque = (found.parameters[name] for name in free[:2])
     assert abs(friction.value - 0.0025) < 3 * friction.sd < 0.001
     assert abs(torque.value) < 3 * torque.sd

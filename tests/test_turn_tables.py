@@ -251,8 +251,7 @@ def test_width_or_ratio_of_a_kinematic_robot_is_calibrated(rig, table):
     ]
     runs = table(f"{SPEEDS},{READ}", *zip(*np.array(speeds).T, *noisy, strict=True), robot=robot)
     noise = "motor_current_left=0.05A,motor_current_right=0.05A,yaw_rate=0.005rad/s"
-    free = ["rover.turning.lateral", "rover.ground.friction.static"]
-    found = calibrate(runs, robot, free=free, noise=noise, profiles=False)
+    found = calibrate(runs, robot, free=["rover.turning.lateral", "rover.ground.friction.static"], noise=noise)
     ratio = found.parameters["rover.turning.lateral"]
     assert found.converged and abs(ratio.value - 0.9) < 3 * ratio.sd < 0.1
     assert found.held_out["turn"].errors["yaw_rate"].rms_sigma < 3
