@@ -69,6 +69,19 @@ class Program:
         return jax.tree.map(lambda x: next(found) if isinstance(x, _Place) else x, self.result)
 
 
+def compile_by(lowered: Any, options: dict[str, Any]) -> Any:
+    """Compile by those of these options of XLA that this version of it has.
+
+    Args:
+        lowered: what `jax.jit(function).lower` gave.
+    """
+    try:
+        return lowered.compile(options)
+    except jax.errors.JaxRuntimeError as error:
+        known = {k: v for k, v in options.items() if f"No such compile option: '{k}'" not in str(error)}
+        return compile_by(lowered, known) if len(known) < len(options) else lowered.compile()
+
+
 class Programs:
     """The programs of a function by the structure of its arguments: those of this process, and those on disk."""
 
@@ -123,10 +136,7 @@ class Programs:
         executable = _loaded(folder, compiled, len(arrays), result)
         if executable is None:
             with _read_from_cache() as read:
-                try:
-                    executable = lowered.compile(self.options)
-                except jax.errors.JaxRuntimeError:  # another XLA may not have these options
-                    executable = lowered.compile()
+                executable = compile_by(lowered, self.options)
             # One that JAX has read from its cache lacks functions when it is written again (XLA on a CPU), and one
             # that calls back into Python holds addresses of this process.
             if read or "callback" in text:

@@ -13,6 +13,7 @@ import importlib.metadata
 import os
 import platform
 import re
+import stat
 import warnings
 from pathlib import Path
 
@@ -104,7 +105,8 @@ def _entries(folder: Path) -> list[tuple[float, int, Path]]:
             state = path.stat()
         except OSError:  # dropped by another process meanwhile
             continue
-        found.append((state.st_mtime, state.st_size, path))
+        if stat.S_ISREG(state.st_mode):  # XLA has a folder of its own there, with a GPU
+            found.append((state.st_mtime, state.st_size, path))
     return found
 
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import pytest
 
 from sweeps import compilation_cache
@@ -71,7 +72,7 @@ def test_second_process_compiles_nothing_and_answers_the_same(first):
 
 @pytest.mark.slow
 def test_count_of_compilations_can_fail(first):
-    """Another program is compiled and kept; one with a host callback never is."""
+    """Another program is compiled and kept; one with a host callback is so since JAX 0.11."""
     cache, began = first
     process(cache, "def plain(x): return 3.25 * x\nmore = lambda: jax.jit(plain)(1.5)")
     asked = (
@@ -81,7 +82,7 @@ def test_count_of_compilations_can_fail(first):
     assert again["read"] == began["kept"]
     names = [path.name for path in Path(began["folder"]).iterdir()]
     assert any(name.startswith("jit_plain") for name in names)
-    assert not any(name.startswith("jit_asking") for name in names)
+    assert any(name.startswith("jit_asking") for name in names) == (jax.__version_info__ >= (0, 11))
 
 
 @pytest.mark.slow
@@ -143,6 +144,8 @@ def test_oldest_entries_are_dropped(tmp_path, monkeypatch):
         entry.parent.mkdir(exist_ok=True)
         entry.write_bytes(bytes(10))
         os.utime(entry, (k, k))
+    (tmp_path / "xla-0" / "xla_gpu_per_fusion_autotune_cache_dir").mkdir()  # XLA's own, where there is a GPU
+    os.utime(tmp_path / "xla-0" / "xla_gpu_per_fusion_autotune_cache_dir", (0, 0))
     compilation_cache._prune(tmp_path)
     left = sorted(int(path.name.rpartition("-")[2]) for path in tmp_path.rglob("program-*"))
     assert left == [7, 8, 9, 10, 11]

@@ -168,13 +168,23 @@ def _equal(ours, theirs):
 
 @pytest.fixture(scope="module")
 def forward():
-    """Derivatives of a step along a direction: as differentiated, and of what it computes."""
+    """Derivatives of a step along a direction: as differentiated, what turns with the driving pulley by a factor, and
+    of what it computes."""
+    right, front = contact_sums.linearize, contact_sums.MOTION.index("front")
 
     @eqx.filter_jit
-    def both(at, moved):
-        return tuple(eqx.filter_jvp(lambda *a, s=s: _stepped(*a, s), at, moved)[1] for s in (advance, _as_computed))
+    def both(at, moved, factor):
+        def scaled(*arguments):
+            found = right(*arguments)
+            return dataclasses.replace(found, slopes=found.slopes.at[front].multiply(factor))
 
-    return both
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(contact_sums, "linearize", scaled)
+            return tuple(
+                eqx.filter_jvp(lambda *a, s=s: _stepped(*a, s), at, moved)[1] for s in (advance, _as_computed)
+            )
+
+    return lambda at, moved, factor=1.0: both(at, moved, jnp.asarray(factor))
 
 
 def _some(after, signals, guided):
@@ -259,17 +269,10 @@ def test_second_derivatives_are_those_of_what_is_computed(recessed):
 
 
 @pytest.mark.slow
-def test_a_wrong_slope_is_seen(eventful, forward, monkeypatch):
+def test_a_wrong_slope_is_seen(eventful, forward):
     """The comparison can fail: a thousandth more of what turns with the driving pulley."""
     run = jax.tree.map(lambda x: jnp.asarray(x, float), Conditions(**RUNS["tracked"]).resolved(eventful))
     at = (eventful, run, motion_of(eventful, run, 1), jnp.asarray(STEP))
-    moved, right = _changes(at, 1), contact_sums.linearize
-
-    def wrong(*arguments):
-        found = right(*arguments)
-        return dataclasses.replace(found, slopes=found.slopes.at[contact_sums.MOTION.index("front")].multiply(1.001))
-
-    monkeypatch.setattr(contact_sums, "linearize", wrong)
-    ours = eqx.filter_jit(lambda at: eqx.filter_jvp(lambda *a: _stepped(*a, advance), at, moved)[1])(at)
+    ours, theirs = forward(at, _changes(at, 1), 1.001)
     with pytest.raises(AssertionError):
-        _equal(ours, forward(at, moved)[1])
+        _equal(ours, theirs)

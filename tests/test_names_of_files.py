@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 import test_settle
+from test_resonance_command import SMALL, runs_of
 
 from calibration.data import columns
 from mmrjax import channels, derived, missions, outputs, requirements
@@ -456,9 +457,7 @@ OTHERS = {
     "reproduce": ("reproduce",),
     "loop": ("loop", "measured", "--replicates", "250", "--no-report"),
     "track": ("simulate", "--model", "track", "--duration", "0.5", "--voltage", "24", "--no-report"),
-    "resonance": (
-        "resonance", "--voltages", "16:32:2", "--payloads", "0", "--duration", "0.5", "--step", "0.0002", "--no-report",
-    ),
+    "resonance": (*SMALL, "--no-report"),
     "climb": ("climb", "--gap", "60", "--voltage", "24", "--duration", "2", "--time-step", "4e-4", "--no-report"),
     "battery": ("simulate", "--profile", "patrol", "--battery", "--no-report"),
     "turn": ("simulate", "--left", "24", "--right", "12", "--model", "drive", "--duration", "1", "--no-report"),
@@ -471,7 +470,10 @@ OTHERS = {
 def test_files_of_every_other_command_have_known_names(made, folder, name):
     (folder / "few.toml").write_text("speed_m_s = 0.3\nmass_kg = 30\n[envelope]\nslope_deg = [0, 5]\n")
     test_settle.bench(folder, test_settle.stairs())
-    sound(made(name, *OTHERS[name]))
+    with (
+        runs_of("waves") if name == "resonance" else contextlib.nullcontext()
+    ):  # in closed form: its files are the same
+        sound(made(name, *OTHERS[name]))
 
 
 @pytest.mark.slow

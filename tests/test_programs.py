@@ -143,6 +143,19 @@ def test_tracers_go_the_usual_way(folder):
     assert not list(folder.iterdir())
 
 
+def test_an_option_that_this_xla_does_not_have_is_left_out_alone():
+    seen = []
+
+    class Lowered:
+        def compile(self, options):
+            seen.append(options)
+            return jax.jit(lambda x: 2 * x).lower(1.0).compile(options)
+
+    options = {"xla_cpu_no_such_option": True, "xla_backend_optimization_level": 1}
+    assert programs.compile_by(Lowered(), options)(1.5) == 3.0
+    assert seen == [options, {"xla_backend_optimization_level": 1}]
+
+
 def test_programs_that_call_back_into_python_are_used_and_not_kept(folder):
     seen = []
 

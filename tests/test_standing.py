@@ -557,10 +557,10 @@ def test_true_pairs_of_one_balance_keep_their_names(pair):
 
 @pytest.mark.slow
 def test_supply_that_sags_over_time_gets_no_name(monkeypatch):
-    """By one volt in 1.5 s, in six starts; it was called a brush drop and an eccentric pulley."""
-    sag = laws.Law("", "supply", lambda s, q: np.full_like(s.w, s.time / 1.5), 1.0 / histories.LARGEST)
+    """By one volt in 0.8 s, in six starts; it was called a brush drop and an eccentric pulley."""
+    sag = laws.Law("", "supply", lambda s, q: np.full_like(s.w, s.time / 0.8), 1.0 / histories.LARGEST)
     monkeypatch.setitem(histories.EVERY, "sag_over_time", sag)
-    made = histories.narrow(["sag_over_time"], 1e6, 1)
+    made = histories.narrow(["sag_over_time"], 1e6, 1, duration=0.8)
     assert made.label["effects"][0]["amplitude"] == pytest.approx(1.0)
     names = ("brush_drop", "pulley_eccentricity", "series_resistance", "supply_sag", "churning", "rotating_inertia")
     dynamic = {f"{c}.ground.friction.dynamic": (0.48, 0.08) for c in ("6T2A", "4W2T")}
