@@ -11,9 +11,8 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from calibration.data.columns import CONDITIONS, SIDES
+from calibration.data.columns import CONDITIONS, ROWS, SIDES
 from calibration.data.errors import BadConfiguration, choices, toml_content, toml_text
-from calibration.data.thinning import ROWS
 from mmrjax import channels, fidelities
 from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
 

@@ -26,6 +26,8 @@ CONDITIONS: dict[str, tuple[float, float]] = {
     "slope_deg": (-45.0, 45.0),
 }
 TIME: dict[str, tuple[float, float]] = {"time_s": (0.0, 1e6)}
+#: Rows of all runs of a log from which on readings of fewer are used (`thinning`).
+ROWS = 4000
 #: What a time history may state of its motors' driver: the share of the supply's voltage that they get, negative
 #: backward; and how they are driven: by that share, or not, their terminals shorted or their circuit open.
 DUTY: dict[str, tuple[float, float]] = {"duty": (-1.0, 1.0)}

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calibration.data.columns import ROWS
+
 if TYPE_CHECKING:
     from calibration.data.table import Runs
 
-#: Rows of all runs together from which on a log is thinned.
-ROWS = 4000
 #: Rows at the start of a run that are read whatever follows: the beginning of a run is measured by them.
 FIRST = 5
 
