@@ -5,14 +5,17 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from worlds import rigs
 
 from calibration.data.runs import Runs
 from calibration.data.thinning import FIRST, thinned
+from calibration.inference import foresight
 from calibration.inference.noise import inferred
 from calibration.inference.notes import Thinned
 from calibration.inference.observers import Histories
 from calibration.words.notes import sentence
 from mmrjax import robots
+from sweeps.commands import rig_check
 
 EVERY, ROWS = 0.01, 300
 
@@ -119,3 +122,20 @@ def test_that_a_log_is_thinned_is_said():
     ]
     assert said == [Thinned("log.csv", len(runs), len(some))]
     assert f"{len(some)} of {len(runs)} rows" in sentence(said[0])
+
+
+def test_rig_check_says_how_many_rows_are_used(tmp_path, monkeypatch, capsys):
+    rng = np.random.default_rng([27, 1])
+    world = rigs.world(rng, "bench", "voltage", rows=(16, 60))
+    rigs.case(world).write(tmp_path)
+    rigs.log(world, rng).write(tmp_path / "log.csv")
+
+    def foresee(runs, robot):
+        return foresight.Foresight((), ("converged",) * len(runs), ("columns",) * len(runs.channels), (), robot)
+
+    monkeypatch.setattr(rig_check.foresight, "foresee", foresee)
+    found = rig_check.examined(tmp_path / "rig.toml", str(tmp_path / "log.csv"))
+    used = len(found.foresight.status)
+    assert 0.9 * 4000 < used < 4200 < len(found.runs)
+    rig_check.print_check(found)
+    assert f"readings of {used} of them" in " ".join(capsys.readouterr().out.split())

@@ -324,6 +324,8 @@ def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
         name = c["column"] if c["theirs"] in ("", c["column"]) else f"{c['column']}, yours {c['theirs']}"
         shown.add_row(name, c["use"], str(c["values"]), *ends)
     say(shown)
+    if len(seen.status) < len(runs):
+        say(f"- loop and calibrate use the readings of {len(seen.status)} of them, evenly in time (--rows)")
     for sentence in [*found.unused(), *runs.missing()]:
         say(f"- {sentence}")
     names, counts = np.unique(np.array(seen.status), return_counts=True)

@@ -929,8 +929,10 @@ def _usual(runs: Runs) -> list[float]:
 
 def _differs(runs: Runs, rows: np.ndarray) -> np.ndarray:
     """Whether a condition at a row of a run is another than at the row before it."""
-    some = [runs[c][rows][1:] != runs[c][rows][:-1] for c in changing(runs)]
-    return np.append(False, np.any(some, 0))
+    differs = np.zeros(len(rows), bool)
+    for column in changing(runs):
+        differs[1:] |= runs[column][rows][1:] != runs[column][rows][:-1]
+    return differs
 
 
 def _longest(runs: Runs, each: list[np.ndarray], rig: Rig, usual: list[float]) -> list[np.ndarray]:
