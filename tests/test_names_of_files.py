@@ -470,9 +470,8 @@ OTHERS = {
 def test_files_of_every_other_command_have_known_names(made, folder, name):
     (folder / "few.toml").write_text("speed_m_s = 0.3\nmass_kg = 30\n[envelope]\nslope_deg = [0, 5]\n")
     test_settle.bench(folder, test_settle.stairs())
-    with (
-        runs_of("waves") if name == "resonance" else contextlib.nullcontext()
-    ):  # in closed form: its files are the same
+    # In closed form: its files are the same.
+    with runs_of("waves") if name == "resonance" else contextlib.nullcontext():
         sound(made(name, *OTHERS[name]))
 
 

@@ -322,12 +322,8 @@ def test_time_in_milliseconds_is_doubted_where_a_start_shows_it(tmp_path):
 def test_a_shaft_that_stands_for_long_may_be_quick_for_a_while(moves):
     """Through zero from a small angle to a large one; and by more than half a turn a sample."""
     angle = np.concatenate([np.full(50, float(moves[0])), moves, np.full(50, float(moves[-1]))])
-    columns = {"output_angle_deg": angle, "time_s": 0.01 * np.arange(len(angle))}
-
-    class Log(dict):
-        source, run_names = "log.csv", np.full(len(angle), "a")
-
-    contradictions._angle(Log(columns))
+    columns = {"output_angle_deg": angle, "time_s": 0.01 * np.arange(len(angle)), "run_id": np.full(len(angle), "a")}
+    contradictions._angle(records.Runs("log.csv", columns))
 
 
 def test_an_angle_that_is_frozen_is_named_itself(tmp_path):

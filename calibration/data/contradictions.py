@@ -158,10 +158,9 @@ def _beside(step: np.ndarray) -> np.ndarray:
 
 
 def _angle(runs: Runs) -> None:
-    angle, time, run = runs["output_angle_deg"], runs["time_s"], runs.run_names
-    for name in np.unique(run):
-        mine = np.flatnonzero(run == name)
-        mine = mine[np.argsort(time[mine], kind="stable")]
+    angle = runs["output_angle_deg"]
+    for name in np.unique(runs.run_names):
+        mine = runs.in_order(name)
         mine = mine[np.isfinite(angle[mine])]
         step = np.diff(angle[mine])
         if step.size < 2:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -71,6 +71,14 @@ def varies(runs: Runs, columns: tuple[str, ...] | None = None) -> np.ndarray:
     return found
 
 
+def differs(rows: np.ndarray, conditions: Iterable[np.ndarray]) -> np.ndarray:
+    """Whether a condition at each of these rows is another than at the one before it, shape (rows,)."""
+    found = np.zeros(len(rows), bool)
+    for condition in conditions:
+        found[1:] |= condition[rows][1:] != condition[rows][:-1]
+    return found
+
+
 def divided(
     rows: np.ndarray, time: np.ndarray, conditions: Sequence[np.ndarray], applied: np.ndarray
 ) -> list[Stretch]:
@@ -79,8 +87,7 @@ def divided(
     Args:
         rows: of the run, in the order of time; time [s], conditions, applied [V]: of every row of the table.
     """
-    differs = np.any([c[rows][1:] != c[rows][:-1] for c in conditions], 0)
-    cuts = [0, *(np.flatnonzero(differs) + 1).tolist(), len(rows)]
+    cuts = [0, *np.flatnonzero(differs(rows, conditions)).tolist(), len(rows)]
     begins = [0.0, *(float(time[rows[k]]) for k in cuts[1:-1]), float(time[rows[-1]])]
     return [
         Stretch(rows[low:high], begin, end, bool(applied[rows[low]] > 0), len(cuts) == 2)
@@ -91,11 +98,10 @@ def divided(
 def stretches(runs: Runs) -> list[list[Stretch]]:
     """The stretches of every run, runs in the order of their names."""
     found = []
-    every, time, volts = runs.run_names, runs["time_s"], applied(runs)
+    time, volts = runs["time_s"], applied(runs)
     columns = [runs[c] for c in changing(runs)]
-    for name in np.unique(every):
-        rows = np.flatnonzero(every == name)
-        found.append(divided(rows[np.argsort(time[rows], kind="stable")], time, columns, volts))
+    for name in np.unique(runs.run_names):
+        found.append(divided(runs.in_order(name), time, columns, volts))
     return found
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.data.courses import applied
+from calibration.data.courses import applied, differs
 from calibration.data.errors import BadData, number
 from calibration.data.instruments import step_of
 from calibration.data.runs import Runs
@@ -363,11 +363,8 @@ def _levels(
     """Rows of a part without gaps, divided where a condition changes, or what is imposed by more than its noise."""
     if not len(rows):
         return
-    cuts = np.zeros(len(rows), bool)
+    cuts = differs(rows, (runs[name] for name in EXACT if runs.has(name)))
     cuts[0] = True
-    for name in EXACT:
-        if runs.has(name):
-            cuts[1:] |= runs[name][rows][1:] != runs[name][rows][:-1]
     x = drives[rows]
     largest, noise = float(np.max(np.abs(drives))), _noise(x)
     size = 1 if noise <= 1e-9 * largest else max(1, min(round(shortest / step / 6), 64))

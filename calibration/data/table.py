@@ -120,6 +120,11 @@ class Runs:
         """Name of the run that each row is of, shape (rows,); of a table without `run_id` all are of one, ""."""
         return self["run_id"] if self.has("run_id") else np.zeros(len(self), str)
 
+    def in_order(self, name: str) -> np.ndarray:
+        """Rows of a run, by its name, in the order of time."""
+        rows = np.flatnonzero(self.run_names == name)
+        return rows[np.argsort(self["time_s"][rows], kind="stable")]
+
     def where(self, rows: np.ndarray) -> Runs:
         """The rows that a mask or an index selects."""
         columns, extras = ({k: v[rows] for k, v in cells.items()} for cells in (self.columns, self.extras))

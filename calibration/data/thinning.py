@@ -28,8 +28,7 @@ def thinned(runs: Runs, most: int = ROWS) -> Runs:
     apart, kept = -(-len(runs) // most), []
     read = np.isfinite(runs.measured())
     for name in dict.fromkeys(runs.run_names.tolist()):
-        rows = np.flatnonzero(runs.run_names == name)
-        rows = rows[np.argsort(runs["time_s"][rows], kind="stable")]
+        rows = runs.in_order(name)
         kept.append(rows[_evenly(read[rows], apart)])
     return dataclasses.replace(runs.where(np.sort(np.concatenate(kept))), log=runs)
 

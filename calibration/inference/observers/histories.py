@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from calibration.data.courses import Stretch, applied, changing, divided, stretches
+from calibration.data.courses import Stretch, applied, changing, differs, divided, stretches
 from calibration.data.errors import BadConfiguration, BadData, number
 from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
@@ -102,9 +102,9 @@ LASTING = 0.25
 FINE, SLOW, EARLIER, DELAYED = 16, 0.1, 0.03, 2.0
 #: How many of the usual longest steps one may be elsewhere.
 FAST = 2
-#: Of a log that is thinned, to one of so many rows or fewer: how many steps there are at least between readings, and
-#: by how much they grow with the time since a condition changed, at most [1/s · s].
-SPARSE, BETWEEN, LATER = 1.5, 4, 0.05
+#: Of a log that is thinned: how many steps there are at least between readings, and by how much they grow with the
+#: time since a condition changed, at most [1/s · s].
+BETWEEN, LATER = 4, 0.05
 #: The same of one whose speed is imposed, and how many of the usual longest steps one of its steps may be.
 COARSELY, SLOWLY = 2, 4
 #: By how much its steps grow with the time since its start [1/s · s].
@@ -229,16 +229,17 @@ class Histories(Observer):
         whole, exact = runs.whole, robot.rig.imposed == "motor_speed"
         linear = robot.rig.between_rows == "linear"
         names, run = np.unique(runs.run_names, return_inverse=True)
-        mine = [_in_order(runs, name) for name in names]
-        every = [_in_order(whole, name) for name in names]
+        mine, every = ([table.in_order(name) for name in names] for table in (runs, whole))
         given = [runs["time_s"][m] for m in mine]
         # Of rows of the log without a reading here those count at which what drives a run changes.
         noted = [
-            np.isin(whole["time_s"][rows], t) | exact | linear | _differs(whole, rows)
+            np.isin(whole["time_s"][rows], t) | exact | linear | _changed(whole, rows)
             for rows, t in zip(every, given, strict=True)
         ]
-        steps = _longest(whole, every, robot.rig, _usual(runs))
-        steps = [np.minimum.reduceat(h, np.flatnonzero(n)[:-1]) for h, n in zip(steps, noted, strict=True)]
+        steps = [
+            np.minimum.reduceat(h, np.flatnonzero(n)[:-1])
+            for h, n in zip(_longest(runs, robot.rig), noted, strict=True)
+        ]
         grids = [
             grid(whole["time_s"][rows[n]], c, h, SOON if exact else GROWTH)
             for rows, n, c, h in zip(every, noted, _changes(whole, every, robot.rig), steps, strict=True)
@@ -326,12 +327,12 @@ class Histories(Observer):
                         'without time_s; a rig\'s file may say start = "measured" or "free"'
                     )
         said: list[Note | str] = []
-        each = [_in_order(runs.whole, name) for name in np.unique(names)]
         step = runs["time_s"].max() / STEPS
         if robot.rig.imposed != "motor_speed":
-            step = max(step, *(h.max(initial=0.0) for h in _longest(runs.whole, each, robot.rig, _usual(runs))))
+            step = max(step, *(h.max(initial=0.0) for h in _longest(runs, robot.rig)))
         if step > FAST * LONGEST:
             said.append(CoarseSteps(float(runs["time_s"].max()), float(step)))
+        each = [runs.whole.in_order(name) for name in np.unique(names)]
         changes = max(len(c) for c in _changes(runs.whole, each, robot.rig)) + 1
         if growth(float(runs["time_s"].max()), changes) > COARSE * GROWTH:
             said.append(ManyChanges(changes - 1))
@@ -780,7 +781,8 @@ def _in_time(
             for rows, t in zip(each, times, strict=True)
         ]
     )
-    conditions = jax.tree.map(lambda x: x[np.array([rows[0] for rows in each])], of_rows)
+    first = np.array([rows[0] for rows in each])
+    conditions = jax.tree.map(lambda x: x[first], of_rows)
     for name in CHANGING:
         x = getattr(of_rows, name)
         if x is not None and any(np.ptp(np.asarray(x)[rows]) > 0 for rows in each):
@@ -820,12 +822,11 @@ def with_begins(robot: Robot, runs: Runs, noise: Noise) -> Robot:
     angle of the first samples, extrapolated to the first; free ones have the error of that as their prior."""
     if robot.rig.start == "rest" or not runs.sampled:
         return robot
-    names, measured = runs.run_names, runs.measured()
+    measured = runs.measured()
     found, known = dict[str, Begin](), []
     rows = runs.configurations(robot)
-    for name in np.unique(names):
-        mine = np.flatnonzero(names == name)
-        mine = mine[np.argsort(runs["time_s"][mine], kind="stable")]
+    for name in np.unique(runs.run_names):
+        mine = runs.in_order(name)
         key = begin_name(str(name))
         at: dict[str, tuple[float, float]] = {}
         for k, channel in enumerate(runs.channels):
@@ -915,55 +916,43 @@ def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) ->
     return bool(np.any(np.abs(after - before) > STILL * np.abs(before + after) / 2))
 
 
-def _in_order(runs: Runs, name: str) -> np.ndarray:
-    """Rows of a run in the order of time."""
-    rows = np.flatnonzero(runs.run_names == name)
-    return rows[np.argsort(runs["time_s"][rows], kind="stable")]
+def _changed(runs: Runs, rows: np.ndarray) -> np.ndarray:
+    """Whether what drives a run changes at each of its rows."""
+    return differs(rows, (runs[column] for column in changing(runs)))
 
 
-def _usual(runs: Runs) -> list[float]:
-    """The usual time from row to row of each run, in the order of their names [s]."""
-    times = [runs["time_s"][_in_order(runs, name)] for name in np.unique(runs.run_names)]
-    return [float(np.median(np.diff(t))) if len(t) > 1 else np.inf for t in times]
+def _usual(apart: np.ndarray) -> float:
+    """The usual one of the times between a run's rows, infinite where there is one row."""
+    return float(np.median(apart)) if len(apart) else np.inf
 
 
-def _differs(runs: Runs, rows: np.ndarray) -> np.ndarray:
-    """Whether a condition at a row of a run is another than at the row before it."""
-    differs = np.zeros(len(rows), bool)
-    for column in changing(runs):
-        differs[1:] |= runs[column][rows][1:] != runs[column][rows][:-1]
-    return differs
-
-
-def _longest(runs: Runs, each: list[np.ndarray], rig: Rig, usual: list[float]) -> list[np.ndarray]:
-    """Longest step after each row of each run but its last [s].
+def _longest(runs: Runs, rig: Rig) -> list[np.ndarray]:
+    """Longest step after each row of its log but the last, of each run in the order of their names [s].
 
     Where the speed is imposed only what effects remember is followed. Where what drives a run changes its sign,
     friction jumps as the speed passes through zero, within a step, which has to be short beside the time from reading
     to reading: where the table's speeds are low or change their sign, and as much earlier as the rig's delay may be.
     Where it shows no speed, and where a current is imposed, after which speeds bend more sharply, all along.
-
-    Args:
-        each: rows of each run in the order of time; usual: time between the readings of each that are used [s].
     """
-    exact = rig.imposed == "motor_speed"
-    speeds = runs.measured()[:, [c.zero_at_rest and c.directed and c.settled for c in runs.channels]]
-    driven = None if exact else applied(runs)
+    whole, exact = runs.whole, rig.imposed == "motor_speed"
+    speeds = whole.measured()[:, [c.zero_at_rest and c.directed and c.settled for c in runs.channels]]
+    driven = None if exact else applied(whole)
     early, found = DELAYED * np.max(np.asarray(rig.delay)) + EARLIER, []
-    for rows, wait in zip(each, usual, strict=True):
-        apart = np.diff(runs["time_s"][rows])
-        row = float(np.median(apart)) if len(apart) else np.inf
+    for name in np.unique(runs.run_names):
+        rows = whole.in_order(name)
+        time = whole["time_s"][rows]
+        apart, wait = np.diff(time), _usual(np.diff(runs["time_s"][runs.in_order(name)]))
         both_ways = driven is not None and driven[rows].min() < 0 < driven[rows].max()
         longest = np.full(len(apart), (FAST if both_ways else 1) * LONGEST)
         if driven is None:
             longest[:] = min(SLOWLY * LONGEST, wait / COARSELY)
-        elif wait > row * SPARSE:
-            time, differs = runs["time_s"][rows], _differs(runs, rows)
-            since = time - time[np.maximum.accumulate(np.where(differs, np.arange(len(rows)), 0))]
+        elif runs.log is not None:
+            begins = np.where(_changed(whole, rows), np.arange(len(rows)), 0)
+            since = time - time[np.maximum.accumulate(begins)]
             longest = np.maximum(longest, np.minimum(LATER * since[:-1], wait / BETWEEN))
         if both_ways:
             slow = _slow(speeds[rows]) | (rig.imposed != "voltage")
-            before = int(np.ceil(early / row))
+            before = int(np.ceil(early / _usual(apart)))
             slow = np.convolve(slow, np.ones(before + 1))[before:] > 0
             longest[slow] = min(LONGEST, wait / FINE)
         found.append(longest)
