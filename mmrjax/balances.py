@@ -412,8 +412,8 @@ def resolved_sides(
     return jax.vmap(lambda s, p: _drawn(robot, chassis, s, p))(signals, pull), pull
 
 
-def driven(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
-    """Signals of an instant up to the voltage balance."""
+def driven(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None) -> Signals:
+    """Signals of an instant up to the voltage balance; direction: as of `begin`."""
     robot = robot.within(conditions.configuration)
     return electrical(robot, conditions, supply(robot, conditions, begin(robot, conditions, state, direction)))
 

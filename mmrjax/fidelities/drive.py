@@ -36,7 +36,7 @@ from mmrjax.signals import (
 # Units of the unknowns (current, motor speed, speed, distance, discharge), all then of the order of one.
 # The memories of those effects that have one follow, each in its own unit.
 _UNITS = (10.0, 1000.0, 1.0, 1.0, 10.0)
-MOTOR, GROUND = 1, 2
+CURRENT, MOTOR, GROUND = 0, 1, 2
 _GAP = 0.01  # of the gap within a backlash, the last unknown where there is one [rad]
 
 #: Time after which a run is read as settled [s].
@@ -98,6 +98,13 @@ def rates(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) ->
         *[signals.speed_wheel - signals.speed_output] * robot.loose,
     ]
     return jnp.stack(rates) / jnp.asarray(units(robot), y.dtype)
+
+
+def winding(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) -> Array:
+    """Rate of the current alone, in its unit, where no speed is imposed [1/s]."""
+    state = state_of(robot, y)
+    signals = balances.driven(robot, conditions, state, None)
+    return jnp.asarray(signals.voltage_left / signals.inductance / _UNITS[CURRENT])
 
 
 _norm = functools.partial(norm, own=len(_UNITS))

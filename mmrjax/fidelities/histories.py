@@ -5,6 +5,11 @@ stiffly accurate (Alexander, Diagonally implicit Runge-Kutta methods for stiff O
 (1977)). A derivative follows from the implicit function theorem stage by stage: linear equations with the matrix
 of Newton's method at the solution, so that a direction more costs one tangent of the rates a stage, instead of a
 rollout.
+
+After a jump of the voltage the current lags by L / R, often much less than a step, and SDIRK2 leaves up to a fifth of
+the jump to the end of such a step. So the jump's lag decays by itself, exponentially, and the method follows the rest
+(an integrating factor; Lawson, Generalized Runge-Kutta processes for stable systems with large Lipschitz constants,
+SIAM J. Numer. Anal. 4 (1967)).
 """
 
 from __future__ import annotations
@@ -19,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.drive import GROUND, MOTOR, moving, rates, start, state_of, units
+from mmrjax.fidelities.drive import CURRENT, GROUND, MOTOR, moving, rates, start, state_of, units, winding
 from mmrjax.linear_equations import inverted, solved
 from mmrjax.params import Scalar
 from mmrjax.rarely import rarely
@@ -41,6 +46,8 @@ STEPS = 8000
 #: time since a change, which makes for errors of a thousandth of a current's rms (inputs at 50 and 200 Hz, L / R of
 #: 0.2 and 2 ms).
 FEW, EACH = 280, 22
+#: More current at which its rate shows how soon it follows its voltage [10 A].
+MORE = 1e-3
 #: Steps of a run whose equations are made linear side by side.
 BLOCK = 32
 
@@ -104,26 +111,91 @@ def at_first(robot: Robot, conditions: Conditions) -> tuple[Conditions, Float[Ar
 class Followed(eqx.Module):
     """A run that is known, and its equations made linear along it: what a change of its rates does to it.
 
-    A change at the end of a step is `carries` times the change before it, and `gains` times the change of the rates
-    at each stage.
+    A change at the end of a step is `carries` times the change before it, `gains` times the change of the rates at
+    each stage, and `lags` times the changes of the rates of the current that its lag follows from.
 
     Attributes:
-        states: unknowns at both stages of every step, the second its end, shape (steps, 2, unknowns).
-        places: where the equations are made linear, of the same shape; clock: when [s], shape (steps, 2).
+        states: unknowns at both stages of every step, without lags, shape (steps, 2, unknowns).
+        begins, ends: unknowns at the beginning and end of every step, shape (steps, unknowns).
+        places: where the equations are made linear; clock: when a step begins, and when it is there [s], shape
+            (steps, 3).
     """
 
     states: Float[Array, "steps 2 unknowns"]
+    begins: Float[Array, "steps unknowns"]
+    ends: Float[Array, "steps unknowns"]
     places: Float[Array, "steps 2 unknowns"]
-    clock: Float[Array, "steps 2"]
+    clock: Float[Array, "steps 3"]
     carries: Float[Array, "steps unknowns unknowns"]
     gains: Float[Array, "steps 2 unknowns unknowns"]
+    lags: Float[Array, "steps rates unknowns"]
 
 
-def _stage(robot: Robot, conditions: Conditions, known: Array, guess: Array, h: Array) -> Array:
-    """Y = known + γ h f(Y)."""
+def _current(y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+    """A unit of the current among the unknowns."""
+    return jnp.eye(len(y), dtype=y.dtype)[CURRENT]
+
+
+class Lag(eqx.Module):
+    """What a current has in excess after its voltage has jumped, which decays within a step.
+
+    Attributes:
+        begin, end: of a step; decay: rate of the decay [1/s].
+        means: over those parts of a step, one after the other, that its stages weigh.
+    """
+
+    begin: Float[Array, ""]
+    means: Float[Array, " 2"]
+    end: Float[Array, ""]
+    decay: Float[Array, ""]
+
+
+def _of_each_step(conditions: Conditions) -> tuple[Conditions | None, Conditions, Conditions]:
+    """What changes as it is before each step and in it, shape (steps,), and what does not; before: None where nothing
+    that drives the current may jump."""
+    changing, constant = _in_time(conditions)
+    driving = changing.voltage, changing.duty, changing.open, changing.motor_current
+    jumps = conditions.motor_speed is None and any(x is not None for x in driving)
+    before = jax.tree.map(lambda x: jnp.concatenate([x[:1], x[:-2]]), changing) if jumps else None
+    return before, jax.tree.map(lambda x: x[:-1], changing), constant
+
+
+def _held(constant: Conditions, before: Conditions | None, now: Conditions) -> tuple[Conditions | None, Conditions]:
+    """Conditions before a step and in it."""
+    return None if before is None else eqx.combine(before, constant), eqx.combine(now, constant)
+
+
+def _rates_at_start(
+    rate: Callable[[Array, Conditions], Array], y: Array, before: Conditions | None, held: Conditions
+) -> Array:
+    """Rates of the current where a step starts: before what drives it jumps, after that, and with a little more
+    current, which tells how soon it follows; none where nothing jumps."""
+    if before is None:
+        return jnp.zeros((0, *rate(y, held).shape))
+    return jnp.stack([rate(y, before), rate(y, held), rate(y + MORE * _current(y), held)])
+
+
+def _lag(rate: Float[Array, " rates"], h: Array) -> Lag:
+    """Of a step, by the rates at its start."""
+    if not len(rate):
+        return Lag(jnp.zeros(()), jnp.zeros(2), jnp.zeros(()), jnp.zeros(()))
+    decay = (rate[1] - rate[2]) / MORE
+    begin = (rate[0] - rate[1]) / decay
+    parts = jnp.array([1 - _GAMMA, _GAMMA]) * h
+    at = begin * jnp.exp(-decay * jnp.stack([jnp.zeros(()), parts[0]]))
+    z = decay * parts
+    means = jnp.where(z > 0, -jnp.expm1(-z) / jnp.where(z > 0, z, 1.0), 1.0) * at
+    return Lag(begin, means, begin * jnp.exp(-decay * h), decay)
+
+
+def _stage(
+    robot: Robot, conditions: Conditions, known: Array, guess: Array, h: Array, mean: Array, decay: Array
+) -> Array:
+    """Y = known + γ h f(Y) of the unknowns without a lag, which acts by its mean."""
+    known = known + _GAMMA * h * decay * mean
 
     def left(y: Array) -> Array:
-        return y - known - _GAMMA * h * rates(robot, conditions, y)
+        return y - known - _GAMMA * h * rates(robot, conditions, y + mean)
 
     def newton(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         count, y, _ = state
@@ -141,78 +213,94 @@ def _stage(robot: Robot, conditions: Conditions, known: Array, guess: Array, h: 
     return jnp.where(error <= SOLVED, y, jnp.nan)
 
 
-def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) -> Float[Array, "steps 2 unknowns"]:
-    """Unknowns of one run from standstill at both stages of every step.
+def states(
+    robot: Robot, conditions: Conditions, times: Float[Array, " times"]
+) -> tuple[Float[Array, "steps 2 unknowns"], Float[Array, "steps unknowns"]]:
+    """Unknowns of one run from standstill at both stages of every step, without lags, and at its end.
 
     Args: as of `histories`.
     """
-    changing, constant = _in_time(conditions)
+    *each, constant = _of_each_step(conditions)
 
-    def step(y: Array, inputs: tuple[Array, Conditions]) -> tuple[Array, Array]:
-        h, now = inputs
-        held = eqx.combine(now, constant)
+    def step(y: Array, inputs: tuple) -> tuple[Array, tuple[Array, Array]]:
+        h, before, held = inputs[0], *_held(constant, *inputs[1:])
+        lag = _lag(_rates_at_start(lambda y, c: winding(robot, c, y), y, before, held), h)
+        first = y - lag.begin * _current(y)
 
-        def stage(given: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
-            found = _stage(robot, held, *given, h)
-            return (y + (1 - _GAMMA) / _GAMMA * (found - y), found), found
+        def stage(given: tuple[Array, Array], mean: Array) -> tuple[tuple[Array, Array], Array]:
+            found = _stage(robot, held, *given, h, mean * _current(y), lag.decay)
+            return (first + (1 - _GAMMA) / _GAMMA * (found - first), found), found
 
-        both = jax.lax.scan(stage, (y, y), length=2)[1]
-        return both[1], both
+        both = jax.lax.scan(stage, (first, first), lag.means)[1]
+        end = both[1] + lag.end * _current(y)
+        return end, (both, end)
 
-    steps = (jnp.diff(times), jax.tree.map(lambda x: x[:-1], changing))
-    return jax.lax.scan(step, at_first(robot, conditions)[1], steps)[1]
+    return jax.lax.scan(step, at_first(robot, conditions)[1], (jnp.diff(times), *each))[1]
 
 
 def followed(
-    robot: Robot, conditions: Conditions, times: Float[Array, " times"], known: Array | None = None
+    robot: Robot, conditions: Conditions, times: Float[Array, " times"], known: tuple[Array, Array] | None = None
 ) -> Followed:
     """A run and its equations made linear along it.
 
     Args: as of `histories`; known: its states, where they are.
     """
-    found = states(robot, conditions, times) if known is None else known
-    changing, constant = _in_time(conditions)
-    of_first, begins_at = at_first(robot, conditions)
-    at = jnp.concatenate([begins_at[None], found[:, 1]])
-    through = _through_rest(robot, of_first, at)
-    h = jnp.diff(times)
+    found, ends = states(robot, conditions, times) if known is None else known
+    *conditions_of, constant = _of_each_step(conditions)
+    of_first, first_state = at_first(robot, conditions)
+    at = jnp.concatenate([first_state[None], ends])
+    through, h = _through_rest(robot, of_first, at), jnp.diff(times)
     # Through rest: Euler's implicit steps to and from it, by the equations as they are off it.
     shares = jnp.stack([through.before, 1 - through.before], 1)
     spans = jnp.where(through.any[:, None], shares, _GAMMA) * h[:, None]
-    clock = jnp.stack([times[:-1] + jnp.where(through.any, through.before, _GAMMA) * h, times[1:]], 1)
+    middle = times[:-1] + jnp.where(through.any, through.before, _GAMMA) * h
+    clock = jnp.stack([times[:-1], middle, times[1:]], 1)
     late = jnp.stack([through.before <= 0, through.before < 1], 1)
-    off_rest = jnp.where(late[:, :, None], at[1:, None], at[:-1, None])
-    places = jnp.where(through.any[:, None, None], off_rest, found)
 
-    def linear(given: tuple[Array, Array, Array, Array, Conditions]) -> tuple[Array, Array]:
-        places, spans, passes, turns, now = given
-        held = eqx.combine(now, constant)
+    def linear(given: tuple) -> tuple[Array, Array, Array, Array]:
+        begin, end, found, spans, late, h, passes, turns, *now = given
+        before, held = _held(constant, *now)
+        one = jnp.eye(len(end), dtype=end.dtype)
+        current = _current(end)
 
-        def inverse(y: Array, span: Array) -> Array:
-            slope = jax.jacfwd(lambda y: rates(robot, held, y))(y)
-            return inverted(jnp.eye(y.shape[0], dtype=y.dtype) - span * slope)
+        def at_start(y: Array) -> tuple[Array, Array]:
+            rate = _rates_at_start(lambda y, c: winding(robot, c, y), y, before, held)
+            return rate, rate
 
-        first, second = jax.vmap(inverse)(places, spans)
-        jump = rarely(turns, _jump, (robot, held, places[1]), jnp.zeros_like(places[1]))
-        one = jnp.eye(len(first), dtype=first.dtype)
+        by_begin, rate = jax.jacfwd(at_start, has_aux=True)(begin)
+        by_rate, lag = jax.jacfwd(lambda r: (_lag(r, h),) * 2, has_aux=True)(rate)
+        off_rest = jnp.where(late[:, None], end - lag.end * current, begin - lag.begin * current)
+        places = jnp.where(passes, off_rest, found) + lag.means[:, None] * current
+        slopes = jax.vmap(jax.jacfwd(lambda y: rates(robot, held, y)))(places)
+        first, second = jax.vmap(inverted)(one - spans[:, None, None] * slopes)
+        jump = rarely(turns, _jump, (robot, held, places[1]), jnp.zeros_like(end))
         # What the second stage starts from, by the first stage and by the change before the step.
         by_first = jnp.where(passes, one + jump[:, None] * one[MOTOR], (1 - _GAMMA) / _GAMMA * one)
-        before = jnp.where(passes, 0.0, 1 - (1 - _GAMMA) / _GAMMA) * one
+        by_before = jnp.where(passes, 0.0, 1 - (1 - _GAMMA) / _GAMMA) * one
         kept = by_first @ first
-        return second @ (kept + before), jnp.stack([spans[0] * second @ kept, spans[1] * second])
+        carries, gains = second @ (kept + by_before), jnp.stack([spans[0] * second @ kept, spans[1] * second])
+        # The lag shortens the current that a step starts from, acts on both stages, and is what is left at the end.
+        by_means = jnp.einsum("sij,sj->si", gains, slopes[:, :, CURRENT] + lag.decay * current)
+        by_decay = lag.means @ gains[:, :, CURRENT]
+        lags = jnp.outer(by_rate.begin, -carries[:, CURRENT]) + by_rate.means.T @ by_means
+        lags = lags + jnp.outer(by_rate.end, current) + jnp.outer(by_rate.decay, by_decay)
+        return places, carries + lags.T @ by_begin, gains, lags
 
-    each = places, spans, through.any, through.turns, jax.tree.map(lambda x: x[:-1], changing)
-    blocks = jax.lax.map(jax.vmap(linear), _in_blocks(each))
-    carries, gains = _of_steps(blocks, len(h))
-    return Followed(found, places, clock, carries, gains)
+    each = at[:-1], ends, found, spans, late, h, through.any, through.turns, *conditions_of
+    places, carries, gains, lags = _of_steps(jax.lax.map(jax.vmap(linear), _in_blocks(each)), len(h))
+    return Followed(found, at[:-1], ends, places, clock, carries, gains, lags)
 
 
 @eqx.filter_custom_jvp
 def _ends(
-    robot: Robot, conditions: Conditions, times: Float[Array, " times"], known: Array, along: Followed | None
+    robot: Robot,
+    conditions: Conditions,
+    times: Float[Array, " times"],
+    known: tuple[Array, Array],
+    along: Followed | None,
 ) -> Array:
     """Unknowns at the end of every step, of states that are known, with their derivatives by the robot."""
-    return known[:, 1]
+    return known[1]
 
 
 @_ends.def_jvp
@@ -228,7 +316,7 @@ def _response(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
         change = eqx.filter_jvp(lambda r: rates(r, held, y), (robot,), (moved,))[1]
         return jnp.zeros_like(y) if change is None else change
 
-    return known[:, 1], respond(conditions, along, source, lambda t, y, dy, _: dy, begin)
+    return known[1], respond(conditions, along, source, lambda t, y, dy, _: dy, begin)
 
 
 def respond(
@@ -248,30 +336,34 @@ def respond(
 
     Sources of a block's steps are computed side by side; one after another is left only a product a step.
     """
-    changing, constant = _in_time(conditions)
+    *conditions_of, constant = _of_each_step(conditions)
 
-    def added(given: tuple[Array, Array, Array, Conditions]) -> Array:
+    def added(along: Followed, before: Conditions | None, now: Conditions) -> Array:
         """By the sources of a step, at its end."""
-        clock, places, gains, now = given
-        held = eqx.combine(now, constant)
-        both = jax.vmap(lambda t, y: source(t, y, held))(clock, places)
-        return jnp.tensordot(gains, both, ((0, 2), (0, 1)))
+        before, held = _held(constant, before, now)
+        both = jax.vmap(lambda t, y: source(t, y, held))(along.clock[1:], along.places)
+        found = jnp.tensordot(along.gains, both, ((0, 2), (0, 1)))
+        if before is None:
+            return found
+        rate = lambda y, held: source(along.clock[0], y, held)[CURRENT]  # noqa: E731
+        lag = _rates_at_start(rate, along.begins, before, held)
+        return found + jnp.tensordot(along.lags, lag, ((0,), (0,)))
 
     def after(dy: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
         dy = jnp.tensordot(step[0], dy, 1) + step[1]
         return dy, dy
 
     def block(dy: Array, inputs: tuple) -> tuple[Array, Array]:
-        (clock, places, carries, gains), now, then = inputs
-        last, changes = jax.lax.scan(after, dy, (carries, jax.vmap(added)((clock, places, gains, now))))
+        along, before, now, then = inputs
+        last, changes = jax.lax.scan(after, dy, (along.carries, jax.vmap(added)(along, before, now)))
         whole = jax.vmap(lambda t, y, dy, changing: seen(t, y, dy, eqx.combine(changing, constant)))
-        return last, whole(clock[:, 1], places[:, 1], changes, then)
+        return last, whole(along.clock[:, 2], along.ends, changes, then)
 
+    changing, _ = _in_time(conditions)
     of_first = eqx.combine(jax.tree.map(lambda x: x[0], changing), constant)
-    still = jnp.zeros_like(source(along.clock[0, 0], along.places[0, 0], of_first)) if begin is None else begin
-    now, then = (jax.tree.map(lambda x, s=s: x[s], changing) for s in (slice(-1), slice(1, None)))
-    given = (along.clock, along.places, along.carries, along.gains), now, then
-    return _of_steps(jax.lax.scan(block, still, _in_blocks(given))[1], len(along.clock))
+    still = jnp.zeros_like(source(along.clock[0, 0], along.begins[0], of_first)) if begin is None else begin
+    each = along, *conditions_of, jax.tree.map(lambda x: x[1:], changing)
+    return _of_steps(jax.lax.scan(block, still, _in_blocks(each))[1], len(along.clock))
 
 
 def _in_blocks(of_steps: T) -> T:
@@ -279,14 +371,14 @@ def _in_blocks(of_steps: T) -> T:
 
     def filled(x: Array) -> Array:
         x = jnp.concatenate([x, jnp.repeat(x[-1:], -len(x) % BLOCK, 0)])
-        return x.reshape(-1, BLOCK, *x.shape[1:])
+        return x.reshape(len(x) // BLOCK, BLOCK, *x.shape[1:])
 
     return jax.tree.map(filled, of_steps)
 
 
 def _of_steps(blocks: T, count: int) -> T:
     """The same of each of so many steps."""
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], blocks)
+    return jax.tree.map(lambda x: x.reshape(x.shape[0] * BLOCK, *x.shape[2:])[:count], blocks)
 
 
 class _Through(eqx.Module):
@@ -362,7 +454,8 @@ def histories(
     stand creeps where gravity pulls, below a tenth of V_s.
     """
     changing, constant = _in_time(conditions)
-    found = states(jax.lax.stop_gradient(robot), conditions, times) if known is None else known.states
+    still = jax.lax.stop_gradient(robot)
+    found = states(still, conditions, times) if known is None else (known.states, known.ends)
     nodes = _ends(robot, conditions, times, found, known)
     ys = jnp.concatenate([at_first(robot, conditions)[1][None], nodes])
     if at is not None:
