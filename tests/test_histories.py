@@ -12,7 +12,7 @@ from mmrjax import params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.drive import drive
-from mmrjax.fidelities.histories import FIRST, LONGEST, followed, grid, histories
+from mmrjax.fidelities.histories import LONGEST, START, followed, grid, histories
 
 RUNS = Conditions(
     voltage=np.array([15.0, 33.0, 24.0]),
@@ -38,8 +38,8 @@ def seen(robot, runs=RUNS):
 def test_grid_holds_the_instants_and_is_fine_where_a_start_is_young():
     step = np.diff(GRID)
     assert GRID[0] == 0.0 and GRID[-1] == TIMES[-1] and np.isin(TIMES, GRID).all()
-    assert (step > 0).all() and step[0] <= 1.5 * FIRST and step.max() <= LONGEST * (1 + 1e-9)
-    assert len(GRID) < 600  # LONGEST throughout would be 320, FIRST 80 000
+    assert (step > 0).all() and step[0] <= 1.5 * START[0] and step.max() <= LONGEST * (1 + 1e-9)
+    assert len(GRID) < 600  # LONGEST throughout would be 320, the first step's 80 000
     assert np.diff(grid(np.array([0.0, 600.0]))).max() > LONGEST  # a long run: no more steps than it can have
 
 

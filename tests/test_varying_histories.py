@@ -26,7 +26,7 @@ from mmrjax import params, robots
 from mmrjax.channels import MM, RPM
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
-from mmrjax.fidelities.histories import FIRST, GROWTH, LONGEST, STEPS, grid, growth, histories
+from mmrjax.fidelities.histories import CHANGE, LONGEST, START, grid, histories
 from mmrjax.fidelities.mission import mission
 from mmrjax.profile import MODES, profile
 
@@ -145,19 +145,24 @@ def changed(runs, **columns):
 
 
 def test_grid_is_fine_after_every_change_and_bounded():
-    times, changes = np.arange(0.05, 2.0, 0.05), np.array([0.5, 1.2, 1.21])
-    found = grid(times, changes)
+    times, changes, sizes = (
+        np.round(np.arange(0.05, 2.0, 0.05), 2),
+        np.array([0.5, 1.2, 1.21]),
+        np.array([2.0, 1.0, 1e-3]),
+    )
+    found = grid(times, changes, sizes)
     step = np.diff(found)
     assert np.isin(times, found).all() and np.isin(changes, found).all() and (step > 0).all()
     assert step.max() <= LONGEST * (1 + 1e-9)
-    for begin in (0.0, *changes):
-        assert step[np.searchsorted(found, begin)] <= 1.5 * FIRST
-    np.testing.assert_array_equal(grid(times), grid(times, [0.0, 2.5]))  # a change outside is none
-    before = grid(times, grows=growth(times.max(), 4))  # of the start and three changes
+    for begin, first in ((0.0, START[0]), (0.5, CHANGE[0] / 2), (1.2, CHANGE[0])):
+        assert 0.5 * first < step[np.searchsorted(found, begin)] <= 1.5 * first
+    assert step[np.searchsorted(found, 1.21)] > 0.8 * LONGEST  # after a small one they are long at once
+    np.testing.assert_array_equal(grid(times), grid(times, np.array([0.0, 2.5]), np.ones(2)))  # no change within
+    before = grid(times)
     np.testing.assert_array_equal(found[found < 0.5], before[before < 0.5])
-    # one change a sample: no more steps than a long run may have, besides its samples
+    # one small change a sample takes no more steps than none
     often = np.arange(1, 4000) * 0.005
-    assert len(grid(often, often)) < 2 * STEPS + 2 * len(often) and growth(20.0, 4000) > GROWTH
+    assert len(grid(often, often, np.full(len(often), 0.01))) <= len(grid(often)) + 3
 
 
 def test_constant_values_at_every_instant_are_those_of_a_constant_run():

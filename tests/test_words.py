@@ -92,11 +92,6 @@ SAMPLES = [
         "the runs to look for them",
     ),
     (
-        of_fit.ManyChanges(40),
-        "a run's supply changes 40 times: inrushes after a change are followed in fewer steps than that of a start; cut "
-        "the runs where the current of an inrush matters",
-    ),
-    (
         of_fit.StopsOnSlope(("a", "b")),
         "run a, b: the motors are not driven on a slope; histories have smooth friction at rest, and a robot that "
         "should stand there creeps by some mm/s. Leave rows at rest out where their readings are finer than that",

@@ -127,12 +127,6 @@ class CoarseSteps(Note):
     step: float
 
 
-class ManyChanges(Note):
-    """Changes of a run's supply that are too many for the steps of each."""
-
-    changes: int
-
-
 class StopsOnSlope(Note):
     """Histories whose motors are not driven on a slope."""
 

@@ -111,8 +111,6 @@ SAID: dict[type, str | Callable[[Any], str]] = {
     notes.Thinned: "{source}: readings of {kept} of {rows} rows are used, evenly in time, and what drives the runs "
     "in all of them; --rows uses more or fewer, and settle uses all",
     notes.CoarseSteps: coarse_steps,
-    notes.ManyChanges: "a run's supply changes {changes} times: inrushes after a change are followed in fewer steps "
-    "than that of a start; cut the runs where the current of an inrush matters",
     notes.StopsOnSlope: "run {runs}: the motors are not driven on a slope; histories have smooth friction at rest, "
     "and a robot that should stand there creeps by some mm/s. Leave rows at rest out where their readings are finer "
     "than that",

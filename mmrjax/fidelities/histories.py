@@ -14,7 +14,7 @@ SIAM J. Numer. Anal. 4 (1967)).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TypeVar
 
 import equinox as eqx
@@ -28,6 +28,7 @@ from mmrjax.fidelities.drive import CURRENT, GROUND, MOTOR, moving, rates, start
 from mmrjax.linear_equations import inverted, solved
 from mmrjax.params import Scalar
 from mmrjax.rarely import rarely
+from mmrjax.rig import on_line
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
 
@@ -37,60 +38,54 @@ _GAMMA = 1 - 0.5**0.5
 #: Most Newton steps of a stage, which starts where the last one ended, and what its equations may leave in the
 #: units of the unknowns (10 A, 1000 rad/s, 1 m/s).
 NEWTON, SOLVED = 30, 1e-9
-#: The first step, its growth with the time since the start [1/s · s], and the longest step [s].
-FIRST, GROWTH, LONGEST = 1e-5, 0.02, 2.5e-3
-#: Most steps of a run that LONGEST may ask for; a longer run has longer steps. And most that short steps after
-#: changes may ask for; where there are more changes, steps grow faster.
+#: The first step [s] and the growth of steps with the time since [1/s · s]: after the start of a robot that may slide
+#: on its ground, and after what drives a run changes by its largest value, or a shaft starts; the longest step [s].
+START, CHANGE, LONGEST = (1e-5, 0.02), (1e-4, 0.3), 2.5e-3
+#: Most steps of a run that LONGEST may ask for; a longer run has longer steps.
 STEPS = 8000
-#: As many of those as a few changes may ask for, and beyond that each of them: steps then grow by a quarter of the
-#: time since a change, which makes for errors of a thousandth of a current's rms (inputs at 50 and 200 Hz, L / R of
-#: 0.2 and 2 ms).
-FEW, EACH = 280, 22
 #: More current at which its rate shows how soon it follows its voltage [10 A].
 MORE = 1e-3
 #: Steps of a run whose equations are made linear side by side.
 BLOCK = 32
 
 
-def growth(duration: float, changes: int) -> float:
-    """Growth of steps with the time since the last of so many changes, the start among them [1/s · s]."""
-    most = min(max(FEW, EACH * changes), STEPS)
-    return max(GROWTH, changes * float(np.log(max(LONGEST, duration / STEPS) / FIRST)) / most)
-
-
 def grid(
     times: Float[np.ndarray, " times"],
-    changes: Sequence[float] | np.ndarray = (),
+    changes: Float[np.ndarray, " changes"] | None = None,
+    sizes: Float[np.ndarray, " changes"] | None = None,
     longest: float | Float[np.ndarray, " intervals"] = LONGEST,
-    grows: float = GROWTH,
+    start: tuple[float, float] = START,
 ) -> np.ndarray:
     """Instants from 0 to the last of `times` [s], `times` and `changes` among them.
 
     Args:
-        changes: instants at which the motors' supply changes [s]; steps are as short after each as after the start.
+        changes: instants at which what drives the motors changes [s]; sizes: by what share of its largest value: the
+            smaller a change, the longer is the first step after it.
         longest: step, where `STEPS` allow it [s]; an array: of each interval between `times`.
-        grows: by how much steps grow after each change, at least [1/s · s].
+        start: the first step and the growth of steps after the start.
     """
     last = float(np.max(times, initial=0.0))
-    changes = np.asarray(changes, float)
-    begins = np.unique(np.concatenate([[0.0], changes[(changes > 0) & (changes < last)]]))
+    changes, sizes = (np.zeros(0) if x is None else np.asarray(x, float) for x in (changes, sizes))
+    inside = (changes > 0) & (changes < last)
+    begins, first = np.append(0.0, changes[inside]), np.append(start[0], CHANGE[0] / sizes[inside])
+    grows = np.append(start[1], np.full(inside.sum(), CHANGE[1]))
     given, times = times, np.unique(np.concatenate([begins, np.asarray(times, float)]))
     longest = np.broadcast_to(np.maximum(longest, last / STEPS), max(len(given) - 1, 1))
     longest = longest[np.clip(np.searchsorted(given, times[:-1], side="right") - 1, 0, len(longest) - 1)]
-    grows = max(grows, growth(last, len(begins)))
-    knee = np.maximum((longest - FIRST) / grows, 0.0)
+    which = np.searchsorted(begins, times[:-1], side="right") - 1  # the change that acts from each instant on
+    since, first, grows = begins[which], first[which], grows[which]
+    knee = np.maximum((longest - first) / grows, 0.0)
 
-    def clock(t: np.ndarray) -> np.ndarray:  # steps taken up to t: ∫ dt / min(longest, FIRST + grows t)
-        young = np.log1p(grows * np.minimum(t, knee) / FIRST) / grows
+    def clock(t: np.ndarray) -> np.ndarray:  # steps taken up to t: ∫ dt / min(longest, first + grows t)
+        young = np.log1p(grows * np.minimum(t, knee) / first) / grows
         return young + np.maximum(t - knee, 0.0) / longest
 
-    since = begins[np.searchsorted(begins, times, side="right") - 1]  # the change that acts from each instant on
-    at, ends, at_knee = clock((times - since)[:-1]), clock(times[1:] - since[:-1]), clock(knee)
+    at, ends, at_knee = clock(times[:-1] - since), clock(times[1:] - since), clock(knee)
     parts = []
     for k in range(len(times) - 1):
         count = max(1, int(np.ceil(ends[k] - at[k] - 1e-9)))
         wanted = np.linspace(at[k], ends[k], count, endpoint=False)
-        young = FIRST / grows * np.expm1(grows * np.minimum(wanted, at_knee[k]))
+        young = first[k] / grows[k] * np.expm1(grows[k] * np.minimum(wanted, at_knee[k]))
         parts.append(since[k] + young + np.maximum(wanted - at_knee[k], 0.0) * longest[k])
         parts[-1][0] = times[k]
     return np.concatenate([*parts, times[-1:]])
@@ -150,42 +145,63 @@ class Lag(eqx.Module):
     decay: Float[Array, ""]
 
 
-def _of_each_step(conditions: Conditions) -> tuple[Conditions | None, Conditions, Conditions]:
-    """What changes as it is before each step and in it, shape (steps,), and what does not; before: None where nothing
-    that drives the current may jump."""
+class _Step(eqx.Module):
+    """A step of a run; or all of them, fields of shape (steps, ...).
+
+    Attributes:
+        length: [s]; begun: 0 of the first step, else 1.
+        before, now: what changes of the conditions, before it and in it; before: None where no lag follows a jump of
+            what drives the current.
+    """
+
+    length: Array
+    begun: Array
+    before: Conditions | None
+    now: Conditions
+
+    def held(self, constant: Conditions) -> Conditions:
+        """All conditions in it."""
+        return eqx.combine(self.now, constant)
+
+    def rates_at_start(
+        self, constant: Conditions, rate: Callable[[Array, Conditions], Array], y: Float[Array, " unknowns"]
+    ) -> Float[Array, "rates ..."]:
+        """Rates of the current where it starts: before what drives the current jumps, after that, and with a little
+        more current, which tells how soon it follows; none where no lag follows. Before a run its current rests."""
+        held = self.held(constant)
+        if self.before is None:
+            return jnp.zeros((0, *rate(y, held).shape))
+        rested = self.begun * rate(y, eqx.combine(self.before, constant))
+        return jnp.stack([rested, rate(y, held), rate(y + MORE * _current(y), held)])
+
+
+def _steps(conditions: Conditions, times: Float[Array, " times"]) -> tuple[_Step, Conditions]:
+    """Every step of a run, and what of its conditions does not change."""
     changing, constant = _in_time(conditions)
-    driving = changing.voltage, changing.duty, changing.open, changing.motor_current
-    jumps = conditions.motor_speed is None and any(x is not None for x in driving)
-    before = jax.tree.map(lambda x: jnp.concatenate([x[:1], x[:-2]]), changing) if jumps else None
-    return before, jax.tree.map(lambda x: x[:-1], changing), constant
-
-
-def _held(constant: Conditions, before: Conditions | None, now: Conditions) -> tuple[Conditions | None, Conditions]:
-    """Conditions before a step and in it."""
-    return None if before is None else eqx.combine(before, constant), eqx.combine(now, constant)
-
-
-def _rates_at_start(
-    rate: Callable[[Array, Conditions], Array], y: Array, before: Conditions | None, held: Conditions
-) -> Array:
-    """Rates of the current where a step starts: before what drives it jumps, after that, and with a little more
-    current, which tells how soon it follows; none where nothing jumps."""
-    if before is None:
-        return jnp.zeros((0, *rate(y, held).shape))
-    return jnp.stack([rate(y, before), rate(y, held), rate(y + MORE * _current(y), held)])
+    before = jax.tree.map(lambda x: jnp.concatenate([x[:1], x[:-2]]), changing)
+    now = jax.tree.map(lambda x: x[:-1], changing)
+    length = jnp.diff(times)
+    begun = (jnp.arange(len(length)) > 0).astype(length.dtype)
+    return _Step(length, begun, before if conditions.motor_speed is None else None, now), constant
 
 
 def _lag(rate: Float[Array, " rates"], h: Array) -> Lag:
     """Of a step, by the rates at its start."""
     if not len(rate):
         return Lag(jnp.zeros(()), jnp.zeros(2), jnp.zeros(()), jnp.zeros(()))
-    decay = (rate[1] - rate[2]) / MORE
-    begin = (rate[0] - rate[1]) / decay
+    slope = (rate[1] - rate[2]) / MORE
+    follows = slope > 0  # but where a diode begins to block
+    decay = jnp.where(follows, slope, 1.0)
+    begin = jnp.where(follows, (rate[0] - rate[1]) / decay, 0.0)
     parts = jnp.array([1 - _GAMMA, _GAMMA]) * h
     at = begin * jnp.exp(-decay * jnp.stack([jnp.zeros(()), parts[0]]))
     z = decay * parts
     means = jnp.where(z > 0, -jnp.expm1(-z) / jnp.where(z > 0, z, 1.0), 1.0) * at
     return Lag(begin, means, begin * jnp.exp(-decay * h), decay)
+
+
+def _lag_of(robot: Robot, constant: Conditions, step: _Step, y: Float[Array, " unknowns"]) -> Lag:
+    return _lag(step.rates_at_start(constant, lambda y, held: winding(robot, held, y), y), step.length)
 
 
 def _stage(
@@ -220,11 +236,10 @@ def states(
 
     Args: as of `histories`.
     """
-    *each, constant = _of_each_step(conditions)
+    steps, constant = _steps(conditions, times)
 
-    def step(y: Array, inputs: tuple) -> tuple[Array, tuple[Array, Array]]:
-        h, before, held = inputs[0], *_held(constant, *inputs[1:])
-        lag = _lag(_rates_at_start(lambda y, c: winding(robot, c, y), y, before, held), h)
+    def taken(y: Array, step: _Step) -> tuple[Array, tuple[Array, Array]]:
+        h, held, lag = step.length, step.held(constant), _lag_of(robot, constant, step, y)
         first = y - lag.begin * _current(y)
 
         def stage(given: tuple[Array, Array], mean: Array) -> tuple[tuple[Array, Array], Array]:
@@ -235,7 +250,7 @@ def states(
         end = both[1] + lag.end * _current(y)
         return end, (both, end)
 
-    return jax.lax.scan(step, at_first(robot, conditions)[1], (jnp.diff(times), *each))[1]
+    return jax.lax.scan(taken, at_first(robot, conditions)[1], steps)[1]
 
 
 def followed(
@@ -246,10 +261,10 @@ def followed(
     Args: as of `histories`; known: its states, where they are.
     """
     found, ends = states(robot, conditions, times) if known is None else known
-    *conditions_of, constant = _of_each_step(conditions)
+    steps, constant = _steps(conditions, times)
     of_first, first_state = at_first(robot, conditions)
     at = jnp.concatenate([first_state[None], ends])
-    through, h = _through_rest(robot, of_first, at), jnp.diff(times)
+    through, h = _through_rest(robot, of_first, at), steps.length
     # Through rest: Euler's implicit steps to and from it, by the equations as they are off it.
     shares = jnp.stack([through.before, 1 - through.before], 1)
     spans = jnp.where(through.any[:, None], shares, _GAMMA) * h[:, None]
@@ -258,17 +273,17 @@ def followed(
     late = jnp.stack([through.before <= 0, through.before < 1], 1)
 
     def linear(given: tuple) -> tuple[Array, Array, Array, Array]:
-        begin, end, found, spans, late, h, passes, turns, *now = given
-        before, held = _held(constant, *now)
+        begin, end, found, spans, late, passes, turns, step = given
+        held = step.held(constant)
         one = jnp.eye(len(end), dtype=end.dtype)
         current = _current(end)
 
         def at_start(y: Array) -> tuple[Array, Array]:
-            rate = _rates_at_start(lambda y, c: winding(robot, c, y), y, before, held)
+            rate = step.rates_at_start(constant, lambda y, held: winding(robot, held, y), y)
             return rate, rate
 
         by_begin, rate = jax.jacfwd(at_start, has_aux=True)(begin)
-        by_rate, lag = jax.jacfwd(lambda r: (_lag(r, h),) * 2, has_aux=True)(rate)
+        by_rate, lag = jax.jacfwd(lambda r: (_lag(r, step.length),) * 2, has_aux=True)(rate)
         off_rest = jnp.where(late[:, None], end - lag.end * current, begin - lag.begin * current)
         places = jnp.where(passes, off_rest, found) + lag.means[:, None] * current
         slopes = jax.vmap(jax.jacfwd(lambda y: rates(robot, held, y)))(places)
@@ -286,7 +301,7 @@ def followed(
         lags = lags + jnp.outer(by_rate.end, current) + jnp.outer(by_rate.decay, by_decay)
         return places, carries + lags.T @ by_begin, gains, lags
 
-    each = at[:-1], ends, found, spans, late, h, through.any, through.turns, *conditions_of
+    each = at[:-1], ends, found, spans, late, through.any, through.turns, steps
     places, carries, gains, lags = _of_steps(jax.lax.map(jax.vmap(linear), _in_blocks(each)), len(h))
     return Followed(found, at[:-1], ends, places, clock, carries, gains, lags)
 
@@ -336,33 +351,30 @@ def respond(
 
     Sources of a block's steps are computed side by side; one after another is left only a product a step.
     """
-    *conditions_of, constant = _of_each_step(conditions)
+    steps, constant = _steps(conditions, jnp.append(along.clock[:, 0], along.clock[-1, 2]))
 
-    def added(along: Followed, before: Conditions | None, now: Conditions) -> Array:
+    def added(along: Followed, step: _Step) -> Array:
         """By the sources of a step, at its end."""
-        before, held = _held(constant, before, now)
+        held = step.held(constant)
         both = jax.vmap(lambda t, y: source(t, y, held))(along.clock[1:], along.places)
         found = jnp.tensordot(along.gains, both, ((0, 2), (0, 1)))
-        if before is None:
-            return found
-        rate = lambda y, held: source(along.clock[0], y, held)[CURRENT]  # noqa: E731
-        lag = _rates_at_start(rate, along.begins, before, held)
-        return found + jnp.tensordot(along.lags, lag, ((0,), (0,)))
+        of_lag = step.rates_at_start(constant, lambda y, held: source(along.clock[0], y, held)[CURRENT], along.begins)
+        return found + jnp.tensordot(along.lags, of_lag, ((0,), (0,)))
 
     def after(dy: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
         dy = jnp.tensordot(step[0], dy, 1) + step[1]
         return dy, dy
 
     def block(dy: Array, inputs: tuple) -> tuple[Array, Array]:
-        along, before, now, then = inputs
-        last, changes = jax.lax.scan(after, dy, (along.carries, jax.vmap(added)(along, before, now)))
+        along, step, then = inputs
+        last, changes = jax.lax.scan(after, dy, (along.carries, jax.vmap(added)(along, step)))
         whole = jax.vmap(lambda t, y, dy, changing: seen(t, y, dy, eqx.combine(changing, constant)))
         return last, whole(along.clock[:, 2], along.ends, changes, then)
 
     changing, _ = _in_time(conditions)
     of_first = eqx.combine(jax.tree.map(lambda x: x[0], changing), constant)
     still = jnp.zeros_like(source(along.clock[0, 0], along.begins[0], of_first)) if begin is None else begin
-    each = along, *conditions_of, jax.tree.map(lambda x: x[1:], changing)
+    each = along, steps, jax.tree.map(lambda x: x[1:], changing)
     return _of_steps(jax.lax.scan(block, still, _in_blocks(each))[1], len(along.clock))
 
 
@@ -454,10 +466,75 @@ def histories(
     stand creeps where gravity pulls, below a tenth of V_s.
     """
     changing, constant = _in_time(conditions)
-    still = jax.lax.stop_gradient(robot)
-    found = states(still, conditions, times) if known is None else (known.states, known.ends)
-    nodes = _ends(robot, conditions, times, found, known)
-    ys = jnp.concatenate([at_first(robot, conditions)[1][None], nodes])
+    ys = _nodes(robot, conditions, times, known)
     if at is not None:
         ys, changing = jax.tree.map(lambda x: x[at], (ys, changing))
     return jax.vmap(lambda y, now: moving(robot, eqx.combine(now, constant), state_of(robot, y)))(ys, changing)
+
+
+def _nodes(
+    robot: Robot, conditions: Conditions, times: Float[Array, " times"], known: Followed | None
+) -> Float[Array, "times unknowns"]:
+    """Unknowns at every instant."""
+    still = jax.lax.stop_gradient(robot)
+    found = states(still, conditions, times) if known is None else (known.states, known.ends)
+    ends = _ends(robot, conditions, times, found, known)
+    return jnp.concatenate([at_first(robot, conditions)[1][None], ends])
+
+
+class Within(eqx.Module):
+    """What steps of a run are like between their instants; signals have fields of shape (steps,).
+
+    Attributes:
+        first: at the beginning; begin, end: from where to where the rest goes on a line while a lag decays.
+        decays: exponent of that decay over the step, shape (steps,).
+    """
+
+    first: Signals
+    begin: Signals
+    end: Signals
+    decays: Float[Array, " steps"]
+
+    @staticmethod
+    def read(steps: tuple[Array, ...], share: Float[Array, " steps"]) -> Float[Array, "steps ..."]:
+        """Readings a share of the way through steps.
+
+        Args:
+            steps: readings at `first`, `begin` and `end`, shape (steps, ...), and `decays`.
+        """
+        first, begin, end, decays = steps
+        left = jnp.reshape(jnp.exp(-decays * share), (*share.shape, *[1] * (first.ndim - share.ndim)))
+        return on_line(begin, end, share) + left * (first - begin)
+
+
+def within(
+    robot: Robot,
+    conditions: Conditions,
+    times: Float[Array, " times"],
+    known: Followed | None = None,
+    at: Int[Array, " places"] | None = None,
+) -> Within:
+    """One run, as `histories`, between its instants.
+
+    Args: as of `histories`; at: steps that are wanted, by the index of the instant that each begins at.
+    """
+    ys = _nodes(robot, conditions, times, known)
+    steps, constant = _steps(conditions, times)
+    then = jax.tree.map(lambda x: x[1:], _in_time(conditions)[0])
+    each = ys[:-1], ys[1:], steps, then
+    if at is not None:
+        each = jax.tree.map(lambda x: x[at], each)
+
+    def shown(conditions: Conditions, y: Array) -> Signals:
+        return moving(robot, conditions, state_of(robot, y))
+
+    def one(y: Array, after: Array, step: _Step, then: Conditions) -> Within:
+        held = step.held(constant)
+        first = shown(held, y)
+        if step.before is None:  # what is imposed is on a line itself
+            return Within(first, first, shown(eqx.combine(then, constant), after), jnp.zeros(()))
+        lag, current = _lag_of(robot, constant, step, y), _current(y)
+        begin, end = shown(held, y - lag.begin * current), shown(held, after - lag.end * current)
+        return Within(first, begin, end, lag.decay * step.length)
+
+    return jax.vmap(one)(*each)

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from calibration.data.columns import SUPPLY
 from calibration.data.courses import Stretch, applied, changing, differs, divided, stretches
 from calibration.data.errors import BadConfiguration, BadData, number
 from calibration.data.runs import Runs
@@ -32,7 +33,7 @@ from calibration.inference.details import Memory, Strongest, TimeSide, TimeStati
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
 from calibration.inference.normal_equations import solved
-from calibration.inference.notes import CoarseSteps, ManyChanges, Note, StopsOnSlope, Thinned
+from calibration.inference.notes import CoarseSteps, Note, StopsOnSlope, Thinned
 from calibration.inference.observers import settled_ends
 from calibration.inference.observers.base import Observer, SearchPolicy
 from calibration.inference.optimizers import (
@@ -57,19 +58,21 @@ from mmrjax.effects import Effect
 from mmrjax.effects.curve import WAYS
 from mmrjax.fidelities.drive import rates, state_of
 from mmrjax.fidelities.histories import (
-    GROWTH,
+    CHANGE,
     LONGEST,
+    START,
     STEPS,
     Followed,
+    Within,
     at_first,
     followed,
     grid,
-    growth,
     histories,
     respond,
+    within,
 )
 from mmrjax.params import Scalar
-from mmrjax.rig import Begin, Begins, Rig, on_line
+from mmrjax.rig import Begin, Begins, Rig
 from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED, FAILED, Signals, State
 
@@ -82,33 +85,28 @@ KNOTS, KNOT_STEPS = 256, 1e7
 LAGS = 12
 #: Values of a delay at which the misfit is looked at, fewest and most; and of what else is scanned, a run each.
 DELAYS, SCANNED = (256, 2048), 32
-#: Growth of steps after changes, over the usual one, from which on that is said.
-COARSE = 15
 #: A first sample so early shows a robot at rest [s]; how much of its largest speed, and how many sds, it may show.
 EARLY, RESTING, RESTING_SD = 0.005, 0.2, 5.0
 #: Members of a search that one call of its program evaluates.
 TOGETHER = 2
-#: Fields of `Conditions` that may change within a run; and of those what makes for an inrush, with how much of the
-#: largest applied voltage a change has to be for steps to be short after it.
+#: Fields of `Conditions` that may change within a run.
 CHANGING = ("voltage", "motor_current", "slope_deg", "payload", "adhesion", "total_mass", "duty", "open")
 #: Of these what is imposed.
 ON_LINES = ("voltage", "motor_current", "duty")
-INRUSH = 2e-3
 #: A stretch of unchanged conditions so long may show steady travel [s].
 LASTING = 0.25
-#: Fewest steps from sample to sample of a run that is driven both ways; where a voltage is imposed, as it passes
-#: through rest: while a speed is below this share of its largest, and before that for so long [s] and for so many of
-#: the rig's delay.
-FINE, SLOW, EARLIER, DELAYED = 16, 0.1, 0.03, 2.0
+#: Fewest steps from sample to sample of a run that is driven both ways, as it passes through rest: while a speed is
+#: below a share of its largest, and before that for so long [s], by what is imposed (when a current brings a shaft to
+#: rest depends more on what is calibrated), and for so many of the rig's delay.
+FINE, DELAYED = 16, 2.0
+SLOW, EARLIER = {"voltage": 0.1, "motor_current": 0.3}, {"voltage": 0.03, "motor_current": 0.06}
 #: How many of the usual longest steps one may be elsewhere.
 FAST = 2
 #: Of a log that is thinned: how many steps there are at least between readings, and by how much they grow with the
-#: time since a condition changed, at most [1/s · s].
-BETWEEN, LATER = 4, 0.05
+#: time since a condition changed, at most [1/s · s]; a supply by more than a share of its largest value.
+BETWEEN, LATER, SMALL = 4, 0.05, 0.05
 #: The same of one whose speed is imposed, and how many of the usual longest steps one of its steps may be.
 COARSELY, SLOWLY = 2, 4
-#: By how much its steps grow with the time since its start [1/s · s].
-SOON = 0.25
 #: Change of a speed from the third to the last quarter of a stretch, as a share, from which on it has not settled.
 #: From rest a speed that nears steady travel exponentially and has reached half of it still changes by 0.23.
 STILL = 0.2
@@ -241,10 +239,11 @@ class Histories(Observer):
             for h, n in zip(_longest(runs, robot.rig), noted, strict=True)
         ]
         grids = [
-            grid(whole["time_s"][rows[n]], c, h, SOON if exact else GROWTH)
+            grid(whole["time_s"][rows[n]], *c, h, START if robot.has_ground else CHANGE)
             for rows, n, c, h in zip(every, noted, _changes(whole, every, robot.rig), steps, strict=True)
         ]
-        longest, samples = _common(max(map(len, grids))), max(map(len, mine))
+        # The last instant begins a step, of no length, as every other does.
+        longest, samples = _common(max(map(len, grids)) + 1), max(map(len, mine))
         times = np.stack([np.concatenate([g, np.repeat(g[-1], longest - len(g))]) for g in grids])
         instant = np.array([np.searchsorted(grids[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
         rows = np.stack([np.concatenate([m, np.full(samples - len(m), -1)]) for m in mine])
@@ -332,10 +331,6 @@ class Histories(Observer):
             step = max(step, *(h.max(initial=0.0) for h in _longest(runs, robot.rig)))
         if step > FAST * LONGEST:
             said.append(CoarseSteps(float(runs["time_s"].max()), float(step)))
-        each = [runs.whole.in_order(name) for name in np.unique(names)]
-        changes = max(len(c) for c in _changes(runs.whole, each, robot.rig)) + 1
-        if growth(float(runs["time_s"].max()), changes) > COARSE * GROWTH:
-            said.append(ManyChanges(changes - 1))
         return said
 
     @classmethod
@@ -406,7 +401,7 @@ class Histories(Observer):
                 """By the state, and at once: the current follows from torque where the speed is imposed."""
 
                 def reading(y: Array, amplitude: Array) -> Array:
-                    return _readings(robot, balances.moving(probed(amplitude), held, state_of(robot, y)))
+                    return _reading(robot, balances.moving(probed(amplitude), held, state_of(robot, y)))
 
                 by_state, at_once = jax.jacfwd(reading, (0, 1))(y, none)
                 return jnp.tensordot(by_state, dy, 1) + at_once[:, :, None] * hat(t)
@@ -501,9 +496,19 @@ class Histories(Observer):
         cases = some[np.unique(which, axis=0, return_index=True)[1]]
         return jax.tree.map(lambda x: jnp.asarray(x[cases]), turned)
 
-    def late(self, every: Float[Array, "runs instants ..."], rig: Rig) -> Float[Array, "rows ..."]:
-        """Of every row, what is there between the instants before and after it less the rig's delay."""
-        return _by_row(jax.vmap(rig.late)(self.times, every, self.time[self.rows_of]), self.rows_of, len(self.run))
+    def late(self, every: tuple[Array, ...], rig: Rig) -> Float[Array, "rows ..."]:
+        """Of every row, what is there within a step, less the rig's delay.
+
+        Args:
+            every: what `Within.read` takes of every step, shape (runs, steps, ...) each.
+        """
+
+        def of_run(times: Array, every: tuple[Array, ...], time: Array) -> Array:
+            step, share = rig.before(times, time)
+            return Within.read(tuple(x[step] for x in every), share)
+
+        of_runs = jax.vmap(of_run)(self.times, every, self.time[self.rows_of])
+        return _by_row(of_runs, self.rows_of, len(self.run))
 
     @property
     def crosses_zero(self) -> bool:
@@ -515,14 +520,10 @@ class Histories(Observer):
         ) -> Array:
             """Readings of a run's rows."""
 
-            def shown(at: Array) -> Array:
-                return jax.vmap(lambda s: _readings(robot, s))(histories(robot, conditions, times, known, at))
-
             if not self.delayed:
-                return shown(instants)
-            before, share = robot.rig.before(times, time)
-            both = shown(jnp.concatenate([before, before + 1]))
-            return on_line(both[: len(time)], both[len(time) :], share)
+                return _readings(robot, histories(robot, conditions, times, known, instants))
+            step, share = robot.rig.before(times, time)
+            return Within.read(_of_steps(robot, within(robot, conditions, times, known, step)), share)
 
         places = self.instant[self.rows_of], self.time[self.rows_of]
         of_runs = jax.vmap(of_run)(self.conditions, self.times, self.known, *places)
@@ -745,18 +746,22 @@ def _autocorrelation(linear: Linearization, lags: int) -> dict[str, list[float]]
     return {name: [float(lag[k]) for lag in by_lag] for k, name in enumerate(linear.channels)}
 
 
-def _changes(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[np.ndarray]:
-    """Instants at which the supply of the motors of each run changes at once [s]."""
-    volts, time = applied(runs), runs["time_s"]
-    if runs.layout.imposed != "voltage":  # which no inrush follows
-        return [np.zeros(0)] * len(each)
-    if not np.isfinite(volts).all() or not volts.any():
-        return [np.zeros(0)] * len(each)
+def _changes(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Instants at which what drives the motors of each run changes at once [s], and by what share of its largest
+    value."""
+    driven, time = applied(runs), runs["time_s"]
+    # An imposed speed takes the current with it; what is on lines does not jump; what is not known is refused later.
+    known = rig.imposed != "motor_speed" and rig.between_rows == "held" and np.isfinite(driven).all() and driven.any()
     coasts = runs["mode"] == "coast" if runs.has("mode") else np.zeros(len(runs), bool)
     found = []
     for rows in each:
-        far = (np.abs(np.diff(volts[rows])) > INRUSH * np.abs(volts[rows]).max()) & (rig.between_rows == "held")
-        found.append(time[rows[1:]][far | (coasts[rows][1:] != coasts[rows][:-1])])
+        sizes = (
+            np.abs(np.diff(driven[rows])) / max(np.abs(driven[rows]).max(), 1e-300)
+            if known
+            else np.zeros(len(rows) - 1)
+        )
+        sizes = np.maximum(sizes, coasts[rows][1:] != coasts[rows][:-1])
+        found.append((time[rows[1:]][sizes > 0], sizes[sizes > 0]))
     return found
 
 
@@ -916,9 +921,18 @@ def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) ->
     return bool(np.any(np.abs(after - before) > STILL * np.abs(before + after) / 2))
 
 
-def _changed(runs: Runs, rows: np.ndarray) -> np.ndarray:
-    """Whether what drives a run changes at each of its rows."""
-    return differs(rows, (runs[column] for column in changing(runs)))
+def _changed(runs: Runs, rows: np.ndarray, share: float = 0.0) -> np.ndarray:
+    """Whether what drives a run changes at each of its rows, what motors are given by more than a share of its
+    largest."""
+    supplied = (runs.layout.imposed_column, SUPPLY, "duty")
+    found = differs(rows, (runs[column] for column in changing(runs) if column not in supplied))
+    found[1:] |= _jumps(applied(runs)[rows]) > share
+    return found
+
+
+def _jumps(driven: np.ndarray) -> np.ndarray:
+    """By what share of its largest value what drives a run changes from row to row."""
+    return np.abs(np.diff(driven)) / max(float(np.abs(driven).max(initial=0.0)), 1e-300)
 
 
 def _usual(apart: np.ndarray) -> float:
@@ -932,12 +946,12 @@ def _longest(runs: Runs, rig: Rig) -> list[np.ndarray]:
     Where the speed is imposed only what effects remember is followed. Where what drives a run changes its sign,
     friction jumps as the speed passes through zero, within a step, which has to be short beside the time from reading
     to reading: where the table's speeds are low or change their sign, and as much earlier as the rig's delay may be.
-    Where it shows no speed, and where a current is imposed, after which speeds bend more sharply, all along.
+    Where it shows no speed, all along.
     """
     whole, exact = runs.whole, rig.imposed == "motor_speed"
     speeds = whole.measured()[:, [c.zero_at_rest and c.directed and c.settled for c in runs.channels]]
     driven = None if exact else applied(whole)
-    early, found = DELAYED * np.max(np.asarray(rig.delay)) + EARLIER, []
+    early, found = DELAYED * np.max(np.asarray(rig.delay)) + EARLIER.get(rig.imposed, 0.0), []
     for name in np.unique(runs.run_names):
         rows = whole.in_order(name)
         time = whole["time_s"][rows]
@@ -947,11 +961,11 @@ def _longest(runs: Runs, rig: Rig) -> list[np.ndarray]:
         if driven is None:
             longest[:] = min(SLOWLY * LONGEST, wait / COARSELY)
         elif runs.log is not None:
-            begins = np.where(_changed(whole, rows), np.arange(len(rows)), 0)
+            begins = np.where(_changed(whole, rows, SMALL), np.arange(len(rows)), 0)
             since = time - time[np.maximum.accumulate(begins)]
             longest = np.maximum(longest, np.minimum(LATER * since[:-1], wait / BETWEEN))
         if both_ways:
-            slow = _slow(speeds[rows]) | (rig.imposed != "voltage")
+            slow = _slow(speeds[rows], SLOW[rig.imposed])
             before = int(np.ceil(early / _usual(apart)))
             slow = np.convolve(slow, np.ones(before + 1))[before:] > 0
             longest[slow] = min(LONGEST, wait / FINE)
@@ -959,15 +973,15 @@ def _longest(runs: Runs, rig: Rig) -> list[np.ndarray]:
     return found
 
 
-def _slow(speeds: np.ndarray) -> np.ndarray:
+def _slow(speeds: np.ndarray, share: float) -> np.ndarray:
     """Whether a run may pass through rest between each of its rows and the next; all along where nothing is shown.
 
     Args:
-        speeds: readings that are 0 at rest, shape (rows, channels).
+        speeds: readings that are 0 at rest, shape (rows, channels); share: of their largest, below which it may.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
-        far = np.abs(speeds) > SLOW * np.nanmax(np.abs(speeds), 0, initial=0.0)
+        far = np.abs(speeds) > share * np.nanmax(np.abs(speeds), 0, initial=0.0)
     ways = np.where(far, np.sign(speeds), 0.0)
     return ~np.any((ways[1:] == ways[:-1]) & (ways[1:] != 0), 1)
 
@@ -979,9 +993,18 @@ def _common(instants: int) -> int:
     return -(-instants // part) * part
 
 
-def _readings(robot: Robot, signals: Signals) -> Float[Array, " channels"]:
+def _reading(robot: Robot, signals: Signals) -> Float[Array, " channels"]:
     shown = balances.sensor(robot, signals)
     return jnp.stack([shown[name] for name in channels.names(robot.channels)], -1)
+
+
+def _readings(robot: Robot, signals: Signals) -> Float[Array, "instants channels"]:
+    return jax.vmap(lambda s: _reading(robot, s))(signals)
+
+
+def _of_steps(robot: Robot, steps: Within) -> tuple[Array, ...]:
+    """What `Within.read` takes of readings."""
+    return *(_readings(robot, s) for s in (steps.first, steps.begin, steps.end)), steps.decays
 
 
 @functools.partial(compiled, options=OVER_TIME)
@@ -997,17 +1020,18 @@ def _turning(observe: Histories, robot: Robot) -> tuple[Array, Array, dict[str, 
 def _over_delays(problem: Problem, z: Array, data: Data, scanned: Array, values: Array) -> tuple[Array, Array]:
     observe: Histories = problem.observe  # type: ignore[assignment]
 
-    def shown(z: Array) -> tuple[Array, Array]:
+    def shown(z: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         robot = problem.robot(z)
-        every = jax.vmap(jax.vmap(lambda s: _readings(robot, s)))(observe.whole(robot))
-        return every, every
+        of_run = lambda c, t, k: _of_steps(robot, within(robot, c, t, k))  # noqa: E731
+        *every, decays = jax.vmap(of_run)(observe.conditions, observe.times, observe.known)
+        return tuple(every), (*every, decays)
 
-    slope, every = jax.jacfwd(shown, has_aux=True)(z)
-    both = jnp.concatenate([every[..., None], slope], -1)
+    slopes, (*every, decays) = jax.jacfwd(shown, has_aux=True)(z)
+    both = [jnp.concatenate([x[..., None], slope], -1) for x, slope in zip(every, slopes, strict=True)]
 
     def one(value: Array) -> tuple[Array, Array]:
         at = jnp.where(scanned, value, z)
-        late = observe.late(both, problem.robot(at).rig)
+        late = observe.late((*both, decays), problem.robot(at).rig)
         error = data.weight * (late[..., 0] - data.measured) / data.sd
         finite = jnp.all(jnp.isfinite(late), -1)
         error = jnp.where(finite, error, MISSING * data.weight)
