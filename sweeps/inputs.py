@@ -14,9 +14,11 @@ from calibration.data.contradictions import misplaced
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.posterior import Posterior
 from calibration.data.robot_file import RobotFile
+from mmrjax import fidelities
 from mmrjax.robot import Robot
 from mmrjax.tables import BENCH, SURFACES
-from sweeps.config import OneRun, RobotPart
+from sweeps import capabilities
+from sweeps.config import FidelityPart, OneRun, RobotPart
 from sweeps.console import tell
 from sweeps.options import flags
 from sweeps.points import imposed
@@ -28,7 +30,7 @@ OPTIONS = flags(OneRun)
 def load_robot(config: RobotPart) -> RobotFile:
     """The robot that a configuration names, with its changes; its effects may be the user's own.
 
-    Former names of parameters are taken, and said on stderr.
+    Former names of parameters are taken, and said on stderr; so is a running gear that is an example's.
 
     Raises:
         BadConfiguration: no such robot, a file or a change that is refused.
@@ -38,6 +40,9 @@ def load_robot(config: RobotPart) -> RobotFile:
     robot = robot_file.change(file.robot, config.set, where="--set", notes=notes)
     for note in notes:
         tell(note)
+    resolves = isinstance(config, FidelityPart) and fidelities.facts(config.model).resolves
+    if resolves and robot.has_ground and not capabilities.states(robot, "running_gear."):
+        tell("the robot's file states no running_gear: wheelbase, belt and masses within are those of an example")
     return dataclasses.replace(file, robot=robot)
 
 

@@ -1001,7 +1001,8 @@ def _on_shaft(torque_constant, *present):
     """A winch or a bench of one drive with losses, the motor's speed imposed forward and backward."""
     load = Shaft(inertia=1e-3, loss_coulomb=0.05, loss_viscous=1e-3, torque_constant=torque_constant)
     robot = robots.blank(Configurations({"bench": load}))
-    robot = params.replace(robot, {"gearbox.ratio": 20.0, "gearbox.efficiency_load": 0.8})
+    stated = {"gearbox.ratio": 20.0, "gearbox.efficiency_load": 0.8, "motor.torque_constant": 0.0259}
+    robot = params.replace(robot, stated)
     runs = Conditions(0, voltage=0.0, motor_speed=[100.0, -100.0, 300.0, -300.0])
     return np.asarray(steady_batch(with_effects(*present, robot=robot), runs).total_current)
 

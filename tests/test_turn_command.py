@@ -11,7 +11,7 @@ import mmrjax as mm
 from calibration.data import runs as records
 from calibration.data.errors import BadData
 from mmrjax import robots
-from mmrjax.channels import SIDES
+from mmrjax.channels import HEAT, SIDES
 from mmrjax.derived import turn as derived
 from mmrjax.errors import UsageError
 from sweeps.commands import simulate
@@ -261,7 +261,7 @@ def test_turns_are_told_in_plain_words():
     assert "winding_hot: winding hotter than permitted" in said(flags="gearbox_overspeed;winding_hot")
     hot = turn_words.turn(robot, row(winding_left_C=float("inf"), power_right_W=-0.01), None)
     assert hot.sides[-2:] == [("electrical power [W]", "5.0", "0.0"), (hot.sides[-1][0], "none settles", "40")]
-    unknown = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, inherits=False))  # how its heat leaves
+    unknown = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, unknown=HEAT[-1:]))
     assert [side[0] for side in turn_words.turn(unknown, row(), None).sides] == [side[0] for side in hot.sides[:-1]]
     nothing = {name: float("nan") for name, value in row().items() if isinstance(value, float)}
     none = turn_words.turn(robot, row(status="not_settled", **nothing), None)

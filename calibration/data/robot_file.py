@@ -469,6 +469,7 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
             continue
         was = start.get(parameter.name, 0.0 if head_.startswith("effects.") else None)
         same = value == was and not parameter.name.startswith(always) and parameter.name not in needed
+        same &= parameter.name not in nothing.rig.unknown or parameter.name in robot.rig.unknown
         if same and (not whole or head_ == "rig"):
             continue
         origin = f"; nominal {was:g}: {spec.source}" if was is not None and value != was else ""

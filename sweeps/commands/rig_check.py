@@ -20,11 +20,10 @@ from calibration.data.writing import finite
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.foresight import Foresight
 from mmrjax import channels
-from mmrjax.channels import Channel
+from mmrjax.channels import HEAT, Channel
 from mmrjax.motor import UNLIMITED
 from mmrjax.robot import Robot
 from mmrjax.shaft import Shaft
-from sweeps import capabilities
 from sweeps.config import RobotPart
 from sweeps.console import say
 from sweeps.inputs import load_robot, read_runs
@@ -94,10 +93,11 @@ class RigCheck:
         ]
         if loose and not self.robot.rig.inherits:
             said.append(f"without ±, so with the program's: {', '.join(loose)}")
-        if not capabilities.thermal(self.robot) and self.robot.motor.temperature_limit < UNLIMITED:
+        if not self.robot.knows(HEAT) and self.robot.motor.temperature_limit < UNLIMITED:
+            lacking = " and ".join(self.robot.unknown(HEAT))
             said.append(
-                "motor.temperature_limit is stated, and not how the windings' heat leaves: it is held against an "
-                "example's motor.resistance_thermal_winding and motor.resistance_thermal_housing; state yours"
+                f"motor.temperature_limit is stated, and not how warm the windings become: state {lacking}, without "
+                "which nothing is held against it"
             )
         if self.robot.motor.voltage_limit is None and self.robot.rig.imposed == "voltage":
             said.append("motor.voltage_limit is not stated: experiments are proposed up to what a table used")
