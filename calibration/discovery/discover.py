@@ -239,7 +239,8 @@ def prepared(
     ready = preparation.prepare(distinct, robot, noise, stated)
     said: Notes = (*notes, *ready.former, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign)
     turned = scales.turned_in(distinct, ready.robot)
-    library = {**library, **kind.library}
+    own = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
+    library = {**library, **kind.library, **own}
     library = scales.library_for(ready.robot, distinct.conditions(ready.robot), library, turned)
     settings = dataclasses.replace(settings_for(kind, replicates, seed, prefer), forbidden=tuple(forbidden))
     return LoopInput(
