@@ -336,7 +336,8 @@ def settle(
     config.Loop,
     beside=config.LoopBeside,
     example="mmrjax loop measured --out found, then mmrjax sweep --robot found/robot.toml",
-    failure="the fit that is proposed did not converge. Every verdict is an answer: 0",
+    failure="the fit that is proposed did not converge, or --within was out before a verdict (the same command with "
+    "more goes on). Every verdict is an answer: 0",
 )
 def loop(
     told: Told,
