@@ -20,7 +20,7 @@ from mmrjax.tables import BENCH, SURFACES
 from sweeps import capabilities
 from sweeps.config import FidelityPart, OneRun, RobotPart
 from sweeps.console import tell
-from sweeps.options import flags
+from sweeps.flags import flags
 from sweeps.points import imposed
 
 #: Option that states a condition of one run.

@@ -94,19 +94,19 @@ def test_a_demanded_turn_is_that_of_the_voltages_found(tmp_path, mmrjax):
 
 
 REFUSED = {
-    "one side": (("--left", "33"), "left_V acts with right_V only"),
+    "one side": (("--left", "33"), "--left acts with --right only"),
     "volts and duties": (
         ("--left", "3", "--right", "1", "--duty-left", "1", "--duty-right", "1"),
-        "without duty_left",
+        "--left acts without --duty-left only",
     ),
-    "speed alone": (("--speed", "0.3"), "speed_m_s acts with yaw_rate_rad_s only"),
+    "speed alone": (("--speed", "0.3"), "--speed acts with --yaw-rate only"),
     "volts and a demand": (
         ("--left", "3", "--right", "1", "--speed", "0.3", "--yaw-rate", "1"),
-        "left_V acts without speed_m_s",
+        "--left acts without --speed",
     ),
-    "volts on the battery": (("--left", "3", "--right", "1", "--battery"), "state duty_left and duty_right"),
-    "track, one side": (("--left", "3", "--model", "track"), "left_V acts with right_V only"),
-    "profile": (("--left", "3", "--right", "1", "--profile", "patrol"), "without profile"),
+    "volts on the battery": (("--left", "3", "--right", "1", "--battery"), "state --duty-left and --duty-right"),
+    "track, one side": (("--left", "3", "--model", "track"), "--left acts with --right only"),
+    "profile": (("--left", "3", "--right", "1", "--profile", "patrol"), "--left acts without --profile only"),
     "supply too low": (("--left", "33", "--right", "1", "--voltage", "20"), "expected at least 33 V"),
     "slope": (("--left", "33", "--right", "1", "--slope", "5"), "its heading changes there all the time"),
     "one motor": (("--left", "3", "--right", "1", "--robot", "ONE"), "expected sides = 2"),

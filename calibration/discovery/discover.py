@@ -76,6 +76,7 @@ from calibration.inference.residual_clusters import residual_clusters
 from calibration.words.notes import in_words
 from mmrjax import channels, effects
 from mmrjax.effects import Effect
+from mmrjax.errors import counted
 from mmrjax.robot import Robot
 
 #: Factors on a noise that nobody states at which the verdict is looked at too: on what is assumed, and on what the
@@ -233,8 +234,8 @@ def prepared(
     kind = observers.kind(distinct)
     if len(distinct) < kind.fewest:
         raise BadData(
-            f"{runs.source}: {len(distinct)} {kind.word} cannot show what a model lacks; at least {kind.fewest} are "
-            "needed"
+            f"{runs.source}: {counted(len(distinct), kind.word)} cannot show what a model lacks; at least "
+            f"{kind.fewest} are needed"
         )
     ready = preparation.prepare(distinct, robot, noise, stated)
     said: Notes = (*notes, *ready.former, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign)

@@ -109,29 +109,31 @@ class SpeedGain(SensorEffect):
         return self.amplitude * signals.speed
 
 
-def _scale(of: Channel) -> type[SensorEffect]:
+def _scale(shown_by: Channel) -> type[SensorEffect]:
     """The error of the scale of a channel's instrument; of a temperature, whose zero is a convention, of its zero."""
-    offset = of.unit_shown == "°C"
+    offset = shown_by.unit_shown == "°C"
 
     class Scale(SensorEffect):
-        name = f"{of.name}_{'offset' if offset else 'gain'}"
-        channel = of.name
+        name = f"{shown_by.name}_{'offset' if offset else 'gain'}"
+        channel = shown_by.name
 
         amplitude: Scalar = amplitude(
             unit="°C" if offset else "-",
-            meaning=f"error of the {of.label} reading" if offset else f"relative error of the {of.label} reading",
+            meaning=f"error of the {shown_by.label} reading"
+            if offset
+            else f"relative error of the {shown_by.label} reading",
             bounds=(-20.0, 20.0) if offset else (-0.2, 0.2),
             sd=2.0 if offset else 0.02,
             source="class of the instrument: 1 to 3 K" if offset else "class of the instrument: 0.5 to 2.5 %",
         )
 
         def term(self, robot: Robot, signals: Signals) -> Scalar:
-            shown: Any = of.read(robot, signals)
-            return self.amplitude * (jnp.ones_like(shown) if offset else shown)
+            read: Any = shown_by.read(robot, signals)
+            return self.amplitude * (jnp.ones_like(read) if offset else read)
 
     words = "".join(word.capitalize() for word in Scale.name.split("_"))
     Scale.__name__ = Scale.__qualname__ = words
-    Scale.__doc__ = f"""Δx = a{"" if offset else " x"} in the reading x of {of.label}.
+    Scale.__doc__ = f"""Δx = a{"" if offset else " x"} in the reading x of {shown_by.label}.
 
     The {"zero" if offset else "scale"} of the instrument is off.
 

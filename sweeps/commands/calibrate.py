@@ -11,6 +11,7 @@ from calibration.inference import blocks, priors
 from calibration.inference.calibrate import calibrate as run
 from calibration.inference.errors import rms_by_fit
 from calibration.inference.result import CalibrationResult
+from mmrjax.errors import counted
 from sweeps import config as configuration
 from sweeps.console import pulse, say, tell
 from sweeps.inputs import load_robot, read_runs
@@ -47,7 +48,9 @@ def calibrate(
 def print_calibration(found: CalibrationResult) -> None:
     """Whether the fit is adequate; parameters, errors and remarks, for a person."""
     say(found.adequacy.statement)
-    shown = Table(title=f"{len(found)} rows, {found.model}", title_justify="left", box=None, pad_edge=False)
+    shown = Table(
+        title=f"{counted(len(found), 'row')}, {found.model}", title_justify="left", box=None, pad_edge=False
+    )
     for heading in ("parameter", "value", "95 % interval", "shift [σ]", "determined"):
         left = heading in ("parameter", "determined")
         shown.add_column(heading, justify="left" if left else "right", no_wrap=True, overflow="ignore")

@@ -21,6 +21,7 @@ from calibration.inference import foresight, identifiability, priors
 from calibration.inference.foresight import Foresight
 from mmrjax import channels
 from mmrjax.channels import HEAT, Channel
+from mmrjax.errors import counted
 from mmrjax.motor import UNLIMITED
 from mmrjax.robot import Robot
 from mmrjax.shaft import Shaft
@@ -85,7 +86,8 @@ class RigCheck:
             )
         if self.examples:
             lines = ", ".join(map(str, self.examples))
-            said.append(f"{len(self.examples)} lines still hold the number of an example ({EXAMPLE}): {lines}")
+            hold = f"{counted(len(self.examples), 'line')} still hold{'s' * (len(self.examples) == 1)}"
+            said.append(f"{hold} the number of an example ({EXAMPLE}): {lines}")
         said += self.doubts
         said += [f"{fact.what} {fact.value}: {fact.odd}" for fact in self.facts if fact.odd]
         loose = [
@@ -318,7 +320,7 @@ def print_check(found: RigCheck) -> None:
 
 
 def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
-    shown = _table(f"\n{runs.source}: {len(runs)} rows", "column", "used as", "values>r", "from>r", "to>r")
+    shown = _table(f"\n{runs.source}: {counted(len(runs), 'row')}", "column", "used as", "values>r", "from>r", "to>r")
     for c in found.columns():
         ends = [_words(c["words"]), ""] if c["words"] else [_end(c["least"]), _end(c["greatest"])]
         name = c["column"] if c["theirs"] in ("", c["column"]) else f"{c['column']}, yours {c['theirs']}"
@@ -329,7 +331,11 @@ def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
     for sentence in [*found.unused(), *runs.missing()]:
         say(f"- {sentence}")
     names, counts = np.unique(np.array(seen.status), return_counts=True)
-    others = [f"{count} rows: {name}" for name, count in zip(names, counts, strict=True) if name not in words.SETTLED]
+    others = [
+        f"{counted(count, 'row')}: {name}"
+        for name, count in zip(names, counts, strict=True)
+        if name not in words.SETTLED
+    ]
     if others:
         say(
             f"- with the file's numbers not every row settles ({', '.join(others)}); one that the "
