@@ -7,7 +7,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from calibration.data import effect_file, posterior, robot_file, surfaces, thinning
+from calibration.data import effect_file, posterior, robot_file, surfaces
 from calibration.data import runs as records
 from calibration.data.columns import IMPOSED, Layout
 from calibration.data.contradictions import misplaced
@@ -100,7 +100,6 @@ def read_runs(
     series: bool = False,
     battery: bool = False,
     of_turns: bool = False,
-    most: int | None = None,
 ) -> records.Runs:
     """Read a table, and say on stderr which of its columns are not used.
 
@@ -110,7 +109,6 @@ def read_runs(
         measured: whether readings are needed; series: whether time histories are taken.
         battery: whether the runs are on the battery, see `records.read`.
         of_turns: whether a table of turns has every channel of either side, and of the yaw, of which it has a column.
-        most: rows from which on a log over time is thinned; None: it is not.
 
     Raises:
         BadData: what `records.read` refuses, time histories where none are taken, or a configuration that the
@@ -128,7 +126,7 @@ def read_runs(
         tell(note)
     if runs.unknown:
         tell(f"{runs.source}: not used: {', '.join(runs.unknown)}")
-    return runs if most is None else thinning.thinned(runs, most)
+    return runs
 
 
 def one_run(

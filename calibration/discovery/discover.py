@@ -15,9 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import own_mass
+from calibration.data.columns import ROWS
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
+from calibration.data.thinning import thinned
 from calibration.discovery import findings, kept, menu, prediction, preference, scales
 from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
@@ -105,6 +107,7 @@ def discover(
     seed: int = 0,
     prefer: str = FIT,
     forbidden: Sequence[str] = (),
+    rows: int = ROWS,
     progress: Callable[[str], None] = lambda text: None,
     keep: Keep = kept.nothing,
     left: Callable[[], float | None] = lambda: None,
@@ -121,6 +124,7 @@ def discover(
         replicates: of the bootstrap; seed: random seed.
         prefer: by what the leader of a class is chosen, `fit` or `held-out`.
         forbidden: kinds of experiments (`menu.KINDS`) and configurations that are not to be proposed.
+        rows: of a log over time from which on readings are used of fewer, evenly in time, which its notes say.
         progress: called with a sentence as the work goes on; keep: by which stages are kept as they end.
         left: time that is left once there is a verdict [s], for which verdicts at other noises are waited; None: all.
 
@@ -131,7 +135,7 @@ def discover(
     tell = in_words(progress)
     ready = prepared(
         runs, robot, noise=noise, stated=stated, library=library, replicates=replicates, seed=seed, prefer=prefer,
-        forbidden=forbidden,
+        forbidden=forbidden, rows=rows,
     )  # fmt: skip
     distinct, known = ready.runs, ready.noise
     for note in ready.foreign:
@@ -223,13 +227,14 @@ def prepared(
     seed: int = 0,
     prefer: str = FIT,
     forbidden: Sequence[str] = (),
+    rows: int = ROWS,
 ) -> LoopInput:
     """What `discover` does before its first fit; arguments and errors as of `discover`.
 
     A campaign that wants verdicts alone goes on with `LoopInput.trace`, so that it takes the way that users take.
     """
     menu.check_forbidden(forbidden, robot)
-    runs = runs.of(robot)
+    runs = thinned(runs.of(robot), rows)
     distinct, numbers, notes = without_copies(runs)
     kind = observers.kind(distinct)
     if len(distinct) < kind.fewest:

@@ -28,12 +28,12 @@ def calibrate(
     0 done; 3 done, but the search or a fit without a block did not converge, or the solver failed at a row.
     """
     robot = load_robot(config).robot
-    runs = read_runs(source, robot, measured=True, series=True, most=config.rows)
+    runs = read_runs(source, robot, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
     with open_folder("calibrate", config, robot, out, force, runs) as folder, pulse(tell, "fitting") as heard:
         found = run(
-            runs, robot, free=config.free, fix=config.fix, stated=stated, noise=config.noise or None,
-            model=config.model, starts=config.starts, population=config.population,
+            runs, robot, rows=config.rows, free=config.free, fix=config.fix, stated=stated,
+            noise=config.noise or None, model=config.model, starts=config.starts, population=config.population,
             generations=config.generations, members=members, seed=config.seed,
             profiles=config.profiles, blocks=config.hold_out, tell=heard,
         )  # fmt: skip

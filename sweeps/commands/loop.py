@@ -60,7 +60,7 @@ def _loop(
 ) -> int:
     began = time.monotonic()
     robot = load_robot(config).robot
-    runs = read_runs(source, robot, measured=True, series=True, most=config.rows)
+    runs = read_runs(source, robot, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
     replicates = max(config.replicates, fewest_replicates(observers.kind(runs)))
 
@@ -88,7 +88,7 @@ def _loop(
         try:
             with _alarm(left(), lambda: "verdict" not in stages):
                 found = discover(
-                    runs, robot, noise=config.noise or None, stated=stated,
+                    runs, robot, rows=config.rows, noise=config.noise or None, stated=stated,
                     library=effect_file.library(config.effects), replicates=replicates, seed=config.seed,
                     prefer=config.prefer, forbidden=config.forbid, progress=progress, keep=keep, left=left,
                 )  # fmt: skip

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from calibration.data import rig_facts, settling, thinning
+from calibration.data import rig_facts, settling
 from calibration.data.columns import SUPPLY, Layout
 from calibration.data.errors import BadConfiguration
 from calibration.data.rig_facts import Fact, Origin
@@ -279,7 +279,7 @@ def examined(file: Path, data: str | None, effects: tuple[str, ...] = ()) -> Rig
     if data is None:
         return found
     runs = read_runs(data, robot, measured=True, series=True)
-    seen = foresight.foresee(thinning.thinned(runs), robot)
+    seen = foresight.foresee(runs, robot)
     doubts = tuple(filter(None, (settling.doubtful_sign(runs), rig_facts.doubtful_time(runs, robot))))
     return dataclasses.replace(found, runs=runs, foresight=seen, doubts=doubts)
 
