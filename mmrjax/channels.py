@@ -18,6 +18,13 @@ if TYPE_CHECKING:
 RPM = math.pi / 30  # rad/s
 MM = 1e-3  # m
 
+#: Parameters of the robot that a number may rest on: current where the motors' speed is imposed, the voltage that an
+#: imposed speed or current takes, a winding's temperature at a current after long running, and over time.
+CURRENT = ("motor.torque_constant",)
+VOLTAGE = ("motor.resistance", *CURRENT)
+HEAT = (*VOLTAGE, "motor.resistance_thermal_winding", "motor.resistance_thermal_housing")
+WARMING = (*HEAT, "motor.time_constant_winding", "motor.time_constant_housing")
+
 
 @dataclasses.dataclass(frozen=True)
 class Channel:
@@ -39,6 +46,7 @@ class Channel:
         settled, over_time: whether settled runs and histories can show it.
         other_units: what is often written in its column by mistake, and the SI value of each.
         side: 0 or 1 of what the left or the right side alone shows; None: what both together do.
+        rests_on: parameters of the robot without which it is not known, by dotted name.
     """
 
     name: str
@@ -60,6 +68,7 @@ class Channel:
     over_time: bool = True
     other_units: tuple[tuple[str, float], ...] = ()
     side: int | None = None
+    rests_on: tuple[str, ...] = ()
 
     @property
     def unit_shown(self) -> str:
@@ -110,6 +119,7 @@ _EITHER: tuple[Channel, ...] = (
         range=(-2000.0, 2000.0),
         sd_largest=100.0,
         read=lambda robot, signals: signals.total_current,
+        rests_on=CURRENT,
         sd_share=0.02,
         resolution=3,
         other_units=(("mA", 1e-3),),
@@ -157,6 +167,7 @@ _EITHER: tuple[Channel, ...] = (
         range=(-2000.0, 2000.0),
         sd_largest=100.0,
         read=lambda robot, signals: signals.current,
+        rests_on=CURRENT,
         sd_share=0.02,
         resolution=3,
         other_units=(("mA", 1e-3),),
@@ -227,6 +238,7 @@ _EITHER: tuple[Channel, ...] = (
         range=(-200.0, 200.0),
         sd_largest=100.0,
         read=lambda robot, signals: signals.voltage,
+        rests_on=VOLTAGE,
         sd_share=0.01,
         resolution=2,
         other_units=(("mV", 1e-3),),
@@ -258,6 +270,7 @@ _EITHER: tuple[Channel, ...] = (
         range=(-50.0, 500.0),
         sd_largest=100.0,
         read=_winding_temperature,
+        rests_on=HEAT,
         sd_share=0.02,
         unit_si="°C",
         over_time=False,

@@ -11,6 +11,11 @@ class UsageError(ValueError):
     """Wrong use of the public API; one sentence: where, what came, what is allowed."""
 
 
+def counted(count: int, noun: str) -> str:
+    """`1 run`, `2,000 runs`: how many of what a noun in the singular names, whose plural has an s."""
+    return f"{count:,} {noun}{'s' * (count != 1)}"
+
+
 def choices(word: str, allowed: Iterable[str], most: int = 1, shown: Iterable[str] | None = None) -> str:
     """«did you mean X? allowed: ...» for an unknown word; up to `most` that are near it. `shown`: those that are
     listed, where not all are."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mmrjax.channels import MM, Channel
+from mmrjax.channels import HEAT, MM, VOLTAGE, Channel
 
 if TYPE_CHECKING:
     from mmrjax.signals import Result
@@ -28,6 +28,7 @@ class Output:
         label: words of tables and reports.
         get: the number [SI] out of a result.
         resolution: digits after the point that a person wants to see [unit].
+        rests_on: parameters of the robot without which it is not known, and NaN, by dotted name.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Output:
     label: str
     get: Callable[[Result], Any]
     resolution: int = 3
+    rests_on: tuple[str, ...] = ()
 
 
 #: Beside the channels, which come first.
@@ -46,15 +48,17 @@ FURTHER: tuple[Output, ...] = (
         lambda r: r.theoretical_speed, 1,
     ),
     Output("slip", "slip", "-", 1.0, "slip", lambda r: r.slip, 4),
-    Output("voltage", "voltage_V", "V", 1.0, "voltage at the motors", lambda r: r.voltage, 2),
+    Output("voltage", "voltage_V", "V", 1.0, "voltage at the motors", lambda r: r.voltage, 2, VOLTAGE),
     Output("adhesion_used", "adhesion_used", "-", 1.0, "adhesion used", lambda r: r.adhesion_used),
     Output("traction", "traction_N", "N", 1.0, "traction", lambda r: r.traction, 1),
-    Output("power_supply", "power_supply_W", "W", 1.0, "supply power", lambda r: r.power_supply, 1),
+    Output("power_supply", "power_supply_W", "W", 1.0, "supply power", lambda r: r.power_supply, 1, VOLTAGE),
     Output("power_motor", "power_motor_W", "W", 1.0, "motor power", lambda r: r.power_motor, 1),
     Output("power_gear", "power_gear_W", "W", 1.0, "gearbox power", lambda r: r.power_gear, 1),
     Output("power_ground", "power_ground_W", "W", 1.0, "ground power", lambda r: r.power_ground, 1),
     Output("power_lift", "power_lift_W", "W", 1.0, "lifting power", lambda r: r.power_lift, 1),
-    Output("efficiency_motor", "efficiency_motor", "-", 1.0, "motor efficiency", lambda r: r.efficiency_motor),
+    Output(
+        "efficiency_motor", "efficiency_motor", "-", 1.0, "motor efficiency", lambda r: r.efficiency_motor, 3, VOLTAGE
+    ),
     Output("efficiency_gear", "efficiency_gear", "-", 1.0, "gearbox efficiency", lambda r: r.efficiency_gear),
     Output(
         "efficiency_chassis", "efficiency_chassis", "-", 1.0, "chassis efficiency",
@@ -62,7 +66,7 @@ FURTHER: tuple[Output, ...] = (
     ),
     Output(
         "winding_settled", "winding_settled_C", "°C", 1.0, "winding, long running",
-        lambda r: r.winding_settled, 1,
+        lambda r: r.winding_settled, 1, HEAT,
     ),
     Output("voltage_cell", "voltage_cell_V", "V", 1.0, "cell voltage", lambda r: r.voltage_cell, 3),
 )  # fmt: skip
@@ -75,7 +79,8 @@ def _reading(channel: str) -> Callable[[Result], Any]:
 def table(shown: Iterable[Channel]) -> tuple[Output, ...]:
     """Every output, the channels that are shown first, in the order of columns."""
     read = tuple(
-        Output(c.name, c.column, c.unit_shown, c.factor, c.label, _reading(c.name), c.resolution) for c in shown
+        Output(c.name, c.column, c.unit_shown, c.factor, c.label, _reading(c.name), c.resolution, c.rests_on)
+        for c in shown
     )
     return read + FURTHER
 

@@ -161,7 +161,8 @@ M = TypeVar("M", bound=eqx.Module)
 
 
 def replace(component: M, values: dict[str, Any]) -> M:
-    """Return `component` with the named parameters replaced; values may be tracers or batches.
+    """Return `component` with the named parameters replaced, of a rig known from then on; values may be tracers or
+    batches.
 
     Args:
         component: a robot or a part of one.
@@ -176,7 +177,13 @@ def replace(component: M, values: dict[str, Any]) -> M:
         meant = [near(name, known, 3) for name in unknown]
         hints = [f"{n} (did you mean {', '.join(m)}?)" if m else n for n, m in zip(unknown, meant, strict=True)]
         raise KeyError(f"no such parameter: {', '.join(hints)}")
-    return _replace(component, values, "")
+    replaced = _replace(component, values, "")
+    rig: Any = getattr(replaced, "rig", None)
+    if rig is None or values.keys().isdisjoint(rig.unknown):
+        return replaced
+    known = dataclasses.replace(rig, unknown=tuple(name for name in rig.unknown if name not in values))
+    changes: dict[str, Any] = {"rig": known}
+    return dataclasses.replace(replaced, **changes)
 
 
 def _replace(component: Any, values: dict[str, Any], prefix: str) -> Any:

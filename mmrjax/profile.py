@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mmrjax.conditions import Conditions, Number
-from mmrjax.errors import UsageError
+from mmrjax.errors import UsageError, counted
 from mmrjax.params import Scalar
 
 #: How the motors are driven in a segment: by a share of the supply's voltage; at a demanded motor speed or ground
@@ -140,7 +140,7 @@ def profile(
     """
     rows = np.asarray(time, float)
     if rows.ndim != 1 or len(rows) < 2:
-        raise UsageError(f"profile, time: got {rows.size} rows; expected two or more")
+        raise UsageError(f"profile, time: got {counted(rows.size, 'row')}; expected two or more")
     if not np.isfinite(rows).all():
         raise UsageError(f"profile, time: row {int(np.argmax(~np.isfinite(rows))) + 1} is not a finite number")
     back = np.flatnonzero(np.diff(rows) <= 0)
@@ -166,7 +166,9 @@ def profile(
     for name, value in given.items():
         x = np.asarray(value, float)
         if x.ndim > 1 or (x.ndim == 1 and len(x) != len(rows)):
-            raise UsageError(f"profile, {name}: got {x.shape[0] if x.ndim else 1} values; expected {len(rows)}")
+            raise UsageError(
+                f"profile, {name}: got {counted(x.shape[0] if x.ndim else 1, 'value')}; expected {len(rows)}"
+            )
         if not np.isfinite(x).all():
             raise UsageError(
                 f"profile, {name}: row {int(np.argmax(~np.isfinite(np.atleast_1d(x)))) + 1} is not finite"
@@ -177,7 +179,7 @@ def profile(
         if (np.abs(duty) > 1).any():
             raise UsageError(f"profile, {name}: got {duty[np.argmax(np.abs(duty))]:g}; expected -1 to 1")
     if len(modes) != len(rows):
-        raise UsageError(f"profile, mode: got {len(modes)} values; expected {len(rows)}")
+        raise UsageError(f"profile, mode: got {counted(len(modes), 'value')}; expected {len(rows)}")
     index = jnp.asarray([MODES.index(name) for name in modes])
     return Profile(time=jnp.asarray(rows), mode=index, linear=linear, cycles=int(cycles), **arrays)
 

@@ -54,6 +54,8 @@ class Quantity:
     axes: tuple[str, ...] = AXES
 
 
+#: Those that rest on how warm the windings become.
+OF_HEAT = ("winding_C", "payload_kg")
 #: Everything that can be asked for, by name.
 QUANTITIES: dict[str, Quantity] = {
     q.name: q

@@ -13,6 +13,7 @@ from mmrjax import missions, outputs
 from mmrjax.channels import Channel, usual
 from mmrjax.channels import names as channel_names
 from mmrjax.conditions import Conditions
+from mmrjax.errors import counted
 from mmrjax.fidelities.base import History
 from mmrjax.fidelities.mission import Mission
 from mmrjax.params import Scalar
@@ -196,7 +197,7 @@ class Results:
     def __repr__(self) -> str:
         if has_tracer(self):
             return f"Results of {self.model}, traced"
-        return f"Results of {self.model}, {max(self.status.size, 1)} runs\n{self.table()}"
+        return f"Results of {self.model}, {counted(max(self.status.size, 1), 'run')}\n{self.table()}"
 
 
 jax.tree_util.register_dataclass(

@@ -116,6 +116,8 @@ class Rig(eqx.Module):
         between_rows: of histories, one of `BETWEEN`; an imposed speed is on straight lines in any case.
         surfaces: (configuration, another from which it differs by its ground alone).
         inherits: whether what its file leaves open is a packaged robot's; if not, nothing in it is another robot's.
+        unknown: parameters that nobody stated and for which nothing stands: what their fields hold is a packaged
+            robot's, so that equations have numbers, and what rests on it is not known (`Robot.knows`).
         loose: whether the load on the shaft has backlash, which histories then follow as a state.
     """
 
@@ -138,6 +140,7 @@ class Rig(eqx.Module):
     between_rows: str = eqx.field(default=BETWEEN[0], static=True)
     surfaces: tuple[tuple[str, str], ...] = eqx.field(default=(), static=True)
     inherits: bool = eqx.field(default=True, static=True)
+    unknown: tuple[str, ...] = eqx.field(default=(), static=True)
     loose: bool = eqx.field(default=False, static=True)
 
     def for_equations(self) -> Rig:

@@ -133,6 +133,25 @@ class Robot(eqx.Module):
         """Whether a ground carries it, on which slope, payload and adhesion act and its movers can slip."""
         return "ground" not in self.lacks
 
+    def unknown(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Those of some parameters, by dotted name, that are not its own: neither stated nor of its base."""
+        return tuple(name for name in names if name in self.rig.unknown)
+
+    def knows(self, names: Iterable[str]) -> bool:
+        """Whether all of some parameters are its own."""
+        return not self.unknown(names)
+
+    @property
+    def current_continuous(self) -> Scalar:
+        """Current of one motor that its winding bears for long [A]; inf where it is not known how heat leaves it."""
+        return self.motor.current_continuous if self.knows(channels.HEAT) else jnp.inf
+
+    def heating(self, power: Scalar, winding: Scalar, housing: Scalar) -> tuple[Scalar, Scalar]:
+        """Rates of the temperatures of winding and housing [K/s], as of `Motor.heating`; none where it is not known
+        how heat leaves them."""
+        rates = self.motor.heating(power, winding, housing)
+        return rates if self.knows(channels.WARMING) else (jnp.zeros_like(rates[0]), jnp.zeros_like(rates[1]))
+
     @property
     def shows_travel(self) -> bool:
         """Whether anything shows how far it travels: a ground, or a channel of what turns with its shaft."""

@@ -90,6 +90,10 @@ _NOTHING = {
 }
 
 
+#: What makers and drawings say, and nothing stands for where nobody does.
+_OF_A_SHEET, _ASSUMED = ("battery.", "motor.", "running_gear."), ("motor.temperature_ambient",)
+
+
 def blank(configurations: Configurations, sides: float = 1.0, rig: Rig | None = None) -> Robot:
     """A robot of which nothing is known but its loads: no losses in its drive and no limits; what a rig's file states
     comes on top.
@@ -99,8 +103,10 @@ def blank(configurations: Configurations, sides: float = 1.0, rig: Rig | None = 
     """
     motor = dataclasses.replace(Motor(), speed_limit=UNLIMITED, temperature_limit=UNLIMITED)
     gearbox = dataclasses.replace(Gearbox(), speed_limit=UNLIMITED, torque_limit=None)
-    rig = dataclasses.replace(rig or Rig(), inherits=False)
-    return params.replace(Robot(Battery(), motor, gearbox, configurations, sides=sides, rig=rig), _NOTHING)
+    robot = Robot(Battery(), motor, gearbox, configurations, sides=sides)
+    unknown = tuple(p.name for p in params.walk(robot) if p.name.startswith(_OF_A_SHEET) and p.name not in _ASSUMED)
+    rig = dataclasses.replace(rig or Rig(), inherits=False, unknown=unknown)
+    return params.replace(dataclasses.replace(robot, rig=rig), _NOTHING)
 
 
 def _simplified(track_torque: float) -> Robot:

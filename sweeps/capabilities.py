@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import numpy as np
 
 from calibration.data import rig_file
 from calibration.data.robot_file import RobotFile
-from mmrjax import params
-from mmrjax.channels import SIDES
-from mmrjax.motor import Motor
+from mmrjax import derived, outputs, params
+from mmrjax.channels import EVERY, HEAT, SIDES, VOLTAGE, WARMING
 from mmrjax.power import Battery
 from mmrjax.robot import Robot
 from mmrjax.robots import blank
@@ -21,18 +21,16 @@ OF_GROUND = (
 OF_TRAVEL = (
     "theoretical_speed_mm_s", "distance_m", "displacement_m", "demanded_speed_mm_s", "energy_per_metre_Wh", "range_m",
 )  # fmt: skip
-#: Those of the heat of a winding, which a rig has where its file states how heat leaves it.
-OF_HEAT = (
-    "winding_settled_C", "permissible_time_s", "winding_temperature_C", "housing_temperature_C", "winding_peak_C",
-    "winding_end_C", "housing_end_C", "winding_left_C", "winding_right_C",
-)  # fmt: skip
-_THERMAL = ("resistance_thermal_winding", "resistance_thermal_housing")
-
-
-def stated(robot: Robot, prefix: str) -> bool:
-    """Whether any parameter whose name begins so is another than that of a rig of which nothing is known."""
-    nothing = _nothing(robot)
-    return any(float(p.value) != nothing[p.name] for p in params.walk(robot) if p.name.startswith(prefix))
+#: Those of how a winding warms.
+_WARMING = ("winding_temperature_C", "housing_temperature_C", "winding_peak_C", "winding_end_C", "housing_end_C")
+#: Column → parameters on which it rests and which a rig's file may leave open.
+RESTS_ON: dict[str, tuple[str, ...]] = {
+    **{output.column: output.rests_on for output in outputs.table(EVERY)},
+    **{output.column: output.rests_on for output in derived.TABLE},
+    **dict.fromkeys(("power_left_W", "power_right_W"), VOLTAGE),
+    **dict.fromkeys(("winding_left_C", "winding_right_C"), HEAT),
+    **dict.fromkeys(("permissible_time_s", *_WARMING), WARMING),
+}
 
 
 def _nothing(robot: Robot) -> dict[str, float]:
@@ -40,25 +38,31 @@ def _nothing(robot: Robot) -> dict[str, float]:
     return {p.name: float(p.value) for p in params.walk(blank(robot.configurations, rig=robot.rig))}
 
 
-def thermal(robot: Robot) -> bool:
-    """Whether it is known how heat leaves the windings."""
-    sheet = Motor()
-    return robot.rig.inherits or any(
-        float(getattr(robot.motor, name)) != float(getattr(sheet, name)) for name in _THERMAL
-    )
+def states(robot: Robot, prefix: str) -> bool:
+    """Whether any parameter whose name begins so is known of a robot, by its file or its base."""
+    return any(p.name.startswith(prefix) and robot.knows([p.name]) for p in params.walk(robot))
 
 
 def battery(robot: Robot) -> bool:
     """Whether it has a battery of its own."""
     if robot.rig.inherits:
         return True
-    nothing, other = Battery(), "current_other"  # `rig_file.DEFAULTS` states that one
-    same = [
-        float(getattr(robot.battery, name)) == float(value)
-        for name, value in vars(nothing).items()
-        if name != other and isinstance(value, int | float)
-    ]
-    return not all(same)
+    nothing, other = Battery(), "battery.current_other"  # `rig_file.DEFAULTS` states that one
+    own = any(
+        getattr(robot.battery, name) != value for name, value in vars(nothing).items() if not eqx.is_array(value)
+    )
+    return own or any(
+        robot.knows([f"battery.{p.name}"]) for p in params.walk(nothing) if f"battery.{p.name}" != other
+    )
+
+
+def unknown(robot: Robot) -> list[str]:
+    """What of a run's numbers is not known of a robot, as its file leaves open what that rests on: a sentence, or
+    none."""
+    gone = [output for output in outputs.FURTHER if not robot.knows(output.rests_on)]
+    lacking = dict.fromkeys(name for output in gone for name in robot.unknown(output.rests_on))
+    labels = "; ".join(output.label for output in gone)
+    return [f"not known, as the robot's file does not state {', '.join(lacking)}: {labels}"] if gone else []
 
 
 def idle_columns(robot: Robot) -> set[str]:
@@ -68,8 +72,8 @@ def idle_columns(robot: Robot) -> set[str]:
         found |= {*OF_GROUND}
     if not robot.shows_travel:
         found |= {*OF_TRAVEL}
-    if not thermal(robot):
-        found |= {*OF_HEAT, *(f"{column.removesuffix('_C')}_{side}_C" for column in OF_HEAT for side in SIDES)}
+    found |= {column for column, names in RESTS_ON.items() if not robot.knows(names)}
+    found |= {f"{column.removesuffix('_C')}_{side}_C" for column in found & {*_WARMING} for side in SIDES}
     if not battery(robot):
         found |= {"voltage_cell_V"}
     return found

@@ -19,6 +19,7 @@ from calibration.data.errors import InputError
 from mmrjax import SOUND_AT_LEVEL_0, __version__, fidelities
 from sweeps import config, config_campaign
 from sweeps import options as made
+from sweeps.flags import flags as flags_of
 
 INTERRUPTED = 130
 
@@ -155,7 +156,7 @@ def simulate(
     cells = told.beside.model_dump()
     stated = {column for column, value in cells.items() if value is not None}
     if runs is not None and stated:
-        options = made.flags(config.OneRun)
+        options = flags_of(config.OneRun)
         raise InputError(
             f"{', '.join(options[column] for column in cells if column in stated)}: got it beside --runs, whose "
             f"columns state the conditions of each run; state it there, or leave out --runs"
@@ -336,7 +337,8 @@ def settle(
     config.Loop,
     beside=config.LoopBeside,
     example="mmrjax loop measured --out found, then mmrjax sweep --robot found/robot.toml",
-    failure="the fit that is proposed did not converge. Every verdict is an answer: 0",
+    failure="the fit that is proposed did not converge, or --within was out before a verdict (the same command with "
+    "more goes on). Every verdict is an answer: 0",
 )
 def loop(
     told: Told,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
@@ -15,6 +16,7 @@ from calibration.data.columns import CONDITIONS, ROWS, SIDES
 from calibration.data.errors import BadConfiguration, choices, toml_content, toml_text
 from mmrjax import channels, fidelities
 from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
+from sweeps.flags import flags
 
 _VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c] for c in ("supply_voltage_V", "payload_kg", "slope_deg"))
 Slope = Annotated[float, Field(ge=_SLOPE[0], le=_SLOPE[1], allow_inf_nan=False)]
@@ -112,11 +114,11 @@ class FidelityPart(ModelPart):
             value, having = getattr(self, f"{name}_s"), _having(name)
             usual = {option.default for option in having.values()}
             if value is not None and self.model not in having and value not in usual:
-                raise PydanticCustomError("idle", f"{name}_s acts with model {_either(having)} only")
+                raise PydanticCustomError("idle", f"`{name}_s` acts with `model` {_either(having)} only")
             if value is not None and self.model in having and value > having[self.model].most:
                 most = having[self.model]
                 raise PydanticCustomError(
-                    "idle", f"{name}_s: got {value:g}; model {self.model} takes at most {most.most:g} {most.unit}"
+                    "idle", f"`{name}_s`: got {value:g}; `model` {self.model} takes at most {most.most:g} {most.unit}"
                 )
         return self
 
@@ -147,10 +149,10 @@ class SupplyPart(Part):
     @model_validator(mode="after")
     def _feeds(self) -> Self:
         if self.discharge_mAh and not self.battery:
-            raise PydanticCustomError("idle", "discharge_mAh acts with battery only")
+            raise PydanticCustomError("idle", "`discharge_mAh` acts with `battery` only")
         if self.battery and getattr(self, "voltages_V", None) is not None:
             raise PydanticCustomError(
-                "idle", "voltages_V acts without battery only, whose voltage is that of its charge"
+                "idle", "`voltages_V` acts without `battery` only, whose voltage is that of its charge"
             )
         return self
 
@@ -302,7 +304,9 @@ class TurnPart(Part):
     def refuse_volts(self, battery: bool) -> None:
         """Refuse volts of either side where a battery decides them."""
         if battery and self.left_V is not None:
-            raise PydanticCustomError("idle", "left_V acts without battery only; state duty_left and duty_right")
+            raise PydanticCustomError(
+                "idle", "`left_V` acts without `battery` only; state `duty_left` and `duty_right`"
+            )
 
     @model_validator(mode="after")
     def _of_both_sides(self) -> Self:
@@ -310,11 +314,12 @@ class TurnPart(Part):
         for left, right in pairs:
             if (getattr(self, left) is None) != (getattr(self, right) is None):
                 one, other = (left, right) if getattr(self, right) is None else (right, left)
-                raise PydanticCustomError("idle", f"{one} acts with {other} only; state both")
+                raise PydanticCustomError("idle", f"`{one}` acts with `{other}` only; state both")
         stated = [one for one, _ in pairs if getattr(self, one) is not None]
         if len(stated) > 1:
             raise PydanticCustomError(
-                "idle", f"{stated[0]} acts without {stated[1]} only; state voltages, duties, or speed and yaw rate"
+                "idle",
+                f"`{stated[0]}` acts without `{stated[1]}` only; state voltages, duties, or speed and yaw rate",
             )
         return self
 
@@ -357,10 +362,10 @@ class ProfilePart(FidelityPart):
             return self
         if self.model != PROFILED:
             raise PydanticCustomError(
-                "idle", f"profile acts with model {PROFILED} only, which follows one; got model {self.model}"
+                "idle", f"`profile` acts with `model` {PROFILED} only, which follows one; got `model` {self.model}"
             )
         if self.duration_s is not None:
-            raise PydanticCustomError("idle", "duration_s acts without profile only, whose last row ends the run")
+            raise PydanticCustomError("idle", "`duration_s` acts without `profile` only, whose last row ends the run")
         return self
 
     @property
@@ -377,10 +382,11 @@ class Simulate(RobotPart, ProfilePart, SupplyPart, TurnPart, PosteriorPart, Outp
         if self.turns:
             beside = [name for name in ("profile", "posterior") if getattr(self, name) is not None]
             if beside:
-                raise PydanticCustomError("idle", f"left, right and heading act without {beside[0]} only")
+                stated = next(name for name in TurnPart.model_fields if getattr(self, name) is not None)
+                raise PydanticCustomError("idle", f"`{stated}` acts without `{beside[0]}` only")
             self.refuse_volts(self.battery)
         if self.profile is not None and self.posterior is not None:
-            raise PydanticCustomError("idle", "posterior acts without profile only")
+            raise PydanticCustomError("idle", "`posterior` acts without `profile` only")
         return self
 
     @property
@@ -408,7 +414,7 @@ class Render(RobotPart, FidelityPart, SupplyPart, TurnPart):
     @model_validator(mode="after")
     def _driven(self) -> Self:
         if self.demands:
-            raise PydanticCustomError("idle", "speed_m_s acts with simulate only; state left_V and right_V")
+            raise PydanticCustomError("idle", "`speed_m_s` acts with simulate only; state `left_V` and `right_V`")
         self.refuse_volts(self.battery)
         return self
 
@@ -484,22 +490,22 @@ class Climb(RobotPart, SupplyPart, OutputPart):
     def _one_obstacle(self) -> Self:
         given = [name for name in ("step_mm", "stairs", "gap_mm", "terrain") if getattr(self, name) is not None]
         if len(given) > 1:
-            raise PydanticCustomError("idle", f"{given[0]} and {given[1]} are stated both; state one obstacle")
+            raise PydanticCustomError("idle", f"`{given[0]}` and `{given[1]}` are stated both; state one obstacle")
         if not given and self.find is None:
             raise PydanticCustomError(
-                "idle", "no obstacle is stated; state step_mm, stairs, gap_mm or terrain, or find"
+                "idle", "no obstacle is stated; state `step_mm`, `stairs`, `gap_mm` or `terrain`, or `find`"
             )
         if self.find == "stairs" and self.stairs is None:
-            raise PydanticCustomError("idle", "find stairs needs stairs, whose tread and count stay")
+            raise PydanticCustomError("idle", "`find` stairs needs `stairs`, whose tread and count stay")
         if self.find is not None and given and not given[0].startswith(self.find):
-            raise PydanticCustomError("idle", f"find {self.find} acts without {given[0]}")
+            raise PydanticCustomError("idle", f"`find` {self.find} acts without `{given[0]}`")
         if self.nose_mm and (self.gap_mm is not None or self.terrain is not None or self.find == "gap"):
-            raise PydanticCustomError("idle", "nose_mm acts with steps and stairs only")
+            raise PydanticCustomError("idle", "`nose_mm` acts with steps and stairs only")
         if self.battery and self.supply_voltage_V is not None:
-            raise PydanticCustomError("idle", "supply_voltage_V acts without battery only")
+            raise PydanticCustomError("idle", "`supply_voltage_V` acts without `battery` only")
         for name in ("film", "derivatives"):
             if getattr(self, name) and self.find is not None:
-                raise PydanticCustomError("idle", f"{name} acts without find only")
+                raise PydanticCustomError("idle", f"`{name}` acts without `find` only")
         return self
 
 
@@ -726,12 +732,18 @@ def _checked(kind: type[C], file: Path | None, values: dict[str, Any], options: 
 
 
 def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given: dict[str, Any]) -> str:
-    first = error.errors()[0]
-    if first["type"] == "idle":
-        return f"{file.name if file is not None else 'options'}: {first['msg']}"
+    first, options = error.errors()[0], flags(kind)
+
+    def called(name: str) -> str:
+        """A field as whoever stated it did, or would: by its option, or its key in the file."""
+        return options.get(name, name) if file is None or name in given else name
+
+    if first["type"] == "idle":  # whose message has fields between backticks
+        said = re.sub(r"`(\w+)`", lambda found: called(found[1]), first["msg"])
+        return said if file is None else f"{file.name}: {said}"
     key = str(first["loc"][0])
     place = ".".join(str(part) for part in first["loc"])
-    where = f"{file.name}, {place}" if file is not None and key not in given else f"option {place}"
+    where = f"{file.name}, {place}" if file is not None and key not in given else called(key)
     if first["type"] == "extra_forbidden":
         return f"{where}: no such key; {choices(key, kind.model_fields)}"
     limits = {

@@ -15,6 +15,7 @@ from calibration.data.errors import BadConfiguration, choices
 from mmrjax.channels import RPM
 from mmrjax.tables import COULOMB_PER_MAH
 from sweeps.config import BatchPart, OutputPart, Part, ProfilePart, RobotPart, Sweep, about, read_toml, resolve
+from sweeps.flags import flags
 
 #: Keys that only a sweep into a store has.
 KEYS = ("axes", "samples", "conditions", "outputs", "storage", "compression", "profile", "obstacle")
@@ -47,7 +48,7 @@ class Obstacle(Part):
     def _of_its_kind(self) -> Self:
         for name, kinds in {"tread_mm": ("stairs",), "count": ("stairs",), "nose_mm": ("step", "stairs")}.items():
             if getattr(self, name) != type(self).model_fields[name].default and self.kind not in kinds:
-                raise PydanticCustomError("idle", f"{name} acts with kind {' or '.join(kinds)} only")
+                raise PydanticCustomError("idle", f"`{name}` acts with `kind` {' or '.join(kinds)} only")
         return self
 
 
@@ -153,8 +154,8 @@ def resolve_campaign(file: Path | None, options: dict[str, Any]) -> Campaign | S
         for name in GRID:
             if options.get(name) is not None:
                 raise BadConfiguration(
-                    f"option {name}: acts with a grid of options only; expected it in {file.name}, among its axes or "
-                    "conditions"
+                    f"{flags(Sweep)[name]}: acts with a grid of options only; expected it in {file.name}, among its "
+                    "axes or conditions"
                 )
         return resolve(Campaign, file, {k: v for k, v in options.items() if k not in GRID}, SharePart)
     return resolve(Sweep, file, options, SharePart)

@@ -7,18 +7,20 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from calibration.data import effect_file, posterior, robot_file, surfaces, thinning
+from calibration.data import effect_file, posterior, robot_file, surfaces
 from calibration.data import runs as records
 from calibration.data.columns import IMPOSED, Layout
 from calibration.data.contradictions import misplaced
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.posterior import Posterior
 from calibration.data.robot_file import RobotFile
+from mmrjax import fidelities
 from mmrjax.robot import Robot
 from mmrjax.tables import BENCH, SURFACES
-from sweeps.config import OneRun, RobotPart
+from sweeps import capabilities
+from sweeps.config import FidelityPart, OneRun, RobotPart
 from sweeps.console import tell
-from sweeps.options import flags
+from sweeps.flags import flags
 from sweeps.points import imposed
 
 #: Option that states a condition of one run.
@@ -28,7 +30,7 @@ OPTIONS = flags(OneRun)
 def load_robot(config: RobotPart) -> RobotFile:
     """The robot that a configuration names, with its changes; its effects may be the user's own.
 
-    Former names of parameters are taken, and said on stderr.
+    Former names of parameters are taken, and said on stderr; so is a running gear that is an example's.
 
     Raises:
         BadConfiguration: no such robot, a file or a change that is refused.
@@ -38,6 +40,9 @@ def load_robot(config: RobotPart) -> RobotFile:
     robot = robot_file.change(file.robot, config.set, where="--set", notes=notes)
     for note in notes:
         tell(note)
+    resolves = isinstance(config, FidelityPart) and fidelities.facts(config.model).resolves
+    if resolves and robot.has_ground and not capabilities.states(robot, "running_gear."):
+        tell("the robot's file states no running_gear: wheelbase, belt and masses within are those of an example")
     return dataclasses.replace(file, robot=robot)
 
 
@@ -95,7 +100,6 @@ def read_runs(
     series: bool = False,
     battery: bool = False,
     of_turns: bool = False,
-    most: int | None = None,
 ) -> records.Runs:
     """Read a table, and say on stderr which of its columns are not used.
 
@@ -105,7 +109,6 @@ def read_runs(
         measured: whether readings are needed; series: whether time histories are taken.
         battery: whether the runs are on the battery, see `records.read`.
         of_turns: whether a table of turns has every channel of either side, and of the yaw, of which it has a column.
-        most: rows from which on a log over time is thinned; None: it is not.
 
     Raises:
         BadData: what `records.read` refuses, time histories where none are taken, or a configuration that the
@@ -123,7 +126,7 @@ def read_runs(
         tell(note)
     if runs.unknown:
         tell(f"{runs.source}: not used: {', '.join(runs.unknown)}")
-    return runs if most is None else thinning.thinned(runs, most)
+    return runs
 
 
 def one_run(

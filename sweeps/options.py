@@ -12,51 +12,10 @@ import typer
 
 from sweeps import config
 from sweeps.config import Part
+from sweeps.flags import facts, flag, of_unit
 
-#: Units that names of fields end with, the longest first, and as they are written.
-UNITS = {
-    "rad_s": "rad/s",
-    "m_s": "m/s",
-    "s": "s",
-    "V": "V",
-    "rpm": "rpm",
-    "kg": "kg",
-    "deg": "deg",
-    "mm": "mm",
-    "mAh": "mAh",
-}
 _TYPES = {"boolean": bool, "integer": int, "number": float, "string": str, "object": list[str]}
 _LISTS = {"number": str, "string": list[str]}  # an axis is one text
-
-
-def facts(kind: type[Part]) -> dict[str, dict[str, Any]]:
-    """What the schema of a configuration says of each field, in the order of its parts, its own first."""
-    schema = kind.model_json_schema()["properties"]
-    own = [name for part in kind.__mro__ if issubclass(part, Part) for name in vars(part).get("__annotations__", {})]
-    found = {}
-    for name in dict.fromkeys(n for n in own if n in schema):
-        stated = schema[name]
-        given: dict[str, Any] = next((a for a in stated.get("anyOf", ()) if a.get("type") != "null"), {})
-        found[name] = {**given, **stated}
-    return found
-
-
-def flag(name: str, fact: Mapping[str, Any]) -> str:
-    """The option of a field: `--discharge` of `discharge_mAh`."""
-    stem, _ = of_unit(name)
-    return str(fact.get("flag") or "--" + stem.replace("_", "-"))
-
-
-def of_unit(name: str) -> tuple[str, str]:
-    """A field's name without its unit, and that, empty where it has none."""
-    return next(
-        ((name.removesuffix(f"_{end}"), unit) for end, unit in UNITS.items() if name.endswith(f"_{end}")), (name, "")
-    )
-
-
-def flags(kind: type[Part]) -> dict[str, str]:
-    """The option of each field."""
-    return {name: flag(name, fact) for name, fact in facts(kind).items()}
 
 
 def described(name: str, fact: Mapping[str, Any]) -> str:

@@ -470,9 +470,23 @@ def test_derivatives_of_the_highest_step_are_differences(robot):
 
 
 def test_posture_of_a_robot_that_states_no_running_gear_is_not_known(robot):
-    bare = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, inherits=False))
+    gear = tuple(p.name for p in params.walk(robot) if p.name.startswith("running_gear."))
+    bare = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, unknown=gear))
     with pytest.raises(BadConfiguration, match="step_mm: the robot's file states no running_gear"):
         sheet.refuse(bare, requirements.read("step_mm = 100", "posture.toml"))
+
+
+def test_heat_that_the_file_does_not_state_is_asked_for(tmp_path, capsys):
+    assert command(["rig", "new", tmp_path / "rig.toml", "--kind", "wheeled"]) == 0
+    asked = tmp_path / "asked.toml"
+    for name, limit in (("payload_kg", 1), ("winding_C", 90)):
+        asked.write_text(f"{name} = {limit}\n[envelope]\nsupply_voltage_V = 12\n")
+        assert command(["check", asked, "--robot", tmp_path / "rig.toml", "--out", tmp_path / "run"]) == 2
+        lacking = "motor.resistance_thermal_winding, motor.resistance_thermal_housing"
+        assert (
+            f"asked.toml, {name}: rests on how warm the windings become, and the robot's file does not state {lacking}"
+            in " ".join(capsys.readouterr().err.split())
+        )
 
 
 def test_a_battery_that_the_file_does_not_state_is_no_supply(tmp_path, capsys):

@@ -15,6 +15,9 @@ from calibration.inference import bases as curves
 from mmrjax import balances, channels, effects, params, robots
 from mmrjax.effects import CURVES, UNNAMED, WAVES, curve
 from mmrjax.fidelities.drive import drive
+from mmrjax.rig import Rig
+from mmrjax.robot import Configurations
+from mmrjax.shaft import Shaft
 from mmrjax.signals import Signals
 
 EACH = pytest.mark.parametrize("effect", CURVES.values(), ids=list(CURVES))
@@ -150,7 +153,24 @@ def test_curves_are_those_that_the_trace_looks_for():
     assert tuple(curve.BALANCES) == curves.BALANCES and tuple(curve.ROUND) == curves.OF_TURNS
     assert (*curve.VARIABLES, *curve.VARIABLES_ROUND) == tuple(curves.VARIABLES)
     assert {b: u for b, (u, *_) in curve.BALANCES.items()} == {b: balances.BALANCES[b][0] for b in curve.BALANCES}
-    assert tuple(curve.READINGS) == channels.USUAL
+    assert set(curve.READINGS) == {c.name for c in channels.EVERY} and set(curve.READ_BY) <= set(curve.READINGS)
+    robot = dataclasses.replace(
+        robots.blank(Configurations({"bench": Shaft(inertia=1e-3, loss_coulomb=0.1)})),
+        rig=Rig(channels=("output_torque", "position")),
+    )
+    columns = {name: np.arange(9.0) for name in ("order", "total_current_A", "motor_speed_rpm")}
+    columns |= {"configuration": np.repeat("bench", 9), "supply_voltage_V": np.tile([6.0, 12.0, 24.0], 3)}
+    (basis,) = (b for b in curves.families(columns, np.ones(9), robot) if b.places[0] in curve.READINGS)
+    assert set(basis.names) == {("output_torque", "order"), ("output_torque", "current"), ("position", "order")}
+    assert all(f"curve_{place}_{over}" in UNNAMED for place, over in basis.names)
+
+
+@pytest.mark.parametrize("law", [laws.law_declared, laws.law_linear, laws.law_unit], ids=lambda law: law.__name__[4:])
+@pytest.mark.parametrize(
+    "name", ["curve_output_torque_current", "curve_yaw_rate_yaw_rate", "curve_motor_current_left_order"]
+)
+def test_curve_of_any_reading_obeys(name, law):
+    law(UNNAMED[name])
 
 
 def test_robot_with_curves_written_and_read_is_the_same(tmp_path):

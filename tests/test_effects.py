@@ -70,7 +70,7 @@ SIGNAL_UNITS = {
     "-": "side duty on_tracks battery slope adhesion order direction direction_travel direction_turn efficiency_load",
 }
 UNIT_OF = {name: unit for unit, fields in SIGNAL_UNITS.items() for name in fields.split()}
-SENSOR_UNITS = {"total_current": "A", "motor_speed": "1/s", "speed": "m/s"}
+SENSOR_UNITS = {c.name: c.unit_si or c.unit for c in channels.EVERY}
 
 
 def dimensions(unit: str) -> Counter:
@@ -228,7 +228,7 @@ def law_declared(effect: type[Effect]) -> None:
     assert not effect.settles_to or (effect.settles_to in BY_NAME and effect.settles_to != effect.name)
     assert effect.balance in balances.BALANCES
     assert bool(effect.channel) == (effect.balance == "sensor")
-    assert not effect.channel or effect.channel in channels.USUAL
+    assert not effect.channel or effect.channel in channels.names(channels.EVERY)
     declared = {p.name: p for p in params.walk(effect())}
     assert [n for n, p in declared.items() if p.spec.amplitude] == ["amplitude"]
     amplitude = declared["amplitude"]
@@ -276,6 +276,7 @@ def law_family(effect: type[Effect]) -> None:
         of = [
             np.ones_like(before),
             *(np.asarray(getattr(STATES, n)) for n in SHARED.get(effect.channel or effect.balance, ())),
+            *(np.asarray(c.read(NOMINAL, STATES)) for c in channels.EVERY if c.name == effect.channel),
         ]
         shares = [before / x for x in of]
         assert any(np.ptp(x) < 1e-9 * np.abs(x).max() for x in shares), "varies, and says not with what"
@@ -416,10 +417,30 @@ def test_effect_obeys(effect, law):
     law(effect)
 
 
+#: Channels of what the random states have.
+SHOWN_BY_STATES = ("motor_current", "output_torque", "motor_voltage", "yaw_rate")
+
+
 @pytest.mark.parametrize("law", (law_declared, law_family, law_linear, law_unit), ids=lambda law: law.__name__[4:])
-@pytest.mark.parametrize("effect", effects.OF_TURNS.values(), ids=lambda effect: effect.name)
-def test_effect_of_turns_obeys(effect, law):
+@pytest.mark.parametrize(
+    "effect",
+    [*effects.OF_TURNS.values(), *(effects.OF_CHANNELS[f"{n}_gain"] for n in SHOWN_BY_STATES)],
+    ids=lambda effect: effect.name,
+)
+def test_effect_of_turns_and_of_channels_obeys(effect, law):
     law(effect)
+
+
+def test_every_channel_has_an_error_of_its_scale():
+    errors = {e.channel: e for e in (*effects.OF_CHANNELS.values(), *effects.ALL) if e.channel}
+    assert set(errors) == {c.name for c in channels.EVERY} and not set(effects.OF_CHANNELS) & set(BY_NAME)
+    values = {f.name: 0.5 for f in dataclasses.fields(Signals) if f.name not in ("memory", "configuration")}
+    signals = Signals(**values)
+    for effect in effects.OF_CHANNELS.values():
+        law_declared(effect)
+        shown = float(channels.find(effect.channel).read(NOMINAL, signals))
+        size = 1.0 if effect.name == "winding_temperature_offset" else shown
+        assert shown and float(effect(amplitude=0.02).term(NOMINAL, signals)) == pytest.approx(0.02 * size)
 
 
 @pytest.mark.parametrize(
@@ -1001,7 +1022,8 @@ def _on_shaft(torque_constant, *present):
     """A winch or a bench of one drive with losses, the motor's speed imposed forward and backward."""
     load = Shaft(inertia=1e-3, loss_coulomb=0.05, loss_viscous=1e-3, torque_constant=torque_constant)
     robot = robots.blank(Configurations({"bench": load}))
-    robot = params.replace(robot, {"gearbox.ratio": 20.0, "gearbox.efficiency_load": 0.8})
+    stated = {"gearbox.ratio": 20.0, "gearbox.efficiency_load": 0.8, "motor.torque_constant": 0.0259}
+    robot = params.replace(robot, stated)
     runs = Conditions(0, voltage=0.0, motor_speed=[100.0, -100.0, 300.0, -300.0])
     return np.asarray(steady_batch(with_effects(*present, robot=robot), runs).total_current)
 

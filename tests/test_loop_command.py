@@ -289,7 +289,7 @@ BAD = {
         "\n".join([HEADER, *(ROW.replace("15", str(u)) for u in (15, 24, 33))]),
         "runs.csv: 3 runs cannot show what a model lacks; at least 6 are needed",
     ),
-    "copies of one row": ("\n".join([HEADER, *[ROW] * 8]), "runs.csv: 1 runs cannot show what a model lacks"),
+    "copies of one row": ("\n".join([HEADER, *[ROW] * 8]), "runs.csv: 1 run cannot show what a model lacks"),
     "three samples": (
         "\n".join([f"{HEADER},time_s", *(f"{ROW},{t}" for t in (0, 1, 2))]),
         "runs.csv: 3 samples cannot show what a model lacks; at least 24 are needed",
@@ -329,7 +329,7 @@ WRONG = {
     "channel": (["--noise", "voltage=2%"], "--noise voltage=2%: no such channel"),
     "no file": (["--effects", "yours.py"], "--effects: got yours.py, no such file"),
     "contract": (["--effects", "mine.py"], "mine.py, PayloadBinding, balance: got trakc; did you mean track?"),
-    "few replicates": (["--replicates", "10"], "option replicates: got 10"),
+    "few replicates": (["--replicates", "10"], "--replicates: got 10"),
     "prior twice": (["--prior", "motor.resistance=1±0.1"] * 2, "--prior motor.resistance: given twice"),
     "prior of a former name": (["--prior", "tracked.mu=1±0.1"], "6T2A.mu"),
     "prior by both names": (

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import concurrent.futures
+import signal
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -62,15 +64,16 @@ def rig(tmp_path):
     return ["loop", "table.csv", "--robot", "rig.toml", "--no-report", "--out", "found"]
 
 
-@pytest.mark.parametrize("end", [KeyboardInterrupt, OutOfTime])
-def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypatch, tmp_path, end):
+@pytest.mark.parametrize(("end", "ends"), [(KeyboardInterrupt, 130), (OutOfTime, 3)])
+def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypatch, tmp_path, end, ends):
     def first(*_, keep, **__):
         keep("verdict", lambda: SimpleNamespace(verdict="class", members=(("iron_loss", "windage"),), families=()))
         raise end
 
     monkeypatch.setattr(command, "discover", first)
-    code, _, err = mmrjax(*rig)
-    assert code == 130 and "kept: verdict; the same command with --out found goes on" in err
+    code, _, err = mmrjax(*rig, "--within", "5min")
+    assert ("no verdict within 300 s\n" in err) == (end is OutOfTime)
+    assert code == ends and "kept: verdict; the same command with --out found goes on" in err
     assert "s  verdict: class, iron_loss or windage; next, errors held out and other noises\n" in err  # at once
     assert "verdict: class, iron_loss or windage; errors held out and other noises are outstanding" in err
     assert not (tmp_path / "found").exists()
@@ -84,15 +87,32 @@ def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypat
     assert code == 2 and "as far as this test goes" in err
 
 
-def test_time_that_is_out_before_the_verdict_ends_at_the_next_stage(rig, mmrjax, monkeypatch):
+@pytest.mark.parametrize("within", ["0s", "0.2s"])
+def test_time_that_is_out_before_the_verdict_ends_it_there_and_says_so(rig, mmrjax, monkeypatch, tmp_path, within):
+    """Between two steps, and in the middle of one."""
+
     def late(*_, progress, left, **__):
-        assert left() == 0.0
+        while left() != 0.0:
+            time.sleep(0.01)
         progress("fitting the base model")
+        time.sleep(5.0)
         raise AssertionError("went on")
 
     monkeypatch.setattr(command, "discover", late)
-    code, _, err = mmrjax(*rig, "--within", "0s")
-    assert code == 130 and "the loop goes on after its last whole stage" in err
+    code, _, err = mmrjax(*rig, "--within", within)
+    assert code == 3 and "went on" not in err and "interrupted" not in err
+    said = (
+        f"no verdict within {within.removesuffix('s')} s, nor a fit of the base model; give it more, as --within 5min"
+    )
+    assert said in err
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0) and not (tmp_path / "found.partial").exists()
+
+
+def test_a_budget_ends_a_step_that_says_nothing():
+    with pytest.raises(OutOfTime), command._alarm(0.05, lambda: True):
+        time.sleep(5.0)
+    with command._alarm(0.01, lambda: False):
+        time.sleep(0.05)
 
 
 @pytest.mark.slow

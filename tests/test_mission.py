@@ -420,7 +420,7 @@ def test_linear_rows_ramp(robot):
 # --- what is wrong ----------------------------------------------------------------------------------
 
 WRONG = {
-    "got 1 rows; expected two or more": dict(time=[0]),
+    "got 1 row; expected two or more": dict(time=[0]),
     "row 3 has 1 s after 2 s; expected a later time": dict(time=[0, 2, 1]),
     "time: row 2 is not a finite number": dict(time=[0, np.nan]),
     "cycles: got 0; expected a whole number from 1": dict(time=[0, 1], cycles=0),
@@ -429,7 +429,7 @@ WRONG = {
     "voltage: got 3 values; expected 2": dict(time=[0, 1], voltage=[1, 2, 3]),
     "voltage: row 2 is not finite": dict(time=[0, 1], voltage=[1, np.nan]),
     "duty: got 1.5; expected -1 to 1": dict(time=[0, 1], duty=1.5),
-    "mode: got 1 values; expected 2": dict(time=[0, 1], mode=["brake"]),
+    "mode: got 1 value; expected 2": dict(time=[0, 1], mode=["brake"]),
     "got duty_left without duty_right; expected both": dict(time=[0, 1], duty_left=1.0),
     "got duty_left beside voltage_left; expected one": dict(
         time=[0, 1], duty_left=1.0, duty_right=1.0, voltage_left=9.0, voltage_right=9.0

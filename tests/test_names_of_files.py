@@ -307,7 +307,7 @@ def test_columns_that_a_rig_may_lack_and_those_of_exports_are_known():
     lists = {
         *capabilities.OF_GROUND,
         *capabilities.OF_TRAVEL,
-        *capabilities.OF_HEAT,
+        *capabilities.RESTS_ON,
         *(column for column, _ in export.COLUMNS.values()),
     }
     assert {n for n in lists if END.search(n) and not known(n, {*registries(), *MORE})} == set()
@@ -316,7 +316,7 @@ def test_columns_that_a_rig_may_lack_and_those_of_exports_are_known():
         for n in registries()
         if re.match(r"(winding|housing)_", n) and n in (*missions.names(), "winding_settled_C")
     }
-    assert of_heat <= set(capabilities.OF_HEAT)
+    assert of_heat <= set(capabilities.RESTS_ON)
 
 
 def test_an_unknown_name_a_coulomb_and_a_twin_are_found(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 import typer
 
 from calibration.data.errors import BadConfiguration
-from sweeps import cli, config, config_campaign, options
+from sweeps import cli, config, config_campaign, flags, options
 
 KINDS = {
     "simulate": (config.Simulate, config.OneRun),
@@ -64,7 +65,7 @@ def test_every_field_that_can_be_chosen_is_an_option_that_says_what_the_schema_s
                 continue
             shown = parameters[command][name]
             assert fact["description"].rstrip(".").partition(" (")[0] in shown.help, name
-            _, unit = options.of_unit(name)
+            _, unit = flags.of_unit(name)
             assert not unit or f"({unit})" in shown.help, name
             assert all(choice in shown.help for choice in fact.get("enum", ()))
             assert shown.default is None, name  # what is not given is the configuration's affair
@@ -73,7 +74,7 @@ def test_every_field_that_can_be_chosen_is_an_option_that_says_what_the_schema_s
 
 def test_units_bounds_choices_and_defaults_are_read_off_the_field():
     def text(kind, name):
-        return options.described(name, options.facts(kind)[name]).replace("\\", "")
+        return options.described(name, flags.facts(kind)[name]).replace("\\", "")
 
     assert text(config.Sweep, "slopes_deg").endswith("  [-45 to 45]  [default: 0,5,10,15,20]")
     assert text(config.Sweep, "discharge_mAh") == (
@@ -148,3 +149,20 @@ def test_configuration_of_one_command_names_what_another_lacks(tmp_path, monkeyp
     _file(tmp_path, 'model = "drive"\nduration_s = 0.0\n')
     assert said("compare", "--config", "c.toml").startswith("mmrjax: c.toml, duration_s: got 0.0; ")
     assert said("check", "--config", "c.toml").startswith("mmrjax: c.toml, model: no such key; ")
+
+
+def test_no_message_of_what_was_stated_by_options_names_a_field(tmp_path):
+    """Every message of a configuration's own rules has its fields between backticks, and those that differ from their
+    option are called by it; from a file by their key."""
+    source = Path(config.__file__).read_text(encoding="utf-8")
+    rules = [m for m in re.findall(r'"idle",\s*(f?"(?:[^"]|"\s*f?")*")', source)]
+    fields = {n for kinds in KINDS.values() for k in kinds for n in flags.flags(k) if "_" in n}
+    assert len(rules) > 15 and [r for r in rules for n in fields if re.search(rf"(?<![`\w]){n}(?![`\w])", r)] == []
+    given = {"left_V": 5.0, "battery": True}
+    with pytest.raises(BadConfiguration, match=r"^--left acts with --right only; state both$"):
+        config.resolve(config.Simulate, None, given)
+    (tmp_path / "a.toml").write_text("left_V = 5.0\n")
+    with pytest.raises(BadConfiguration, match=r"^a\.toml: left_V acts with right_V only; state both$"):
+        config.resolve(config.Simulate, tmp_path / "a.toml", {})
+    with pytest.raises(BadConfiguration, match=r"^--left: got 500\.0; "):
+        config.resolve(config.Simulate, None, {"left_V": 500.0, "right_V": 1.0})

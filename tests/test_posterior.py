@@ -218,7 +218,7 @@ def test_draws_of_which_some_never_settle_have_no_spread_and_warn_of_nothing():
 
 @pytest.mark.parametrize(("value", "sd", "most", "said"), [
     (4.1932, 0.0612, 3, "4.193 ± 0.061"), (5243.2, 12.3, 1, "5243 ± 12"), (2.0, 0.0, 2, "2.00 ± 0.00"),
-    (0.5, 0.000012, 3, "0.500 ± 0.000"),
+    (0.5, 0.000012, 3, "0.500 ± 0.000"), (-0.0001, 0.02, 3, "0.000 ± 0.020"), (-0.001, 0.0, 2, "0.00 ± 0.00"),
 ])  # fmt: skip
 def test_a_value_is_said_to_two_digits_of_its_sd(value, sd, most, said):
     assert uncertainty.with_sd(value, sd, most) == said

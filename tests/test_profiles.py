@@ -189,7 +189,7 @@ WRONG = {
     "comments only": ("# cycles = 3\n", r"mission.csv: the file is empty"),
     "header only": ("time_s,duty\n", r"got a header and no rows; expected two rows or more"),
     "one row only": ("time_s,duty\n0,1\n", r"got one row; expected two rows or more, of which the last ends the mission"),
-    "a short row": ("time_s,duty\n0,1\n5\n", r"row 2: got 1 cells; the header has 2 columns"),
+    "a short row": ("time_s,duty\n0,1\n5\n", r"row 2: got 1 cell; the header has 2 columns"),
     "commas and points": ("time_s;duty\n0;0,5\n5;0.5\n", r"duty: got 0,5 and 0\.5; expected decimal commas or points"),
     "unknown surface": ("time_s,duty,surface\n0,1,ice\n5,1,ice\n", r"row 1, surface: got ice; expected one of these; .*asphalt"),
     "no cycles": ("# cycles = 0\ntime_s,duty\n0,1\n5,1\n", r"mission.csv, cycles: got 0; expected a whole number from 1"),

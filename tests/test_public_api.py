@@ -148,7 +148,7 @@ def test_one_run_has_scalars(robot):
     assert one.shape == () and one.total_current.shape == () and one.history is None
     assert str(one.configuration) == "4W2T" and str(one.statuses) == "converged"
     assert one.to_dict()["total_current_A"].shape == ()
-    assert len(str(one).splitlines()) == 3 and repr(one).startswith("Results of steady, 1 runs\n")
+    assert len(str(one).splitlines()) == 3 and repr(one).startswith("Results of steady, 1 run\n")
 
 
 def test_fields_broadcast_configurations_among_them(robot):

@@ -302,15 +302,23 @@ def test_a_robot_that_turns_states_its_wheelbase_and_is_written_with_it(tmp_path
     assert "an example's" in height.why
 
 
-@pytest.mark.parametrize(("limit", "flagged"), [("", False), ("temperature_limit = 125.0\n", True)])
-def test_no_winding_is_too_hot_for_a_rig_that_states_no_limit(tmp_path, limit, flagged):
-    """Also where none would settle: at 30 A of 1 ohm."""
-    robot = read(tmp_path, ROVER.replace("[motor]\n", f"[motor]\n{limit}").replace("mass = 4.0", "mass = 80.0"))
+LIMIT, PATH = "temperature_limit = 125.0\n", "resistance_thermal_winding = 1.7\nresistance_thermal_housing = 6.0\n"
+
+
+@pytest.mark.parametrize(
+    ("stated", "flagged", "lacking"),
+    [("", False, False), (LIMIT, False, True), (PATH, False, False), (LIMIT + PATH, True, False)],
+)
+def test_no_winding_is_too_hot_for_a_rig_that_states_no_limit_or_no_heat(tmp_path, stated, flagged, lacking):
+    """Also where none would settle: at 30 A of 1 ohm. What is stated is so with the packaged motor's number too."""
+    robot = read(tmp_path, ROVER.replace("[motor]\n", f"[motor]\n{stated}").replace("mass = 4.0", "mass = 80.0"))
     seen = steady_batch(robot, Conditions(voltage=np.array([40.0]), slope_deg=np.array([20.0])))
-    assert not np.isfinite(float(seen.winding_settled[0]))
+    assert float(seen.winding_settled[0]) == np.inf if PATH in stated else np.isnan(float(seen.winding_settled[0]))
     assert bool(int(seen.flags[0]) >> FLAGS.index("winding_hot") & 1) == flagged
     said = " ".join(rig_check.examined(tmp_path / "rig.toml", None).remarks())
-    assert ("held against an example's motor.resistance_thermal_winding" in said) == flagged
+    wanted = "state motor.resistance_thermal_winding and motor.resistance_thermal_housing, without which"
+    assert (wanted in said) == lacking
+    assert again(tmp_path, robot).rig.unknown == robot.rig.unknown
 
 
 def without(text, *keys):

@@ -5,8 +5,10 @@ import pytest
 
 from calibration.data import runs as records
 from calibration.data.errors import BadData
-from mmrjax import robots
+from calibration.data.table import Runs
+from mmrjax import channels, robots
 from mmrjax.conditions import Conditions
+from sweeps.pages import calibration_figures, loop_figures
 
 HEADER = (
     "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,motor_speed_rpm,speed_mm_s"
@@ -332,3 +334,22 @@ def test_a_command_says_it_on_stderr_before_it_fits(mmrjax, tmp_path, monkeypatc
             "separated by semicolons" in err
             and "1 of 2 cells of total_current_A are empty, the first in row 2" in err
         )
+
+
+def test_pages_order_the_rows_of_a_run_as_the_table_does():
+    """Rows of two runs, mixed and backwards in time."""
+    time = np.array([3.0, 2.0, 1.0, 0.0, 5.0, 4.0])
+    columns = {"run_id": np.array(["a", "b", "a", "b", "a", "b"]), "time_s": time, "total_current_A": time}
+    columns |= {"configuration": np.repeat("6T2A", 6), "supply_voltage_V": 5 * time}
+    table = columns | {"after_total_current_A": time, "residual_after_total_current_sigma": time}
+    shown = channels.rows(["total_current"])
+    loop = loop_figures.over_time(Runs("t", columns), table, shown, "none")
+    fit = calibration_figures.histories(table, shown)
+    drawn = [
+        np.asarray(line.get_xdata(), float)
+        for fig in (fit, loop)
+        for axes in fig.axes
+        for line in axes.lines
+        if len(line.get_xdata()) == 3
+    ]
+    assert len(drawn) >= 6 and all((np.diff(x) > 0).all() for x in drawn)

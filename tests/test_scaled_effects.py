@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from worlds import rigs
 
+import mmrjax as mm
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration
-from calibration.discovery import scales
+from calibration.discovery import discover, scales
 from mmrjax import effects, params
+from mmrjax.channels import RPM
 from mmrjax.effects.scaled import amplitude_of, scaled, shape_of
 from sweeps.commands import rig_new
 
@@ -81,7 +83,8 @@ def test_every_effect_of_a_rigs_size_is_read_again_as_it_was_written(tmp_path, k
 def test_effects_of_turns_of_a_rigs_size_are_read_again_as_they_were_written(tmp_path):
     """The loop writes them into the robot of a table of turns, which every command takes."""
     robot, *_ = rig("wheeled", "voltage", tmp_path)
-    library = {name: scaled(kind, (3.0, 1.0, 2.0)) for name, kind in effects.OF_TURNS.items()}
+    beside = effects.OF_TURNS | effects.OF_CHANNELS
+    library = {name: scaled(kind, (3.0, 1.0, 2.0)) for name, kind in beside.items()}
     whole = with_all(robot, library, 0.5)
     robot_file.write(whole, tmp_path / "robot.toml")
     assert library and eqx.tree_equal(whole.effects, robot_file.read(tmp_path / "robot.toml").effects)
@@ -139,11 +142,11 @@ def test_a_motor_that_states_what_it_bears_is_judged_by_that(tmp_path):
     robot, runs, _ = rig("bench", "voltage", tmp_path)
     limits = []
     for hot in (90.0, 125.0):
-        motor = dataclasses.replace(robot.motor, temperature_limit=hot)
-        motor = params.replace(motor, {"resistance_thermal_winding": 4.0, "resistance_thermal_housing": 400.0})
-        able = dataclasses.replace(robot, motor=motor)
+        able = dataclasses.replace(robot, motor=dataclasses.replace(robot.motor, temperature_limit=hot))
+        path = {"motor.resistance_thermal_winding": 4.0, "motor.resistance_thermal_housing": 400.0}
+        able = params.replace(able, {name: jnp.asarray(value) for name, value in path.items()})
         kind = scales.library_for(able, runs.conditions(able), effects.BY_NAME)["torque_constant_saturation"]
-        limits.append(amplitude_of(kind()).spec.bounds[1] * float(motor.current_continuous) ** 2)
+        limits.append(amplitude_of(kind()).spec.bounds[1] * float(able.current_continuous) ** 2)
     assert limits[0] == pytest.approx(limits[1], rel=1e-6)
 
 
@@ -188,3 +191,55 @@ def servo(folder):
     """The robot of the template of a servo."""
     (folder / "rig.toml").write_text(rig_new.template("servo"), encoding="utf-8")
     return robot_file.read(folder / "rig.toml")
+
+
+METERED = """
+base = "none"
+channels = ["total_current", "motor_speed", "output_torque"]
+[motor]
+resistance = "2.0 ± 1 %"
+torque_constant = "0.025 ± 0.3 %"
+friction_coulomb = "0.0015 ± 2 %"
+[gearbox]
+ratio = 20
+efficiency_load = "0.75 ± 0.5 %"
+[bench]
+load = "shaft"
+inertia = 0.002
+loss_coulomb = "0.05 ± 1 %"
+loss_viscous = "0.001 ± 1 %"
+"""
+
+
+def metered(tmp_path, off):
+    """A bench whose torque meter reads so much high, and its table."""
+    (tmp_path / "rig.toml").write_text(METERED)
+    robot = robot_file.read(tmp_path / "rig.toml")
+    volts = np.repeat(np.linspace(3.0, 24.0, 10), 2)
+    seen = mm.simulate(robot, mm.Conditions(voltage=volts))
+    noise = 1 + 0.003 * np.random.default_rng(1).standard_normal((3, len(volts)))
+    read = noise * [
+        seen.total_current,
+        np.asarray(seen.motor_speed) / RPM,
+        np.asarray(seen.output_torque) * (1 + off),
+    ]
+    columns = ("total_current_A", "motor_speed_rpm", "output_torque_Nm")
+    heads = [name for c in columns for name in (c, f"{c.rpartition('_')[0]}_sd_{c.rpartition('_')[2]}")]
+    rows = [[v, *(y for x in xs for y in (x, 0.003 * x))] for v, xs in zip(volts, read.T, strict=True)]
+    lines = [",".join(("supply_voltage_V", *heads)), *(",".join(f"{x:.6g}" for x in row) for row in rows)]
+    (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
+    return records.read(tmp_path / "runs.csv", robot=robot), robot
+
+
+def test_the_loop_looks_for_an_error_of_every_instrument(tmp_path):
+    runs, robot = metered(tmp_path, 0.0)
+    scored = [e for e in discover.prepared(runs, robot).library.values() if e.balance == "sensor"]
+    assert {e.channel for e in scored} == set(robot.rig.channels)
+
+
+@pytest.mark.slow
+def test_a_torque_meters_gain_is_named(tmp_path):
+    runs, robot = metered(tmp_path, 0.05)
+    found = mm.discover(runs, robot)
+    assert found.verdict == "named" and [e.name for e in found.effects] == ["output_torque_gain"]
+    assert found.effects[0].parameters["amplitude"].value == pytest.approx(0.05, abs=0.015)

@@ -324,7 +324,7 @@ def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmr
 
 
 @pytest.mark.parametrize(("options", "code", "says"), [
-    (["--method", "guess"], 2, "option method: got 'guess'; input should be one of local, sobol, morris"),
+    (["--method", "guess"], 2, "--method: got 'guess'; input should be one of local, sobol, morris"),
     (["--parameters", "motor.resistence"], 2, "--parameters motor.resistence: no such parameter; did you mean motor.res"),
     (["--parameters", "moter.*"], 2, "--parameters moter.*: no parameters below it; did you mean motor.*?"),
     (["--outputs", "current"], 2, "--outputs current: no such output; did you mean total_current? allowed: total_"),

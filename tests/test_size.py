@@ -261,7 +261,7 @@ REFUSED = {
         "mass,time",
     ): r"^mmrjax: --pareto: got time; did you mean mass|^mmrjax: --pareto: got time; allowed: ",
     ("--motors", "RE 31"): r"^mmrjax: --motors: got RE 31; ",
-    ("--starts", "0"): r"^mmrjax: option starts: got 0; ",
+    ("--starts", "0"): r"^mmrjax: --starts: got 0; ",
 }
 
 

@@ -14,6 +14,7 @@ from pathlib import Path, PurePosixPath
 import pytest
 
 from mmrjax import channels
+from mmrjax.errors import counted
 
 ROOT = Path(__file__).resolve().parents[1]
 LAYERS = ("mmrjax", "calibration", "sweeps")  # each may import those before it
@@ -797,3 +798,21 @@ def test_toml_is_read_in_one_place():
         if "tomllib" in (text := path.read_text(encoding="utf-8")) and "tomllib" in dict(imports(ast.parse(text), ""))
     }
     assert found == {"calibration/data/errors.py", "calibration/data/profiles.py"}
+
+
+def test_how_many_of_something_is_said_in_the_singular_where_it_is_one():
+    """By `errors.counted`: what is of a larger number (`3 of {n} rows`), or cannot be one, may have its plural."""
+    assert [counted(n, "row") for n in (0, 1, 2, 2000)] == ["0 rows", "1 row", "2 rows", "2,000 rows"]
+    unless, things = (
+        r"(?<!of )(?<!first )(?<!--runs: got )",
+        "runs|rows|cells|values|parameters|samples|lines|designs",
+    )
+    plural = re.compile(rf"{unless}\{{len\([^{{}}]*\)\}} (?:settled )?({things})\b")
+    found = [
+        f"{path.relative_to(ROOT)}: {line.strip()}"
+        for room in ("mmrjax", "calibration", "sweeps")
+        for path in sorted((ROOT / room).rglob("*.py"))
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if plural.search(line)
+    ]
+    assert [line for line in found if "LONGEST" not in line and "if single else" not in line] == []

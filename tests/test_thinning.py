@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 from worlds import rigs
 
+from calibration.data import columns
+from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.data.thinning import FIRST, thinned
-from calibration.inference import foresight
+from calibration.discovery import discover
+from calibration.inference import calibrate, foresight
 from calibration.inference.noise import inferred
 from calibration.inference.notes import Thinned
 from calibration.inference.observers import Histories
@@ -131,6 +134,7 @@ def test_rig_check_says_how_many_rows_are_used(tmp_path, monkeypatch, capsys):
     rigs.log(world, rng).write(tmp_path / "log.csv")
 
     def foresee(runs, robot):
+        runs = thinned(runs)
         return foresight.Foresight((), ("converged",) * len(runs), ("columns",) * len(runs.channels), (), robot)
 
     monkeypatch.setattr(rig_check.foresight, "foresee", foresee)
@@ -139,3 +143,26 @@ def test_rig_check_says_how_many_rows_are_used(tmp_path, monkeypatch, capsys):
     assert 0.9 * 4000 < used < 4200 < len(found.runs)
     rig_check.print_check(found)
     assert f"readings of {used} of them" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("rows", [100, None])
+@pytest.mark.parametrize("way", [(calibrate, "prepare"), (discover, "preparation.prepare"), (foresight, "prepare")])
+def test_python_takes_as_many_rows_as_the_command_line(monkeypatch, way, rows):
+    """Of the same log the same rows, whoever asks; each row once thinned is still of the whole log."""
+    room, before = way
+    runs, seen = log(rows=2500), []
+
+    def prepared(table, *_, **__):
+        seen.append(table)
+        raise InterruptedError
+
+    monkeypatch.setattr(f"{room.__name__}.{before}", prepared)
+    call = {calibrate: calibrate.calibrate, discover: discover.discover, foresight: foresight.foresee}[room]
+    with pytest.raises(InterruptedError):
+        call(runs, robots.nominal(), **({} if rows is None else {"rows": rows}))
+    (used,) = seen
+    wanted = thinned(runs, columns.ROWS if rows is None else rows)
+    np.testing.assert_array_equal(used["time_s"], wanted["time_s"])
+    assert len(used) < len(runs) == len(used.whole) == len(thinned(used, 50).whole)
+    with pytest.raises(BadConfiguration, match="rows: got 0; expected 1 or more"):
+        call(runs, robots.nominal(), rows=0)

@@ -162,7 +162,7 @@ def test_a_voltage_beside_the_battery_is_refused(mmrjax, tmp_path):
             "mmrjax: --voltage: got 15 beside --battery, whose voltage is that of its charge; give one of them\n"
         )
     code, _, err = mmrjax("sweep", "--battery", "--voltages", "15,24")
-    assert code == 2 and "voltages_V acts without battery only" in err
+    assert code == 2 and "--voltages acts without --battery only" in err
     code, _, err = mmrjax("sensitivity", "--battery", "--vary", "voltage=15:24")
     assert code == 2 and "--vary voltage: acts without --battery only" in err
     (tmp_path / "plan.toml").write_text("[axes]\nvoltage = [15, 24]\n[conditions]\nbattery = true\n")

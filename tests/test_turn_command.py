@@ -11,7 +11,7 @@ import mmrjax as mm
 from calibration.data import runs as records
 from calibration.data.errors import BadData
 from mmrjax import robots
-from mmrjax.channels import SIDES
+from mmrjax.channels import HEAT, SIDES
 from mmrjax.derived import turn as derived
 from mmrjax.errors import UsageError
 from sweeps.commands import simulate
@@ -94,19 +94,19 @@ def test_a_demanded_turn_is_that_of_the_voltages_found(tmp_path, mmrjax):
 
 
 REFUSED = {
-    "one side": (("--left", "33"), "left_V acts with right_V only"),
+    "one side": (("--left", "33"), "--left acts with --right only"),
     "volts and duties": (
         ("--left", "3", "--right", "1", "--duty-left", "1", "--duty-right", "1"),
-        "without duty_left",
+        "--left acts without --duty-left only",
     ),
-    "speed alone": (("--speed", "0.3"), "speed_m_s acts with yaw_rate_rad_s only"),
+    "speed alone": (("--speed", "0.3"), "--speed acts with --yaw-rate only"),
     "volts and a demand": (
         ("--left", "3", "--right", "1", "--speed", "0.3", "--yaw-rate", "1"),
-        "left_V acts without speed_m_s",
+        "--left acts without --speed",
     ),
-    "volts on the battery": (("--left", "3", "--right", "1", "--battery"), "state duty_left and duty_right"),
-    "track, one side": (("--left", "3", "--model", "track"), "left_V acts with right_V only"),
-    "profile": (("--left", "3", "--right", "1", "--profile", "patrol"), "without profile"),
+    "volts on the battery": (("--left", "3", "--right", "1", "--battery"), "state --duty-left and --duty-right"),
+    "track, one side": (("--left", "3", "--model", "track"), "--left acts with --right only"),
+    "profile": (("--left", "3", "--right", "1", "--profile", "patrol"), "--left acts without --profile only"),
     "supply too low": (("--left", "33", "--right", "1", "--voltage", "20"), "expected at least 33 V"),
     "slope": (("--left", "33", "--right", "1", "--slope", "5"), "its heading changes there all the time"),
     "one motor": (("--left", "3", "--right", "1", "--robot", "ONE"), "expected sides = 2"),
@@ -261,7 +261,7 @@ def test_turns_are_told_in_plain_words():
     assert "winding_hot: winding hotter than permitted" in said(flags="gearbox_overspeed;winding_hot")
     hot = turn_words.turn(robot, row(winding_left_C=float("inf"), power_right_W=-0.01), None)
     assert hot.sides[-2:] == [("electrical power [W]", "5.0", "0.0"), (hot.sides[-1][0], "none settles", "40")]
-    unknown = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, inherits=False))  # how its heat leaves
+    unknown = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, unknown=HEAT[-1:]))
     assert [side[0] for side in turn_words.turn(unknown, row(), None).sides] == [side[0] for side in hot.sides[:-1]]
     nothing = {name: float("nan") for name, value in row().items() if isinstance(value, float)}
     none = turn_words.turn(robot, row(status="not_settled", **nothing), None)

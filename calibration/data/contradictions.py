@@ -10,8 +10,8 @@ from calibration.data.columns import HEADING, LEVERS, RPM, SPEED, SUPPLY
 from calibration.data.errors import BadData, number
 from calibration.data.table import Runs
 from mmrjax import params
+from mmrjax.channels import CURRENT, VOLTAGE
 from mmrjax.robot import Robot, cannot_turn
-from mmrjax.running_gear import RunningGear
 
 #: Share of the motors' back-EMF below which no voltage turns them at an imposed speed [-], and least back-EMF that
 #: tells [V].
@@ -58,8 +58,7 @@ def cannot_stand(robot: Robot) -> str | None:
     """Why it is not known how a robot stands; None where it is."""
     if not robot.has_ground:
         return "the robot's load is a shaft, which stands on no ground"
-    usual = {p.name: float(p.value) for p in params.walk(RunningGear())}
-    if not robot.rig.inherits and all(float(p.value) == usual[p.name] for p in params.walk(robot.running_gear)):
+    if not any(robot.knows([f"running_gear.{p.name}"]) for p in params.walk(robot.running_gear)):
         return "the robot's file states no running_gear; state its wheelbase, levers and masses there"
     return None
 
@@ -114,14 +113,15 @@ def _mass(runs: Runs, robot: Robot) -> None:
 def _voltage(runs: Runs, robot: Robot, column: str) -> None:
     """The motors' back-EMF follows from the imposed speed; a supply may be turned round by its bridge. What a load
     drives brakes, with less voltage by as much as its current takes: where no current is read, some rows may."""
-    if not runs.has(column) or not np.nan_to_num(runs[column]).any():
+    if not runs.has(column) or not np.nan_to_num(runs[column]).any() or not robot.knows(CURRENT):
         return
     voltage = runs[column]
     back = np.asarray(robot.motor.voltage_back(jnp.asarray(runs[SPEED] * RPM)))
     along = np.abs(voltage) if runs.layout.magnitude(MAGNITUDES.get(column, "")) else voltage * np.sign(back)
     if column == SUPPLY and (voltage > 0).all():
         along = np.abs(voltage)
-    current = next((c for c in CURRENTS if runs.has(c) and not runs.layout.magnitude(CURRENTS[c])), None)
+    read = CURRENTS if robot.knows(VOLTAGE) else ()
+    current = next((c for c in read if runs.has(c) and not runs.layout.magnitude(CURRENTS[c])), None)
     if current is not None:
         motors = float(robot.sides) if current == "total_current_A" else 1.0
         along = along - np.nan_to_num(runs[current]) / motors * float(robot.motor.resistance) * np.sign(back)

@@ -20,6 +20,7 @@ from calibration.data import delimited, units
 from calibration.data.errors import BadConfiguration, BadData, choices, is_number, number
 from calibration.data.units import Quantity
 from mmrjax import channels
+from mmrjax.errors import counted
 from mmrjax.fidelities.mission import Start
 from mmrjax.profile import APART, MODES, MOTOR_SPEED, PAIRS, SPEED, VOLTAGE, profile, sides_refused
 from mmrjax.tables import CONDITION_LIMITS, SURFACES, adhesion_ratio, lateral_ratio
@@ -246,7 +247,9 @@ def _parsed(content: bytes, name: str) -> ProfileTable:
         raise BadData(f"{name}: got {got}; expected two rows or more, of which the last ends the mission")
     for k, row in enumerate(body, 1):
         if len(row) != len(header):
-            raise BadData(f"{name} row {k}: got {len(row)} cells; the header has {len(header)} columns")
+            raise BadData(
+                f"{name} row {k}: got {counted(len(row), 'cell')}; the header has {counted(len(header), 'column')}"
+            )
     cells = _Cells(name, columns, {c: [row[j] for row in body] for j, c in enumerate(header)}, settings["linear"])
     time = _time(cells)
     if why := sides_refused(list(cells.columns), cells.has(MODES[SPEED]), cells.called):

@@ -14,11 +14,12 @@ from calibration.data.errors import rounded
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from mmrjax import params
-from mmrjax.channels import RPM
+from mmrjax.channels import RPM, VOLTAGE
 from mmrjax.robot import Robot
 from mmrjax.shaft import Shaft
 from mmrjax.signals import GRAVITY
 
+BATTERY = "battery"
 #: From this ratio a gearbox has three stages or more; and the efficiency that makers state for those at most.
 STAGES, EFFICIENCY = 100.0, 0.85
 #: How many times its time constant a speed takes that is not that of its motors alone; fewest samples that show it.
@@ -46,11 +47,6 @@ def facts(robot: Robot) -> list[Fact]:
     return found
 
 
-def _has(robot: Robot, name: str) -> bool:
-    """Whether a robot's file has to state a parameter; of one with a base, all are."""
-    return robot.rig.inherits or name in rig_file.needed(robot.rig)
-
-
 def _within(value: float, low: float, high: float, why: str) -> str:
     """`why` where a value is out of what is usual."""
     return "" if low <= value <= high else f"{why} (usual: {rounded(low)} to {rounded(high)})"
@@ -60,7 +56,7 @@ def _motor(robot: Robot) -> Iterator[Fact]:
     motor = robot.motor
     constant, resistance, inertia = (float(x) for x in (motor.torque_constant, motor.resistance, motor.inertia))
     voltage = motor.voltage_limit
-    with_constant, with_resistance = _has(robot, "motor.torque_constant"), _has(robot, "motor.resistance")
+    with_constant, with_resistance = robot.knows(["motor.torque_constant"]), robot.knows(["motor.resistance"])
     if with_constant:
         per_volt = 1 / constant / RPM
         odd = _within(per_volt, 5, 20_000, "is torque_constant in N·m/A? 1 mN·m/A is 0.001")
@@ -116,11 +112,11 @@ def _current(robot: Robot, torque: float) -> float:
 
 def _drawn(robot: Robot, what: str, torque: float, places: str) -> Iterator[Fact]:
     """The current that a torque takes, held against the stall current where the voltage's limit is stated."""
-    if not _has(robot, "motor.torque_constant"):
+    if not robot.knows(["motor.torque_constant"]):
         return
     current, limit = _current(robot, torque), robot.motor.voltage_limit
     odd = _within(current, 0, 200, f"look at {places}, and the gearbox")
-    if limit is not None and _has(robot, "motor.resistance"):
+    if limit is not None and robot.knows(["motor.resistance"]):
         stall = limit / float(robot.motor.resistance)
         if current > stall:
             odd = f"above the stall current {rounded(stall)} A at {rounded(limit)} V, so it stands; look at {places}"
@@ -165,7 +161,7 @@ def _vehicle(robot: Robot, name: str) -> Iterator[Fact]:
         f"{name}: steepest slope that the ground holds", f"{grip:.0f}°", odd or _within(grip, 5, 60, "look at static")
     )
     limit = robot.motor.voltage_limit
-    if limit is None or not _has(robot, "motor.resistance"):
+    if limit is None or not robot.knows(["motor.resistance"]):
         return
     pull = _torque(robot, limit / float(robot.motor.resistance)) - float(load.track.loss_coulomb)
     climb = pull * sides / (radius * mass * GRAVITY) - rolling - guide
@@ -208,7 +204,7 @@ def doubtful_time(runs: Runs, robot: Robot) -> str:
 def time_constant(robot: Robot) -> float:
     """Of the speed of the motors with the slowest of their loads J R/k² [s]; infinite where that is not known."""
     motor, sides, found = robot.motor, float(robot.sides), 0.0
-    if not (_has(robot, "motor.torque_constant") and _has(robot, "motor.resistance")):
+    if not robot.knows(VOLTAGE):
         return math.inf
     for load in robot.configurations.members:
         if float(load.torque_gravity if isinstance(load, Shaft) else 0.0) > 0:
@@ -245,6 +241,7 @@ def origins(file: RobotFile) -> list[Origin]:
         mine = head in robot.configurations
         shown = p.name in stated or mine or p.name.startswith(("motor.friction", "gearbox."))
         shown |= p.name == rig_file.CENTRE and rig_file.WHEELBASE in stated
+        shown |= head == BATTERY and any(name.startswith(f"{BATTERY}.") for name in stated)
         assumed = not robot.rig.inherits and (
             p.name == "motor.inertia" or (p.name == "motor.inductance" and "motor.resistance" in stated)
         )
@@ -254,6 +251,8 @@ def origins(file: RobotFile) -> list[Origin]:
             why = "the file, by mass and travel of the linear unit" if head in file.linear else "the file"
         elif robot.rig.inherits:
             why = "its base"
+        elif head == BATTERY and not robot.knows([p.name]):
+            why = "not stated: an example's; what is run on the battery rests on it"
         else:
             why = _default(p.name, rest if mine else "")
         found.append(Origin(p.name, float(p.value), p.spec.unit, priors.get(p.name), why))

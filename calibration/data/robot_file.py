@@ -167,8 +167,8 @@ def parse(path: Path, library: Library = effects.BY_NAME, notes: list[str] | Non
     tables = {name: table for name, table in present.items() if isinstance(table, dict)}
     acting = {name: table.pop("configurations") for name, table in tables.items() if "configurations" in table}
     factors = {name: table.pop(FACTORS) for name, table in tables.items() if FACTORS in table}
-    of_turns = {**effects.OF_TURNS, **library}
-    of_size = {name: _of_size(of_turns, name, value, path.name) for name, value in factors.items()}
+    sized = {**effects.OF_TURNS, **effects.OF_CHANNELS, **library}
+    of_size = {name: _of_size(sized, name, value, path.name) for name, value in factors.items()}
     robot = with_effects(robot, tuple(present), {**library, **of_size}, acting, where=path.name)
     parameters = dict(_flatten(content))
     robot = rig_file.with_priors(change(robot, parameters, where=path.name, notes=notes), sds, path.name)
@@ -426,8 +426,7 @@ def _check_pairs(robot: Robot, where: str) -> None:
             )
     for effect in robot.effects:
         ends = {p.name: float(p.value) for p in params.walk(effect)}
-        curve = effect.name in effects.CURVES or effect.name in effects.CURVES_ROUND
-        if curve and not ends["low"] < ends["high"]:
+        if effect.name in effects.UNNAMED and "low" in ends and not ends["low"] < ends["high"]:
             raise BadConfiguration(
                 f"{where}, effects.{effect.name}.high: got {ends['high']:g}; expected more than low, {ends['low']:g}"
             )
@@ -469,6 +468,7 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
             continue
         was = start.get(parameter.name, 0.0 if head_.startswith("effects.") else None)
         same = value == was and not parameter.name.startswith(always) and parameter.name not in needed
+        same &= parameter.name not in nothing.rig.unknown or parameter.name in robot.rig.unknown
         if same and (not whole or head_ == "rig"):
             continue
         origin = f"; nominal {was:g}: {spec.source}" if was is not None and value != was else ""

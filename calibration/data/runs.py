@@ -34,6 +34,7 @@ from calibration.data.errors import BadConfiguration, BadData, InputError, choic
 from calibration.data.table import Runs
 from mmrjax import channels
 from mmrjax.channels import MM, RPM, Channel
+from mmrjax.errors import counted
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
@@ -105,7 +106,9 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
         raise BadData(f"{name}: a header and no rows; expected at least one run")
     for k, row in enumerate(rows[1:], 1):
         if len(row) != len(header):
-            raise BadData(f"{name} row {k}: got {len(row)} cells; the header has {len(header)} columns")
+            raise BadData(
+                f"{name} row {k}: got {counted(len(row), 'cell')}; the header has {counted(len(header), 'column')}"
+            )
     columns: dict[str, np.ndarray] = {}
     bad: list[tuple[int, int, str]] = []
     for j, meaning in enumerate(meanings):

@@ -16,6 +16,7 @@ from calibration.data.instruments import step_of
 from calibration.data.runs import Runs
 from mmrjax import channels
 from mmrjax.channels import Channel
+from mmrjax.errors import counted
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
@@ -265,7 +266,8 @@ def _in_order(runs: Runs) -> list[np.ndarray]:
             )
     if max(map(len, each)) < FEWEST:
         raise BadData(
-            f"{runs.source}: {max(map(len, each))} samples in its longest run; at least {FEWEST} are needed"
+            f"{runs.source}: {counted(max(map(len, each)), 'sample')} in its longest run; at least {FEWEST} are "
+            "needed"
         )
     return each
 

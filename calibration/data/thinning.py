@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.data.columns import ROWS
+from calibration.data.errors import BadConfiguration
 
 if TYPE_CHECKING:
     from calibration.data.table import Runs
@@ -22,7 +23,12 @@ def thinned(runs: Runs, most: int = ROWS) -> Runs:
     Of each run are kept its first rows, its last, and one of every few between: of rows side by side the one with
     readings of the channels of which fewest were kept so far, else the first. A table without `time_s` is left as it
     is.
+
+    Raises:
+        BadConfiguration: none at all is asked for.
     """
+    if most < 1:
+        raise BadConfiguration(f"rows: got {most}; expected 1 or more")
     if not runs.sampled or len(runs) <= most:
         return runs
     apart, kept = -(-len(runs) // most), []
@@ -30,7 +36,7 @@ def thinned(runs: Runs, most: int = ROWS) -> Runs:
     for name in dict.fromkeys(runs.run_names.tolist()):
         rows = runs.in_order(name)
         kept.append(rows[_evenly(read[rows], apart)])
-    return dataclasses.replace(runs.where(np.sort(np.concatenate(kept))), log=runs)
+    return dataclasses.replace(runs.where(np.sort(np.concatenate(kept))), log=runs.whole)
 
 
 def _evenly(read: np.ndarray, apart: int) -> np.ndarray:

@@ -15,9 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import own_mass
+from calibration.data.columns import ROWS
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
+from calibration.data.thinning import thinned
 from calibration.discovery import findings, kept, menu, prediction, preference, scales
 from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
@@ -76,6 +78,7 @@ from calibration.inference.residual_clusters import residual_clusters
 from calibration.words.notes import in_words
 from mmrjax import channels, effects
 from mmrjax.effects import Effect
+from mmrjax.errors import counted
 from mmrjax.robot import Robot
 
 #: Factors on a noise that nobody states at which the verdict is looked at too: on what is assumed, and on what the
@@ -104,6 +107,7 @@ def discover(
     seed: int = 0,
     prefer: str = FIT,
     forbidden: Sequence[str] = (),
+    rows: int = ROWS,
     progress: Callable[[str], None] = lambda text: None,
     keep: Keep = kept.nothing,
     left: Callable[[], float | None] = lambda: None,
@@ -120,6 +124,7 @@ def discover(
         replicates: of the bootstrap; seed: random seed.
         prefer: by what the leader of a class is chosen, `fit` or `held-out`.
         forbidden: kinds of experiments (`menu.KINDS`) and configurations that are not to be proposed.
+        rows: of a log over time from which on readings are used of fewer, evenly in time, which its notes say.
         progress: called with a sentence as the work goes on; keep: by which stages are kept as they end.
         left: time that is left once there is a verdict [s], for which verdicts at other noises are waited; None: all.
 
@@ -130,7 +135,7 @@ def discover(
     tell = in_words(progress)
     ready = prepared(
         runs, robot, noise=noise, stated=stated, library=library, replicates=replicates, seed=seed, prefer=prefer,
-        forbidden=forbidden,
+        forbidden=forbidden, rows=rows,
     )  # fmt: skip
     distinct, known = ready.runs, ready.noise
     for note in ready.foreign:
@@ -222,24 +227,26 @@ def prepared(
     seed: int = 0,
     prefer: str = FIT,
     forbidden: Sequence[str] = (),
+    rows: int = ROWS,
 ) -> LoopInput:
     """What `discover` does before its first fit; arguments and errors as of `discover`.
 
     A campaign that wants verdicts alone goes on with `LoopInput.trace`, so that it takes the way that users take.
     """
     menu.check_forbidden(forbidden, robot)
-    runs = runs.of(robot)
+    runs = thinned(runs.of(robot), rows)
     distinct, numbers, notes = without_copies(runs)
     kind = observers.kind(distinct)
     if len(distinct) < kind.fewest:
         raise BadData(
-            f"{runs.source}: {len(distinct)} {kind.word} cannot show what a model lacks; at least {kind.fewest} are "
-            "needed"
+            f"{runs.source}: {counted(len(distinct), kind.word)} cannot show what a model lacks; at least "
+            f"{kind.fewest} are needed"
         )
     ready = preparation.prepare(distinct, robot, noise, stated)
     said: Notes = (*notes, *ready.former, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign)
     turned = scales.turned_in(distinct, ready.robot)
-    library = {**library, **kind.library}
+    own = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
+    library = {**library, **kind.library, **own}
     library = scales.library_for(ready.robot, distinct.conditions(ready.robot), library, turned)
     settings = dataclasses.replace(settings_for(kind, replicates, seed, prefer), forbidden=tuple(forbidden))
     return LoopInput(

@@ -21,5 +21,5 @@ def nothing(name: str, make: Callable[[], T]) -> T:
     return make()
 
 
-class OutOfTime(Exception):
-    """The loop's budget of time is spent before there is a verdict."""
+class OutOfTime(KeyboardInterrupt):
+    """The loop's budget of time is spent before there is a verdict: it ends as if interrupted, by itself."""

@@ -121,7 +121,7 @@ def reach(robot: Robot, conditions: Conditions, measured: tuple[str, ...]) -> Re
     motors = int(robot.sides)
     travel = operating_readings(robot, conditions, channels.USUAL)
     largest = {c: float(np.nanmax(travel[:, k], initial=0.0)) for k, c in enumerate(channels.USUAL)}
-    bears = float(motor.current_continuous)
+    bears = float(robot.current_continuous)
     current = min(largest["total_current"] / motors or LOADED * highest / resistance, bears)
     motor_speed = largest["motor_speed"] or RUNNING * highest / constant
     radius = max(float(c.radius) for c in robot.configurations.members)

@@ -197,7 +197,7 @@ def _rated(robot: Robot, signals: Signals) -> Signals:
     if not (rig.shows_voltage and current and speed and volts and float(motor.resistance)):
         return signals
     volts = max(volts, motor.voltage_limit or 0.0)
-    load = min(float(motor.current_continuous), LOADED * volts / float(motor.resistance)) / current
+    load = min(float(robot.current_continuous), LOADED * volts / float(motor.resistance)) / current
     fast = min(motor.speed_limit, RUNNING * volts / float(motor.torque_constant)) / speed
     grown = {name: max(load, 1.0) * getattr(signals, name) for name in LOADS}
     grown |= {name: max(fast, 1.0) * getattr(signals, name) for name in SPEEDS}

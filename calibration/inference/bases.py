@@ -19,8 +19,7 @@ from calibration.inference.linearization import Linearization
 from mmrjax import channels
 from mmrjax.balances import absent
 from mmrjax.channels import Channel
-from mmrjax.effects import UNNAMED
-from mmrjax.effects.curve import WAYS, acts_along, in_travel
+from mmrjax.effects.curve import DRIFT, READ_BY, WAYS, acts_along, in_travel
 from mmrjax.robot import Robot
 
 #: Balances that carry curves: one for each equation that the channels close, and the ground's, whose defect
@@ -48,7 +47,7 @@ TERMS, DEGREE = 5, 2
 CONDITIONS = "conditions"
 #: Axes along which something may happen for a while, the first that a table has; shares of the range that its windows
 #: have, each of which starts in the middle of the one before; fewest rows in one.
-AXES, WINDOWS, FEWEST = ("time", "order"), (1 / 4, 1 / 8, 1 / 16), 3
+AXES, WINDOWS, FEWEST = DRIFT, (1 / 4, 1 / 8, 1 / 16), 3
 #: Conditions of which a level may differ from the others, the SI value of their column's unit, and the unit; most
 #: levels that each may have.
 LEVELS = {
@@ -224,12 +223,7 @@ def families(
         return way[:, None] * legendre.legvander(scaled(x, weight), TERMS - 1) * np.exp(-0.35 * np.arange(TERMS))
 
     names = [(balance, variable) for variable in over.values() for balance in balances]
-    shown = [
-        (c.name, v)
-        for c in channels_of(robot)
-        for v in over
-        if (v in AXES or VARIABLES[v] == c.column) and f"curve_{c.name}_{v}" in UNNAMED
-    ]
+    shown = [(c.name, v) for c in channels_of(robot) for v in over if v in AXES or v == READ_BY.get(c.name)]
     new = [n for n in shown if over[n[1]] == n[1]]
     # As above: what is left out makes room for another of its channel, or of the first that has one.
     read = [n if n in new else next((m for m in new if m[0] == n[0]), new[0]) for n in shown] if new else []
@@ -335,7 +329,7 @@ def windows(
         return ()
     # The first again for those that hold too few or too many rows: tables of one size share what is compiled.
     shapes += shapes[:1] * (len(offered) - len(shapes))
-    read = [c.name for c in channels_of(robot) if f"curve_{c.name}_order" in UNNAMED]
+    read = [c.name for c in channels_of(robot)]
     return tuple(
         Basis.of(
             np.stack([s * ways[acts_along(place)] for place in places for s, _ in shapes])[:, :, None],

@@ -11,8 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import robot_file, surfaces
+from calibration.data.columns import ROWS
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
+from calibration.data.thinning import thinned
 from calibration.inference import blocks as holdout
 from calibration.inference import (
     checks,
@@ -64,6 +66,7 @@ def calibrate(
     seed: int = 0,
     profiles: bool | None = None,
     blocks: Sequence[str] | bool | None = None,
+    rows: int = ROWS,
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> CalibrationResult:
     """Calibrate `robot` to measured runs.
@@ -83,6 +86,7 @@ def calibrate(
         seed: of the starts and of all that is drawn; profiles: whether to profile every parameter.
         blocks: kinds of blocks to hold out; True: all that tell something of such data.
             These three by default as the kind of data and the fidelity say.
+        rows: of a log over time from which on readings are used of fewer, evenly in time, which its notes say.
         tell: is given a sentence now and then while a long calibration goes on.
 
     Raises:
@@ -94,7 +98,7 @@ def calibrate(
         raise BadConfiguration(
             'calibrate: JAX computes in single precision; set jax.config.update("jax_enable_x64", True) first'
         )
-    runs = runs.of(robot)
+    runs = thinned(runs.of(robot), rows)
     observe = observers.kind(runs)
     facts = observers.facts(model)
     effort = facts.effort

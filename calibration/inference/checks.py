@@ -15,6 +15,7 @@ from calibration.inference.conduct import conduct
 from calibration.inference.noise import Noise
 from calibration.inference.notes import Constant, Note, Unmeasured
 from calibration.inference.ranges import check_ranges
+from mmrjax.errors import counted
 from mmrjax.robot import Robot
 from mmrjax.signals import SLIDES, STATUSES
 
@@ -55,10 +56,10 @@ def _enough(runs: Runs, names: Sequence[str], noise: Noise) -> None:
     also = f" and estimate {levels} noise levels" if levels else ""
     cure = "fix some with --fix, or state --noise" if levels else "fix some with --fix"
     whole = readings == len(runs) * shown
-    rows = f"{len(runs)} row{'s' * (len(runs) > 1)}"
-    have = f"{rows} of {shown} channels" if whole else f"{readings} readings in {rows}"
+    rows = counted(len(runs), "row")
+    have = f"{rows} of {shown} channels" if whole else f"{counted(readings, 'reading')} in {rows}"
     least = f"{needed} rows" if whole else f"{needed * shown} readings"
-    what = f"cannot fit {len(names)} parameters{also}" if names else "cannot be fitted"
+    what = f"cannot fit {counted(len(names), 'parameter')}{also}" if names else "cannot be fitted"
     raise BadData(f"{runs.source}: {have} {what}; at least {least} are needed{f', or {cure}' if names else ''}")
 
 

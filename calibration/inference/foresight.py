@@ -7,8 +7,10 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data.columns import ROWS
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
+from calibration.data.thinning import thinned
 from calibration.inference import identifiability, observers, priors
 from calibration.inference import optimizers as fit
 from calibration.inference.preparation import prepare
@@ -53,19 +55,20 @@ class Foresight:
     robot: Robot
 
 
-def foresee(runs: Runs, robot: Robot, noise: str | None = None) -> Foresight:
+def foresee(runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS) -> Foresight:
     """What `runs` can determine of `robot`, by the linear analysis at its own values.
 
     Rows that the robot does not reach with these values count for nothing.
 
     Args:
         noise: as `noise.parse`; None takes the file's sd columns, or shares of the readings.
+        rows: of a log over time from which on readings are used of fewer.
 
     Raises:
         BadData: data that cannot be used.
         BadConfiguration: no parameter of the robot can be freed.
     """
-    runs = runs.of(robot)
+    runs = thinned(runs.of(robot), rows)
     ready = prepare(runs, robot, noise)
     observe, robot, known = ready.observe, ready.robot, ready.noise
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}

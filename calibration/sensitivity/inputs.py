@@ -116,7 +116,7 @@ def default_names(
     left_out = {*guides, *fidelities.unread(model, known), *robot.rig.exact}
     if not robot.rig.inherits:  # what another robot has is none of its own
         stated = {name for name, _, _ in robot.rig.priors}
-        left_out |= {name for name in known if name.startswith(_OTHERS) and name not in stated}
+        left_out |= {name for name in known if name.startswith(_OTHERS) and name not in stated} | {*robot.rig.unknown}
     return tuple(
         name
         for name, p in known.items()

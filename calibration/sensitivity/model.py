@@ -68,7 +68,8 @@ def default_outputs(robot: Robot) -> tuple[str, ...]:
         beside = ("power_supply",)
     elif robot.rig.imposed == "motor_speed":  # that stalls on no slope
         beside = tuple(name for name in DEFAULT if name != "steepest_slope")
-    return (*channels.names(robot.channels), *beside)
+    known = known_outputs(robot)
+    return tuple(n for n in (*channels.names(robot.channels), *beside) if robot.knows(known[n].rests_on))
 
 
 def chosen_outputs(words: tuple[str, ...], robot: Robot) -> tuple[OutputRow, ...]:
@@ -85,6 +86,10 @@ def chosen_outputs(words: tuple[str, ...], robot: Robot) -> tuple[OutputRow, ...
                 raise BadConfiguration(f"--outputs {name}: no such output; {choices(name, [*known, 'start'])}")
             if (row := known[name]) in derived.OF_GROUND and not robot.has_ground:
                 raise BadConfiguration(f"--outputs {name}: the robot's load is a shaft, which stands on no ground")
+            if lacking := robot.unknown(row.rests_on):
+                raise BadConfiguration(
+                    f"--outputs {name}: not known, as the robot's file does not state {' and '.join(lacking)}"
+                )
             if row in derived.OF_POSTURE and (why := cannot_stand(robot)):
                 raise BadConfiguration(f"--outputs {name}: {why}")
             found.append(row)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from calibration.inference import blocks, notes
 from calibration.inference.identifiability import HELD
 from mmrjax import channels
+from mmrjax.errors import counted
 
 if TYPE_CHECKING:
     from calibration.inference.lack_of_fit import Adequacy
@@ -123,7 +124,7 @@ def generations(note: notes.Generations) -> str:
     end = "the last gained nothing that counts"
     if not note.settled:
         end = "the last still gained: go on with more --generations"
-    return f"{note.members} members in {note.generations} generations; {end}"
+    return f"{counted(note.members, 'member')} in {counted(note.generations, 'generation')}; {end}"
 
 
 def lost_rows(note: notes.LostRows) -> str:

@@ -14,6 +14,7 @@ from calibration.inference import bases
 from calibration.inference import blocks as blocks_room
 from calibration.words import fits
 from mmrjax import channels, effects
+from mmrjax.errors import counted
 
 if TYPE_CHECKING:
     from calibration.discovery.clusters import Cluster
@@ -432,7 +433,7 @@ def worse(found: Sequence[Worse], held_out: Mapping[str, tuple[Errors, Errors]])
             changes[-1] += f" (of the {min(w.rows for w in mine)} rows that both predict)"
         lost = max(was - now for was, now in predicted.values())
         if lost > 0:
-            changes.append(f"{lost} row{'s' * (lost > 1)} fewer predicted")
+            changes.append(f"{counted(lost, 'row')} fewer predicted")
         if changes:
             parts.append(f"by {blocks_room.in_words(kind)} {', '.join(changes)}")
     return f"Held out, what was found predicts worse: {'; '.join(parts)}." if parts else ""

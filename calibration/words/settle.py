@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from calibration.data.settling import Settled, Stretch
+from mmrjax.errors import counted
 
 #: Of each of `settling.REASONS`: what is so, and what to do where it is much.
 WHY = {
@@ -43,7 +44,7 @@ def statement(found: Settled) -> str:
     back = sum(s.imposed < 0 for s in kept)
     ways = f", {len(kept) - back} forward and {back} backward" if back else ""
     return (
-        f"{len(kept)} settled run{'s' * (len(kept) != 1)}{ways}, from {rows} of {len(found.runs)} samples "
+        f"{counted(len(kept), 'settled run')}{ways}, from {rows} of {len(found.runs)} samples "
         f"(each at least {found.shortest:.3g} s long, its means steady to {100 * found.drift:g} %)."
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from calibration.inference.notes import Step
+from mmrjax.errors import counted
 
 STEPS = {
     # the loop
@@ -46,5 +47,5 @@ def step(now: Step) -> str:
 
 def still(doing: str, seconds: float, compiled: int) -> str:
     """That a step goes on, how long it has, and how many programs were compiled in it."""
-    programs = f", {compiled} program{'s' * (compiled != 1)} compiled" if compiled else ""
+    programs = f", {counted(compiled, 'program')} compiled" if compiled else ""
     return f"still {doing} ({seconds:.0f} s{programs})"

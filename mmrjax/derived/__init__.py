@@ -12,6 +12,8 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from mmrjax.channels import CURRENT, VOLTAGE
+
 
 @dataclasses.dataclass(frozen=True)
 class Derived:
@@ -24,6 +26,7 @@ class Derived:
         module: that computes it, with others it may share a computation with.
         resolution: digits after the point that a person wants to see [unit].
         ignores: conditions that it does not depend on, because it solves for them.
+        rests_on: parameters of the robot without which it is not known, by dotted name.
     """
 
     name: str
@@ -34,6 +37,7 @@ class Derived:
     module: str
     resolution: int = 3
     ignores: tuple[str, ...] = ()
+    rests_on: tuple[str, ...] = ()
 
 
 _SLOPE, _START = "mmrjax.derived.steepest_slope", "mmrjax.derived.start"
@@ -44,9 +48,20 @@ TABLE: tuple[Derived, ...] = (
     Derived(
         "steepest_slope", "steepest_slope_deg", "deg", 1.0, "steepest slope held", _SLOPE, 2, ignores=("slope_deg",)
     ),
-    Derived("peak_current", "peak_current_A", "A", 1.0, "peak current of the start, all motors", _START, 2),
+    Derived(
+        "peak_current",
+        "peak_current_A",
+        "A",
+        1.0,
+        "peak current of the start, all motors",
+        _START,
+        2,
+        rests_on=CURRENT,
+    ),
     Derived("time_to_speed", "time_to_speed_s", "s", 1.0, "time to 95 % of speed", _START, 3),
-    Derived("energy_start", "energy_start_J", "J", 1.0, "electrical energy of the start", _START, 2),
+    Derived(
+        "energy_start", "energy_start_J", "J", 1.0, "electrical energy of the start", _START, 2, rests_on=VOLTAGE
+    ),
     Derived("pitch", "pitch_deg", "deg", math.pi / 180, "pitch at rest, nose up", _POSTURE, 2),
     Derived("highest_step", "highest_step_mm", "mm", 1e-3, "highest step of the posture", _POSTURE, 1),
     Derived("best_step", "best_step_mm", "mm", 1e-3, "highest step in any posture", _POSTURE, 1),

@@ -15,7 +15,8 @@ from mmrjax.effects import (
     turning,
 )
 from mmrjax.effects.base import Effect, amplitude, defined_in
-from mmrjax.effects.curve import CURVES, CURVES_ROUND, WAVES
+from mmrjax.effects.curve import CURVES, CURVES_ROUND, CURVES_SHOWN, WAVES
+from mmrjax.effects.sensor import OF_CHANNELS
 
 _FILES = (mass, inertia, supply, electrical, inductance, motor, gearbox, track, ground, slip, sensor)
 
@@ -26,15 +27,15 @@ ALL: tuple[type[Effect], ...] = tuple(effect for file in _FILES for effect in de
 BY_NAME: dict[str, type[Effect]] = {effect.name: effect for effect in ALL}
 
 #: Discrepancies without a name, which robot files know and no library holds.
-UNNAMED: dict[str, type[Effect]] = {**CURVES, **WAVES, **CURVES_ROUND}
+UNNAMED: dict[str, type[Effect]] = {**CURVES, **WAVES, **CURVES_ROUND, **CURVES_SHOWN}
 
 #: Of a robot that turns: robot files know them, and the loop looks for them in tables of turns.
 OF_TURNS: dict[str, type[Effect]] = {effect.name: effect for effect in defined_in(turning)}
 
-#: What robot files know beside the library.
-BESIDE: dict[str, type[Effect]] = {**UNNAMED, **OF_TURNS}
+#: What robot files know beside the library. Those of channels the loop looks for where a robot has the channel.
+BESIDE: dict[str, type[Effect]] = {**UNNAMED, **OF_TURNS, **OF_CHANNELS}
 
 __all__ = [
-    "ALL", "BESIDE", "BY_NAME", "CURVES", "CURVES_ROUND", "OF_TURNS", "UNNAMED", "WAVES", "Effect", "amplitude",
-    "defined_in",
+    "ALL", "BESIDE", "BY_NAME", "CURVES", "CURVES_ROUND", "CURVES_SHOWN", "OF_CHANNELS", "OF_TURNS", "UNNAMED",
+    "WAVES", "Effect", "amplitude", "defined_in",
 ]  # fmt: skip

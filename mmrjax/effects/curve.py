@@ -26,7 +26,14 @@ BALANCES = {
 #: The same of a robot that turns alone.
 ROUND = {"yaw": ("N·m", 0.5, "direction_turn")}
 #: Channels to whose readings a curve may be added, likewise; an instrument's error of 1 % of its range is plausible.
-READINGS = {c.name: (c.unit_si or c.unit, 0.01 * c.range[1] * c.factor, "direction") for c in channels.usual()}
+READINGS = {
+    c.name: (
+        c.unit_si or c.unit,
+        0.01 * c.range[1] * c.factor,
+        "direction_turn" if c in channels.OF_TURNS and c.side is None else "direction",
+    )
+    for c in channels.EVERY
+}
 PLACES = {**BALANCES, **ROUND, **READINGS}
 #: Variables of a curve, signals that every one of these balances knows, the time since the start of the run and the
 #: place of a run in the sequence: unit and ordinary range.
@@ -45,6 +52,12 @@ VARIABLES_ROUND = {"yaw_rate": ("rad/s", 0.0, 4.0), "side": ("-", -1.0, 1.0)}
 IN_TURNS = ("voltage", "current", "speed_motor", "payload", "speed", "order")
 #: Variables that have a sign by themselves; the others count along the motion: of the shafts, or of the turn.
 SIGNED = ("payload", "time", "order", "side")
+#: The variable with which a channel's reading goes, and the axes of a drift, over which its curves are.
+READ_BY = {
+    "total_current": "current", "motor_current": "current", "output_torque": "current", "motor_speed": "speed_motor",
+    "output_speed": "speed_motor", "speed": "speed", "motor_voltage": "voltage", "yaw_rate": "yaw_rate",
+}  # fmt: skip
+DRIFT = ("time", "order")
 ORDINATES = tuple(f"y{k}" for k in range(6))
 #: Share of the range over which a curve levels out beyond each of its ends.
 LEVEL = 0.05
@@ -230,7 +243,18 @@ WAVES: dict[str, type[Effect]] = {effect.name: effect for effect in map(_wave, B
 
 #: Every curve by its name. Robot files know them; they are no part of the library that is scored.
 CURVES: dict[str, type[Effect]] = {
-    effect.name: effect for effect in (_curve(place, over) for place in (*BALANCES, *READINGS) for over in VARIABLES)
+    effect.name: effect
+    for effect in (_curve(place, over) for place in (*BALANCES, *channels.USUAL) for over in VARIABLES)
+}
+#: Those of the readings of any other channel, over what the loop looks for them.
+CURVES_SHOWN: dict[str, type[Effect]] = {
+    effect.name: effect
+    for effect in (
+        _curve(place, over)
+        for place in READINGS
+        for over in (*DRIFT, READ_BY.get(place))
+        if over is not None and place not in channels.USUAL
+    )
 }
 #: Those of a robot that turns alone.
 CURVES_ROUND: dict[str, type[Effect]] = {

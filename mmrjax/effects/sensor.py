@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 
+from mmrjax import channels
+from mmrjax.channels import Channel
 from mmrjax.effects.base import Effect, amplitude
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
@@ -103,3 +107,42 @@ class SpeedGain(SensorEffect):
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * signals.speed
+
+
+def _scale(shown_by: Channel) -> type[SensorEffect]:
+    """The error of the scale of a channel's instrument; of a temperature, whose zero is a convention, of its zero."""
+    offset = shown_by.unit_shown == "°C"
+
+    class Scale(SensorEffect):
+        name = f"{shown_by.name}_{'offset' if offset else 'gain'}"
+        channel = shown_by.name
+
+        amplitude: Scalar = amplitude(
+            unit="°C" if offset else "-",
+            meaning=f"error of the {shown_by.label} reading"
+            if offset
+            else f"relative error of the {shown_by.label} reading",
+            bounds=(-20.0, 20.0) if offset else (-0.2, 0.2),
+            sd=2.0 if offset else 0.02,
+            source="class of the instrument: 1 to 3 K" if offset else "class of the instrument: 0.5 to 2.5 %",
+        )
+
+        def term(self, robot: Robot, signals: Signals) -> Scalar:
+            read: Any = shown_by.read(robot, signals)
+            return self.amplitude * (jnp.ones_like(read) if offset else read)
+
+    words = "".join(word.capitalize() for word in Scale.name.split("_"))
+    Scale.__name__ = Scale.__qualname__ = words
+    Scale.__doc__ = f"""Δx = a{"" if offset else " x"} in the reading x of {shown_by.label}.
+
+    The {"zero" if offset else "scale"} of the instrument is off.
+
+    Source: {"tolerances of thermocouples, IEC 60584-1" if offset else "limits of error of instruments, IEC 60051-2"}.
+    """
+    return Scale
+
+
+#: Of every channel that the classes above are not about: a rig that has it.
+OF_CHANNELS: dict[str, type[Effect]] = {
+    effect.name: effect for effect in (_scale(c) for c in channels.EVERY if c not in channels.usual())
+}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import equinox as eqx
 import jax
@@ -58,6 +58,11 @@ class History(eqx.Module):
         else:
             shown = balances.sensor(robot, signals)
         reading = {c.name: shown[c.name] for c in channels.EVERY if c.over_time}
+        if not robot.knows(channels.VOLTAGE):
+            nan = jnp.full_like(signals.current, jnp.nan)
+            volts = ("voltage", "voltage_source", "voltage_drop", "voltage_left", "inductance")
+            unknown: dict[str, Any] = dict.fromkeys(volts, nan)
+            signals = dataclasses.replace(signals, **unknown)
         clock, (distance, signals, reading, reactions) = as_tables(
             robot.rig, time, (distance, signals, reading, reactions)
         )

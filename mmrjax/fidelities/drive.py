@@ -281,7 +281,8 @@ def _turning(
 
 
 def _status(robot: Robot, conditions: Conditions, end: Signals, parked: Array, done: Array) -> Array:
-    status = status_moving(robot, conditions, end, end.voltage)
+    voltage = voltage_at_rest(robot, conditions) if conditions.voltage_follows else end.voltage
+    status = status_moving(robot, conditions, end, voltage)
     status = jnp.where(parked, STALLED, status)
     empty = (conditions.battery > 0.5) & robot.battery.empty(end.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)

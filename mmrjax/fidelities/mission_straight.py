@@ -117,7 +117,7 @@ def instant(
     signals = balances.moving(asked.robot, asked.conditions, state)
     winding, housing = (y[k] * UNITS[k] for k in (WINDING, HOUSING))
     copper = robot.motor.voltage_winding(signals.current, winding) * signals.current
-    heating = robot.motor.heating(copper, winding, housing)
+    heating = robot.heating(copper, winding, housing)
     still = jnp.where(stands, 0.0, 1.0)
     rates = [
         signals.voltage_left / signals.inductance,

@@ -112,7 +112,7 @@ def instant(
     rates = [
         signals.voltage_left / signals.inductance,
         still * signals.acceleration_wheel * robot.gearbox.ratio,
-        *robot.motor.heating(copper, winding, housing),
+        *robot.heating(copper, winding, housing),
         asked.integral_rate,
         still * travel.acceleration,
         still * travel.acceleration_lateral,

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from mmrjax import balances, ground
+from mmrjax import balances, channels, ground, outputs
 from mmrjax.motor import UNLIMITED
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
@@ -20,7 +21,7 @@ CURRENT_SMALL = 1e-3
 
 
 def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
-    """Readings, power chain of Fig. 4 and exceeded limits of one instant."""
+    """Readings, power chain of Fig. 4 and exceeded limits of one instant; what is not known of a rig is NaN."""
     sides = robot.sides
     power_supply = sides * signals.voltage * signals.current
     power_motor = sides * signals.torque_motor * signals.speed_motor
@@ -28,9 +29,9 @@ def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
     power_ground = sides * signals.traction * signals.speed
     temperature = robot.motor.temperature_settled(signals.current)
     limit = robot.motor.temperature_limit
-    over = {**exceeded(robot, signals), "winding_hot": (temperature > limit) & (limit < UNLIMITED)}  # settled or not
-    flags = mask(over)
-    return Result(
+    hot = (temperature > limit) & (limit < UNLIMITED) & robot.knows(channels.HEAT)  # settled or not
+    flags = mask({**exceeded(robot, signals), "winding_hot": hot})
+    found = Result(
         reading=balances.sensor(robot, signals),
         theoretical_speed=signals.speed_theoretical,
         slip=ground.slip(signals.speed, signals.speed_theoretical),
@@ -51,6 +52,14 @@ def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
         status=status,
         flags=flags,
     )
+    return known(robot, found)
+
+
+def known(robot: Robot, found: Result) -> Result:
+    """`found` with NaN in what rests on parameters that are not known of a robot."""
+    unknown = [output.name for output in outputs.FURTHER if not robot.knows(output.rests_on)]
+    nan: dict[str, Any] = {name: jnp.full_like(getattr(found, name), jnp.nan) for name in unknown}
+    return dataclasses.replace(found, **nan)
 
 
 def exceeded(robot: Robot, signals: Signals) -> dict[str, Scalar]:

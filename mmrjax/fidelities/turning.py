@@ -22,7 +22,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.effects.base import Effect
 from mmrjax.fidelities import lanes, rest
 from mmrjax.fidelities.rest import SHARE, TIME, voltage_at_rest
-from mmrjax.fidelities.result import efficiency, result, withhold
+from mmrjax.fidelities.result import efficiency, known, result, withhold
 from mmrjax.fidelities.rosenbrock import inverse, norm_of_sides
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
@@ -408,7 +408,7 @@ def result_of(robot: Robot, travel: balances.Travel, status: Array) -> Result:
     mean = jax.tree.map(lambda x: jnp.mean(x, axis=0), each)
     flags = each.flags[0] | each.flags[1]
     limit = robot.sides / 2 * signals.adhesion_limit
-    return dataclasses.replace(
+    found = dataclasses.replace(
         mean,
         reading=balances.shown(robot, signals),
         slip=ground.slip(mean.speed, mean.theoretical_speed),
@@ -420,6 +420,7 @@ def result_of(robot: Robot, travel: balances.Travel, status: Array) -> Result:
         status=status,
         flags=flags,
     )
+    return known(robot, found)
 
 
 def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array]:

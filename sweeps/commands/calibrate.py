@@ -11,6 +11,7 @@ from calibration.inference import blocks, priors
 from calibration.inference.calibrate import calibrate as run
 from calibration.inference.errors import rms_by_fit
 from calibration.inference.result import CalibrationResult
+from mmrjax.errors import counted
 from sweeps import config as configuration
 from sweeps.console import pulse, say, tell
 from sweeps.inputs import load_robot, read_runs
@@ -27,12 +28,12 @@ def calibrate(
     0 done; 3 done, but the search or a fit without a block did not converge, or the solver failed at a row.
     """
     robot = load_robot(config).robot
-    runs = read_runs(source, robot, measured=True, series=True, most=config.rows)
+    runs = read_runs(source, robot, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
     with open_folder("calibrate", config, robot, out, force, runs) as folder, pulse(tell, "fitting") as heard:
         found = run(
-            runs, robot, free=config.free, fix=config.fix, stated=stated, noise=config.noise or None,
-            model=config.model, starts=config.starts, population=config.population,
+            runs, robot, rows=config.rows, free=config.free, fix=config.fix, stated=stated,
+            noise=config.noise or None, model=config.model, starts=config.starts, population=config.population,
             generations=config.generations, members=members, seed=config.seed,
             profiles=config.profiles, blocks=config.hold_out, tell=heard,
         )  # fmt: skip
@@ -47,7 +48,9 @@ def calibrate(
 def print_calibration(found: CalibrationResult) -> None:
     """Whether the fit is adequate; parameters, errors and remarks, for a person."""
     say(found.adequacy.statement)
-    shown = Table(title=f"{len(found)} rows, {found.model}", title_justify="left", box=None, pad_edge=False)
+    shown = Table(
+        title=f"{counted(len(found), 'row')}, {found.model}", title_justify="left", box=None, pad_edge=False
+    )
     for heading in ("parameter", "value", "95 % interval", "shift [σ]", "determined"):
         left = heading in ("parameter", "determined")
         shown.add_column(heading, justify="left" if left else "right", no_wrap=True, overflow="ignore")

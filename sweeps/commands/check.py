@@ -11,7 +11,8 @@ from rich.table import Table
 from calibration.data import requirements, robot_file
 from calibration.data.errors import BadConfiguration, rounded
 from calibration.sizing import sheet
-from mmrjax.requirements import CHARGE
+from mmrjax.channels import HEAT
+from mmrjax.requirements import CHARGE, OF_HEAT
 from mmrjax.robot import Robot
 from sweeps import capabilities
 from sweeps import config as configuration
@@ -39,6 +40,7 @@ def check(config: configuration.Check, out: Path | None, force: bool) -> int:
     imposed.check_on_ground(robot, "check")
     sheet.refuse(robot, asked)
     _check_charge(robot, asked)
+    _check_heat(robot, asked)
     with open_folder("check", config, robot, out, force) as folder:
         outcomes = sheet.check(robot, asked, changes=config.changes)
         found = CheckResult(asked, robot, outcomes, posture.of_requirements(robot, outcomes))
@@ -62,6 +64,18 @@ def _check_charge(robot: Robot, asked: requirements.Requirements) -> None:
             raise BadConfiguration(
                 f"{asked.source}, {r.name}: the robot's file states no battery; add [battery] to it, or state "
                 "supply_voltage_V in [envelope]"
+            )
+
+
+def _check_heat(robot: Robot, asked: requirements.Requirements) -> None:
+    """Refuse requirements on a winding after long running of which the robot's file does not state how warm it
+    becomes."""
+    lacking = robot.unknown(HEAT)
+    for r in asked.each:
+        if lacking and r.name in OF_HEAT:
+            raise BadConfiguration(
+                f"{asked.source}, {r.name}: rests on how warm the windings become, and the robot's file does not "
+                f"state {', '.join(lacking)}; state them, or leave the requirement out"
             )
 
 

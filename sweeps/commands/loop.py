@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,7 +28,7 @@ from sweeps.console import pulse, say, tell
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
 from sweeps.skeleton import leave, page
-from sweeps.store import RunFolder, open_folder
+from sweeps.store import SOLVER_FAILED, RunFolder, open_folder
 
 T = TypeVar("T")
 
@@ -41,15 +43,24 @@ def loop(
 ) -> int:
     """Run the closed loop on a table and leave a run folder; returns the exit code.
 
-    0 done, whatever the verdict; 3 done, but the fit that is proposed did not converge. Stages are kept as they end,
-    so that the same command goes on after an interrupt, or once its time is out before there is a verdict.
+    0 done, whatever the verdict; 3 done, but the fit that is proposed did not converge, or its time was out before
+    there was a verdict. Stages are kept as they end, so that the same command goes on after that, or an interrupt.
 
     Args:
         within: wall-clock time after which it ends with the best that there is [s].
     """
+    try:
+        return _loop(config, source, out, force, members, within)
+    except OutOfTime:
+        return SOLVER_FAILED
+
+
+def _loop(
+    config: configuration.Loop, source: str, out: Path | None, force: bool, members: Path | None, within: float | None
+) -> int:
     began = time.monotonic()
     robot = load_robot(config).robot
-    runs = read_runs(source, robot, measured=True, series=True, most=config.rows)
+    runs = read_runs(source, robot, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
     replicates = max(config.replicates, fewest_replicates(observers.kind(runs)))
 
@@ -75,14 +86,18 @@ def loop(
             return found
 
         try:
-            found = discover(
-                runs, robot, noise=config.noise or None, stated=stated, library=effect_file.library(config.effects),
-                replicates=replicates, seed=config.seed, prefer=config.prefer, forbidden=config.forbid,
-                progress=progress, keep=keep, left=left,
-            )  # fmt: skip
-        except (KeyboardInterrupt, OutOfTime):
+            with _alarm(left(), lambda: "verdict" not in stages):
+                found = discover(
+                    runs, robot, rows=config.rows, noise=config.noise or None, stated=stated,
+                    library=effect_file.library(config.effects), replicates=replicates, seed=config.seed,
+                    prefer=config.prefer, forbidden=config.forbid, progress=progress, keep=keep, left=left,
+                )  # fmt: skip
+        except KeyboardInterrupt as ended:
+            if isinstance(ended, OutOfTime):
+                first = "" if stages else ", nor a fit of the base model; give it more, as --within 5min"
+                tell(f"no verdict within {within:g} s{first}")
             _say_kept(stages, folder, config.robot)
-            raise KeyboardInterrupt from None
+            raise
         if config.resolve:
             found = dataclasses.replace(found, resolved=resolve(
                 found, noise=config.noise or None, population=config.population, generations=config.generations,
@@ -99,6 +114,31 @@ def loop(
         return leave(folder, config, manifest, solved=found.converged, page=shown, runs=found.runs)
 
 
+@contextlib.contextmanager
+def _alarm(seconds: float | None, wanted: Callable[[], bool]) -> Iterator[None]:
+    """Raise `OutOfTime` within once so much time has passed, in the middle of a step too where the platform can,
+    while it is `wanted`; each second again, since what is called may hold it back.
+
+    Args:
+        seconds: None: never.
+    """
+    if seconds is None or not hasattr(signal, "SIGALRM"):
+        yield
+        return
+
+    def ring(*_: Any) -> None:
+        if wanted():
+            raise OutOfTime
+
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3), 1.0)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
 def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> None:
     """Say which stages are kept, and leave the robot of the base fit where there is one but no verdict."""
     if not stages:
@@ -111,7 +151,7 @@ def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> Non
     base = stages["base"][0].base
     robot = findings.proposed_robot(base.space, base.candidate)
     robot_file.write(robot, folder.partial / REFIT_FILE, note=f"{robot_name}, fitted; the loop has no verdict yet")
-    tell(f"no verdict yet; the best that there is so far is the refit, {folder.partial / REFIT_FILE}")
+    tell(f"the best that is known so far is the refit, {folder.partial / REFIT_FILE}")
 
 
 def print_discovery(found: DiscoveryResult) -> None:

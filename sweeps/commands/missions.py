@@ -18,6 +18,7 @@ from calibration.data.errors import BadConfiguration
 from calibration.data.profiles import ProfileTable
 from mmrjax import balances, channels, ground, missions, outputs
 from mmrjax.conditions import Conditions
+from mmrjax.errors import counted
 from mmrjax.fidelities.mission import Mission
 from mmrjax.fidelities.mission_steps import MARKS
 from mmrjax.missions import JOULE_PER_WH
@@ -361,8 +362,9 @@ def print_missions(found: Missions, idle: Collection[str] = ()) -> None:
     about = {output.column: output for output in (*missions.OUTPUTS, *missions.OF_TURNS)}
     table, source = found.table, found.source
     count = len(table["status"])
-    cycles = f", {source.cycles} cycles" if source.cycles > 1 else ""
-    say(f"profile {source.source}: {source.duration:g} s{cycles}, {source.segments} segments each")
+    cycles, each = (f", {source.cycles} cycles", " each") if source.cycles > 1 else ("", "")
+    segments = counted(source.segments, "segment")
+    say(f"profile {source.source}: {source.duration:g} s{cycles}, {segments}{each}")
     shown = Table(show_header=False)
     shown.add_row("configuration", *table["configuration"][:_SHOWN])
     for key in _PRINTED:

@@ -13,10 +13,9 @@ from mmrjax import render as pictures
 from mmrjax import render_above
 from mmrjax.fidelities.track import track_batch
 from mmrjax.signals import STATUSES
-from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.commands import turn
-from sweeps.console import progress, say, tell
+from sweeps.console import progress, say
 from sweeps.inputs import load_robot, one_run
 from sweeps.pages import words
 from sweeps.points import imposed, run, scale
@@ -45,8 +44,6 @@ def render(
         given = {**given, **turn.cells(config, given)}
     conditions = run.commanded(robot, one_run(robot, given, config.battery), config)
     run.refuse(robot, conditions, config)
-    if not robot.rig.inherits and not capabilities.stated(robot, "running_gear."):
-        tell("the robot's file states no running_gear: wheelbase, belt and masses within are those of an example")
     with progress(1, quiet=False) as advance:
         told = scale.shares(advance, 1)
         trajectory = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=told)

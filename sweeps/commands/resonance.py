@@ -232,6 +232,6 @@ def print_resonance(found: ResonanceResult) -> None:
     say(found.statement())
     others = {s: n for s, n in found.statuses.items() if n and s != STATUSES[0]}
     if others:
-        say("of " + f"{len(found.table['status'])} runs: " + ", ".join(f"{n} {s}" for s, n in others.items()))
+        say(f"of {len(found.table['status'])} runs: " + ", ".join(f"{n} {s}" for s, n in others.items()))
     if SLOW in others:
         say(f"{SLOW}: fewer than {PERIODS} {found.passing.name} passed in the second half of the run")

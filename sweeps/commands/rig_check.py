@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from calibration.data import rig_facts, settling, thinning
+from calibration.data import rig_facts, settling
 from calibration.data.columns import SUPPLY, Layout
 from calibration.data.errors import BadConfiguration
 from calibration.data.rig_facts import Fact, Origin
@@ -20,11 +20,11 @@ from calibration.data.writing import finite
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.foresight import Foresight
 from mmrjax import channels
-from mmrjax.channels import Channel
+from mmrjax.channels import HEAT, Channel
+from mmrjax.errors import counted
 from mmrjax.motor import UNLIMITED
 from mmrjax.robot import Robot
 from mmrjax.shaft import Shaft
-from sweeps import capabilities
 from sweeps.config import RobotPart
 from sweeps.console import say
 from sweeps.inputs import load_robot, read_runs
@@ -86,7 +86,8 @@ class RigCheck:
             )
         if self.examples:
             lines = ", ".join(map(str, self.examples))
-            said.append(f"{len(self.examples)} lines still hold the number of an example ({EXAMPLE}): {lines}")
+            hold = f"{counted(len(self.examples), 'line')} still hold{'s' * (len(self.examples) == 1)}"
+            said.append(f"{hold} the number of an example ({EXAMPLE}): {lines}")
         said += self.doubts
         said += [f"{fact.what} {fact.value}: {fact.odd}" for fact in self.facts if fact.odd]
         loose = [
@@ -94,10 +95,11 @@ class RigCheck:
         ]
         if loose and not self.robot.rig.inherits:
             said.append(f"without ±, so with the program's: {', '.join(loose)}")
-        if not capabilities.thermal(self.robot) and self.robot.motor.temperature_limit < UNLIMITED:
+        if not self.robot.knows(HEAT) and self.robot.motor.temperature_limit < UNLIMITED:
+            lacking = " and ".join(self.robot.unknown(HEAT))
             said.append(
-                "motor.temperature_limit is stated, and not how the windings' heat leaves: it is held against an "
-                "example's motor.resistance_thermal_winding and motor.resistance_thermal_housing; state yours"
+                f"motor.temperature_limit is stated, and not how warm the windings become: state {lacking}, without "
+                "which nothing is held against it"
             )
         if self.robot.motor.voltage_limit is None and self.robot.rig.imposed == "voltage":
             said.append("motor.voltage_limit is not stated: experiments are proposed up to what a table used")
@@ -277,7 +279,7 @@ def examined(file: Path, data: str | None, effects: tuple[str, ...] = ()) -> Rig
     if data is None:
         return found
     runs = read_runs(data, robot, measured=True, series=True)
-    seen = foresight.foresee(thinning.thinned(runs), robot)
+    seen = foresight.foresee(runs, robot)
     doubts = tuple(filter(None, (settling.doubtful_sign(runs), rig_facts.doubtful_time(runs, robot))))
     return dataclasses.replace(found, runs=runs, foresight=seen, doubts=doubts)
 
@@ -318,7 +320,7 @@ def print_check(found: RigCheck) -> None:
 
 
 def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
-    shown = _table(f"\n{runs.source}: {len(runs)} rows", "column", "used as", "values>r", "from>r", "to>r")
+    shown = _table(f"\n{runs.source}: {counted(len(runs), 'row')}", "column", "used as", "values>r", "from>r", "to>r")
     for c in found.columns():
         ends = [_words(c["words"]), ""] if c["words"] else [_end(c["least"]), _end(c["greatest"])]
         name = c["column"] if c["theirs"] in ("", c["column"]) else f"{c['column']}, yours {c['theirs']}"
@@ -329,7 +331,11 @@ def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
     for sentence in [*found.unused(), *runs.missing()]:
         say(f"- {sentence}")
     names, counts = np.unique(np.array(seen.status), return_counts=True)
-    others = [f"{count} rows: {name}" for name, count in zip(names, counts, strict=True) if name not in words.SETTLED]
+    others = [
+        f"{counted(count, 'row')}: {name}"
+        for name, count in zip(names, counts, strict=True)
+        if name not in words.SETTLED
+    ]
     if others:
         say(
             f"- with the file's numbers not every row settles ({', '.join(others)}); one that the "

@@ -62,7 +62,7 @@ def sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool
     file = load_robot(config)
     robot = file.robot
     if config.method not in METHODS:
-        raise BadConfiguration(f"option method: got {config.method!r}; input should be one of {', '.join(METHODS)}")
+        raise BadConfiguration(f"--method: got {config.method!r}; input should be one of {', '.join(METHODS)}")
     outputs = chosen_outputs(config.outputs, robot)
     ranges = _ranges(config.vary)
     runs = _operating_points(config, robot, ranges)

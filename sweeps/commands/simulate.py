@@ -68,7 +68,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         table, histories = _simulated(folder, seen, runs, config)
         table[PERMISSIBLE] = permissible(robot, table)
         stands = posture.postures(robot, runs, run.commanded(robot, runs, config))
-        notes = remarks(robot, table)
+        notes = remarks(robot, table) + capabilities.unknown(robot)
         found = None
         if drawn is not None and config.posterior is not None:
             found = uncertainty.intervals(robot, drawn, runs, config, config.posterior, folder)
@@ -192,12 +192,12 @@ def remarks(robot: Robot, table: dict[str, np.ndarray]) -> list[str]:
                 f"{name}winding_hot: {limit:g} °C are reached after {float(times[k]):.3g} s at this "
                 f"current, from {ambient:g} °C"
             )
-        if np.isinf(table["winding_settled_C"][k]) and capabilities.thermal(robot):
+        if np.isinf(table["winding_settled_C"][k]):
             current = float(amperes(robot, table)[k])
             said.append(
                 f"{name}winding, long running: {words.NONE_SETTLES} at {current:.2f} A a motor, as resistance "
                 "rises faster than its heat leaves; it stays permissible up to "
-                f"{float(robot.motor.current_continuous):.2f} A"
+                f"{float(robot.current_continuous):.2f} A"
             )
         if status == "battery_empty" and "time_end_s" in table:
             when, far = float(table["time_end_s"][k]), float(table["displacement_m"][k])

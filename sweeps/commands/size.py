@@ -13,6 +13,7 @@ from calibration.data.parts import motors
 from calibration.sizing import sheet
 from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.search import size as search
+from mmrjax.errors import counted
 from sweeps import config as configuration
 from sweeps.console import say
 from sweeps.inputs import load_robot
@@ -92,8 +93,8 @@ def print_size(found: SizeResult) -> None:
     say(shown)
     if s.front:
         first, second = found.objectives
-        say(f"{len(s.front)} designs on the front of {first} and {second}, from {objective(s.front[0], first)} to "
-            f"{objective(s.front[-1], second)}")  # fmt: skip
+        say(f"{counted(len(s.front), 'design')} on the front of {first} and {second}, from "
+            f"{objective(s.front[0], first)} to {objective(s.front[-1], second)}")  # fmt: skip
     lacking = [o for o in found.outcomes if not o.met]
     if lacking:
         say(

@@ -17,6 +17,7 @@ from rich.table import Table
 from calibration.data import profiles, robot_file
 from calibration.data.errors import BadConfiguration, InputError
 from calibration.data.robot_file import RobotFile
+from mmrjax.errors import counted
 from mmrjax.signals import STATUSES
 from sweeps import config_campaign, skeleton
 from sweeps.config import Sweep
@@ -318,7 +319,8 @@ def statuses(done: Iterable[Done]) -> dict[str, int]:
 
 def print_counts(counts: Mapping[str, int], things: str, model: str = "") -> None:
     """How the runs or points of a model ended, in words."""
-    shown = Table(title=f"{sum(counts.values()):,} {things}", title_justify="left")
+    total = counted(sum(counts.values()), things.removesuffix("s"))
+    shown = Table(title=total, title_justify="left")
     for heading in ("status", things, "meaning"):
         shown.add_column(heading, justify="right" if heading == things else "left")
     for status, count in counts.items():

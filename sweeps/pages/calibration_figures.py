@@ -8,6 +8,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from calibration.data.table import Runs
 from calibration.inference import blocks
 from calibration.inference.identifiability import Z95
 from calibration.inference.result import CalibrationResult
@@ -116,11 +117,11 @@ def before_after(found: CalibrationResult) -> Figure:
 
 def histories(table: dict[str, np.ndarray], channels: Sequence[Channel]) -> Figure:
     """Time histories: measured dots and the fitted line, a row of panels for each run (six at most)."""
-    names = list(dict.fromkeys(table["run_id"]))[:HISTORIES] if "run_id" in table else [None]
+    runs = Runs("a table", {name: table[name] for name in ("run_id", "time_s") if name in table})
+    names = list(dict.fromkeys(runs.run_names.tolist()))[:HISTORIES]
     fig, grid = figure(len(names), len(channels), 2.2 * len(names))
     for row, name in zip(grid, names, strict=True):
-        pick = np.ones(len(table["time_s"]), bool) if name is None else table["run_id"] == name
-        order = np.flatnonzero(pick)[np.argsort(table["time_s"][pick])]
+        order = runs.in_order(name)
         for axes, channel in zip(row, channels, strict=True):
             axes.plot(table["time_s"][order], table[channel.column][order], "o", ms=3, color=INK)
             axes.plot(table["time_s"][order], table[f"after_{channel.column}"][order], color=BLUE)

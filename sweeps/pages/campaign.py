@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mmrjax import signals
+from mmrjax.errors import counted
 from mmrjax.fidelities.climb import OVER
 from mmrjax.variation import STATUS
 from sweeps.pages import campaign_figures, words
@@ -92,7 +93,7 @@ def write(folder: Path, file: RobotFile, layout: Layout, result: dict[str, Any])
         folder,
         "campaign.html.j2",
         album,
-        title=f"Sweep of {total:,} points",
+        title=f"Sweep of {counted(total, 'point')}",
         model=result["model"],
         total=total,
         status=statuses,

@@ -49,7 +49,9 @@ def _run_by_run(album: Album, found: DiscoveryResult) -> None:
 def _over_time(album: Album, found: DiscoveryResult) -> None:
     assert isinstance(found.detail, TimeStatistics)
     detail = found.detail
-    album.add("before_after", lambda: loop_figures.over_time(rows_of(found), found.channels, found.verdict))
+    album.add(
+        "before_after", lambda: loop_figures.over_time(found.runs, rows_of(found), found.channels, found.verdict)
+    )
     album.add("series", lambda: loop_figures.time_statistics(detail, found.channels, found.verdict))
 
 

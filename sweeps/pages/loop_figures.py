@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
+from calibration.data.table import Runs
 from calibration.discovery.result import DiscoveryResult, Evidence, UnnamedDiscrepancy
 from calibration.inference import blocks
 from calibration.inference.bases import in_words
@@ -106,17 +107,16 @@ def _range(x: np.ndarray) -> str:
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
-def over_time(table: dict[str, np.ndarray], channels: Sequence[Channel], verdict: str) -> Figure:
+def over_time(runs: Runs, table: dict[str, np.ndarray], channels: Sequence[Channel], verdict: str) -> Figure:
     """Residual of every history over time in sigmas, before and after; one column a run, samples as dots and their
-    running mean as a line."""
-    names = list(dict.fromkeys(table.get("run_id", np.zeros(len(table["row"]), str))))[:RUNS_SHOWN]
+    running mean as a line. The `table` is of the rows of `runs`."""
+    names = list(dict.fromkeys(runs.run_names.tolist()))[:RUNS_SHOWN]
     count = len(channels)
     fig, grid = figure(count, len(names), 1.8 * count, sharex="col", sharey="row")
     whens = [("before", ORANGE)] if verdict != "none" else []
     whens += [("after", BLUE)]
     for column, name in enumerate(names):
-        mine = np.flatnonzero(table["run_id"] == name) if "run_id" in table else np.arange(len(table["row"]))
-        mine = mine[np.argsort(table["time_s"][mine])]
+        mine = runs.in_order(name)
         for axes, channel in zip(grid[:, column], channels, strict=True):
             axes.axhspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
             axes.axhline(0, color=FAINT, lw=0.8)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mmrjax import missions
+from mmrjax.channels import WARMING
 from mmrjax.signals import FLAGS
 from sweeps import capabilities
 from sweeps.pages import mission_figures, turn, words
@@ -73,7 +74,7 @@ def write(folder: Path, file: RobotFile, found: Missions) -> Path:
         returned=max(float(first["energy_returned_Wh"]), 0.0),
         kept=len(rows["time_s"]),
         whole=found.whole,
-        heat=capabilities.thermal(robot),
+        heat=robot.knows(WARMING),
         travels="distance_m" not in idle,
         turns=source.turns,
         **named(file),
@@ -113,11 +114,12 @@ OF_HEAT = ("hottest winding", "rms current, one motor")
 def _limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
     """How much of each limit the mission uses: words, its value, the limit, and the share of it [%]."""
     rpm, motor, gearbox, battery = np.pi / 30, robot.motor, robot.gearbox, robot.battery
+    heat = robot.knows(WARMING)
     asked = [
         (OF_HEAT[0], run["winding_peak_C"], float(motor.temperature_limit), "°C", 0),
         ("motor speed", run["peak_motor_speed_rpm"], float(motor.speed_limit) / rpm, "rpm", 0),
         ("gearbox input speed", run["peak_motor_speed_rpm"], float(gearbox.speed_limit) / rpm, "rpm", 0),
-        (OF_HEAT[1], run["rms_current_A"] / float(robot.sides), float(motor.current_continuous), "A",
+        (OF_HEAT[1], run["rms_current_A"] / float(robot.sides), float(robot.current_continuous), "A",
          2),
     ]  # fmt: skip
     if gearbox.torque_limit is not None:
@@ -126,7 +128,7 @@ def _limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
         {"words": words, "value": f"{value:.{digits}f} {unit}", "limit": f"{limit:.{digits}f} {unit}",
          "percent": warmed(value, limit, float(motor.temperature_ambient)) if unit == "°C" else 100 * value / limit}
         for words, value, limit, unit, digits in asked
-        if np.isfinite(value) and limit < UNLIMITED and (words not in OF_HEAT or capabilities.thermal(robot))
+        if np.isfinite(value) and limit < UNLIMITED and (words not in OF_HEAT or heat)
     ]  # fmt: skip
     low, cutoff = float(run["cell_low_V"]), float(battery.voltage_cutoff)
     if np.isfinite(low):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mmrjax.channels import MM, RPM
+from mmrjax.channels import MM, RPM, VOLTAGE
 from sweeps import capabilities
 from sweeps.pages import posture_words, power_figures, words
 from sweeps.pages.page import Album, columns, conditions, first_rows, label, named, render, statuses
@@ -88,8 +88,9 @@ def write(
         columns=columns(robot.channels),
         about=conditions(runs, mass=True),
         further={c: about for c, about in FURTHER.items() if c in shown},
-        heat=capabilities.thermal(robot),
+        heat="winding_settled_C" in shown,
         has_ground=robot.has_ground,
+        unknown=[] if robot.knows(VOLTAGE) else capabilities.unknown(robot),
         **known,
         **named(file),
     )

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mmrjax.channels import Channel
+from mmrjax.errors import counted
 from sweeps import capabilities
 from sweeps.pages import sweep_figures, words
 from sweeps.pages.page import Album, named, render, statuses
@@ -47,7 +48,7 @@ def write(folder: Path, file: RobotFile, *, model: str, runs: Table) -> Path:
         "sweep.html.j2",
         album,
         of_channels=robot.channels,
-        title=f"Sweep of {len(runs['status'])} runs",
+        title=f"Sweep of {counted(len(runs['status']), 'run')}",
         model=model,
         counts=counts(capabilities.without_idle(robot, runs), robot.channels),
         volts_drawn=_drawn(runs),

@@ -76,7 +76,7 @@ def check(config: GridPart, robot: Robot) -> None:
     imposed.check_acting(robot, (OPTIONS[key] for key in ON_GROUND if getattr(config, key) is not None))
     surface = config.surface
     if surface is not None and robot.rig.scales_adhesion and surface not in SURFACES:
-        raise BadConfiguration(f"option surface: got {surface!r}; {choices(surface, SURFACES)}")
+        raise BadConfiguration(f"{OPTIONS['surface']}: got {surface!r}; {choices(surface, SURFACES)}")
 
 
 def axes(config: GridPart, robot: Robot, battery: bool = False) -> dict[str, tuple[object, ...]]:

@@ -12,12 +12,13 @@ import numpy as np
 
 from calibration.data import profiles
 from calibration.data.errors import BadConfiguration, choices
-from mmrjax import __version__, fidelities
+from mmrjax import __version__, fidelities, outputs
 from mmrjax.conditions import OF_TURNS
 from mmrjax.profile import Profile
 from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
 from mmrjax.variation import STATUS, Variation
+from sweeps import capabilities
 from sweeps.config_campaign import Campaign
 from sweeps.console import tell
 from sweeps.points import axes, scale
@@ -50,6 +51,12 @@ def prepare(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> scal
     task = task_of(config, robot, profile is not None and profile.turns)
     if unknown := [name for name in config.outputs if name not in task.attributes]:
         raise BadConfiguration(f"{where}, outputs: got {unknown[0]}; {choices(unknown[0], task.attributes, 3)}")
+    rests = {**{o.name: o.rests_on for o in outputs.table(robot.channels)}, **capabilities.RESTS_ON}
+    for name in config.outputs:
+        if lacking := [n for n in robot.unknown(rests.get(name, ())) if n not in plan.design.names]:
+            raise BadConfiguration(
+                f"{where}, outputs: {name} is not known, as the robot's file does not state {' and '.join(lacking)}"
+            )
     assert config.chunk is not None
     blocks = Blocks.of(plan.design.shape, config.chunk)
     if profile is None and task.run is None:

@@ -120,6 +120,6 @@ def say_lost(found: Intervals) -> None:
 def with_sd(value: float, sd: float, most: int) -> str:
     """«4.19 ± 0.06», to two digits of the sd, at most so many after the point."""
     if not (np.isfinite(sd) and sd > 0):
-        return f"{value:.{most}f} ± {sd:.{most}f}"
+        return f"{value:z.{most}f} ± {sd:.{most}f}"
     digits = int(np.clip(1 - np.floor(np.log10(sd)), 0, most))
-    return f"{value:.{digits}f} ± {sd:.{digits}f}"
+    return f"{value:z.{digits}f} ± {sd:.{digits}f}"

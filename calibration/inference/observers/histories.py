@@ -192,7 +192,7 @@ class Histories(Observer):
         known: the runs of the robot that is observed; None: not known.
     """
 
-    word: ClassVar[str] = "samples"
+    word: ClassVar[str] = "sample"
     fewest: ClassVar[int] = 24
     axis: ClassVar[str] = "time_s"
     blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage", "run")

@@ -89,7 +89,7 @@ class SettledRuns(Observer):
         fidelity: that simulates them; of_size: whether errors are percent of a channel's size, see `Layout`.
     """
 
-    word: ClassVar[str] = "runs"
+    word: ClassVar[str] = "run"
     fewest: ClassVar[int] = 6
     sizes_padded: ClassVar[tuple[int, ...]] = (16, 24, 32, 48, 64, 96, 128, 192, 256)
     blocks: ClassVar[tuple[str, ...]] = (
