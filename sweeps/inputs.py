@@ -14,11 +14,14 @@ from calibration.data.contradictions import misplaced
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.posterior import Posterior
 from calibration.data.robot_file import RobotFile
-from mmrjax.robot import Robot
+from mmrjax.channels import RPM
+from mmrjax.derived.turn import by_itself
+from mmrjax.robot import Robot, cannot_turn
 from mmrjax.tables import BENCH, SURFACES
 from sweeps.config import OneRun, RobotPart
 from sweeps.console import tell
 from sweeps.options import flags
+from sweeps.pages import turn_words
 from sweeps.points import imposed
 
 #: Option that states a condition of one run.
@@ -36,9 +39,23 @@ def load_robot(config: RobotPart) -> RobotFile:
     notes: list[str] = []
     file = robot_file.find(config.robot, effect_file.library(config.effects), notes)
     robot = robot_file.change(file.robot, config.set, where="--set", notes=notes)
-    for note in notes:
+    unlike = () if getattr(config, "turns", False) else _unlike(file.name, robot)
+    for note in (*notes, *unlike):
         tell(note)
-    return dataclasses.replace(file, robot=robot)
+    return dataclasses.replace(file, robot=robot, remarks=unlike)
+
+
+def _unlike(name: str, robot: Robot) -> tuple[str, ...]:
+    """A sentence on a robot whose sides differ, of whatever travels straight: how it turns where they are driven
+    alike."""
+    if not robot.unlike or not robot.has_ground:
+        return ()
+    if why := cannot_turn(robot, robot.configurations):
+        return (turn_words.unlike(name, robot.unlike, f"how it would turn is not known: {why}"),)
+    value = imposed.usual(robot)
+    found = by_itself(robot, value * RPM if robot.rig.imposed == "motor_speed" else value)
+    turns = turn_words.by_itself(robot, found, value)
+    return (turn_words.unlike(name, robot.unlike, turns),) if turns else ()
 
 
 def beside_robot(file: RobotFile) -> Posterior:

@@ -71,6 +71,7 @@ class RobotFile:
         source: path of its file, or name of a packaged robot, whose file states nothing.
         stated: names of the parameters that the file states, in place of a linear unit's those of its shaft.
         linear: configurations that it states as linear units; text: of the file.
+        remarks: sentences on what the robot is, for whoever reads numbers of it.
     """
 
     robot: Robot
@@ -78,6 +79,7 @@ class RobotFile:
     stated: frozenset[str] = frozenset()
     linear: frozenset[str] = frozenset()
     text: str = ""
+    remarks: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:

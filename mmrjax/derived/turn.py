@@ -5,13 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mmrjax import channels
 from mmrjax.channels import MM
+from mmrjax.conditions import OF_SIDES, Conditions
+from mmrjax.fidelities.steady import steady_batch
 from mmrjax.robot import Robot
+from mmrjax.signals import Result
 
+#: Yaw rate below which a robot travels straight [rad/s]; its turn would take two centuries.
+NONE = 1e-9
 #: Columns, with what they are.
 COLUMNS: dict[str, str] = {
     "turning_radius_mm": "radius of the circle of the centre of mass, positive to the left; inf: straight",
@@ -24,6 +30,19 @@ COLUMNS: dict[str, str] = {
 }  # fmt: skip
 
 
+def by_itself(robot: Robot, imposed: float) -> Result:
+    """How a robot whose sides differ turns on level ground where both are driven alike, a settled turn of each of its
+    configurations in order.
+
+    Args:
+        imposed: voltage [V], or motor speed [rad/s] where that is what its rig imposes.
+    """
+    both = OF_SIDES[-2:] if robot.rig.imposed == "motor_speed" else OF_SIDES[:2]
+    alike = dict.fromkeys(both, imposed if robot.rig.imposed == "motor_speed" else 1.0)
+    asked = Conditions([*robot.configurations], voltage=abs(imposed), **alike).resolved(robot)
+    return jax.device_get(steady_batch(robot, asked))
+
+
 def columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray) -> dict[str, np.ndarray]:
     """The columns of settled turns, of what their channels read [SI]; arrays of one shape.
 
@@ -31,8 +50,8 @@ def columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray) -> dic
         radius: of the driving wheels [m].
     """
     turn = np.asarray(reading["yaw_rate"])
-    # A turn once in three hours is none: what is left of zero by rounding is no radius.
-    rate = np.where(np.abs(turn) > 1e-9, turn, np.nan)
+    # What is left of zero by rounding is no radius.
+    rate = np.where(np.abs(turn) > NONE, turn, np.nan)
     shafts = {side: np.asarray(reading[f"motor_speed_{side}"]) for side in channels.SIDES}
     rolled = {side: radius * n / float(robot.gearbox.ratio) for side, n in shafts.items()}
     units = float(robot.sides) / 2

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from mmrjax.channels import MM, SIDES
+from mmrjax.derived.turn import NONE
 from mmrjax.robot import Robot
+from mmrjax.signals import STATUSES, Result
+from mmrjax.simulation import STRAIGHT
 from mmrjax.turning import BETWEEN, OVER
 from sweeps import capabilities
 from sweeps.pages import words
@@ -33,6 +38,32 @@ class Turn:
     answer: str
     sides: list[tuple[str, str, str]]
     notes: list[str]
+
+
+def unlike(name: str, effects: Sequence[str], turns: str) -> str:
+    """Of a robot whose sides differ by some effects, which runs that say nothing of either side do not show."""
+    return f"{name}: {STRAIGHT} ({', '.join(effects)}); {turns}"
+
+
+def by_itself(robot: Robot, found: Result, value: float) -> str:
+    """How a robot turns whose sides are driven alike, by its configurations; empty where none does.
+
+    Args:
+        value: what is imposed [V, rpm].
+    """
+    imposed, states = ("rpm", "motor_speed_left_rpm and motor_speed_right_rpm") if (
+        robot.rig.imposed == "motor_speed"
+    ) else ("V", "--left and --right, or duty_left and duty_right")  # fmt: skip
+    rates, speeds = (np.asarray(found.reading[channel]) for channel in ("yaw_rate", "speed"))
+    each = zip(robot.configurations, rates, speeds, np.asarray(found.status), strict=True)
+    told = [
+        f"{name} {words.STATUSES[STATUSES[int(status)]].short}" if not math.isfinite(rate)
+        else f"{name} by {abs(rate):.3g} rad/s to the {SIDES[int(rate < 0)]} at {speed:.3g} m/s ahead"
+        for name, rate, speed, status in each
+        if not abs(rate) < NONE
+    ]  # fmt: skip
+    alike = f"driven alike, {value:g} {imposed} on level ground"
+    return f"{alike}, it turns: {'; '.join(told)} ({states} show it)" if told else ""
 
 
 def turn(robot: Robot, row: Mapping[str, Any], ended: Mapping[str, float] | None) -> Turn:

@@ -74,6 +74,14 @@ def default(robot: Robot, option: str) -> float:
     return most if robot.rig.imposed == "voltage" else _digits(most)
 
 
+def usual(robot: Robot) -> float:
+    """What an example has imposed, `default` where the file states a limit [V, rpm]."""
+    try:
+        return default(robot, "")
+    except BadConfiguration:
+        return float(SAID[robot.rig.imposed].one)
+
+
 def levels(robot: Robot, option: str, notes: list[str] | None = None) -> tuple[float, ...]:
     """What a grid has imposed where nothing is stated: a third, two thirds and all of the limit, or Table 8's.
 
