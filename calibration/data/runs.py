@@ -25,6 +25,7 @@ from calibration.data.columns import (
     SPEEDS,
     SUPPLY,
     TIME,
+    VOLTS,
     WHEN,
     WORDS,
     Layout,
@@ -134,9 +135,10 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
             columns[meaning.column] = np.array(values)
     if bad:
         raise BadData(_listed(name, [said for _, _, said in sorted(bad)]))
+    notes = (*notes, *sides.of_volts(name, columns, battery))
     told = instruments.infer_instruments(layout.instruments, columns)
     stated = {i.channel for i in told}
-    unsigned = tuple(i for i in sides.magnitudes(columns, layout.sides) if measured and i.channel not in stated)
+    unsigned = tuple(i for i in sides.magnitudes(columns, layout) if measured and i.channel not in stated)
     layout = dataclasses.replace(layout, instruments=(*told, *unsigned))
     _fill(name, columns, len(rows) - 1, layout)
     _check_driving(name, columns)
@@ -366,6 +368,8 @@ def _check_header(
         required = tuple(c for c in required if c != SPEED)
         if SPEED in stated:
             raise BadData(f"{name}: column {SPEED} beside {', '.join(layout.sides)}; keep one of them")
+    if stated & set(VOLTS):  # of which the supply's is the larger
+        required = tuple(c for c in required if c != SUPPLY)
     if not layout.complete and "surface" in stated:  # which says the configuration too, where it has those of one
         required = tuple(c for c in required if c != "configuration")
     for column in (c for c in (*required, *layout.measured_columns) if c not in stated):
@@ -427,10 +431,10 @@ def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layou
             )
         side = next((side for side in channels.SIDES if side in words(column)), None)
         turns = set(SIDES) <= set(known.values()) and not stated.isdisjoint(c.column for c in channels.OF_TURNS)
-        if side and turns and not stated & set(SIDES) and column.endswith("V"):
+        if side and turns and not stated & {*SIDES, *VOLTS} and column.endswith("V"):
             raise BadData(
-                f"{name}: column {column}: a table states shares of the supply's voltage, duty_left and "
-                f"duty_right, so duty_{side} = {column} / {SUPPLY}"
+                f"{name}: column {column}: if it is the voltage that drives the {side} side, name it "
+                f'voltage_{side}_V, or state [columns] voltage_{side}_V = "{column}" in the robot\'s file'
             )
 
 

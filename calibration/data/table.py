@@ -65,9 +65,8 @@ class Runs:
 
     @property
     def of_sides(self) -> np.ndarray:
-        """What drives the left and the right side, in the unit of `Layout.sides`, shape (2, rows); of a table with
-        `turns`."""
-        return np.stack([self.columns.get(name, np.ones(len(self))) for name in self.layout.sides])
+        """See `Layout.of_sides`; of a table with `turns`."""
+        return self.layout.of_sides(self.columns)
 
     @property
     def channels(self) -> tuple[Channel, ...]:

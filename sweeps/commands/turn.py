@@ -11,6 +11,7 @@ import numpy as np
 import scipy.optimize
 from rich.table import Table
 
+from calibration.data import sides
 from calibration.data.columns import SIDES, SUPPLY
 from calibration.data.errors import BadConfiguration
 from calibration.data.table import Runs
@@ -175,14 +176,14 @@ def cells(config: configuration.TurnPart, given: dict[str, Any]) -> dict[str, An
         return found | {"duty_left": config.duty_left, "duty_right": config.duty_right}
     if config.left_V is None or config.right_V is None:  # those of a demand are found later
         return found | {name: 1.0 for name in SIDES}
-    most = max(abs(config.left_V), abs(config.right_V))
-    supply = given[SUPPLY] if given.get(SUPPLY) is not None else most
-    if supply < most:
+    most, supply = max(abs(config.left_V), abs(config.right_V)), given.get(SUPPLY)
+    if supply is not None and supply < most:
         raise BadConfiguration(
             f"--voltage: got {supply:g}; expected at least {most:g} V, what --left and --right ask"
         )
-    share = 1 / supply if supply else 0.0
-    return found | {SUPPLY: supply, "duty_left": config.left_V * share, "duty_right": config.right_V * share}
+    volts = np.array([config.left_V, config.right_V])
+    source, duties = sides.shares(volts, None if supply is None else np.asarray(supply))
+    return found | {SUPPLY: float(source), **dict(zip(SIDES, map(float, duties), strict=True))}
 
 
 def _channels(robot: Robot, settled: bool) -> tuple[Channel, ...]:
