@@ -205,6 +205,21 @@ def test_a_turn_that_nothing_drives_is_refused(rig, table, row, got):
         table(f"supply_voltage_V,duty_left,duty_right,{SPEEDS}", (24, 0, 1, 0, 900), (*row, 0, 0), robot=rig(DRIVEN))
 
 
+@pytest.mark.parametrize("of_turns", ["duty_left,duty_right", "heading_deg,duty_left,duty_right", "heading_deg"])
+def test_readings_of_turns_on_a_slope_are_refused_with_what_follows_them(tmp_path, rig, table, of_turns):
+    robot, each = rig(DRIVEN), [1] * len(of_turns.split(","))
+    header = f"supply_voltage_V,slope_deg,{of_turns},{SPEEDS}"
+    rows = [(24, slope, *each, 900, 900) for slope in (0, 5, -3)]
+    with pytest.raises(
+        BadData, match=r"row 2, slope_deg: got 5 in a table of settled turns, and so in 2 of 3 .* drive"
+    ):
+        table(header, *rows, robot=robot)
+    assert len(table(header, rows[0], robot=robot)) == 1
+    path = tmp_path / "asked.csv"  # which are followed over time
+    path.write_text(f"supply_voltage_V,slope_deg,{of_turns}\n24,5,{','.join(map(str, each))}\n")
+    assert records.read(path, measured=False, robot=robot).turns
+
+
 def test_yaw_rate_in_degrees_is_converted(rig, table):
     robot = rig(KINEMATIC)
     runs = table(f"{SPEEDS},yaw_rate_deg_s", *[(a, b, np.degrees(w)) for a, b, _, _, w in SOUND], robot=robot)

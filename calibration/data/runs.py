@@ -20,6 +20,7 @@ from calibration.data.columns import (
     DEFAULTS,
     DRIVEN,
     DUTY,
+    HEADING,
     SIDES,
     SPEED,
     SPEEDS,
@@ -148,6 +149,8 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
     if battery and layout.imposed == "voltage":
         columns[SUPPLY] = np.full(len(rows) - 1, np.nan)
     elif measured and not set(TIME) <= set(columns):  # a history may stop, and go on forwards against its motors
+        if {*layout.sides, *HEADING} & set(columns):
+            _check_level(name, columns)
         (_check_turns if set(layout.sides) & set(columns) else _check_signs)(name, columns, layout)
     if not any(column in columns for column in WHEN):
         columns["order"] = np.arange(1.0, len(rows))
@@ -581,6 +584,19 @@ def _check_turns(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
     if idle.size:
         got = ", ".join(f"{c} {number(columns[c][idle[0]])}" for c in (layout.imposed_column, *layout.sides))
         raise BadData(f"{name} row {idle[0] + 1}: got {got}; nothing drives either side; remove the row")
+
+
+def _check_level(name: str, columns: dict[str, np.ndarray]) -> None:
+    """Refuse readings of turns on a slope, of which none is settled."""
+    slope = columns["slope_deg"]
+    if slope.any():
+        row = int(np.flatnonzero(slope)[0])
+        more = f", and so in {np.count_nonzero(slope)} of {len(slope)} rows" if np.count_nonzero(slope) > 1 else ""
+        raise BadData(
+            f"{name} row {row + 1}, slope_deg: got {number(slope[row])} in a table of settled turns{more}; on a "
+            "slope the heading changes all the time, so that no turn is settled there: expected 0; remove such rows "
+            "(simulate --left, --right and --slope with --model drive follows one over time)"
+        )
 
 
 def _check_mass(name: str, columns: dict[str, np.ndarray]) -> None:
