@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import types
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,16 +10,19 @@ import pytest
 
 import mmrjax as mm
 from calibration.data import runs as records
-from calibration.data.errors import BadData
-from mmrjax import robots
+from calibration.data.errors import BadConfiguration, BadData
+from mmrjax import requirements, robots
 from mmrjax.channels import SIDES
 from mmrjax.derived import turn as derived
 from mmrjax.errors import UsageError
+from sweeps import config, inputs
 from sweeps.commands import simulate
+from sweeps.commands import turn as turn_room
 from sweeps.pages import mission_figures, turn, turn_words
 from sweeps.pages.figure_style import svg
 from sweeps.points.imposed import UNLIMITED
 from sweeps.points.job import showing_turns
+from sweeps.results import check
 from tests.commands import rows
 
 
@@ -90,7 +94,63 @@ def test_a_demanded_turn_is_that_of_the_voltages_found(tmp_path, mmrjax):
     assert float(driven["yaw_rate_rad_s"]) == pytest.approx(1.0, rel=1e-6)
     code, _, err = mmrjax("simulate", *told[:4], "--voltage", "12", "--out", str(tmp_path / "weak"))
     assert code == 2
-    assert "take 18.1 V at one motor; the supply has 12 V" in " ".join(err.split())
+    said = " ".join(err.split())
+    assert "take 18.1 V at one motor; the supply has 12 V, with which it reaches about 0.1" in said
+    words = (
+        said.rpartition("about ")[0].split("about ")[1],
+        said.rpartition("about ")[2],
+    )  # "0.1 rad/s at ...", "0.1 m/s at"
+    less = [f"{0.99 * float(word.split()[0]):.4g}" for word in words]
+    for speed, rate in ((told[1], less[0]), (less[1], told[3])):
+        weak = "--speed", speed, "--yaw-rate", rate, "--voltage", "12", "--no-report"
+        assert mmrjax("simulate", *weak, "--out", str(tmp_path / f"at {rate}"))[0] == 0
+
+
+#: Of a robot that rolls as its motors turn: speed over voltage [m/(s V)], and its width [m].
+ROLLS, WIDE = 0.03, 0.5
+
+
+@pytest.mark.parametrize(
+    ("speed", "rate", "says"),
+    [
+        (0.3, 3.0, "take 35 V at one motor; the supply has 24 V, with which it reaches about 1.68 rad/s at 0.3 m/s and "
+                   "no more than 2.88 rad/s, on the spot"),
+        (-0.6, 1.0, "take 28.3 V at one motor; .* about 0.48 rad/s at 0.6 m/s and about 0.47 m/s at 1 rad/s"),
+        (0.0, -9.0, "with which it reaches no more than 2.88 rad/s, on the spot"),
+        (2.0, -0.5, "with which it reaches about 0.595 m/s at 0.5 rad/s and no more than 0.72 m/s, straight"),
+    ],
+)  # fmt: skip
+def test_a_turn_beyond_the_supply_is_refused_with_what_it_reaches(monkeypatch, speed, rate, says):
+    """Which is kept of the demand, the other as much as the supply gives: v + B |ω| / 2 = ROLLS U."""
+
+    def rolling(robot, asked):
+        left, right = (np.ravel(getattr(asked, f"duty_{side}"))[0] for side in SIDES)
+        inner = np.concatenate([[min(left, right, key=abs)], max(left, right, key=abs) * turn_room.SHARES])
+        outer = np.full(len(inner), max(left, right, key=abs))
+        pair = (inner, outer) if abs(left) <= abs(right) else (outer, inner)
+        volts = np.ravel(asked.voltage)[0] * np.stack(pair)
+        reading = {"speed": ROLLS * volts.mean(0), "yaw_rate": ROLLS * (volts[1] - volts[0]) / WIDE}
+        return types.SimpleNamespace(result=types.SimpleNamespace(reading=reading)), asked
+
+    monkeypatch.setattr(turn_room, "_with_others", rolling)
+    robot, demand = robots.nominal(), config.Simulate(speed_m_s=speed, yaw_rate_rad_s=rate)
+    runs = inputs.one_run(robot, {"supply_voltage_V": 24.0, **turn_room.cells(demand, {})})
+    with pytest.raises(BadConfiguration, match=f"{speed:g} m/s and {rate:g} rad/s .*{says}"):
+        turn_room._demanded(robot, runs.conditions(robot), runs, demand)
+
+
+def test_a_required_turn_without_a_steady_state_is_not_told_of_options_of_runs():
+    asked = types.SimpleNamespace(quantity=requirements.QUANTITIES["turning_radius_mm"])
+    said = check.reached(types.SimpleNamespace(requirement=asked, value=None, status="not_settled"))
+    assert "no settled turn" in said and "--duration" not in said
+    assert said != check.reached(types.SimpleNamespace(requirement=asked, value=None, status="stalled"))
+
+
+def test_a_turn_that_is_not_found_though_it_is_within_reach_is_friction_s():
+    speeds, rates = np.array([0.7, np.nan, 0.0]), np.array([0.0, np.nan, 3.0])
+    assert "friction that falls with sliding" in turn_words.reach(0.3, 1.0, speeds, rates)
+    assert "reaches" in turn_words.reach(0.3, 2.0, speeds, rates)
+    assert "no turn settles" in turn_words.reach(0.3, 2.0, np.full(3, np.nan), rates)
 
 
 REFUSED = {

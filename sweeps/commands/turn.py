@@ -119,6 +119,14 @@ def _demanded(robot: Robot, asked: Conditions, runs: Runs, config: configuration
         speed, turn = (np.asarray(reading[name])[0] for name in ("speed", "yaw_rate"))
         return np.array([speed, 0.5 * width * turn]) - wanted
 
+    def at_full_voltage() -> tuple[np.ndarray, np.ndarray]:
+        """Speeds and yaw rates of settled turns with all of the supply's voltage on the side that is to be the
+        faster, from straight travel to the spot."""
+        faster = np.abs(belts) == np.abs(belts).max()
+        faster &= np.cumsum(faster) == 1  # of two, on the spot
+        reading = _with_others(robot, driven(np.where(faster, np.sign(belts) * supply, 0.0)))[0].result.reading
+        return np.asarray(reading["speed"])[1:], np.asarray(reading["yaw_rate"])[1:]
+
     alike = dataclasses.replace(asked, duty_left=None, duty_right=None)
     supply = float(np.ravel(jax.vmap(lambda c: voltage_at_rest(robot, c))(alike))[0])
     belts = wanted[0] + WIDER * wanted[1] * np.array([-1.0, 1.0])
@@ -130,16 +138,16 @@ def _demanded(robot: Robot, asked: Conditions, runs: Runs, config: configuration
         if np.abs(found.fun).max() < NEAR:  # not NaN
             break
     else:
-        raise BadConfiguration(
-            f"--speed, --yaw-rate: no settled turn of {config.speed_m_s:g} m/s and {config.yaw_rate_rad_s:g} rad/s "
-            f"was found{' on the battery' if config.battery else ''}; friction that falls with sliding may have none "
-            "there"
-        )
-    if np.abs(volts).max() > supply:
-        raise BadConfiguration(
-            f"--speed, --yaw-rate: {config.speed_m_s:g} m/s and {config.yaw_rate_rad_s:g} rad/s take "
-            f"{np.abs(volts).max():.3g} V at one motor; the supply has {supply:.3g} V"
-        )
+        volts = np.full(2, np.inf)
+    if not np.abs(volts).max() <= supply:
+        demand = f"{config.speed_m_s:g} m/s and {config.yaw_rate_rad_s:g} rad/s"
+        source = f"the {'battery' if config.battery else 'supply'} has {supply:.3g} V"
+        why = (
+            f"{demand} take {np.abs(volts).max():.3g} V at one motor" if np.isfinite(volts).all()
+            else f"no settled turn of {demand} was found"
+        )  # fmt: skip
+        reaches = turn_words.reach(config.speed_m_s, config.yaw_rate_rad_s, *at_full_voltage())
+        raise BadConfiguration(f"--speed, --yaw-rate: {why}; {source}, {reaches}")
     duties = volts / supply
     columns = {**runs.columns, **dict(zip(SIDES, duties[:, None], strict=True))}
     return driven(volts), dataclasses.replace(runs, columns=columns)

@@ -66,6 +66,28 @@ def by_itself(robot: Robot, found: Result, value: float) -> str:
     return f"{alike}, it turns: {'; '.join(told)} ({states} show it)" if told else ""
 
 
+def reach(speed: float, rate: float, speeds: np.ndarray, rates: np.ndarray) -> str:
+    """Why a turn is not found: what is reached at full voltage, or that friction has none there.
+
+    Args:
+        speed: demanded [m/s]; rate: demanded yaw rate [rad/s].
+        speeds, rates: of settled turns at full voltage, from straight travel to the spot, NaN where there is none.
+    """
+    known = np.isfinite(speeds) & np.isfinite(rates)
+    if not known.any():
+        return "and with all of that no turn settles"
+    ahead, round_ = np.abs(speeds[known]), np.abs(rates[known])
+    most_rate = np.interp(abs(speed), ahead[::-1], round_[::-1], right=math.nan)
+    most_speed = np.interp(abs(rate), round_, ahead, right=math.nan)
+    if most_rate >= abs(rate):
+        return "which would do; friction that falls with sliding may have none there"
+    told = [f"about {most_rate:.3g} rad/s at {abs(speed):g} m/s"] if speed and math.isfinite(most_rate) else []
+    told += [f"about {most_speed:.3g} m/s at {abs(rate):g} rad/s"] if math.isfinite(most_speed) else []
+    told += [f"no more than {ahead.max():.3g} m/s, straight"] if not math.isfinite(most_rate) else []
+    told += [f"no more than {round_.max():.3g} rad/s, on the spot"] if not math.isfinite(most_speed) else []
+    return f"with which it reaches {' and '.join(told)}"
+
+
 def turn(robot: Robot, row: Mapping[str, Any], ended: Mapping[str, float] | None) -> Turn:
     """A turn in words.
 

@@ -13,9 +13,13 @@ from calibration.data.requirements import Requirements
 from calibration.sizing import sheet
 from calibration.sizing.sheet import Change, Outcome
 from mmrjax.robot import Robot
+from mmrjax.signals import NOT_SETTLED, STATUSES
 from mmrjax.tables import COULOMB_PER_MAH
 from sweeps.pages import words
 from sweeps.results.posture import Drawn
+
+#: Why a required turn has no value where it has no steady state.
+NO_TURN = "no settled turn at full voltage, as where friction falls with sliding; simulate --model drive follows it"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,11 +85,11 @@ def wanted(outcome: Outcome) -> str:
 
 def reached(outcome: Outcome) -> str:
     """The value with its unit, or why there is none."""
-    return (
-        words.why(outcome.status)
-        if outcome.value is None
-        else f"{rounded(outcome.value)} {outcome.requirement.quantity.unit}"
-    )
+    quantity = outcome.requirement.quantity
+    if outcome.value is not None:
+        return f"{rounded(outcome.value)} {quantity.unit}"
+    no_turn = quantity.group == "turn" and outcome.status == STATUSES[NOT_SETTLED]
+    return NO_TURN if no_turn else words.why(outcome.status)
 
 
 def shortfall(outcome: Outcome) -> str:
