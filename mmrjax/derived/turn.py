@@ -8,16 +8,20 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from mmrjax import channels
 from mmrjax.channels import MM
+from mmrjax.compiling import compiled
 from mmrjax.conditions import OF_SIDES, Conditions
-from mmrjax.fidelities.steady import steady_batch
+from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.robot import Robot
 from mmrjax.signals import Result
 
 #: Yaw rate below which a robot travels straight [rad/s]; its turn would take two centuries.
 NONE = 1e-9
+#: Channels of a motion in the plane.
+PLANE = ("speed", "lateral_speed", "yaw_rate")
 #: Columns, with what they are.
 COLUMNS: dict[str, str] = {
     "turning_radius_mm": "radius of the circle of the centre of mass, positive to the left; inf: straight",
@@ -28,6 +32,30 @@ COLUMNS: dict[str, str] = {
     "winding_left_C": "winding of the left motor after long running",
     "winding_right_C": "winding of the right motor after long running",
 }  # fmt: skip
+
+
+def turning_radius(ahead: Any, aside: Any, rate: Any) -> Array:
+    """Of the circle of the centre of mass, positive to the left, inf where it travels straight [m].
+
+    Args:
+        ahead, aside: speeds of the centre of mass [m/s]; rate: yaw rate [rad/s]; arrays of one shape.
+    """
+    turns = jnp.abs(rate) > NONE
+    along = jnp.sqrt(jnp.maximum(jnp.square(ahead) + jnp.square(aside), 1e-24))  # a root of nothing has no derivative
+    left = jnp.where(jnp.asarray(ahead) * rate < 0, -1.0, 1.0)
+    return jnp.where(turns, left * along / jnp.where(turns, jnp.abs(rate), 1.0), jnp.inf)
+
+
+@compiled
+def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
+    """The radius of a settled turn of one run.
+
+    Returns:
+        `turning_radius` [m], NaN where nothing settles; `status` of the turn. Derivatives are implicit.
+    """
+    point = steady(robot, conditions)
+    found = turning_radius(*(point.reading[name] for name in PLANE))
+    return {"turning_radius": jnp.where(jnp.isnan(point.speed), jnp.nan, found), "status": point.status}
 
 
 def by_itself(robot: Robot, imposed: float) -> Result:
@@ -57,7 +85,7 @@ def columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray) -> dic
     units = float(robot.sides) / 2
     ahead, left = (-np.asarray(reading["lateral_speed"]) / rate, np.asarray(reading["speed"]) / rate)
     found = {
-        "turning_radius_mm": np.where(np.isnan(rate), np.inf, np.copysign(np.hypot(ahead, left), left) / MM),
+        "turning_radius_mm": np.asarray(turning_radius(*(np.asarray(reading[name]) for name in PLANE))) / MM,
         "centre_x_mm": ahead / MM,
         "centre_y_mm": left / MM,
         "effective_width_mm": (rolled["right"] - rolled["left"]) / rate / MM,
