@@ -6,8 +6,6 @@ import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from calibration.data import units
 from calibration.data.errors import BadData
 from calibration.data.units import Quantity
@@ -195,18 +193,6 @@ class Layout:
         """Columns that say what drives the left and the right side of a robot that turns; none of one that cannot."""
         imposed = {"voltage": tuple(SIDES), "motor_speed": SPEEDS}.get(self.imposed, ())
         return imposed if self.has_ground else ()
-
-    def of_sides(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """What drives the left and the right side, as its sign says forward or backward: voltage [V], on a battery a
-        share of it, or speed [rpm]; shape (2, rows).
-
-        Args:
-            columns: of a table that turns.
-        """
-        alike = np.ones(len(next(iter(columns.values()))))
-        driven = np.stack([columns.get(name, columns.get("duty", alike)) for name in self.sides])
-        supply = columns.get(SUPPLY, alike) if self.imposed == "voltage" else alike
-        return driven * np.where(np.isnan(supply), 1.0, supply)
 
     @property
     def axes(self) -> tuple[str, ...]:

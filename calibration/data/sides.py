@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calibration.data.columns import DUTY, SIDES, SUPPLY, VOLTS, Layout
 from calibration.data.errors import BadData, number
-from calibration.data.table import Runs
 from mmrjax import channels
 from mmrjax.rig import Instrument
+
+if TYPE_CHECKING:
+    from calibration.data.table import Runs
 
 #: Of rows that tell: what drives the sides apart, or one backward, as a share of the most that does so [-].
 CLEAR = 0.25
@@ -18,6 +21,19 @@ CLEAR = 0.25
 FEWEST, MOSTLY = 3, 0.75
 #: By how much a side's voltage may be above the supply's, as both are written with few digits [-].
 ROUNDED = 0.01
+
+
+def driven(columns: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray:
+    """What drives the left and the right side, forward or backward by its sign: voltage [V], on a battery a share of
+    it, or speed [rpm]; shape (2, rows).
+
+    Args:
+        columns: of a table that turns.
+    """
+    alike = np.ones(len(next(iter(columns.values()))))
+    each = np.stack([columns.get(name, columns.get("duty", alike)) for name in layout.sides])
+    supply = columns.get(SUPPLY, alike) if layout.imposed == "voltage" else alike
+    return each * np.where(np.isnan(supply), 1.0, supply)
 
 
 def shares(volts: np.ndarray, supply: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -53,7 +69,7 @@ def of_volts(name: str, columns: dict[str, np.ndarray], battery: bool) -> tuple[
         (other,) = {*VOLTS} - {*stated}
         raise BadData(f"{name}: column {other} is missing beside {stated[0]}; state what drives both sides")
     volts = np.stack([columns.pop(c) for c in VOLTS])
-    supply, driven = shares(volts, columns.get(SUPPLY))
+    supply, parts = shares(volts, columns.get(SUPPLY))
     beyond = np.abs(volts) > np.abs(supply) * (1 + ROUNDED)
     if beyond.any():
         side, row = (int(k[0]) for k in np.nonzero(beyond))
@@ -63,7 +79,7 @@ def of_volts(name: str, columns: dict[str, np.ndarray], battery: bool) -> tuple[
             "larger of both sides'"
         )
     origin = SUPPLY if SUPPLY in columns else f"{SUPPLY}, the larger of both"
-    columns |= {SUPPLY: supply, **dict(zip(SIDES, np.clip(driven, -1.0, 1.0), strict=True))}
+    columns |= {SUPPLY: supply, **dict(zip(SIDES, np.clip(parts, -1.0, 1.0), strict=True))}
     return (f"{name}: {' and '.join(VOLTS)} are read as {' and '.join(SIDES)}, shares of {origin}",)
 
 
@@ -109,10 +125,10 @@ def _refuse_against(
     if told.sum() < FEWEST or against.sum() <= MOSTLY * told.sum():
         return
     row = int(np.argmax(np.where(against, np.abs(drive), -1.0)))
-    got, driven = (" and ".join(number(float(f"{x[row]:.4g}")) for x in sides) for sides in (shown, runs.of_sides))
+    got, at = (" and ".join(number(float(f"{x[row]:.4g}")) for x in sides) for sides in (shown, runs.of_sides))
     unit = runs.layout.imposed_column.rpartition("_")[2]
     raise BadData(
-        f"{runs.source} row {row + 1}, {column}: got {got} where left and right side are driven at {driven} {unit}, "
+        f"{runs.source} row {row + 1}, {column}: got {got} where left and right side are driven at {at} {unit}, "
         f"and so in {against.sum()} of {told.sum()} rows; expected {expected}"
     )
 
@@ -127,7 +143,7 @@ def magnitudes(columns: Mapping[str, np.ndarray], layout: Layout) -> tuple[Instr
     if not layout.sides or not set(layout.sides) <= set(columns):
         return ()
     found = []
-    for side, drive in zip(channels.SIDES, layout.of_sides(columns), strict=True):
+    for side, drive in zip(channels.SIDES, driven(columns, layout), strict=True):
         channel = channels.find(f"motor_current_{side}")
         if channel.column in columns:
             shown = columns[channel.column]
