@@ -15,6 +15,7 @@ from mmrjax import requirements, robots
 from mmrjax.channels import SIDES
 from mmrjax.derived import turn as derived
 from mmrjax.errors import UsageError
+from mmrjax.profile import profile
 from sweeps import config, inputs
 from sweeps.commands import simulate
 from sweeps.commands import turn as turn_room
@@ -385,7 +386,37 @@ def test_simulate_in_python_refuses_turns_as_the_command_line_does():
     with pytest.raises(UsageError, match="duty_left: got a robot of 1 side"):
         mm.simulate(alone, mm.Conditions("6T2A", duty_left=1, duty_right=0.5))
     with pytest.raises(UsageError, match="duty: got it beside duty_left and duty_right"):
-        mm.simulate(mm.nominal(), mm.Conditions("6T2A", duty=0.5, duty_left=1, duty_right=0.5))
+        mm.simulate(mm.nominal(), mm.Conditions("6T2A", duty=jnp.asarray(0.5), duty_left=1, duty_right=0.5))
+
+
+@pytest.mark.parametrize("duty", [1, 1.0, 0.5, [1.0, 1.0]])
+def test_a_duty_written_beside_both_sides_is_refused_whatever_it_is(duty):
+    with pytest.raises(UsageError, match=r"^duty: got it beside duty_left and duty_right; expected one of the two"):
+        mm.Conditions("6T2A", duty=duty, duty_left=1, duty_right=0.5)
+    alone = mm.Conditions(0, duty=duty, duty_left=0.5)  # of the right side
+    again = dataclasses.replace(alone, duty_right=jnp.asarray(0.5))
+    assert np.all(np.asarray(again.of_sides().duty) == 0.5) and np.all(
+        np.asarray(alone.of_sides().duty[1]) == np.asarray(duty)
+    )
+
+
+TURNING = profile([0.0, 1.0], duty_left=[0.5, 0.5], duty_right=[1.0, 1.0])
+ONE_SIDE = dataclasses.replace(robots.nominal(), sides=jnp.asarray(1.0))
+
+
+@pytest.mark.parametrize(
+    ("robot", "told", "says"),
+    [
+        (ONE_SIDE, {"profile": TURNING}, "profile: got a robot of 1 side; expected sides = 2"),
+        (mm.nominal(), {"profile": "patrol"}, "profile: got str; expected mmrjax.profile.profile"),
+        (mm.nominal(), {"profile": TURNING, "model": "steady"}, "model: got steady beside a profile; expected drive"),
+        (mm.nominal(), {"profile": TURNING, "duration": 3.0}, "duration: got 3.0 beside a profile, whose last row"),
+        (mm.nominal(), {"start": "rest"}, "start: got one without a profile"),
+    ],
+)
+def test_profiles_in_python_are_refused_before_they_are_followed(robot, told, says):
+    with pytest.raises(UsageError, match=says):
+        mm.simulate(robot, mm.Conditions("6T2A"), **told)
 
 
 def test_tables_have_no_negative_zero(monkeypatch):
