@@ -128,9 +128,7 @@ def read_runs(
         BadData: what `records.read` refuses, time histories where none are taken, or a configuration that the
             robot does not have.
     """
-    runs = records.read(source, measured=measured, battery=battery, robot=robot)
-    if of_turns and runs.turns:
-        runs = records.read(source, measured=measured, battery=battery, robot=robot.showing_turns(runs.unknown))
+    runs = records.read(source, measured=measured, battery=battery, robot=robot, of_turns=of_turns)
     if not series:
         from calibration.inference import observers
 

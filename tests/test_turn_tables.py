@@ -13,6 +13,7 @@ from calibration.inference.ranges import check_ranges
 from mmrjax import balances
 from mmrjax.channels import RPM
 from mmrjax.signals import State
+from sweeps.inputs import read_runs
 
 #: A robot on four wheels whose sides' speeds are imposed; the numbers are nobody's.
 KINEMATIC = """
@@ -103,6 +104,23 @@ def test_a_table_of_turns_with_channels_of_turns_alone_is_answered_by_the_line_t
     line = said.value.args[0].rpartition("file ")[2]
     robot = rig(f'base = "nominal"\n{line}')
     assert [c.name for c in records.read(path, robot=robot).channels] == ["yaw_rate"]
+
+
+def test_a_table_of_turns_is_read_once_with_the_channels_of_turns_that_it_has(tmp_path, capsys, monkeypatch):
+    path, reads = tmp_path / "turns.csv", []
+    read = records.read
+    monkeypatch.setattr(records, "read", lambda *told, **how: reads.append(told) or read(*told, **how))
+    header = "configuration,voltage_left_V,voltage_right_V,total_mass_kg,payload_kg,slope_deg"
+    path.write_text(f"{header},yaw_rate_rad_s,motor_current_left_A\n" + "6T2A,24,12,13.1,0,0,-1.1,2\n" * 2)
+    runs = read_runs(str(path), mm.nominal(), measured=True, of_turns=True)
+    assert len(reads) == 1 and not runs.unknown
+    assert [c.name for c in runs.channels] == [
+        "total_current", "motor_speed", "speed", "motor_current_left", "yaw_rate"
+    ]  # fmt: skip
+    straight = tmp_path / "straight.csv"
+    straight.write_text(f"{header.replace('voltage_left_V,voltage_right_V', 'supply_voltage_V')},yaw_rate_rad_s,speed_mm_s"
+                        "\n6T2A,24,13.1,0,0,0,700\n")  # fmt: skip
+    assert read_runs(str(straight), mm.nominal(), measured=True, of_turns=True).unknown == ("yaw_rate_rad_s",)
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,14 @@ PACKAGED = {"measured": "measured.csv", "simulated_by_paper": "simulated_by_pape
 SIGN_SDS, SIGN_SHARE = 4.0, 0.05
 
 
-def read(source: str | Path, *, measured: bool = True, battery: bool = False, robot: Robot | None = None) -> Runs:
+def read(
+    source: str | Path,
+    *,
+    measured: bool = True,
+    battery: bool = False,
+    robot: Robot | None = None,
+    of_turns: bool = False,
+) -> Runs:
     """Read a packaged table by its name, or a CSV file.
 
     Args:
@@ -59,27 +66,32 @@ def read(source: str | Path, *, measured: bool = True, battery: bool = False, ro
             or empty.
         robot: that the table is of; it says which columns are needed, and which channels it has. None: the packaged
             one; the table then has every other channel too of which it has a column.
+        of_turns: whether a table of turns has every channel of either side, and of the yaw, of which it has a column.
 
     Raises:
         BadData: no such file, nothing in it, no channel, a missing, misspelt or repeated column, a row of another
             length, or a cell that is no number, not finite or out of range; said with file, row (counted
             from 1 below the header), column, value and what is allowed.
     """
-    layout = Layout.of(robot)
+    layout, how = Layout.of(robot), {"inferred": robot is None, "of_turns": of_turns}
     if str(source) in PACKAGED:
         with resources.as_file(resources.files("calibration") / "data" / PACKAGED[str(source)]) as path:
-            runs = _read(path, str(source), measured, battery, layout, inferred=robot is None)
+            runs = _read(path, str(source), measured, battery, layout, **how)
     else:
         path = Path(source)
         if not path.exists():
             raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
-        runs = _read(path, path.name or str(source), measured, battery, layout, inferred=robot is None)
+        runs = _read(
+            path, path.name or str(source), measured, battery, layout, inferred=robot is None, of_turns=of_turns
+        )
     if robot is not None:
         contradictions.check(runs, robot)
     return runs
 
 
-def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, *, inferred: bool) -> Runs:
+def _read(
+    path: Path, name: str, measured: bool, battery: bool, layout: Layout, *, inferred: bool, of_turns: bool
+) -> Runs:
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -96,7 +108,9 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
     if repeated:
         raise BadData(f"{name}: column {repeated[0]} stands {header.count(repeated[0])} times; expected once")
     if inferred:
-        layout = _with_channels(name, header, layout)
+        layout = _with_channels(name, header, layout, channels.EVERY)
+    if of_turns and {*layout.sides, *VOLTS, *HEADING} & {m.column for m in layout.meanings(name, header) if m}:
+        layout = _with_channels(name, header, layout, channels.OF_TURNS)
     meanings = layout.meanings(name, header)
     _check_header(name, header, meanings, measured, battery, layout)
     if below := _row_of_units(name, meanings, rows[1:2]):
@@ -246,11 +260,11 @@ def _lacks(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterato
             )
 
 
-def _with_channels(name: str, header: list[str], layout: Layout) -> Layout:
-    """`layout` with every other channel too of which a file has a column."""
+def _with_channels(name: str, header: list[str], layout: Layout, more: Sequence[Channel]) -> Layout:
+    """`layout` with those of some more channels of which a file has a column."""
     meanings = dataclasses.replace(layout, channels=channels.EVERY).meanings(name, header)
     stated = {m.column for m in meanings if m is not None}
-    found = tuple(c for c in channels.EVERY if c in layout.channels or c.column in stated)
+    found = tuple(c for c in channels.EVERY if c in layout.channels or (c in more and c.column in stated))
     return dataclasses.replace(layout, channels=found)
 
 

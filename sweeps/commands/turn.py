@@ -21,13 +21,13 @@ from mmrjax.conditions import Conditions
 from mmrjax.derived import turn as derived
 from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.rest import voltage_at_rest
-from mmrjax.robot import Robot, cannot_turn
+from mmrjax.robot import Robot
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import progress, say
 from sweeps.inputs import load_robot, one_run
 from sweeps.pages import posture_words, turn_words
-from sweeps.points import run, scale
+from sweeps.points import imposed, run, scale
 from sweeps.results import posture
 from sweeps.skeleton import page
 from sweeps.store import open_folder
@@ -171,8 +171,7 @@ def check(robot: Robot, named: str) -> None:
     Raises:
         BadConfiguration: why.
     """
-    if why := cannot_turn(robot, (named,)):
-        raise BadConfiguration(f"--left, --right, --heading: {why}")
+    imposed.check_can_turn(robot, (named,), "--left, --right, --heading")
     if robot.rig.imposed != "voltage":
         raise BadConfiguration("--left, --right: the robot's file says that its motors are not driven by voltage")
 

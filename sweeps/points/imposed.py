@@ -166,6 +166,16 @@ def check_on_ground(robot: Robot, command: str) -> None:
         )
 
 
+def check_can_turn(robot: Robot, names: Iterable[str], where: str) -> None:
+    """Refuse a robot that cannot turn in some of these configurations.
+
+    Raises:
+        BadConfiguration: opens with `where`, and says why.
+    """
+    if why := cannot_turn(robot, names):
+        raise BadConfiguration(f"{where}: {why}")
+
+
 def check_turning(robot: Robot, stated: Collection[str], names: Iterable[str], where: str) -> None:
     """Refuse conditions that free a robot to turn which cannot, or that leave open what drives a side.
 
@@ -174,7 +184,6 @@ def check_turning(robot: Robot, stated: Collection[str], names: Iterable[str], w
     """
     if not (freed := [name for name in OF_TURNS if name in stated]):
         return
-    if why := cannot_turn(robot, names):
-        raise BadConfiguration(f"{where}, {freed[0]}: {why}")
+    check_can_turn(robot, names, f"{where}, {freed[0]}")
     if why := sides_contradict(stated):
         raise BadConfiguration(f"{where}, {why}")
