@@ -326,7 +326,11 @@ def test_turns_are_told_in_plain_words():
     assert [side[0] for side in turn_words.turn(unknown, row(), None).sides] == [side[0] for side in hot.sides[:-1]]
     nothing = {name: float("nan") for name, value in row().items() if isinstance(value, float)}
     none = turn_words.turn(robot, row(status="not_settled", **nothing), None)
-    assert none.answer.startswith("not_settled: ") and "no steady state" in none.answer
+    assert (
+        none.answer.startswith("not_settled: ")
+        and "no settled turn" in none.answer
+        and "--duration" not in none.answer
+    )
     assert not none.sides and not none.notes
     assert "parts allow" not in said()
     robot = params.replace(robot, {"6T2A.turning.width": 0.5})

@@ -12,7 +12,7 @@ import numpy as np
 from mmrjax.channels import MM, SIDES
 from mmrjax.derived.turn import NONE
 from mmrjax.robot import Robot
-from mmrjax.signals import STATUSES, Result
+from mmrjax.signals import NOT_SETTLED, STATUSES, Result
 from mmrjax.simulation import STRAIGHT
 from mmrjax.turning import BETWEEN, OVER
 from sweeps import capabilities
@@ -97,7 +97,8 @@ def turn(robot: Robot, row: Mapping[str, Any], ended: Mapping[str, float] | None
     """
     status, known = str(row["status"]), math.isfinite(float(row["yaw_rate_rad_s"]))
     going = known and status in ("converged", "not_settled")
-    answer = _moves(row) if going else f"{status}: {words.STATUSES[status].why}"
+    unsettled = ended is None and status == STATUSES[NOT_SETTLED]
+    answer = _moves(row) if going else f"{status}: {words.NO_TURN if unsettled else words.STATUSES[status].why}"
     if ended is not None and going:
         answer = (
             f"After {ended['time_s']:g} s: {ended['displacement_m']:.2f} m from the start, turned by "

@@ -18,9 +18,6 @@ from mmrjax.tables import COULOMB_PER_MAH
 from sweeps.pages import words
 from sweeps.results.posture import Drawn
 
-#: Why a required turn has no value where it has no steady state.
-NO_TURN = "no settled turn at full voltage, as where friction falls with sliding; simulate --model drive follows it"
-
 
 @dataclasses.dataclass(frozen=True)
 class CheckResult:
@@ -89,7 +86,7 @@ def reached(outcome: Outcome) -> str:
     if outcome.value is not None:
         return f"{rounded(outcome.value)} {quantity.unit}"
     no_turn = quantity.group == "turn" and outcome.status == STATUSES[NOT_SETTLED]
-    return NO_TURN if no_turn else words.why(outcome.status)
+    return words.NO_TURN if no_turn else words.why(outcome.status)
 
 
 def shortfall(outcome: Outcome) -> str:
