@@ -133,6 +133,10 @@ def test_a_table_of_turns_is_read_once_with_the_channels_of_turns_that_it_has(tm
         ),
         ("U_right_V,U_left_V", r"column U_right_V: .* name it voltage_right_V, or state \[columns\] voltage_right_V"),
         (
+            "motor_voltage_left_V,motor_voltage_right_V",
+            r"supply_voltage_V is missing; .* \[columns\] voltage_left_V = \"motor_voltage_left_V\", voltage_right_V",
+        ),
+        (
             "U_1,U_2",
             "row 2, motor_current_left_A: got -2 at 24 V; nothing else .*; a turn has duty_left and duty_right too",
         ),
@@ -140,8 +144,9 @@ def test_a_table_of_turns_is_read_once_with_the_channels_of_turns_that_it_has(tm
 )
 def test_a_table_of_turns_without_what_drives_the_sides_is_told_what_to_add(rig, table, sides, says):
     rows = [(24, 5, 10, 3.0, 9.0, 0.3), (24, 2, 10, -2.0, 9.0, 0.6)]
+    supply = "supply" if sides.startswith("motor") else "supply_voltage_V"
     with pytest.raises(BadData, match=says):
-        table(f"supply_voltage_V,{sides},{READ}", *rows, robot=rig(DRIVEN))
+        table(f"{supply},{sides},{READ}", *rows, robot=rig(DRIVEN))
 
 
 #: Of SOUND, at 0.012 V/rpm.

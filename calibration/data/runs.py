@@ -393,6 +393,10 @@ def _check_header(
         close = difflib.get_close_matches(column, strange, 1, 0.6)
         if column in required or (close and layout.complete):
             got = f"; is {close[0]} meant?" if close else ""
+            if column == SUPPLY and {f"motor_{volts}" for volts in VOLTS} <= {*header}:  # which may be readings too
+                got = "; what drives the sides may be stated, in the robot's file: [columns] " + ", ".join(
+                    f'{volts} = "motor_{volts}"' for volts in VOLTS
+                )
             raise BadData(
                 f"{name}: column {layout.expected(column)} is missing{got} (required: {', '.join(required)})"
                 + ("" if close else _other_names(strange, column))
