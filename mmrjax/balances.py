@@ -44,13 +44,16 @@ BALANCES = {
     "sensor": ("", "what the instruments show, each channel in its unit"),
 }
 
+#: Of these, those of a robot that turns: they act round the turn, the others along the travel of a side.
+ROUND = ("lateral", "yaw")
+
 
 def absent(robot: Robot) -> frozenset[str]:
     """Balances that a robot has not, or that nothing of it shows: the ground's of a load on a shaft, those of the
     voltage where the motors' speed or current is imposed."""
     supply = set() if robot.rig.imposed == "voltage" else {"supply"}
     winding = set() if robot.rig.shows_voltage else {"electrical", "inductance"}
-    return robot.lacks | supply | winding | (set() if robot.rig.turns else {"lateral", "yaw"})
+    return robot.lacks | supply | winding | (set() if robot.rig.turns else {*ROUND})
 
 
 def added(robot: Robot, signals: Signals, balance: str, channel: str = "") -> Scalar:

@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from mmrjax.errors import UsageError
+
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
 
@@ -37,7 +39,7 @@ class Conditions(eqx.Module):
         adhesion: adhesion of this surface as a ratio to the one that the robot's friction is stated for [-].
         total_mass: mass of robot and payload as weighed [kg]; None takes the robot's own mass and the payload.
         order: place in the sequence of runs; what drifts from run to run depends on it [-].
-        duty: share of the supply's voltage that the driver gives the motors, negative backward [-].
+        duty: share of the supply's voltage that the driver gives the motors, negative backward [-]; None: 1.
         open: 1 where the motors' circuit is open, so that they coast.
         motor_speed: imposed on the motors' shafts [rad/s], whatever voltage that takes; None: the voltage is imposed.
         motor_acceleration: of an imposed speed [rad/s²]; None: none.
@@ -90,7 +92,7 @@ class Conditions(eqx.Module):
         adhesion: Number = 1.0,
         total_mass: Number | None = None,
         order: Number = 0.0,
-        duty: Number = 1.0,
+        duty: Number | None = None,
         open: Number | bool = 0.0,
         motor_speed: Number | None = None,
         motor_acceleration: Number | None = None,
@@ -107,6 +109,10 @@ class Conditions(eqx.Module):
         levers_front_deg: Number | None = None,
         levers_rear_deg: Number | None = None,
     ) -> None:
+        # arrays are of other conditions, or of a table; what a user writes down is a number or some
+        if not isinstance(duty, np.ndarray | jax.Array | None) and None not in (duty_left, duty_right):
+            raise UsageError(sides_contradict(("duty", *OF_SIDES[:2])))
+        duty = 1.0 if duty is None else duty
         which: Any = configuration if isinstance(configuration, jax.Array) else np.asarray(configuration)
         if which.dtype.kind != "U":
             which = _number(which, int)

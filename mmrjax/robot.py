@@ -124,6 +124,11 @@ class Robot(eqx.Module):
         return dataclasses.replace(self, rig=dataclasses.replace(self.rig, channels=(*own, *more)))
 
     @property
+    def unlike(self) -> tuple[str, ...]:
+        """Names of its effects by which its sides differ; runs that say nothing of either side have none of them."""
+        return tuple(effect.name for effect in self.effects if effect.unlike)
+
+    @property
     def lacks(self) -> frozenset[str]:
         """Balances that its loads have not."""
         return frozenset(self.configurations.members[0].lacks)

@@ -28,6 +28,8 @@ from mmrjax.tables import CONDITION_LIMITS
 
 #: Runs of which `simulate` keeps histories at once.
 HISTORIES = 1000
+#: What is said of runs that say nothing of either side, of a robot whose sides differ.
+STRAIGHT = "the robot's sides differ, and runs that say nothing of either side travel straight, as if steered"
 STATUS, _ = CODES
 
 
@@ -87,6 +89,9 @@ def simulate(
     _check_conditions(conditions)
     _check_battery(robot, conditions)
     _check_turning(robot, conditions, profile)
+    turns = conditions.turns or (profile is not None and profile.turns)
+    if not (turns or has_tracer(robot.effects)) and (unlike := robot.unlike):
+        warnings.warn(f"{', '.join(unlike)}: {STRAIGHT}; {OF_TURNS[0]}=1, {OF_TURNS[1]}=1 let it turn", stacklevel=2)
     if profile is not None:
         return _missions(robot, conditions, profile, start, history)
     robot = robot.showing_turns() if conditions.turns else robot

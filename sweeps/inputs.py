@@ -15,12 +15,15 @@ from calibration.data.errors import BadConfiguration, choices
 from calibration.data.posterior import Posterior
 from calibration.data.robot_file import RobotFile
 from mmrjax import fidelities
-from mmrjax.robot import Robot
+from mmrjax.channels import RPM
+from mmrjax.derived.turn import by_itself
+from mmrjax.robot import Robot, cannot_turn
 from mmrjax.tables import BENCH, SURFACES
 from sweeps import capabilities
 from sweeps.config import FidelityPart, OneRun, RobotPart
 from sweeps.console import tell
 from sweeps.flags import flags
+from sweeps.pages import turn_words
 from sweeps.points import imposed
 
 #: Option that states a condition of one run.
@@ -38,12 +41,26 @@ def load_robot(config: RobotPart) -> RobotFile:
     notes: list[str] = []
     file = robot_file.find(config.robot, effect_file.library(config.effects), notes)
     robot = robot_file.change(file.robot, config.set, where="--set", notes=notes)
-    for note in notes:
+    unlike = () if getattr(config, "turns", False) else _unlike(file.name, robot)
+    for note in (*notes, *unlike):
         tell(note)
     resolves = isinstance(config, FidelityPart) and fidelities.facts(config.model).resolves
     if resolves and robot.has_ground and not capabilities.states(robot, "running_gear."):
         tell("the robot's file states no running_gear: wheelbase, belt and masses within are those of an example")
-    return dataclasses.replace(file, robot=robot)
+    return dataclasses.replace(file, robot=robot, remarks=unlike)
+
+
+def _unlike(name: str, robot: Robot) -> tuple[str, ...]:
+    """A sentence on a robot whose sides differ, of whatever travels straight: how it turns where they are driven
+    alike."""
+    if not robot.unlike or not robot.has_ground:
+        return ()
+    if why := cannot_turn(robot, robot.configurations):
+        return (turn_words.unlike(name, robot.unlike, f"how it would turn is not known: {why}"),)
+    value = imposed.usual(robot)
+    found = by_itself(robot, value * RPM if robot.rig.imposed == "motor_speed" else value)
+    turns = turn_words.by_itself(robot, found, value)
+    return (turn_words.unlike(name, robot.unlike, turns),) if turns else ()
 
 
 def beside_robot(file: RobotFile) -> Posterior:
@@ -114,9 +131,7 @@ def read_runs(
         BadData: what `records.read` refuses, time histories where none are taken, or a configuration that the
             robot does not have.
     """
-    runs = records.read(source, measured=measured, battery=battery, robot=robot)
-    if of_turns and runs.turns:
-        runs = records.read(source, measured=measured, battery=battery, robot=robot.showing_turns(runs.unknown))
+    runs = records.read(source, measured=measured, battery=battery, robot=robot, of_turns=of_turns)
     if not series:
         from calibration.inference import observers
 

@@ -89,9 +89,9 @@ def test_every_page_warns_of_curves_that_nobody_has_named(robot):
     assert inspect.signature(frame.render).parameters["curves"].default is inspect.Parameter.empty
     curved = dataclasses.replace(robot, effects=(effects.UNNAMED["curve_electrical_current"](), effects.ALL[0]()))
     assert frame.curves(robot) == [] and frame.curves(curved) == ["curve_electrical_current"]
-    text = frame._with_contents("<h1>a</h1><h2>b</h2>", words.of_curves(frame.curves(curved)))
+    text = frame._with_contents("<h1>a</h1><h2>b</h2>", {"curve-warning": words.of_curves(frame.curves(curved))})
     assert 0 < text.index("<code>curve_electrical_current</code>") < text.index('<nav id="contents"')
-    assert "curve-warning" not in frame._with_contents("<h1>a</h1><h2>b</h2>", words.of_curves([]))
+    assert "curve-warning" not in frame._with_contents("<h1>a</h1><h2>b</h2>", {"curve-warning": words.of_curves([])})
 
 
 def test_legend_of_the_energy_split_has_what_is_drawn():

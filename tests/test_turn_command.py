@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import types
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,16 +10,20 @@ import pytest
 
 import mmrjax as mm
 from calibration.data import runs as records
-from calibration.data.errors import BadData
-from mmrjax import robots
+from calibration.data.errors import BadConfiguration, BadData
+from mmrjax import requirements, robots
 from mmrjax.channels import HEAT, SIDES
 from mmrjax.derived import turn as derived
 from mmrjax.errors import UsageError
+from mmrjax.profile import profile
+from sweeps import config, inputs
 from sweeps.commands import simulate
+from sweeps.commands import turn as turn_room
 from sweeps.pages import mission_figures, turn, turn_words
 from sweeps.pages.figure_style import svg
 from sweeps.points.imposed import UNLIMITED
 from sweeps.points.job import showing_turns
+from sweeps.results import check
 from tests.commands import rows
 
 
@@ -90,7 +95,63 @@ def test_a_demanded_turn_is_that_of_the_voltages_found(tmp_path, mmrjax):
     assert float(driven["yaw_rate_rad_s"]) == pytest.approx(1.0, rel=1e-6)
     code, _, err = mmrjax("simulate", *told[:4], "--voltage", "12", "--out", str(tmp_path / "weak"))
     assert code == 2
-    assert "take 18.1 V at one motor; the supply has 12 V" in " ".join(err.split())
+    said = " ".join(err.split())
+    assert "take 18.1 V at one motor; the supply has 12 V, with which it reaches about 0.1" in said
+    words = (
+        said.rpartition("about ")[0].split("about ")[1],
+        said.rpartition("about ")[2],
+    )  # "0.1 rad/s at ...", "0.1 m/s at"
+    less = [f"{0.99 * float(word.split()[0]):.4g}" for word in words]
+    for speed, rate in ((told[1], less[0]), (less[1], told[3])):
+        weak = "--speed", speed, "--yaw-rate", rate, "--voltage", "12", "--no-report"
+        assert mmrjax("simulate", *weak, "--out", str(tmp_path / f"at {rate}"))[0] == 0
+
+
+#: Of a robot that rolls as its motors turn: speed over voltage [m/(s V)], and its width [m].
+ROLLS, WIDE = 0.03, 0.5
+
+
+@pytest.mark.parametrize(
+    ("speed", "rate", "says"),
+    [
+        (0.3, 3.0, "take 35 V at one motor; the supply has 24 V, with which it reaches about 1.68 rad/s at 0.3 m/s and "
+                   "no more than 2.88 rad/s, on the spot"),
+        (-0.6, 1.0, "take 28.3 V at one motor; .* about 0.48 rad/s at 0.6 m/s and about 0.47 m/s at 1 rad/s"),
+        (0.0, -9.0, "with which it reaches no more than 2.88 rad/s, on the spot"),
+        (2.0, -0.5, "with which it reaches about 0.595 m/s at 0.5 rad/s and no more than 0.72 m/s, straight"),
+    ],
+)  # fmt: skip
+def test_a_turn_beyond_the_supply_is_refused_with_what_it_reaches(monkeypatch, speed, rate, says):
+    """Which is kept of the demand, the other as much as the supply gives: v + B |ω| / 2 = ROLLS U."""
+
+    def rolling(robot, asked):
+        left, right = (np.ravel(getattr(asked, f"duty_{side}"))[0] for side in SIDES)
+        inner = np.concatenate([[min(left, right, key=abs)], max(left, right, key=abs) * turn_room.SHARES])
+        outer = np.full(len(inner), max(left, right, key=abs))
+        pair = (inner, outer) if abs(left) <= abs(right) else (outer, inner)
+        volts = np.ravel(asked.voltage)[0] * np.stack(pair)
+        reading = {"speed": ROLLS * volts.mean(0), "yaw_rate": ROLLS * (volts[1] - volts[0]) / WIDE}
+        return types.SimpleNamespace(result=types.SimpleNamespace(reading=reading)), asked
+
+    monkeypatch.setattr(turn_room, "_with_others", rolling)
+    robot, demand = robots.nominal(), config.Simulate(speed_m_s=speed, yaw_rate_rad_s=rate)
+    runs = inputs.one_run(robot, {"supply_voltage_V": 24.0, **turn_room.cells(demand, {})})
+    with pytest.raises(BadConfiguration, match=f"{speed:g} m/s and {rate:g} rad/s .*{says}"):
+        turn_room._demanded(robot, runs.conditions(robot), runs, demand)
+
+
+def test_a_required_turn_without_a_steady_state_is_not_told_of_options_of_runs():
+    asked = types.SimpleNamespace(quantity=requirements.QUANTITIES["turning_radius_mm"])
+    said = check.reached(types.SimpleNamespace(requirement=asked, value=None, status="not_settled"))
+    assert "no settled turn" in said and "--duration" not in said
+    assert said != check.reached(types.SimpleNamespace(requirement=asked, value=None, status="stalled"))
+
+
+def test_a_turn_that_is_not_found_though_it_is_within_reach_is_friction_s():
+    speeds, rates = np.array([0.7, np.nan, 0.0]), np.array([0.0, np.nan, 3.0])
+    assert "friction that falls with sliding" in turn_words.reach(0.3, 1.0, speeds, rates)
+    assert "reaches" in turn_words.reach(0.3, 2.0, speeds, rates)
+    assert "no turn settles" in turn_words.reach(0.3, 2.0, np.full(3, np.nan), rates)
 
 
 REFUSED = {
@@ -265,7 +326,11 @@ def test_turns_are_told_in_plain_words():
     assert [side[0] for side in turn_words.turn(unknown, row(), None).sides] == [side[0] for side in hot.sides[:-1]]
     nothing = {name: float("nan") for name, value in row().items() if isinstance(value, float)}
     none = turn_words.turn(robot, row(status="not_settled", **nothing), None)
-    assert none.answer.startswith("not_settled: ") and "no steady state" in none.answer
+    assert (
+        none.answer.startswith("not_settled: ")
+        and "no settled turn" in none.answer
+        and "--duration" not in none.answer
+    )
     assert not none.sides and not none.notes
     assert "parts allow" not in said()
     robot = params.replace(robot, {"6T2A.turning.width": 0.5})
@@ -325,7 +390,37 @@ def test_simulate_in_python_refuses_turns_as_the_command_line_does():
     with pytest.raises(UsageError, match="duty_left: got a robot of 1 side"):
         mm.simulate(alone, mm.Conditions("6T2A", duty_left=1, duty_right=0.5))
     with pytest.raises(UsageError, match="duty: got it beside duty_left and duty_right"):
-        mm.simulate(mm.nominal(), mm.Conditions("6T2A", duty=0.5, duty_left=1, duty_right=0.5))
+        mm.simulate(mm.nominal(), mm.Conditions("6T2A", duty=jnp.asarray(0.5), duty_left=1, duty_right=0.5))
+
+
+@pytest.mark.parametrize("duty", [1, 1.0, 0.5, [1.0, 1.0]])
+def test_a_duty_written_beside_both_sides_is_refused_whatever_it_is(duty):
+    with pytest.raises(UsageError, match=r"^duty: got it beside duty_left and duty_right; expected one of the two"):
+        mm.Conditions("6T2A", duty=duty, duty_left=1, duty_right=0.5)
+    alone = mm.Conditions(0, duty=duty, duty_left=0.5)  # of the right side
+    again = dataclasses.replace(alone, duty_right=jnp.asarray(0.5))
+    assert np.all(np.asarray(again.of_sides().duty) == 0.5) and np.all(
+        np.asarray(alone.of_sides().duty[1]) == np.asarray(duty)
+    )
+
+
+TURNING = profile([0.0, 1.0], duty_left=[0.5, 0.5], duty_right=[1.0, 1.0])
+ONE_SIDE = dataclasses.replace(robots.nominal(), sides=jnp.asarray(1.0))
+
+
+@pytest.mark.parametrize(
+    ("robot", "told", "says"),
+    [
+        (ONE_SIDE, {"profile": TURNING}, "profile: got a robot of 1 side; expected sides = 2"),
+        (mm.nominal(), {"profile": "patrol"}, "profile: got str; expected mmrjax.profile.profile"),
+        (mm.nominal(), {"profile": TURNING, "model": "steady"}, "model: got steady beside a profile; expected drive"),
+        (mm.nominal(), {"profile": TURNING, "duration": 3.0}, "duration: got 3.0 beside a profile, whose last row"),
+        (mm.nominal(), {"start": "rest"}, "start: got one without a profile"),
+    ],
+)
+def test_profiles_in_python_are_refused_before_they_are_followed(robot, told, says):
+    with pytest.raises(UsageError, match=says):
+        mm.simulate(robot, mm.Conditions("6T2A"), **told)
 
 
 def test_tables_have_no_negative_zero(monkeypatch):

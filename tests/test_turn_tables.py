@@ -13,6 +13,7 @@ from calibration.inference.ranges import check_ranges
 from mmrjax import balances
 from mmrjax.channels import RPM
 from mmrjax.signals import State
+from sweeps.inputs import read_runs
 
 #: A robot on four wheels whose sides' speeds are imposed; the numbers are nobody's.
 KINEMATIC = """
@@ -105,14 +106,36 @@ def test_a_table_of_turns_with_channels_of_turns_alone_is_answered_by_the_line_t
     assert [c.name for c in records.read(path, robot=robot).channels] == ["yaw_rate"]
 
 
+def test_a_table_of_turns_is_read_once_with_the_channels_of_turns_that_it_has(tmp_path, capsys, monkeypatch):
+    path, reads = tmp_path / "turns.csv", []
+    read = records.read
+    monkeypatch.setattr(records, "read", lambda *told, **how: reads.append(told) or read(*told, **how))
+    header = "configuration,voltage_left_V,voltage_right_V,total_mass_kg,payload_kg,slope_deg"
+    path.write_text(f"{header},yaw_rate_rad_s,motor_current_left_A\n" + "6T2A,24,12,13.1,0,0,-1.1,2\n" * 2)
+    runs = read_runs(str(path), mm.nominal(), measured=True, of_turns=True)
+    assert len(reads) == 1 and not runs.unknown
+    assert [c.name for c in runs.channels] == [
+        "total_current", "motor_speed", "speed", "motor_current_left", "yaw_rate"
+    ]  # fmt: skip
+    straight = tmp_path / "straight.csv"
+    straight.write_text(f"{header.replace('voltage_left_V,voltage_right_V', 'supply_voltage_V')},yaw_rate_rad_s,speed_mm_s"
+                        "\n6T2A,24,13.1,0,0,0,700\n")  # fmt: skip
+    assert read_runs(str(straight), mm.nominal(), measured=True, of_turns=True).unknown == ("yaw_rate_rad_s",)
+
+
 @pytest.mark.parametrize(
     ("sides", "says"),
     [
         (
             "left_V,right_V",
-            "column left_V: a table states shares of the supply's voltage, .* duty_left = left_V / supply",
+            r"column left_V: .* drives the left side, name it voltage_left_V, or state \[columns\] voltage_left_V = "
+            '"left_V" in',
         ),
-        ("voltage_right_V,voltage_left_V", "column voltage_right_V: .* so duty_right = voltage_right_V / supply"),
+        ("U_right_V,U_left_V", r"column U_right_V: .* name it voltage_right_V, or state \[columns\] voltage_right_V"),
+        (
+            "motor_voltage_left_V,motor_voltage_right_V",
+            r"supply_voltage_V is missing; .* \[columns\] voltage_left_V = \"motor_voltage_left_V\", voltage_right_V",
+        ),
         (
             "U_1,U_2",
             "row 2, motor_current_left_A: got -2 at 24 V; nothing else .*; a turn has duty_left and duty_right too",
@@ -121,8 +144,76 @@ def test_a_table_of_turns_with_channels_of_turns_alone_is_answered_by_the_line_t
 )
 def test_a_table_of_turns_without_what_drives_the_sides_is_told_what_to_add(rig, table, sides, says):
     rows = [(24, 5, 10, 3.0, 9.0, 0.3), (24, 2, 10, -2.0, 9.0, 0.6)]
+    supply = "supply" if sides.startswith("motor") else "supply_voltage_V"
     with pytest.raises(BadData, match=says):
-        table(f"supply_voltage_V,{sides},{READ}", *rows, robot=rig(DRIVEN))
+        table(f"{supply},{sides},{READ}", *rows, robot=rig(DRIVEN))
+
+
+#: Of SOUND, at 0.012 V/rpm.
+VOLTS = [(0.012 * row[0], 0.012 * row[1], *row) for row in SOUND]
+
+
+def test_voltages_of_both_sides_are_shares_of_the_larger_or_of_the_supply(rig, table):
+    robot = rig(DRIVEN)
+    runs = table(f"voltage_left_V,voltage_right_V,{SPEEDS},{READ}", *VOLTS, robot=robot)
+    volts = np.array(VOLTS)[:, :2]
+    supply = np.abs(volts).max(1)
+    np.testing.assert_allclose(runs["supply_voltage_V"], supply)
+    duties = np.stack([runs["duty_left"], runs["duty_right"]], 1)
+    np.testing.assert_allclose(duties, volts / supply[:, None])
+    assert np.abs(duties).max() == 1.0 and runs.turns and not runs.has("voltage_left_V")
+    assert any("voltage_left_V and voltage_right_V are read as duty_left" in n for n in runs.notes)
+    rows = [(-24, *row) for row in VOLTS]
+    stated = table(f"supply_voltage_V,voltage_left_V,voltage_right_V,{SPEEDS},{READ}", *rows, robot=robot)
+    np.testing.assert_allclose(stated["duty_left"], volts[:, 0] / -24)
+    assert (stated["supply_voltage_V"] == -24).all()
+    renamed = rig(DRIVEN.replace("[motor]", '[columns]\nvoltage_left_V = "Ul"\nvoltage_right_V = "Ur"\n[motor]', 1))
+    theirs = table(f"Ul,Ur,{SPEEDS},{READ}", *VOLTS, robot=renamed)
+    np.testing.assert_array_equal(theirs["duty_right"], runs["duty_right"])
+
+
+def test_a_supply_of_either_sign_drives_the_sides(rig, table):
+    """Shares of a negative voltage drive backward where they are positive."""
+    robot, header = rig(DRIVEN), f"supply_voltage_V,duty_left,duty_right,{SPEEDS},{READ}"
+    rows = [(-24, -a / 2000, -b / 2000, a, b, abs(i), abs(k), w) for a, b, i, k, w in SOUND * 2]
+    unsigned = table(header, *rows, robot=robot)
+    np.testing.assert_allclose(unsigned.of_sides[0], [0.012 * a for a, *_ in SOUND * 2])
+    assert [i.channel for i in unsigned.layout.instruments] == ["motor_current_left", "motor_current_right"]
+    with pytest.raises(
+        BadData, match=r"got -1500 and 1500 where left and right side are driven at 18 and -18 V, and"
+    ):
+        table(header, *[(24, *row[1:]) for row in rows], robot=robot)
+
+
+def test_the_packaged_robot_turns_by_voltages_of_its_sides_without_a_supply(tmp_path):
+    path = tmp_path / "turns.csv"
+    header = "configuration,total_mass_kg,payload_kg,slope_deg,voltage_left_mV,voltage_right_mV"
+    path.write_text(f"{header}\n6T2A,13.1,0,0,6000,24000\n6T2A,13.1,0,0,-12000,12000\n")
+    runs = records.read(path, measured=False)
+    conditions = runs.conditions(mm.nominal())
+    np.testing.assert_allclose(conditions.voltage, [24.0, 12.0])
+    np.testing.assert_allclose(conditions.duty_left, [0.25, -1.0])
+    with pytest.raises(BadData, match=r"voltage_left_V beside --battery, .* state duty_left and duty_right"):
+        records.read(path, measured=False, battery=True)
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "says"),
+    [
+        ("voltage_left_V", (3,), "column voltage_right_V is missing beside voltage_left_V; state what drives both"),
+        ("voltage_left_V,voltage_right_V,duty_left,duty_right", (3, 6, 0.5, 1), "column duty_left beside voltage_left"),
+        ("voltage_left_V,voltage_right_V,duty", (3, 6, 1), "column duty beside voltage_left_V, .* keep one"),
+        ("voltage_left_V,voltage_right_V,supply_voltage_V", (3, 13, 12), "row 2, voltage_right_V: got 13 of a supply "
+         "of 12 V; expected no more than supply_voltage_V, or no such column"),
+        ("voltage_left_V,voltage_right_V", (0, 0), "row 2: got .* nothing drives either side"),
+        ("voltage_left_V,voltage_right_V", ("", 3), "row 2, voltage_left_V: got an empty cell; expected a number, -100"),
+    ],
+)  # fmt: skip
+def test_voltages_of_the_sides_that_cannot_be_are_refused(rig, table, header, row, says):
+    sound = {"supply_voltage_V": 12, "duty": 1, "duty_left": 1, "duty_right": 1}
+    first = [sound.get(name, 6) for name in header.split(",")]
+    with pytest.raises(BadData, match=says):
+        table(f"{header},{SPEEDS}", (*first, 0, 900), (*row, 0, 900), robot=rig(DRIVEN))
 
 
 @pytest.mark.parametrize(
@@ -135,6 +226,21 @@ def test_a_table_of_turns_without_what_drives_the_sides_is_told_what_to_add(rig,
 def test_a_turn_that_nothing_drives_is_refused(rig, table, row, got):
     with pytest.raises(BadData, match=rf"turns\.csv row 2: got {got}; nothing drives either side"):
         table(f"supply_voltage_V,duty_left,duty_right,{SPEEDS}", (24, 0, 1, 0, 900), (*row, 0, 0), robot=rig(DRIVEN))
+
+
+@pytest.mark.parametrize("of_turns", ["duty_left,duty_right", "heading_deg,duty_left,duty_right", "heading_deg"])
+def test_readings_of_turns_on_a_slope_are_refused_with_what_follows_them(tmp_path, rig, table, of_turns):
+    robot, each = rig(DRIVEN), [1] * len(of_turns.split(","))
+    header = f"supply_voltage_V,slope_deg,{of_turns},{SPEEDS}"
+    rows = [(24, slope, *each, 900, 900) for slope in (0, 5, -3)]
+    with pytest.raises(
+        BadData, match=r"row 2, slope_deg: got 5 in a table of settled turns, and so in 2 of 3 .* drive"
+    ):
+        table(header, *rows, robot=robot)
+    assert len(table(header, rows[0], robot=robot)) == 1
+    path = tmp_path / "asked.csv"  # which are followed over time
+    path.write_text(f"supply_voltage_V,slope_deg,{of_turns}\n24,5,{','.join(map(str, each))}\n")
+    assert records.read(path, measured=False, robot=robot).turns
 
 
 def test_yaw_rate_in_degrees_is_converted(rig, table):
@@ -189,7 +295,7 @@ REFUSED = {
     "duties by letters": (DRIVEN, f"supply_voltage_V,duty_L,duty_R,{READ}", [(24, 1, 1, *r[2:]) for r in SOUND],
                           "column duty_L: the sides are called left and right; name it duty_left"),
     "yaw to the right": (KINEMATIC, f"{SPEEDS},{READ}", row_of(*KEEP[:4], (4, -1)),
-                         r"row 4, yaw_rate_rad_s: got -0.9 where .* are -1500 and 1500, and so in 5 of 5 rows; "
+                         r"row 4, yaw_rate_rad_s: got -0.9 where .* at -1500 and 1500 rpm, and so in 5 of 5 rows; "
                          "expected a positive one where the right side is the faster"),
     "currents exchanged": (KINEMATIC, f"{SPEEDS},{READ}", row_of(*KEEP[:2], (3, 1), (2, 1), KEEP[4]),
                            r"row 4, motor_current_left_A and motor_current_right_A: got 8 and -8 .* exchanged"),

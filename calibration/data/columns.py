@@ -18,9 +18,12 @@ if TYPE_CHECKING:
     from mmrjax.rig import Instrument
     from mmrjax.robot import Robot
 
+#: Column of what is imposed (`rig.IMPOSED`), and the SI value of its unit.
+SUPPLY, SPEED, CURRENT = "supply_voltage_V", "motor_speed_rpm", "motor_current_A"
+IMPOSED = {"voltage": (SUPPLY, 1.0), "motor_speed": (SPEED, RPM), "motor_current": (CURRENT, 1.0)}
 #: Condition columns with the least and greatest value allowed.
 CONDITIONS: dict[str, tuple[float, float]] = {
-    "supply_voltage_V": (-100.0, 100.0),  # negative: backward
+    SUPPLY: (-100.0, 100.0),  # negative: backward
     "total_mass_kg": (0.1, 500.0),
     "payload_kg": (0.0, 300.0),
     "slope_deg": (-45.0, 45.0),
@@ -36,6 +39,8 @@ DRIVING = ("duty", "mode")
 #: What a table may state of a robot whose sides are driven apart: the shares of the supply's voltage that the motors
 #: of either side get; and where it heads at the start, from uphill, positive to the left.
 SIDES: dict[str, tuple[float, float]] = {"duty_left": (-1.0, 1.0), "duty_right": (-1.0, 1.0)}
+#: The same in volts, which are read as those shares (`sides.of_volts`).
+VOLTS: dict[str, tuple[float, float]] = dict.fromkeys(("voltage_left_V", "voltage_right_V"), CONDITIONS[SUPPLY])
 #: The same where speeds are imposed.
 SPEEDS = tuple(channels.find(f"motor_speed_{side}").column for side in channels.SIDES)
 HEADING: dict[str, tuple[float, float]] = {"heading_deg": (-360.0, 360.0)}
@@ -50,9 +55,6 @@ WHEN = ("time_s", "order")
 WORDS = ("configuration", "surface", "run_id", "mode")
 #: Columns that every table of the packaged robot has to have, and those that one without measurements may lack.
 REQUIRED, OWN = ("configuration", *CONDITIONS), ("total_mass_kg",)
-#: Column of what is imposed (`rig.IMPOSED`), and the SI value of its unit.
-SUPPLY, SPEED, CURRENT = "supply_voltage_V", "motor_speed_rpm", "motor_current_A"
-IMPOSED = {"voltage": (SUPPLY, 1.0), "motor_speed": (SPEED, RPM), "motor_current": (CURRENT, 1.0)}
 #: What a column that a table may lack is then.
 DEFAULTS = {"slope_deg": 0.0, "payload_kg": 0.0, SUPPLY: 0.0}
 #: Conditions that act on a vehicle alone.
@@ -67,6 +69,7 @@ _OF_CONDITIONS = {
     "duty": Quantity("duty", units.SHARE, DUTY["duty"]),
     "duty_left": Quantity("duty_left", units.SHARE, SIDES["duty_left"]),
     "duty_right": Quantity("duty_right", units.SHARE, SIDES["duty_right"]),
+    **{name: Quantity(name.removesuffix("_V"), units.VOLTAGE, limits) for name, limits in VOLTS.items()},
     "heading_deg": Quantity("heading", units.ANGLE, HEADING["heading_deg"]),
     **{name: Quantity(name.removesuffix("_deg"), units.ANGLE, limits) for name, limits in LEVERS.items()},
 }
@@ -76,7 +79,7 @@ def ranges() -> dict[str, tuple[float, float]]:
     """Least and greatest value of every number column."""
     readings = {c.column: c.range for c in channels.EVERY}
     deviations = {c.sd_column: (0.0, c.sd_largest) for c in channels.EVERY}
-    return {**CONDITIONS, **readings, **deviations, **TIME, **DUTY, **SIDES, **HEADING, **LEVERS, **ORDER}
+    return {**CONDITIONS, **readings, **deviations, **TIME, **DUTY, **SIDES, **VOLTS, **HEADING, **LEVERS, **ORDER}
 
 
 def _of_channel(channel: Channel) -> dict[str, Quantity]:
@@ -218,7 +221,7 @@ class Layout:
         """Every column that means something."""
         driven: tuple[str, ...] = DRIVING if self.imposed == "voltage" else ()
         if self.sides:
-            driven = (*driven, *self.sides, *HEADING)
+            driven = (*driven, *self.sides, *(VOLTS if self.imposed == "voltage" else ()), *HEADING)
         if self.has_ground:
             driven = (*driven, *LEVERS)
         named = ("configuration", *self.axes, SUPPLY, *self.measured_columns, *self.deviation_columns, "surface")

@@ -53,7 +53,7 @@ def applied(runs: Runs) -> np.ndarray:
         return runs[runs.layout.imposed_column]
     voltage = runs["supply_voltage_V"] * (runs["duty"] if runs.has("duty") else 1.0)
     if runs.turns:
-        voltage = voltage * np.abs(runs.of_sides).max(0)
+        voltage = np.abs(runs.of_sides).max(0)
     return np.where(runs["mode"] == "voltage", voltage, 0.0) if runs.has("mode") else voltage
 
 

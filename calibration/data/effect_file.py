@@ -10,6 +10,7 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,9 +18,10 @@ import jax.numpy as jnp
 
 from calibration.data.errors import BadConfiguration, choices, is_number
 from mmrjax import channels, effects, params, robots
-from mmrjax.balances import BALANCES, added, moving
+from mmrjax.balances import BALANCES, ROUND, added, moving
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
+from mmrjax.effects.base import THE_SIDE
 from mmrjax.effects.contract import readable
 from mmrjax.signals import Signals, State
 
@@ -39,8 +41,17 @@ _STATED = {
     "odd_in_travel": bool,
     "movers": str,
     "memory_unit": str,
+    "driver": str,
 }
 _MOVERS = ("tracks", "wheels")
+#: What the left side of a turn has that straight travel has not; with the other sign in the mirror image.
+TURN: dict[str, Any] = {
+    "side": 1.0,
+    "yaw_rate": 0.8,
+    "speed_lateral": 0.1,
+    "direction_turn": 1.0,
+    "moment_lateral": -2.0,
+}
 
 
 def library(paths: Sequence[Path | str] = ()) -> Library:
@@ -150,15 +161,18 @@ def _check(path: Path, effect: type[Effect]) -> None:
 
 @functools.cache
 def _instants(balance: str, channel: str, configuration: int) -> tuple[Signals, Signals, Signals]:
-    """Of the nominal robot on its battery: what a term may read while it climbs, all signals of that instant, and
-    what a term may read at rest."""
+    """Of the nominal robot on its battery: what a term of the left side may read while it climbs and turns to the
+    left, all signals of that instant, and what a term may read at rest."""
     robot = robots.nominal()
     run = Conditions(configuration, slope_deg=6.0, payload=2.0, battery=1.0, discharge=100.0)
     zero = jnp.zeros(())
     climbing = State(jnp.asarray(1.5), jnp.asarray(800.0), jnp.asarray(0.6), jnp.asarray(100.0))
     rest = State(zero, zero, zero, zero)
-    climbs = readable(robot, run, climbing, balance, channel)
-    return climbs, moving(robot, run, climbing), readable(robot, run, rest, balance, channel)
+    # What is summed for the turn is summed when both sides' slip and resistance are known.
+    before = "slip" if balance in ROUND else balance
+    climbs, every = readable(robot, run, climbing, before, channel), moving(robot, run, climbing)
+    still = readable(robot, run, rest, before, channel)
+    return dataclasses.replace(climbs, **TURN), dataclasses.replace(every, **TURN), still
 
 
 def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect], size: float) -> None:
@@ -175,10 +189,12 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
         known, every, rest = (
             dataclasses.replace(s, memory=memory) for s in _instants(effect.balance, effect.channel, configuration)
         )
+        mirrored = dataclasses.replace(known, **{name: -value for name, value in TURN.items()})
         external = dataclasses.replace(known, battery=jnp.zeros(()))
         try:
             none, once, twice = (term(jnp.asarray(k * size), known) for k in (0.0, 1.0, 2.0))
             late, fed = (term(jnp.asarray(size), s) for s in (every, external))
+            other = term(jnp.asarray(size), mirrored) * (-1 if effect.balance in ROUND else 1)
             slope = jax.grad(lambda a, s=known: jnp.sum(term(a, s)))(jnp.asarray(0.0))
             at_rest = eqx.filter_grad(lambda s: jnp.sum(term(jnp.asarray(size), s)))(rest)
             kept = []
@@ -201,5 +217,11 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
             raise refuse(": rate or settled value of its memory is no finite number")
         if not all(jnp.isfinite(x).all() for x in jax.tree.leaves(at_rest)):
             raise refuse(": derivatives of its term are not finite at rest, where drive and track start")
+        alike = effect.balance == "sensor" or jnp.allclose(once, other, rtol=1e-9, atol=0.0)
+        if not alike and effect.driver != THE_SIDE:
+            raise refuse(
+                f", driver: got {effect.driver!r} of a term that is not the same on both sides; expected "
+                f'"{THE_SIDE}", so that it is known that a robot that has it does not travel straight by itself'
+            )
         if effect.needs_battery and float(fed) != 0.0:
             raise refuse(f", needs_battery: its term is {float(fed):g} on an external supply; expected 0")

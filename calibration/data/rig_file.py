@@ -265,8 +265,13 @@ def _columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
     return tuple(found)
 
 
-def needed(rig: Rig) -> tuple[str, ...]:
-    """Parameters of the drive that a robot which starts from nothing has to state."""
+def needed(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> tuple[str, ...]:
+    """Parameters that a robot which starts from nothing has to state: of the drive, and of one that turns.
+
+    Args:
+        values: of its parameters, by dotted name.
+    """
+    turns = any(name.endswith(WIDTH) and is_number(value) and value > 0 for name, value in values)
     current = {"total_current", "motor_current", "winding_temperature"} & {*rig.channels, rig.imposed}
     voltage = rig.imposed == "voltage" or "motor_voltage" in rig.channels
     hot = "winding_temperature" in rig.channels
@@ -277,6 +282,7 @@ def needed(rig: Rig) -> tuple[str, ...]:
         ("motor.resistance", voltage or hot),
         ("motor.resistance_thermal_winding", hot),
         ("motor.resistance_thermal_housing", hot),
+        (WHEELBASE, turns),
     )
     return tuple(name for name, wanted in conditions if wanted)
 

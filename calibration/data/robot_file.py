@@ -71,6 +71,7 @@ class RobotFile:
         source: path of its file, or name of a packaged robot, whose file states nothing.
         stated: names of the parameters that the file states, in place of a linear unit's those of its shaft.
         linear: configurations that it states as linear units; text: of the file.
+        remarks: sentences on what the robot is, for whoever reads numbers of it.
     """
 
     robot: Robot
@@ -78,6 +79,7 @@ class RobotFile:
     stated: frozenset[str] = frozenset()
     linear: frozenset[str] = frozenset()
     text: str = ""
+    remarks: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -201,12 +203,9 @@ def _without_parameters(
     for name in given:
         if "." not in name and name not in COUNTS:
             raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameters(name, known)}")
-    missing = [name for name in rig_file.needed(rig) if name not in given]
+    missing = [name for name in rig_file.needed(rig, given.items()) if name not in given]
     if not found.travels and "speed" in rig.channels:
         missing += [f"{name}.radius" for name in found.by_name if f"{name}.radius" not in given]
-    turns = any(given.get(f"{name}.{rig_file.WIDTH}") for name in found.by_name)
-    if turns and rig_file.WHEELBASE not in given:
-        missing.append(rig_file.WHEELBASE)
     rig_file.refuse_missing([*missing, *found.missing], known, where, given)
     return robot, sds, found.linear
 
@@ -458,8 +457,7 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
             line = f"{FACTORS} = {list(type(effect).factors)}  # sd, shape, limits: times the library's"
             tables[f"effects.{effect.name}"].append(line)
     start = {p.name: float(p.value) for p in params.walk(nothing)}
-    turns = any(p.name.endswith(rig_file.WIDTH) and float(p.value) > 0 for p in params.walk(robot))
-    needed = (*rig_file.needed(robot.rig), *([rig_file.WHEELBASE] if turns else []))
+    needed = rig_file.needed(robot.rig, ((p.name, float(p.value)) for p in params.walk(robot)))
     always = (*(f"{name}." for name in robot.configurations), "effects.")
     for parameter in params.walk(robot):
         head_, _, key = parameter.name.rpartition(".")

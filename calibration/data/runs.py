@@ -20,11 +20,13 @@ from calibration.data.columns import (
     DEFAULTS,
     DRIVEN,
     DUTY,
+    HEADING,
     SIDES,
     SPEED,
     SPEEDS,
     SUPPLY,
     TIME,
+    VOLTS,
     WHEN,
     WORDS,
     Layout,
@@ -48,7 +50,14 @@ PACKAGED = {"measured": "measured.csv", "simulated_by_paper": "simulated_by_pape
 SIGN_SDS, SIGN_SHARE = 4.0, 0.05
 
 
-def read(source: str | Path, *, measured: bool = True, battery: bool = False, robot: Robot | None = None) -> Runs:
+def read(
+    source: str | Path,
+    *,
+    measured: bool = True,
+    battery: bool = False,
+    robot: Robot | None = None,
+    of_turns: bool = False,
+) -> Runs:
     """Read a packaged table by its name, or a CSV file.
 
     Args:
@@ -58,27 +67,32 @@ def read(source: str | Path, *, measured: bool = True, battery: bool = False, ro
             or empty.
         robot: that the table is of; it says which columns are needed, and which channels it has. None: the packaged
             one; the table then has every other channel too of which it has a column.
+        of_turns: whether a table of turns has every channel of either side, and of the yaw, of which it has a column.
 
     Raises:
         BadData: no such file, nothing in it, no channel, a missing, misspelt or repeated column, a row of another
             length, or a cell that is no number, not finite or out of range; said with file, row (counted
             from 1 below the header), column, value and what is allowed.
     """
-    layout = Layout.of(robot)
+    layout, how = Layout.of(robot), {"inferred": robot is None, "of_turns": of_turns}
     if str(source) in PACKAGED:
         with resources.as_file(resources.files("calibration") / "data" / PACKAGED[str(source)]) as path:
-            runs = _read(path, str(source), measured, battery, layout, inferred=robot is None)
+            runs = _read(path, str(source), measured, battery, layout, **how)
     else:
         path = Path(source)
         if not path.exists():
             raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
-        runs = _read(path, path.name or str(source), measured, battery, layout, inferred=robot is None)
+        runs = _read(
+            path, path.name or str(source), measured, battery, layout, inferred=robot is None, of_turns=of_turns
+        )
     if robot is not None:
         contradictions.check(runs, robot)
     return runs
 
 
-def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, *, inferred: bool) -> Runs:
+def _read(
+    path: Path, name: str, measured: bool, battery: bool, layout: Layout, *, inferred: bool, of_turns: bool
+) -> Runs:
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -95,7 +109,9 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
     if repeated:
         raise BadData(f"{name}: column {repeated[0]} stands {header.count(repeated[0])} times; expected once")
     if inferred:
-        layout = _with_channels(name, header, layout)
+        layout = _with_channels(name, header, layout, channels.EVERY)
+    if of_turns and {*layout.sides, *VOLTS, *HEADING} & {m.column for m in layout.meanings(name, header) if m}:
+        layout = _with_channels(name, header, layout, channels.OF_TURNS)
     meanings = layout.meanings(name, header)
     _check_header(name, header, meanings, measured, battery, layout)
     if below := _row_of_units(name, meanings, rows[1:2]):
@@ -137,9 +153,10 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
             columns[meaning.column] = np.array(values)
     if bad:
         raise BadData(_listed(name, [said for _, _, said in sorted(bad)]))
+    notes = (*notes, *sides.of_volts(name, columns, battery))
     told = instruments.infer_instruments(layout.instruments, columns)
     stated = {i.channel for i in told}
-    unsigned = tuple(i for i in sides.magnitudes(columns, layout.sides) if measured and i.channel not in stated)
+    unsigned = tuple(i for i in sides.magnitudes(columns, layout) if measured and i.channel not in stated)
     layout = dataclasses.replace(layout, instruments=(*told, *unsigned))
     _fill(name, columns, len(rows) - 1, layout)
     _check_driving(name, columns)
@@ -149,6 +166,8 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
     if battery and layout.imposed == "voltage":
         columns[SUPPLY] = np.full(len(rows) - 1, np.nan)
     elif measured and not set(TIME) <= set(columns):  # a history may stop, and go on forwards against its motors
+        if {*layout.sides, *HEADING} & set(columns):
+            _check_level(name, columns)
         (_check_turns if set(layout.sides) & set(columns) else _check_signs)(name, columns, layout)
     if not any(column in columns for column in WHEN):
         columns["order"] = np.arange(1.0, len(rows))
@@ -244,11 +263,11 @@ def _lacks(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterato
             )
 
 
-def _with_channels(name: str, header: list[str], layout: Layout) -> Layout:
-    """`layout` with every other channel too of which a file has a column."""
+def _with_channels(name: str, header: list[str], layout: Layout, more: Sequence[Channel]) -> Layout:
+    """`layout` with those of some more channels of which a file has a column."""
     meanings = dataclasses.replace(layout, channels=channels.EVERY).meanings(name, header)
     stated = {m.column for m in meanings if m is not None}
-    found = tuple(c for c in channels.EVERY if c in layout.channels or c.column in stated)
+    found = tuple(c for c in channels.EVERY if c in layout.channels or (c in more and c.column in stated))
     return dataclasses.replace(layout, channels=found)
 
 
@@ -369,12 +388,18 @@ def _check_header(
         required = tuple(c for c in required if c != SPEED)
         if SPEED in stated:
             raise BadData(f"{name}: column {SPEED} beside {', '.join(layout.sides)}; keep one of them")
+    if stated & set(VOLTS):  # of which the supply's is the larger
+        required = tuple(c for c in required if c != SUPPLY)
     if not layout.complete and "surface" in stated:  # which says the configuration too, where it has those of one
         required = tuple(c for c in required if c != "configuration")
     for column in (c for c in (*required, *layout.measured_columns) if c not in stated):
         close = difflib.get_close_matches(column, strange, 1, 0.6)
         if column in required or (close and layout.complete):
             got = f"; is {close[0]} meant?" if close else ""
+            if column == SUPPLY and {f"motor_{volts}" for volts in VOLTS} <= {*header}:  # which may be readings too
+                got = "; what drives the sides may be stated, in the robot's file: [columns] " + ", ".join(
+                    f'{volts} = "motor_{volts}"' for volts in VOLTS
+                )
             raise BadData(
                 f"{name}: column {layout.expected(column)} is missing{got} (required: {', '.join(required)})"
                 + ("" if close else _other_names(strange, column))
@@ -430,10 +455,10 @@ def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layou
             )
         side = next((side for side in channels.SIDES if side in words(column)), None)
         turns = set(SIDES) <= set(known.values()) and not stated.isdisjoint(c.column for c in channels.OF_TURNS)
-        if side and turns and not stated & set(SIDES) and column.endswith("V"):
+        if side and turns and not stated & {*SIDES, *VOLTS} and column.endswith("V"):
             raise BadData(
-                f"{name}: column {column}: a table states shares of the supply's voltage, duty_left and "
-                f"duty_right, so duty_{side} = {column} / {SUPPLY}"
+                f"{name}: column {column}: if it is the voltage that drives the {side} side, name it "
+                f'voltage_{side}_V, or state [columns] voltage_{side}_V = "{column}" in the robot\'s file'
             )
 
 
@@ -580,6 +605,19 @@ def _check_turns(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
     if idle.size:
         got = ", ".join(f"{c} {number(columns[c][idle[0]])}" for c in (layout.imposed_column, *layout.sides))
         raise BadData(f"{name} row {idle[0] + 1}: got {got}; nothing drives either side; remove the row")
+
+
+def _check_level(name: str, columns: dict[str, np.ndarray]) -> None:
+    """Refuse readings of turns on a slope, of which none is settled."""
+    slope = columns["slope_deg"]
+    if slope.any():
+        row = int(np.flatnonzero(slope)[0])
+        more = f", and so in {np.count_nonzero(slope)} of {len(slope)} rows" if np.count_nonzero(slope) > 1 else ""
+        raise BadData(
+            f"{name} row {row + 1}, slope_deg: got {number(slope[row])} in a table of settled turns{more}; on a "
+            "slope the heading changes all the time, so that no turn is settled there: expected 0; remove such rows "
+            "(simulate --left, --right and --slope with --model drive follows one over time)"
+        )
 
 
 def _check_mass(name: str, columns: dict[str, np.ndarray]) -> None:

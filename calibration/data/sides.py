@@ -3,18 +3,84 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calibration.data.columns import DUTY, SIDES, SUPPLY, VOLTS, Layout
 from calibration.data.errors import BadData, number
-from calibration.data.table import Runs
 from mmrjax import channels
 from mmrjax.rig import Instrument
+
+if TYPE_CHECKING:
+    from calibration.data.table import Runs
 
 #: Of rows that tell: what drives the sides apart, or one backward, as a share of the most that does so [-].
 CLEAR = 0.25
 #: Fewest rows that tell, and the share of them that has to be against what is possible [-].
 FEWEST, MOSTLY = 3, 0.75
+#: By how much a side's voltage may be above the supply's, as both are written with few digits [-].
+ROUNDED = 0.01
+
+
+def driven(columns: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray:
+    """What drives the left and the right side, forward or backward by its sign: voltage [V], on a battery a share of
+    it, or speed [rpm]; shape (2, rows).
+
+    Args:
+        columns: of a table that turns.
+    """
+    alike = np.ones(len(next(iter(columns.values()))))
+    each = np.stack([columns.get(name, columns.get("duty", alike)) for name in layout.sides])
+    supply = columns.get(SUPPLY, alike) if layout.imposed == "voltage" else alike
+    return each * np.where(np.isnan(supply), 1.0, supply)
+
+
+def shares(volts: np.ndarray, supply: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """The supply's voltage [V], where none is stated the larger of both sides', and their shares of it.
+
+    Args:
+        volts: of left and right side [V], shape (2, rows); supply: shape (rows,).
+    """
+    source = np.max(np.abs(volts), 0) if supply is None else supply
+    return source, np.divide(volts, source, out=np.zeros_like(volts), where=source != 0)
+
+
+def of_volts(name: str, columns: dict[str, np.ndarray], battery: bool) -> tuple[str, ...]:
+    """Put the shares of the supply's voltage in the place of the sides' voltages that a table states.
+
+    Returns:
+        A sentence that says so; none where it states none.
+
+    Raises:
+        BadData: a battery feeds the motors, one side's is missing, shares beside, or more than the supply has.
+    """
+    stated = [c for c in VOLTS if c in columns]
+    if not stated:
+        return ()
+    if battery:
+        raise BadData(
+            f"{name}: column {stated[0]} beside --battery, whose voltage falls; state {' and '.join(SIDES)}, the "
+            "shares of it"
+        )
+    if twin := next((c for c in (*SIDES, *DUTY) if c in columns), None):
+        raise BadData(f"{name}: column {twin} beside {stated[0]}, which says how either side is driven; keep one")
+    if len(stated) == 1:
+        (other,) = {*VOLTS} - {*stated}
+        raise BadData(f"{name}: column {other} is missing beside {stated[0]}; state what drives both sides")
+    volts = np.stack([columns.pop(c) for c in VOLTS])
+    supply, parts = shares(volts, columns.get(SUPPLY))
+    beyond = np.abs(volts) > np.abs(supply) * (1 + ROUNDED)
+    if beyond.any():
+        side, row = (int(k[0]) for k in np.nonzero(beyond))
+        raise BadData(
+            f"{name} row {row + 1}, {[*VOLTS][side]}: got {number(volts[side, row])} of a supply of "
+            f"{number(supply[row])} V; expected no more than {SUPPLY}, or no such column: the supply's is then the "
+            "larger of both sides'"
+        )
+    origin = SUPPLY if SUPPLY in columns else f"{SUPPLY}, the larger of both"
+    columns |= {SUPPLY: supply, **dict(zip(SIDES, np.clip(parts, -1.0, 1.0), strict=True))}
+    return (f"{name}: {' and '.join(VOLTS)} are read as {' and '.join(SIDES)}, shares of {origin}",)
 
 
 def check(runs: Runs) -> None:
@@ -59,25 +125,28 @@ def _refuse_against(
     if told.sum() < FEWEST or against.sum() <= MOSTLY * told.sum():
         return
     row = int(np.argmax(np.where(against, np.abs(drive), -1.0)))
-    got, driven = (" and ".join(number(float(f"{x[row]:.4g}")) for x in sides) for sides in (shown, runs.of_sides))
+    got, at = (" and ".join(number(float(f"{x[row]:.4g}")) for x in sides) for sides in (shown, runs.of_sides))
+    unit = runs.layout.imposed_column.rpartition("_")[2]
     raise BadData(
-        f"{runs.source} row {row + 1}, {column}: got {got} where {' and '.join(runs.layout.sides)} are {driven}, and "
-        f"so in {against.sum()} of {told.sum()} rows; expected {expected}"
+        f"{runs.source} row {row + 1}, {column}: got {got} where left and right side are driven at {at} {unit}, "
+        f"and so in {against.sum()} of {told.sum()} rows; expected {expected}"
     )
 
 
-def magnitudes(columns: Mapping[str, np.ndarray], sides: tuple[str, ...]) -> tuple[Instrument, ...]:
+def magnitudes(columns: Mapping[str, np.ndarray], layout: Layout) -> tuple[Instrument, ...]:
     """Instruments of the sides' currents that show no sign: positive in every row in which their side is driven
     backward.
 
     Args:
-        columns: of the table; sides: those that say what drives either side.
+        columns: of the table.
     """
+    if not layout.sides or not set(layout.sides) <= set(columns):
+        return ()
     found = []
-    for side, driven in zip(channels.SIDES, sides, strict=False):
+    for side, drive in zip(channels.SIDES, driven(columns, layout), strict=True):
         channel = channels.find(f"motor_current_{side}")
-        if channel.column in columns and driven in columns:
-            drive, shown = columns[driven], columns[channel.column]
+        if channel.column in columns:
+            shown = columns[channel.column]
             back = np.isfinite(shown) & (drive < -CLEAR * np.max(np.abs(drive)))
             if back.sum() >= FEWEST - 1 and (shown[back] > 0).all() and not (shown < 0).any():
                 found.append(Instrument(channel.name, signed=False))

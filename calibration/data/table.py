@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.data import surfaces
+from calibration.data import sides, surfaces
 from calibration.data.columns import DRIVEN, DUTY, HEADING, IMPOSED, LEVERS, SUPPLY, TIME, Layout
 from calibration.data.errors import BadData, choices
 from mmrjax import channels
@@ -65,9 +65,8 @@ class Runs:
 
     @property
     def of_sides(self) -> np.ndarray:
-        """What drives the left and the right side, in the unit of `Layout.sides`, shape (2, rows); of a table with
-        `turns`."""
-        return np.stack([self.columns.get(name, np.ones(len(self))) for name in self.layout.sides])
+        """See `sides.driven`; of a table with `turns`."""
+        return sides.driven(self.columns, self.layout)
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -214,10 +213,10 @@ class Runs:
             ]
         column, factor = IMPOSED[robot.rig.imposed]
         imposed = robot.rig.imposed != "voltage"
-        sides = {name: self[name] for name in HEADING if self.has(name)}
+        apart = {name: self[name] for name in HEADING if self.has(name)}
         for side, name in zip(channels.SIDES, self.layout.sides, strict=False):
             if self.has(name):
-                sides[f"{robot.rig.imposed if imposed else 'duty'}_{side}"] = factor * self[name]
+                apart[f"{robot.rig.imposed if imposed else 'duty'}_{side}"] = factor * self[name]
         if imposed and not self.has(column):
             raise BadData(f"{self.source}: no {column}, which the robot's file says is imposed; give it in a table")
         return Conditions(
@@ -228,8 +227,8 @@ class Runs:
             battery=battery,
             discharge=discharge,
             adhesion=adhesion,
-            adhesion_lateral=lateral if sides else None,
-            **sides,
+            adhesion_lateral=lateral if apart else None,
+            **apart,
             **{name: self[name] for name in LEVERS if self.has(name)},
             total_mass=self["total_mass_kg"] if self.has("total_mass_kg") else None,
             order=self["order"] if self.has("order") else 0.0,

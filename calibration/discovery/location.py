@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any
 
 from calibration.inference import bases as bases_room
-from mmrjax.effects.base import EQUATION
+from mmrjax.effects.base import EQUATION, THE_SIDE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +53,7 @@ class DiscrepancyLocation:
         what = bases_room.in_words(self.place) if self.channel else EQUATION[self.balance]
         drivers = {"speed_motor": "speed", "current": "current" if self.balance == "electrical" else "load"}
         drivers |= {"payload": "load", "slope": "demand" if self.balance == "slip" else "slope"}
-        drivers |= {"yaw_rate": "speed", "side": "the side"}
+        drivers |= {"yaw_rate": "speed", "side": THE_SIDE}
         return f"{what} that changes with {drivers.get(variable, variable)}"
 
     def to_json(self) -> dict[str, Any]:

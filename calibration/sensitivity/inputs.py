@@ -101,19 +101,19 @@ _OTHERS = ("driver.", "rig.", "motor.resistance_thermal_", "motor.time_constant_
 
 
 def default_names(
-    robot: Robot, configurations: Sequence[str], battery: bool, model: str = "steady"
+    robot: Robot, configurations: Sequence[str], battery: bool, model: str = "steady", turns: bool = False
 ) -> tuple[str, ...]:
     """The robot's parameters that have a prior of some width, of these configurations and what all share.
 
     Left out: the battery's where it does not feed the motors, what guides carry where there are none, and what the
-    fidelity does not read.
+    fidelity does not read, in straight travel or in turns.
     """
     absent = [name for name in robot.configurations if name not in configurations]
     wheels = [name for name in configurations if float(robot.configurations[name].on_tracks) < 0.5]
     out = tuple(f"{name}." for name in absent) + (() if battery else ("battery.",))
     guides = {f"{name}.{g}" for name in wheels for g in (priors.GUIDE_SHARE, priors.GUIDE_FRICTION)}
     known = priors.known(robot)
-    left_out = {*guides, *fidelities.unread(model, known), *robot.rig.exact}
+    left_out = {*guides, *fidelities.unread(model, known, turns), *robot.rig.exact}
     if not robot.rig.inherits:  # what another robot has is none of its own
         stated = {name for name, _, _ in robot.rig.priors}
         left_out |= {name for name in known if name.startswith(_OTHERS) and name not in stated} | {*robot.rig.unknown}

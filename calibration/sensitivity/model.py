@@ -16,7 +16,7 @@ from calibration.data.errors import BadConfiguration, choices
 from mmrjax import channels, derived, fidelities
 from mmrjax import outputs as table_of_outputs
 from mmrjax.compiling import compiled
-from mmrjax.conditions import Conditions
+from mmrjax.conditions import OF_SIDES, Conditions
 from mmrjax.derived import Derived
 from mmrjax.outputs import Output
 from mmrjax.robot import Robot
@@ -61,9 +61,12 @@ def known_outputs(robot: Robot) -> dict[str, OutputRow]:
     return {o.name: o for o in rows}
 
 
-def default_outputs(robot: Robot) -> tuple[str, ...]:
+def default_outputs(robot: Robot, turns: bool) -> tuple[str, ...]:
     """Names of the outputs that are studied where none are named: every channel, and what the robot's load has."""
     beside: tuple[str, ...] = DEFAULT
+    if turns:
+        apart = {row.name for row in derived.OF_STRAIGHT}
+        return (*channels.names(robot.channels), *(n for n in DEFAULT if n not in apart), derived.OF_TURNS[0].name)
     if not robot.has_ground:
         beside = ("power_supply",)
     elif robot.rig.imposed == "motor_speed":  # that stalls on no slope
@@ -72,16 +75,26 @@ def default_outputs(robot: Robot) -> tuple[str, ...]:
     return tuple(n for n in (*channels.names(robot.channels), *beside) if robot.knows(known[n].rests_on))
 
 
-def chosen_outputs(words: tuple[str, ...], robot: Robot) -> tuple[OutputRow, ...]:
+def chosen_outputs(words: tuple[str, ...], robot: Robot, turns: bool = False) -> tuple[OutputRow, ...]:
     """The outputs of these names, the usual ones for none; `start` stands for all of the start.
 
+    Args:
+        turns: whether the robot is free to turn, with the instruments of that.
+
     Raises:
-        BadConfiguration: an unknown name; lists the choices; one of a ground or stance that the robot lacks.
+        BadConfiguration: an unknown name; lists the choices; one of a ground or stance that the robot lacks, of turns
+            where it travels straight, or of straight travel where it turns.
     """
     known, found = known_outputs(robot), []
     start = tuple(d.name for d in derived.TABLE if d.module.endswith(".start"))
-    for word in words or default_outputs(robot):
+    of_turns = {*(o.name for o in derived.OF_TURNS), *(c.name for c in channels.OF_TURNS if c.settled)}
+    for word in words or default_outputs(robot, turns):
         for name in start if word == "start" else (word,):
+            if not turns and name in of_turns and name not in channels.names(robot.channels):
+                raise BadConfiguration(
+                    f"--outputs {name}: the robot travels straight; vary what drives its sides apart, as --vary "
+                    f"{OF_SIDES[0]}=0.2:0.8"
+                )
             if name not in known:
                 raise BadConfiguration(f"--outputs {name}: no such output; {choices(name, [*known, 'start'])}")
             if (row := known[name]) in derived.OF_GROUND and not robot.has_ground:
@@ -90,6 +103,8 @@ def chosen_outputs(words: tuple[str, ...], robot: Robot) -> tuple[OutputRow, ...
                 raise BadConfiguration(
                     f"--outputs {name}: not known, as the robot's file does not state {' and '.join(lacking)}"
                 )
+            if turns and row in derived.OF_STRAIGHT:
+                raise BadConfiguration(f"--outputs {word}: of straight travel, and what varies lets the robot turn")
             if row in derived.OF_POSTURE and (why := cannot_stand(robot)):
                 raise BadConfiguration(f"--outputs {name}: {why}")
             found.append(row)

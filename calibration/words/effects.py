@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from calibration.words.experiments import ACTS, DOING
 from mmrjax.effects import OF_TURNS, Effect
+from mmrjax.effects.base import THE_SIDE
 
 #: What isolates a balance: rows of `experiments.DOING`, `weigh`, and of a channel of `sensor` rows of `ACTS`.
 ISOLATED_BY = {
@@ -20,7 +21,7 @@ VARY = {
     "load": "the load (slope or payload at one voltage)", "slope": "the slope", "weight": "the payload",
     "configuration": "the configuration", "direction": "the direction of travel",
     "demand": "the demand on adhesion (slope or payload)", "angle": "nothing: sample fast enough to see a turn",
-    "the side": "nothing: compare the sides in straight travel and in turns both ways",
+    THE_SIDE: "nothing: compare the sides in straight travel and in turns both ways",
     "position": "the position: go over the whole travel both ways at one voltage",
     "": "nothing: it is the same share everywhere",
 }  # fmt: skip

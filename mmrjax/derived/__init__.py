@@ -41,7 +41,7 @@ class Derived:
 
 
 _SLOPE, _START = "mmrjax.derived.steepest_slope", "mmrjax.derived.start"
-_POSTURE = "mmrjax.derived.posture"
+_POSTURE, _TURN = "mmrjax.derived.posture", "mmrjax.derived.turn"
 
 #: Read through the module, so that a line more is an output more everywhere.
 TABLE: tuple[Derived, ...] = (
@@ -65,10 +65,14 @@ TABLE: tuple[Derived, ...] = (
     Derived("pitch", "pitch_deg", "deg", math.pi / 180, "pitch at rest, nose up", _POSTURE, 2),
     Derived("highest_step", "highest_step_mm", "mm", 1e-3, "highest step of the posture", _POSTURE, 1),
     Derived("best_step", "best_step_mm", "mm", 1e-3, "highest step in any posture", _POSTURE, 1),
+    Derived("turning_radius", "turning_radius_mm", "mm", 1e-3, "turning radius", _TURN, 1),
 )
 #: Those of a stance, and of a robot on a ground.
 OF_POSTURE = tuple(d for d in TABLE if d.module == _POSTURE)
-OF_GROUND = (*OF_POSTURE, *(d for d in TABLE if d.module == _SLOPE))
+OF_GROUND = (*OF_POSTURE, *(d for d in TABLE if d.module in (_SLOPE, _TURN)))
+#: Those of a robot that turns alone, and of straight travel alone.
+OF_TURNS = tuple(d for d in TABLE if d.module == _TURN)
+OF_STRAIGHT = tuple(d for d in TABLE if d.module in (_SLOPE, _START))
 
 
 def names() -> tuple[str, ...]:

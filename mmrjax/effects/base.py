@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from mmrjax.conditions import Conditions
 from mmrjax.params import Scalar, parameter
@@ -30,6 +31,8 @@ EQUATION = {
     "inductance": "inductance",
     "sensor": "reading",
 }
+#: Driver of an effect that is not the same on both sides: a robot that has it does not travel straight by itself.
+THE_SIDE = "the side"
 
 
 def amplitude(*, unit: str, meaning: str, bounds: tuple[float, float], sd: float, source: str) -> Any:
@@ -50,7 +53,7 @@ class Effect(eqx.Module):
             positive term takes away: a voltage drop, a loss torque, a resisting force, a lost speed; in `mass`,
             `inertia` and `inductance` it adds, and in `sensor` it adds to the reading of `channel`.
         driver: what its term changes with: `speed`, `current`, `load`, ...; `direction` if it is the way round that
-            it is about. Effects
+            it is about, `the side` if it is not the same on both sides. Effects
             of one equation with one driver are a family: the forms of a law that data may not tell apart. Empty where
             it is the same share everywhere.
         rests_on: dotted names of parameters of the robot in proportion to which its term is, for whoever finds its
@@ -126,6 +129,11 @@ class Effect(eqx.Module):
         """Its equation and its driver, in words: `loss torque that changes with speed`."""
         what = f"reading of {cls.channel}".replace("_", " ") if cls.channel else EQUATION[cls.balance]
         return f"{what} that changes with {cls.driver}" if cls.driver else f"{what} that is the same share everywhere"
+
+    @property
+    def unlike(self) -> bool:
+        """Whether the sides of a robot that has it, its amplitude concrete, differ."""
+        return self.driver == THE_SIDE and bool(np.any(np.asarray(self.amplitude)))
 
     @property
     def acts_everywhere(self) -> bool:

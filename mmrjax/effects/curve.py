@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax import channels
-from mmrjax.effects.base import Effect, amplitude
+from mmrjax.effects.base import THE_SIDE, Effect, amplitude
 from mmrjax.effects.periodic import Periodic, phase_parameter
 from mmrjax.params import Index, Scalar, parameter
 from mmrjax.robot import Robot
@@ -143,6 +143,7 @@ def _curve(place: str, over: str) -> type[Effect]:
         name = f"curve_{place}_{over}"
         balance = "sensor" if shown else place
         channel = place if shown else ""
+        driver = THE_SIDE if over == "side" else ""
         variable: ClassVar[str] = over
         memory_size = 1.0 if over == "time" else None
         memory_unit = unit_x

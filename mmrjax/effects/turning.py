@@ -6,7 +6,7 @@ beside that library. Robot files know them, and `calibrate` frees their amplitud
 
 from __future__ import annotations
 
-from mmrjax.effects.base import Effect, amplitude
+from mmrjax.effects.base import THE_SIDE, Effect, amplitude
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
@@ -22,7 +22,7 @@ class SideFriction(Effect):
     """
 
     balance = "motor"
-    driver = "the side"
+    driver = THE_SIDE
 
     amplitude: Scalar = amplitude(
         unit="N·m",
@@ -45,7 +45,7 @@ class SideTorque(Effect):
     """
 
     balance = "motor"
-    driver = "the side"
+    driver = THE_SIDE
     rests_on = ("motor.torque_constant",)
 
     amplitude: Scalar = amplitude(
@@ -70,7 +70,7 @@ class SideVoltage(Effect):
     """
 
     balance = "electrical"
-    driver = "the side"
+    driver = THE_SIDE
 
     amplitude: Scalar = amplitude(
         unit="-",
@@ -122,7 +122,7 @@ class SideRadius(Effect):
     """
 
     balance = "slip"
-    driver = "the side"
+    driver = THE_SIDE
 
     amplitude: Scalar = amplitude(
         unit="-",

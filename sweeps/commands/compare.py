@@ -45,7 +45,7 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
     file = load_robot(config)
     stated = runs = read_runs(source, file.robot, measured=True, series=True, of_turns=True)
     if runs.turns:
-        file = dataclasses.replace(file, robot=file.robot.showing_turns(runs.layout.measured_columns))
+        file = dataclasses.replace(file, robot=file.robot.showing_turns(runs.layout.measured_columns), remarks=())
     if runs.sampled:
         return _over_time(config, file, runs, own_mass, out, force)
     robot = instruments.with_inferred_instruments(file.robot, runs)
@@ -69,7 +69,7 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
             folder.write_table(
                 "comparison.csv", comparison | {f"simulated_{key}": found.columns[key] for key in kept}
             )
-        further = {"errors": summary, "notes": notes}
+        further = {"errors": summary, "notes": [*file.remarks, *notes]}
         result = run.SimulationResult("compare", config.model, robot, runs, table, further)
         shown = page(
             "comparison", dataclasses.replace(file, robot=robot), model=config.model, data_name=runs.source,
@@ -98,7 +98,7 @@ def _over_time(
         notes = [*missing(comparison, runs.channels), *sentences((*ready.checked, *ready.begins, *ready.weighed))]
         print_comparison(comparison, summary, runs.channels, notes, sized=True)
         result = run.SimulationResult(
-            "compare", HISTORIES, ready.robot, runs, table, {"errors": summary, "notes": notes}
+            "compare", HISTORIES, ready.robot, runs, table, {"errors": summary, "notes": [*file.remarks, *notes]}
         )
         shown = page(
             "comparison", dataclasses.replace(file, robot=ready.robot), model=HISTORIES, data_name=runs.source,

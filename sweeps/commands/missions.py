@@ -24,7 +24,7 @@ from mmrjax.fidelities.mission_steps import MARKS
 from mmrjax.missions import JOULE_PER_WH
 from mmrjax.power import COULOMB_PER_MAH
 from mmrjax.profile import PAIRS
-from mmrjax.robot import Robot, cannot_turn
+from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
 from mmrjax.tables import lateral_ratio
 from sweeps import capabilities
@@ -135,8 +135,8 @@ def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> No
     """Refuse a robot that cannot turn where the profile drives its sides apart, and more than the supply has."""
     if not source.turns:
         return
-    if why := cannot_turn(robot, sorted({str(name) for name in runs.configurations_named(robot)})):
-        raise BadConfiguration(f"{source.source} drives the sides apart: {why}")
+    names = sorted({str(name) for name in runs.configurations_named(robot)})
+    imposed.check_can_turn(robot, names, f"{source.source} drives the sides apart")
     most = max((float(np.abs(source.values[name]).max()) for name in PAIRS[1] if name in source.values), default=0.0)
     supply = np.min(np.abs(source.values["voltage"] if "voltage" in source.values else runs[SUPPLY]))
     if most > supply:

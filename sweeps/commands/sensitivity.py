@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.table import Table
@@ -22,6 +24,7 @@ from calibration.sensitivity.result import METHODS, NEGLIGIBLE, Points, Sensitiv
 from calibration.sensitivity.study import Study, Supply
 from calibration.words import sensitivity as words
 from mmrjax.channels import RPM
+from mmrjax.conditions import OF_TURNS
 from mmrjax.power import COULOMB_PER_MAH
 from mmrjax.robot import Robot
 from mmrjax.tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
@@ -34,6 +37,7 @@ from sweeps.points import axes as axes_room
 from sweeps.points import grid as grid_room
 from sweeps.points import imposed
 from sweeps.points.grid import configurations, grid
+from sweeps.points.job import showing_turns
 from sweeps.points.run import refuse
 from sweeps.skeleton import leave, page
 from sweeps.store import open_folder
@@ -60,16 +64,18 @@ def sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool
     0 done; 3 done, but the solver failed at some operating points.
     """
     file = load_robot(config)
-    robot = file.robot
     if config.method not in METHODS:
         raise BadConfiguration(f"--method: got {config.method!r}; input should be one of {', '.join(METHODS)}")
-    outputs = chosen_outputs(config.outputs, robot)
     ranges = _ranges(config.vary)
+    freed = [name for name in ranges if name in OF_TURNS]
+    robot = showing_turns(file.robot, freed)
+    outputs = chosen_outputs(config.outputs, robot, bool(freed))
     runs = _operating_points(config, robot, ranges)
     inputs = _inputs(config, file, runs, ranges)
-    candidates = _candidates(config, robot, runs)
+    candidates = _candidates(config, robot, runs, bool(freed))
     conditions = runs.conditions(robot)
-    refuse(robot, conditions, config)
+    turned: dict[str, Any] = {name: np.full(len(runs), np.mean(ranges[name])) for name in freed}
+    refuse(robot, dataclasses.replace(conditions, **turned), config)
     supply = Supply(float(config.battery), config.discharge_mAh * COULOMB_PER_MAH, np.asarray(conditions.adhesion))
     study = Study(robot, inputs, Points.of(runs), outputs, config.model, config.options, supply, tell)
     with open_folder("sensitivity", config, robot, out, force, runs) as folder:
@@ -77,7 +83,9 @@ def sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool
         folder.write_json("result.json", found.to_json())
         for name, table in found.tables().items():
             folder.write_table(name, table)
-        robot_file.write(robot, folder.partial / "robot.toml", note=f"the robot of this study, from {config.robot}")
+        robot_file.write(
+            file.robot, folder.partial / "robot.toml", note=f"the robot of this study, from {config.robot}"
+        )
         print_sensitivity(found)
         manifest = {"seed": found.seed, "statuses": found.statuses}
         shown = page("sensitivity", found, file)
@@ -113,6 +121,8 @@ def _operating_points(
     table8: dict[str, tuple[float, ...]] = {}
     if layout.table8:
         table8 = CORNERS if config.method in ("sobol", "morris", "shapley") else WHOLE
+        if not set(OF_TURNS).isdisjoint(ranges):  # which settle on level ground alone
+            table8 = {**table8, "slopes_deg": (0.0,)}
     axes = {key: getattr(config, key) or table8.get(key) for key in (*WHOLE, "motor_speeds_rpm")}
     for name in ranges:
         imposed.check_acting(robot, [f"--vary {name}"] if name in axes_room.ON_GROUND else [])
@@ -154,16 +164,18 @@ def _inputs(
         if config.parameters:
             raise BadConfiguration("--posterior: says what is uncertain, and so does --parameters; give one of them")
         return room.of_posterior(robot, beside_robot(file), ranges)
-    names = config.parameters or room.default_names(robot, present, config.battery, config.model)
+    names = config.parameters or room.default_names(
+        robot, present, config.battery, config.model, not {*OF_TURNS}.isdisjoint(ranges)
+    )
     return room.of_priors(robot, names, ranges)
 
 
-def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs) -> Candidates:
-    """Runs of a table, or of Table 8 in every configuration; of a rig its operating points."""
+def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs, turns: bool) -> Candidates:
+    """Runs of a table, or of Table 8 in every configuration; of a rig, and of turns, its operating points."""
     if config.candidates:
         runs = read_runs(config.candidates, robot, measured=False)
         source = runs.source
-    elif not Layout.of(robot).table8:
+    elif turns or not Layout.of(robot).table8:
         runs, source = points, "the operating points"
     else:
         runs = grid(GridPart(surface=config.surface), robot)

@@ -83,11 +83,11 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
             uncertainty.say_lost(found)
         if len(runs) > _SHOWN:
             say(f"... and {len(runs) - _SHOWN} more in runs.csv")
-        further: dict[str, Any] = {"notes": notes}
+        further: dict[str, Any] = {"notes": [*file.remarks, *notes]}
         if stands is not None:
             folder.write_table("posture.csv", stands.table)
             say(posture_words.stands(stands))
-            notes += posture_words.remarks(stands)
+            further["notes"] += posture_words.remarks(stands)
         if histories is not None and robot.has_ground:
             further["starts"] = starts(robot, histories, runs)
         if PEAK in table:

@@ -11,6 +11,7 @@ import numpy as np
 import scipy.optimize
 from rich.table import Table
 
+from calibration.data import sides
 from calibration.data.columns import SIDES, SUPPLY
 from calibration.data.errors import BadConfiguration
 from calibration.data.table import Runs
@@ -20,13 +21,13 @@ from mmrjax.conditions import Conditions
 from mmrjax.derived import turn as derived
 from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.rest import voltage_at_rest
-from mmrjax.robot import Robot, cannot_turn
+from mmrjax.robot import Robot
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import progress, say
 from sweeps.inputs import load_robot, one_run
 from sweeps.pages import posture_words, turn_words
-from sweeps.points import run, scale
+from sweeps.points import imposed, run, scale
 from sweeps.results import posture
 from sweeps.skeleton import page
 from sweeps.store import open_folder
@@ -118,6 +119,14 @@ def _demanded(robot: Robot, asked: Conditions, runs: Runs, config: configuration
         speed, turn = (np.asarray(reading[name])[0] for name in ("speed", "yaw_rate"))
         return np.array([speed, 0.5 * width * turn]) - wanted
 
+    def at_full_voltage() -> tuple[np.ndarray, np.ndarray]:
+        """Speeds and yaw rates of settled turns with all of the supply's voltage on the side that is to be the
+        faster, from straight travel to the spot."""
+        faster = np.abs(belts) == np.abs(belts).max()
+        faster &= np.cumsum(faster) == 1  # of two, on the spot
+        reading = _with_others(robot, driven(np.where(faster, np.sign(belts) * supply, 0.0)))[0].result.reading
+        return np.asarray(reading["speed"])[1:], np.asarray(reading["yaw_rate"])[1:]
+
     alike = dataclasses.replace(asked, duty_left=None, duty_right=None)
     supply = float(np.ravel(jax.vmap(lambda c: voltage_at_rest(robot, c))(alike))[0])
     belts = wanted[0] + WIDER * wanted[1] * np.array([-1.0, 1.0])
@@ -129,16 +138,16 @@ def _demanded(robot: Robot, asked: Conditions, runs: Runs, config: configuration
         if np.abs(found.fun).max() < NEAR:  # not NaN
             break
     else:
-        raise BadConfiguration(
-            f"--speed, --yaw-rate: no settled turn of {config.speed_m_s:g} m/s and {config.yaw_rate_rad_s:g} rad/s "
-            f"was found{' on the battery' if config.battery else ''}; friction that falls with sliding may have none "
-            "there"
-        )
-    if np.abs(volts).max() > supply:
-        raise BadConfiguration(
-            f"--speed, --yaw-rate: {config.speed_m_s:g} m/s and {config.yaw_rate_rad_s:g} rad/s take "
-            f"{np.abs(volts).max():.3g} V at one motor; the supply has {supply:.3g} V"
-        )
+        volts = np.full(2, np.inf)
+    if not np.abs(volts).max() <= supply:
+        demand = f"{config.speed_m_s:g} m/s and {config.yaw_rate_rad_s:g} rad/s"
+        source = f"the {'battery' if config.battery else 'supply'} has {supply:.3g} V"
+        why = (
+            f"{demand} take {np.abs(volts).max():.3g} V at one motor" if np.isfinite(volts).all()
+            else f"no settled turn of {demand} was found"
+        )  # fmt: skip
+        reaches = turn_words.reach(config.speed_m_s, config.yaw_rate_rad_s, *at_full_voltage())
+        raise BadConfiguration(f"--speed, --yaw-rate: {why}; {source}, {reaches}")
     duties = volts / supply
     columns = {**runs.columns, **dict(zip(SIDES, duties[:, None], strict=True))}
     return driven(volts), dataclasses.replace(runs, columns=columns)
@@ -162,8 +171,7 @@ def check(robot: Robot, named: str) -> None:
     Raises:
         BadConfiguration: why.
     """
-    if why := cannot_turn(robot, (named,)):
-        raise BadConfiguration(f"--left, --right, --heading: {why}")
+    imposed.check_can_turn(robot, (named,), "--left, --right, --heading")
     if robot.rig.imposed != "voltage":
         raise BadConfiguration("--left, --right: the robot's file says that its motors are not driven by voltage")
 
@@ -175,14 +183,14 @@ def cells(config: configuration.TurnPart, given: dict[str, Any]) -> dict[str, An
         return found | {"duty_left": config.duty_left, "duty_right": config.duty_right}
     if config.left_V is None or config.right_V is None:  # those of a demand are found later
         return found | {name: 1.0 for name in SIDES}
-    most = max(abs(config.left_V), abs(config.right_V))
-    supply = given[SUPPLY] if given.get(SUPPLY) is not None else most
-    if supply < most:
+    most, supply = max(abs(config.left_V), abs(config.right_V)), given.get(SUPPLY)
+    if supply is not None and supply < most:
         raise BadConfiguration(
             f"--voltage: got {supply:g}; expected at least {most:g} V, what --left and --right ask"
         )
-    share = 1 / supply if supply else 0.0
-    return found | {SUPPLY: supply, "duty_left": config.left_V * share, "duty_right": config.right_V * share}
+    volts = np.array([config.left_V, config.right_V])
+    source, duties = sides.shares(volts, None if supply is None else np.asarray(supply))
+    return found | {SUPPLY: float(source), **dict(zip(SIDES, map(float, duties), strict=True))}
 
 
 def _channels(robot: Robot, settled: bool) -> tuple[Channel, ...]:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jinja2
 import numpy as np
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from mmrjax import __version__, channels, effects, params
 from mmrjax.channels import Channel
@@ -64,6 +64,7 @@ def named(file: RobotFile) -> dict[str, Any]:
 
     robot, name = file.robot, file.name
     known: dict[str, Any] = {"robot": name, "changed": [], "own": [], "curves": curves(robot)}
+    known["remarks"] = file.remarks
     if not robot.rig.inherits:
         return known | {"own": capabilities.parameters(file)}
     if name in ROBOTS and changed_parameters(robot, ROBOTS[name]()):
@@ -199,6 +200,7 @@ def render(
     album: Album,
     *,
     curves: Sequence[str],
+    remarks: Sequence[str] = (),
     of_channels: Iterable[Channel] = (),
     **known: Any,
 ) -> Path:
@@ -209,6 +211,7 @@ def render(
 
     Args:
         curves: of the robot that the page is about, which nobody has named (see `curves`): it warns of them.
+        remarks: sentences on the robot, of which it warns too.
         of_channels: that the page is about.
     """
     templates = resources.files("sweeps.pages") / "templates"
@@ -229,7 +232,8 @@ def render(
     known["files"] = _beside(Path(folder), words.FILES | known.get("files", {}))
     page = environment.get_template(template).render(pictures=album.pictures, **known)
     page = page.replace("<table", '<div class="scroll" tabindex="0"><table').replace("</table>", "</table></div>")
-    page = _with_contents(page, words.of_curves(curves))
+    warnings = {"curve-warning": words.of_curves(curves), "robot-warning": escape(". ".join(remarks))}
+    page = _with_contents(page, warnings)
     path = Path(folder) / "report.html"
     path.write_text(page, encoding="utf-8")
     return path
@@ -248,8 +252,8 @@ def _beside(folder: Path, meanings: dict[str, str]) -> dict[str, str]:
 _HEADING = re.compile(r"<h2(?: id=\"([^\"]+)\")?>(.*?)</h2>", re.S)
 
 
-def _with_contents(page: str, warning: str) -> str:
-    """A page with links to its headings, and a warning if there is one, before the first of them."""
+def _with_contents(page: str, warnings: Mapping[str, str]) -> str:
+    """A page with links to its headings, and what warnings there are, before the first of them."""
     links = []
 
     def with_id(found: re.Match[str]) -> str:
@@ -260,5 +264,9 @@ def _with_contents(page: str, warning: str) -> str:
 
     page = _HEADING.sub(with_id, page)
     first = page.index("<h2")
-    card = f'<div class="card warn" id="curve-warning"><span>{warning}</span></div>\n' if warning else ""
-    return f'{page[:first]}{card}<nav id="contents" aria-label="contents">{" ".join(links)}</nav>\n{page[first:]}'
+    cards = "".join(
+        f'<div class="card warn" id="{name}"><span>{warning}</span></div>\n'
+        for name, warning in warnings.items()
+        if warning
+    )
+    return f'{page[:first]}{cards}<nav id="contents" aria-label="contents">{" ".join(links)}</nav>\n{page[first:]}'

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from mmrjax.channels import MM, SIDES
+from mmrjax.derived.turn import NONE
 from mmrjax.robot import Robot
+from mmrjax.signals import NOT_SETTLED, STATUSES, Result
+from mmrjax.simulation import STRAIGHT
 from mmrjax.turning import BETWEEN, OVER
 from sweeps import capabilities
 from sweeps.pages import words
@@ -35,6 +40,54 @@ class Turn:
     notes: list[str]
 
 
+def unlike(name: str, effects: Sequence[str], turns: str) -> str:
+    """Of a robot whose sides differ by some effects, which runs that say nothing of either side do not show."""
+    return f"{name}: {STRAIGHT} ({', '.join(effects)}); {turns}"
+
+
+def by_itself(robot: Robot, found: Result, value: float) -> str:
+    """How a robot turns whose sides are driven alike, by its configurations; empty where none does.
+
+    Args:
+        value: what is imposed [V, rpm].
+    """
+    imposed, states = ("rpm", "motor_speed_left_rpm and motor_speed_right_rpm") if (
+        robot.rig.imposed == "motor_speed"
+    ) else ("V", "--left and --right, or duty_left and duty_right")  # fmt: skip
+    rates, speeds = (np.asarray(found.reading[channel]) for channel in ("yaw_rate", "speed"))
+    each = zip(robot.configurations, rates, speeds, np.asarray(found.status), strict=True)
+    told = [
+        f"{name} {words.STATUSES[STATUSES[int(status)]].short}" if not math.isfinite(rate)
+        else f"{name} by {abs(rate):.3g} rad/s to the {SIDES[int(rate < 0)]} at {speed:.3g} m/s ahead"
+        for name, rate, speed, status in each
+        if not abs(rate) < NONE
+    ]  # fmt: skip
+    alike = f"driven alike, {value:g} {imposed} on level ground"
+    return f"{alike}, it turns: {'; '.join(told)} ({states} show it)" if told else ""
+
+
+def reach(speed: float, rate: float, speeds: np.ndarray, rates: np.ndarray) -> str:
+    """Why a turn is not found: what is reached at full voltage, or that friction has none there.
+
+    Args:
+        speed: demanded [m/s]; rate: demanded yaw rate [rad/s].
+        speeds, rates: of settled turns at full voltage, from straight travel to the spot, NaN where there is none.
+    """
+    known = np.isfinite(speeds) & np.isfinite(rates)
+    if not known.any():
+        return "and with all of that no turn settles"
+    ahead, round_ = np.abs(speeds[known]), np.abs(rates[known])
+    most_rate = np.interp(abs(speed), ahead[::-1], round_[::-1], right=math.nan)
+    most_speed = np.interp(abs(rate), round_, ahead, right=math.nan)
+    if most_rate >= abs(rate):
+        return "which would do; friction that falls with sliding may have none there"
+    told = [f"about {most_rate:.3g} rad/s at {abs(speed):g} m/s"] if speed and math.isfinite(most_rate) else []
+    told += [f"about {most_speed:.3g} m/s at {abs(rate):g} rad/s"] if math.isfinite(most_speed) else []
+    told += [f"no more than {ahead.max():.3g} m/s, straight"] if not math.isfinite(most_rate) else []
+    told += [f"no more than {round_.max():.3g} rad/s, on the spot"] if not math.isfinite(most_speed) else []
+    return f"with which it reaches {' and '.join(told)}"
+
+
 def turn(robot: Robot, row: Mapping[str, Any], ended: Mapping[str, float] | None) -> Turn:
     """A turn in words.
 
@@ -44,7 +97,8 @@ def turn(robot: Robot, row: Mapping[str, Any], ended: Mapping[str, float] | None
     """
     status, known = str(row["status"]), math.isfinite(float(row["yaw_rate_rad_s"]))
     going = known and status in ("converged", "not_settled")
-    answer = _moves(row) if going else f"{status}: {words.STATUSES[status].why}"
+    unsettled = ended is None and status == STATUSES[NOT_SETTLED]
+    answer = _moves(row) if going else f"{status}: {words.NO_TURN if unsettled else words.STATUSES[status].why}"
     if ended is not None and going:
         answer = (
             f"After {ended['time_s']:g} s: {ended['displacement_m']:.2f} m from the start, turned by "

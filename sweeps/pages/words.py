@@ -162,6 +162,10 @@ OUTCOMES = {
 }
 
 
+#: Why a settled turn has no value where none was found.
+NO_TURN = "no settled turn, as where friction falls with sliding; simulate --model drive follows it over time"
+
+
 def why(outcome: str) -> str:
     """In one line why a quantity has no value."""
     return STATUSES[outcome].why if outcome in STATUSES else OUTCOMES[outcome]

@@ -74,6 +74,14 @@ def default(robot: Robot, option: str) -> float:
     return most if robot.rig.imposed == "voltage" else _digits(most)
 
 
+def usual(robot: Robot) -> float:
+    """What an example has imposed, `default` where the file states a limit [V, rpm]."""
+    try:
+        return default(robot, "")
+    except BadConfiguration:
+        return float(SAID[robot.rig.imposed].one)
+
+
 def levels(robot: Robot, option: str, notes: list[str] | None = None) -> tuple[float, ...]:
     """What a grid has imposed where nothing is stated: a third, two thirds and all of the limit, or Table 8's.
 
@@ -158,6 +166,16 @@ def check_on_ground(robot: Robot, command: str) -> None:
         )
 
 
+def check_can_turn(robot: Robot, names: Iterable[str], where: str) -> None:
+    """Refuse a robot that cannot turn in some of these configurations.
+
+    Raises:
+        BadConfiguration: opens with `where`, and says why.
+    """
+    if why := cannot_turn(robot, names):
+        raise BadConfiguration(f"{where}: {why}")
+
+
 def check_turning(robot: Robot, stated: Collection[str], names: Iterable[str], where: str) -> None:
     """Refuse conditions that free a robot to turn which cannot, or that leave open what drives a side.
 
@@ -166,7 +184,6 @@ def check_turning(robot: Robot, stated: Collection[str], names: Iterable[str], w
     """
     if not (freed := [name for name in OF_TURNS if name in stated]):
         return
-    if why := cannot_turn(robot, names):
-        raise BadConfiguration(f"{where}, {freed[0]}: {why}")
+    check_can_turn(robot, names, f"{where}, {freed[0]}")
     if why := sides_contradict(stated):
         raise BadConfiguration(f"{where}, {why}")

@@ -13,6 +13,7 @@ from calibration.data.requirements import Requirements
 from calibration.sizing import sheet
 from calibration.sizing.sheet import Change, Outcome
 from mmrjax.robot import Robot
+from mmrjax.signals import NOT_SETTLED, STATUSES
 from mmrjax.tables import COULOMB_PER_MAH
 from sweeps.pages import words
 from sweeps.results.posture import Drawn
@@ -81,11 +82,11 @@ def wanted(outcome: Outcome) -> str:
 
 def reached(outcome: Outcome) -> str:
     """The value with its unit, or why there is none."""
-    return (
-        words.why(outcome.status)
-        if outcome.value is None
-        else f"{rounded(outcome.value)} {outcome.requirement.quantity.unit}"
-    )
+    quantity = outcome.requirement.quantity
+    if outcome.value is not None:
+        return f"{rounded(outcome.value)} {quantity.unit}"
+    no_turn = quantity.group == "turn" and outcome.status == STATUSES[NOT_SETTLED]
+    return words.NO_TURN if no_turn else words.why(outcome.status)
 
 
 def shortfall(outcome: Outcome) -> str:

@@ -23,6 +23,7 @@ from calibration.inference.observers.histories import Histories
 from calibration.inference.observers.settled import SettledLinearization, SettledRuns, shares
 from calibration.inference.problem import Observation
 from mmrjax import effects, fidelities
+from mmrjax.balances import ROUND
 from mmrjax.compiling import compiled
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import IN_TURNS, VARIABLES_ROUND, WAYS
@@ -33,8 +34,6 @@ from mmrjax.signals import NOT_SETTLED, Signals
 
 #: Variables of curves in turns; the order of runs is the table's.
 VARIABLES = (*(v for v in IN_TURNS if v != "order"), *VARIABLES_ROUND)
-#: Balances that act round the turn; the others along the motion of the shafts of a side.
-ROUND = ("lateral", "yaw")
 
 
 def by_point(signals: Signals, name: str) -> Float[Array, " points"]:
