@@ -25,7 +25,7 @@ DRIVE = {
     "motor.friction_coulomb": 2e-3, "motor.friction_viscous": 1e-6, "motor.inertia": 2e-6, "motor.inductance": 1e-3,
 }  # fmt: skip
 SAMPLES = np.linspace(0, 2, 201)
-TIMES = grid(SAMPLES, np.arange(0, 2, 0.5))
+TIMES = grid(SAMPLES, np.arange(0, 2, 0.5), change=(1e-5, 0.04))
 VOLTAGE = np.where(TIMES % 1.0 < 0.5, 6.0, -6.0)
 
 

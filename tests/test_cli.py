@@ -607,7 +607,7 @@ def test_configuration_has_what_applies_to_its_command_alone():
     assert "model" in told[config.Calibrate] and not told[config.Calibrate] & {"duration_s", "battery", "chunk"}
     assert not told[config.Compare] & {"battery", "discharge_mAh", "chunk", "slopes_deg"}
     assert "model" not in config.as_toml(config.resolve(config.Loop, None, {"seed": 1}))
-    with pytest.raises(BadConfiguration, match=r"--model: no such key"):
+    with pytest.raises(BadConfiguration, match=r"^model: no such key"):
         config.resolve(config.Loop, None, {"model": "steady"})
 
 

@@ -314,7 +314,7 @@ def test_a_run_may_last_a_day(mmrjax):
     code, _, err = mmrjax("simulate", "--model", "drive", "--duration", "86401")
     assert code == 2 and "86400" in err
     code, _, err = mmrjax("simulate", "--model", "track", "--duration", "3601")
-    assert code == 2 and "duration_s: got 3601; model track takes at most 3600 s" in err
+    assert code == 2 and "--duration: got 3601; --model track takes at most 3600 s" in err
 
 
 def test_remarks_name_the_run_they_are_of():

@@ -147,7 +147,7 @@ def test_a_parameter_that_is_set_is_known(tmp_path):
 
 def test_a_study_of_what_is_unknown_is_refused(tmp_path):
     robot = read(tmp_path, BENCH, "motor_speed")
-    assert default_outputs(robot) == ("output_torque",)
+    assert default_outputs(robot, False) == ("output_torque",)
     with pytest.raises(BadConfiguration, match=r"power_supply: not known, as .* does not state motor\.resistance$"):
         chosen_outputs(("power_supply",), robot)
 

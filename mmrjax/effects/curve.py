@@ -26,6 +26,7 @@ BALANCES = {
 #: The same of a robot that turns alone.
 ROUND = {"yaw": ("N·m", 0.5, "direction_turn")}
 #: Channels to whose readings a curve may be added, likewise; an instrument's error of 1 % of its range is plausible.
+#: None to a heading, the channel `yaw`: that is the balance.
 READINGS = {
     c.name: (
         c.unit_si or c.unit,
@@ -33,6 +34,7 @@ READINGS = {
         "direction_turn" if c in channels.OF_TURNS and c.side is None else "direction",
     )
     for c in channels.EVERY
+    if c.name not in {**BALANCES, **ROUND}
 }
 PLACES = {**BALANCES, **ROUND, **READINGS}
 #: Variables of a curve, signals that every one of these balances knows, the time since the start of the run and the

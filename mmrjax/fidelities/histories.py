@@ -39,8 +39,10 @@ _GAMMA = 1 - 0.5**0.5
 #: units of the unknowns (10 A, 1000 rad/s, 1 m/s).
 NEWTON, SOLVED = 30, 1e-9
 #: The first step [s] and the growth of steps with the time since [1/s · s]: after the start of a robot that may slide
-#: on its ground, and after what drives a run changes by its largest value, or a shaft starts; the longest step [s].
-START, CHANGE, LONGEST = (1e-5, 0.02), (1e-4, 0.3), 2.5e-3
+#: on its ground, and after what drives a run changes by its largest value, or a shaft starts.
+START, CHANGE = (1e-5, 0.02), (1e-4, 0.3)
+#: The latter where a backlash is crossed; and the longest step [s].
+LOOSE, LONGEST = (1e-5, 0.08), 2.5e-3
 #: Most steps of a run that LONGEST may ask for; a longer run has longer steps.
 STEPS = 8000
 #: More current at which its rate shows how soon it follows its voltage [10 A].
@@ -55,20 +57,22 @@ def grid(
     sizes: Float[np.ndarray, " changes"] | None = None,
     longest: float | Float[np.ndarray, " intervals"] = LONGEST,
     start: tuple[float, float] = START,
+    change: tuple[float, float] = CHANGE,
 ) -> np.ndarray:
     """Instants from 0 to the last of `times` [s], `times` and `changes` among them.
 
     Args:
-        changes: instants at which what drives the motors changes [s]; sizes: by what share of its largest value: the
-            smaller a change, the longer is the first step after it.
+        changes: instants at which what drives the motors changes [s]; sizes: by what share of its largest value, of
+            which 1 is usual: the smaller a change, the longer is the first step after it.
         longest: step, where `STEPS` allow it [s]; an array: of each interval between `times`.
-        start: the first step and the growth of steps after the start.
+        start, change: the first step and the growth of steps after the start and after changes.
     """
     last = float(np.max(times, initial=0.0))
-    changes, sizes = (np.zeros(0) if x is None else np.asarray(x, float) for x in (changes, sizes))
+    changes = np.zeros(0) if changes is None else np.asarray(changes, float)
+    sizes = np.ones(len(changes)) if sizes is None else np.asarray(sizes, float)
     inside = (changes > 0) & (changes < last)
-    begins, first = np.append(0.0, changes[inside]), np.append(start[0], CHANGE[0] / sizes[inside])
-    grows = np.append(start[1], np.full(inside.sum(), CHANGE[1]))
+    begins, first = np.append(0.0, changes[inside]), np.append(start[0], change[0] / sizes[inside])
+    grows = np.append(start[1], np.full(inside.sum(), change[1]))
     given, times = times, np.unique(np.concatenate([begins, np.asarray(times, float)]))
     longest = np.broadcast_to(np.maximum(longest, last / STEPS), max(len(given) - 1, 1))
     longest = longest[np.clip(np.searchsorted(given, times[:-1], side="right") - 1, 0, len(longest) - 1)]
@@ -218,9 +222,10 @@ def _stage(
         matrix, value = jax.jacfwd(lambda y: (left(y),) * 2, has_aux=True)(y)
         step = solved(matrix, value)
         # Over a kink of the friction law full steps can swing to and fro for ever.
-        tried = y - jnp.array([0.3, 1.0], y.dtype)[:, None] * step
+        tried = y - jnp.array([0.1, 0.4, 1.0], y.dtype)[:, None] * step
         over = jnp.max(jnp.abs(jax.vmap(left)(tried)), 1)
-        return count + 1, jnp.where(over[0] < over[1], tried[0], tried[1]), jnp.min(over)
+        best = jnp.where(over[0] < over[1], tried[0], tried[1])
+        return count + 1, jnp.where(over[2] <= jnp.min(over), tried[2], best), jnp.min(over)
 
     def going(state: tuple[Array, Array, Array]) -> Array:
         return (state[0] < NEWTON) & (state[2] > SOLVED)

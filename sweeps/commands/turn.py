@@ -33,7 +33,7 @@ from sweeps.skeleton import page
 from sweeps.store import open_folder
 
 #: Duties of the inner side, as shares of the outer one's, over which a settled turn is shown.
-SHARES = np.linspace(1.0, -1.0, 25)
+SHARES = np.linspace(1.0, -1.0, 97)
 #: Channels of a turn, beside the robot's own.
 SHOWN = tuple(c.name for c in channels.OF_TURNS)
 

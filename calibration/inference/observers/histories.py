@@ -60,6 +60,7 @@ from mmrjax.fidelities.drive import rates, state_of
 from mmrjax.fidelities.histories import (
     CHANGE,
     LONGEST,
+    LOOSE,
     START,
     STEPS,
     Followed,
@@ -238,8 +239,9 @@ class Histories(Observer):
             np.minimum.reduceat(h, np.flatnonzero(n)[:-1])
             for h, n in zip(_longest(runs, robot.rig), noted, strict=True)
         ]
+        change = LOOSE if robot.loose else CHANGE
         grids = [
-            grid(whole["time_s"][rows[n]], *c, h, START if robot.has_ground else CHANGE)
+            grid(whole["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change)
             for rows, n, c, h in zip(every, noted, _changes(whole, every, robot.rig), steps, strict=True)
         ]
         # The last instant begins a step, of no length, as every other does.
