@@ -45,7 +45,12 @@ def load_robot(config: RobotPart) -> RobotFile:
     for note in (*notes, *unlike):
         tell(note)
     resolves = isinstance(config, FidelityPart) and fidelities.facts(config.model).resolves
-    if resolves and robot.has_ground and not capabilities.states(robot, "running_gear."):
+    runs = (
+        robot.has_ground
+        and robot.rig.imposed == "voltage"
+        and all(c.inertia > 0 for _, c in robot.configurations.items())
+    )
+    if resolves and runs and not capabilities.states(robot, "running_gear."):  # else the model itself is refused
         tell("the robot's file states no running_gear: wheelbase, belt and masses within are those of an example")
     return dataclasses.replace(file, robot=robot, remarks=unlike)
 
