@@ -135,7 +135,7 @@ def test_rig_check_says_what_of_a_battery_is_an_examples(tmp_path):
 def test_a_fidelity_that_resolves_the_running_gear_says_where_it_is_an_examples(tmp_path, capsys, kept, said):
     read(tmp_path, kept.partition("[rover.turning]")[0] + kept.partition("inertia = 0.2\n")[2], "voltage", DRIVEN)
     for model in ("steady", "track"):
-        load_robot(Simulate(robot=str(tmp_path / "rig.toml"), set=("rover.inertia=0.001",), model=model))
+        load_robot(Simulate(robot=str(tmp_path / "rig.toml"), set={"rover.inertia": 0.001}, model=model))
         assert ("are those of an example" in capsys.readouterr().err) == (said and model == "track")
 
 

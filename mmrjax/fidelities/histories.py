@@ -172,11 +172,12 @@ class _Step(eqx.Module):
     ) -> Float[Array, "rates ..."]:
         """Rates of the current where it starts: before what drives the current jumps, after that, and with a little
         more current, which tells how soon it follows; none where no lag follows. Before a run its current rests."""
-        held = self.held(constant)
         if self.before is None:
-            return jnp.zeros((0, *rate(y, held).shape))
-        rested = self.begun * rate(y, eqx.combine(self.before, constant))
-        return jnp.stack([rested, rate(y, held), rate(y + MORE * _current(y), held)])
+            return jnp.zeros((0, *rate(y, self.held(constant)).shape))
+        changing = jax.tree.map(lambda before, now: jnp.stack([before, now, now]), self.before, self.now)
+        at = jnp.stack([y, y, y + MORE * _current(y)])
+        found = jax.vmap(lambda y, now: rate(y, eqx.combine(now, constant)))(at, changing)
+        return found * jnp.reshape(jnp.stack([self.begun, 1.0, 1.0]), (3, *[1] * (found.ndim - 1)))
 
 
 def _steps(conditions: Conditions, times: Float[Array, " times"]) -> tuple[_Step, Conditions]:
@@ -535,11 +536,13 @@ def within(
 
     def one(y: Array, after: Array, step: _Step, then: Conditions) -> Within:
         held = step.held(constant)
-        first = shown(held, y)
         if step.before is None:  # what is imposed is on a line itself
+            first = shown(held, y)
             return Within(first, first, shown(eqx.combine(then, constant), after), jnp.zeros(()))
         lag, current = _lag_of(robot, constant, step, y), _current(y)
-        begin, end = shown(held, y - lag.begin * current), shown(held, after - lag.end * current)
+        at = jnp.stack([y, y - lag.begin * current, after - lag.end * current])
+        found = jax.vmap(lambda y: jax.tree.map(jnp.asarray, shown(held, y)))(at)
+        first, begin, end = (jax.tree.map(lambda x, k=k: x[k], found) for k in range(3))
         return Within(first, begin, end, lag.decay * step.length)
 
     return jax.vmap(one)(*each)
