@@ -290,7 +290,7 @@ def test_steps_follow_the_rows_of_a_log_whose_input_changes_at_each(tmp_path, mo
     runs = records.read(table, robot=robot)
     made = observers.kind(runs).of(runs, robot)
     shown = np.asarray(made(robot).reading)
-    monkeypatch.setattr(integrator, "CHANGE", (1e-6, 0.02))
+    monkeypatch.setattr(histories_room, "CHANGE", (1e-6, 0.1))
     monkeypatch.setattr(histories_room, "FINE", 256)
     fine = observers.kind(runs).of(runs, robot)
     exact = np.asarray(fine(robot).reading)
