@@ -205,8 +205,15 @@ def _lag(rate: Float[Array, " rates"], h: Array) -> Lag:
     return Lag(begin, means, begin * jnp.exp(-decay * h), decay)
 
 
+def _windings(
+    robot: Robot, constant: Conditions, step: _Step, y: Float[Array, " unknowns"]
+) -> Float[Array, " rates"]:
+    """What the lag of a step follows from."""
+    return step.rates_at_start(constant, lambda y, held: winding(robot, held, y), y)
+
+
 def _lag_of(robot: Robot, constant: Conditions, step: _Step, y: Float[Array, " unknowns"]) -> Lag:
-    return _lag(step.rates_at_start(constant, lambda y, held: winding(robot, held, y), y), step.length)
+    return _lag(_windings(robot, constant, step, y), step.length)
 
 
 def _stage(
@@ -284,11 +291,7 @@ def followed(
         one = jnp.eye(len(end), dtype=end.dtype)
         current = _current(end)
 
-        def at_start(y: Array) -> tuple[Array, Array]:
-            rate = step.rates_at_start(constant, lambda y, held: winding(robot, held, y), y)
-            return rate, rate
-
-        by_begin, rate = jax.jacfwd(at_start, has_aux=True)(begin)
+        by_begin, rate = jax.jacfwd(lambda y: (_windings(robot, constant, step, y),) * 2, has_aux=True)(begin)
         by_rate, lag = jax.jacfwd(lambda r: (_lag(r, step.length),) * 2, has_aux=True)(rate)
         off_rest = jnp.where(late[:, None], end - lag.end * current, begin - lag.begin * current)
         places = jnp.where(passes, off_rest, found) + lag.means[:, None] * current

@@ -755,14 +755,9 @@ def _changes(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[tuple[np.ndar
     # An imposed speed takes the current with it; what is on lines does not jump; what is not known is refused later.
     known = rig.imposed != "motor_speed" and rig.between_rows == "held" and np.isfinite(driven).all() and driven.any()
     coasts = runs["mode"] == "coast" if runs.has("mode") else np.zeros(len(runs), bool)
-    found = []
+    driven, found = driven if known else np.zeros(len(runs)), []
     for rows in each:
-        sizes = (
-            np.abs(np.diff(driven[rows])) / max(np.abs(driven[rows]).max(), 1e-300)
-            if known
-            else np.zeros(len(rows) - 1)
-        )
-        sizes = np.maximum(sizes, coasts[rows][1:] != coasts[rows][:-1])
+        sizes = np.maximum(_jumps(driven[rows]), coasts[rows][1:] != coasts[rows][:-1])
         found.append((time[rows[1:]][sizes > 0], sizes[sizes > 0]))
     return found
 
