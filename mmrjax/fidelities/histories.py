@@ -114,13 +114,11 @@ class Followed(eqx.Module):
     each stage, and `lags` times the changes of the rates of the current that its lag follows from.
 
     Attributes:
-        states: unknowns at both stages of every step, without lags, shape (steps, 2, unknowns).
         begins, ends: unknowns at the beginning and end of every step, shape (steps, unknowns).
-        places: where the equations are made linear; clock: when a step begins, and when it is there [s], shape
-            (steps, 3).
+        places: where the equations are made linear, at both stages, shape (steps, 2, unknowns); clock: when a step
+            begins, and when it is there [s], shape (steps, 3).
     """
 
-    states: Float[Array, "steps 2 unknowns"]
     begins: Float[Array, "steps unknowns"]
     ends: Float[Array, "steps unknowns"]
     places: Float[Array, "steps 2 unknowns"]
@@ -312,7 +310,7 @@ def followed(
 
     each = at[:-1], ends, found, spans, late, through.any, through.turns, steps
     places, carries, gains, lags = _of_steps(jax.lax.map(jax.vmap(linear), _in_blocks(each)), len(h))
-    return Followed(found, at[:-1], ends, places, clock, carries, gains, lags)
+    return Followed(at[:-1], ends, places, clock, carries, gains, lags)
 
 
 @eqx.filter_custom_jvp
@@ -320,10 +318,11 @@ def _ends(
     robot: Robot,
     conditions: Conditions,
     times: Float[Array, " times"],
-    known: tuple[Array, Array],
+    known: tuple[Array | None, Array],
     along: Followed | None,
 ) -> Array:
-    """Unknowns at the end of every step, of states that are known, with their derivatives by the robot."""
+    """Unknowns at the end of every step, of states that are known (or how they are followed, `along`), with their
+    derivatives by the robot."""
     return known[1]
 
 
@@ -486,7 +485,7 @@ def _nodes(
 ) -> Float[Array, "times unknowns"]:
     """Unknowns at every instant."""
     still = jax.lax.stop_gradient(robot)
-    found = states(still, conditions, times) if known is None else (known.states, known.ends)
+    found = states(still, conditions, times) if known is None else (None, known.ends)
     ends = _ends(robot, conditions, times, found, known)
     return jnp.concatenate([at_first(robot, conditions)[1][None], ends])
 
