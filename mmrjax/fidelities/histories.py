@@ -35,9 +35,12 @@ from mmrjax.signals import Signals
 T = TypeVar("T")
 
 _GAMMA = 1 - 0.5**0.5
-#: Most Newton steps of a stage, which starts where the last one ended, and what its equations may leave in the
-#: units of the unknowns (10 A, 1000 rad/s, 1 m/s).
-NEWTON, SOLVED = 30, 1e-9
+#: Most evaluations of a stage's equations, whose search starts where the last one ended, and what they may leave in
+#: the units of the unknowns (10 A, 1000 rad/s, 1 m/s).
+NEWTON, SOLVED = 60, 1e-9
+#: Shares of a Newton step that are tried until one leaves less: over a kink of the friction law full steps can swing
+#: to and fro for ever.
+SHARES = (1.0, 0.4, 0.1)
 #: The first step [s] and the growth of steps with the time since [1/s · s]: after the start of a robot that may slide
 #: on its ground, and after what drives a run changes by its largest value, or a shaft starts.
 START, CHANGE = (1e-5, 0.02), (1e-4, 0.3)
@@ -214,6 +217,25 @@ def _lag_of(robot: Robot, constant: Conditions, step: _Step, y: Float[Array, " u
     return _lag(_windings(robot, constant, step, y), step.length)
 
 
+class _Search(eqx.Module):
+    """A Newton search.
+
+    Attributes:
+        count: evaluations so far.
+        at: where the equations are next looked at; error: what they left where they were looked at last.
+        begin, step: the place from which the search goes, and the Newton step there; tried: which of `SHARES` of it.
+        least: what is left at `begin`.
+    """
+
+    count: Array
+    at: Float[Array, " unknowns"]
+    error: Float[Array, ""]
+    begin: Float[Array, " unknowns"]
+    step: Float[Array, " unknowns"]
+    tried: Int[Array, ""]
+    least: Float[Array, ""]
+
+
 def _stage(
     robot: Robot, conditions: Conditions, known: Array, guess: Array, h: Array, mean: Array, decay: Array
 ) -> Array:
@@ -223,21 +245,25 @@ def _stage(
     def left(y: Array) -> Array:
         return y - known - _GAMMA * h * rates(robot, conditions, y + mean)
 
-    def newton(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        count, y, _ = state
-        matrix, value = jax.jacfwd(lambda y: (left(y),) * 2, has_aux=True)(y)
-        step = solved(matrix, value)
-        # Over a kink of the friction law full steps can swing to and fro for ever.
-        tried = y - jnp.array([0.1, 0.4, 1.0], y.dtype)[:, None] * step
-        over = jnp.max(jnp.abs(jax.vmap(left)(tried)), 1)
-        best = jnp.where(over[0] < over[1], tried[0], tried[1])
-        return count + 1, jnp.where(over[2] <= jnp.min(over), tried[2], best), jnp.min(over)
+    def turn(search: _Search) -> _Search:
+        """Equations at a place, and the next place."""
+        matrix, value = jax.jacfwd(lambda y: (left(y),) * 2, has_aux=True)(search.at)
+        error = jnp.max(jnp.abs(value))
+        back = ~(error < search.least) & (search.tried < len(SHARES) - 1)
+        tried = jnp.where(back, search.tried + 1, 0)
+        begin = jnp.where(back, search.begin, search.at)
+        step = jnp.where(back, search.step, -solved(matrix, value))
+        at = jnp.where(error <= SOLVED, search.at, begin + jnp.asarray(SHARES, begin.dtype)[tried] * step)
+        return _Search(search.count + 1, at, error, begin, step, tried, jnp.where(back, search.least, error))
 
-    def going(state: tuple[Array, Array, Array]) -> Array:
-        return (state[0] < NEWTON) & (state[2] > SOLVED)
+    def going(search: _Search) -> Array:
+        return (search.count < NEWTON) & ((search.error > SOLVED) | (search.tried > 0))
 
-    _, y, error = jax.lax.while_loop(going, newton, (jnp.asarray(0), guess, jnp.asarray(jnp.inf, guess.dtype)))
-    return jnp.where(error <= SOLVED, y, jnp.nan)
+    far = jnp.asarray(jnp.inf, guess.dtype)
+    last = jnp.asarray(len(SHARES) - 1)
+    begun = _Search(jnp.asarray(0), guess, far, guess, jnp.zeros_like(guess), last, far)
+    found = jax.lax.while_loop(going, turn, begun)
+    return jnp.where(found.error <= SOLVED, found.at, jnp.nan)
 
 
 def states(
@@ -331,7 +357,7 @@ def _response(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     """With a robot's parameters, which are moved."""
     (robot, conditions, times, known, along), moved = primals, tangents[0]
     along = followed(robot, conditions, times, known) if along is None else along
-    begin = None
+    begin = jnp.zeros_like(along.begins[0])
     if robot.rig.begins is not None:
         begin = eqx.filter_jvp(lambda r: at_first(r, conditions)[1], (robot,), (moved,))[1]
 
@@ -347,7 +373,7 @@ def respond(
     along: Followed,
     source: Callable[[Array, Array, Conditions], Array],
     seen: Callable[[Array, Array, Array, Conditions], Array],
-    begin: Array | None = None,
+    begin: Array,
 ) -> Array:
     """What small changes of the rates do to a run.
 
@@ -355,7 +381,7 @@ def respond(
         conditions: as of `histories`; along: the run.
         source: (time, state, conditions) → change of the rates there, shape (unknowns, ...).
         seen: (time, state, its change, conditions) → what is kept of the change at the end of every step.
-        begin: change of the state at the first instant; None: none.
+        begin: change of the state at the first instant.
 
     Sources of a block's steps are computed side by side; one after another is left only a product a step.
     """
@@ -379,11 +405,8 @@ def respond(
         whole = jax.vmap(lambda t, y, dy, changing: seen(t, y, dy, eqx.combine(changing, constant)))
         return last, whole(along.clock[:, 2], along.ends, changes, then)
 
-    changing, _ = _in_time(conditions)
-    of_first = eqx.combine(jax.tree.map(lambda x: x[0], changing), constant)
-    still = jnp.zeros_like(source(along.clock[0, 0], along.begins[0], of_first)) if begin is None else begin
-    each = along, steps, jax.tree.map(lambda x: x[1:], changing)
-    return _of_steps(jax.lax.scan(block, still, _in_blocks(each))[1], len(along.clock))
+    each = along, steps, jax.tree.map(lambda x: x[1:], _in_time(conditions)[0])
+    return _of_steps(jax.lax.scan(block, begin, _in_blocks(each))[1], len(along.clock))
 
 
 def _in_blocks(of_steps: T) -> T:
@@ -446,7 +469,8 @@ def _jump(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) ->
     of rest moves by -1 / f⁻ (Filippov systems; Leine and Nijmeijer 2004, Section 7.3); 0 where it does not pass."""
     edge, along = _edge(robot, conditions)
     way = jnp.sign(y[MOTOR])
-    before, after = (rates(robot, conditions, y + (side * edge - y[MOTOR]) * along) for side in (-way, way))
+    sides = jnp.stack([-way, way])
+    before, after = jax.vmap(lambda side: rates(robot, conditions, y + (side * edge - y[MOTOR]) * along))(sides)
     passes = before[MOTOR] * after[MOTOR] > 0
     return jnp.where(passes, (after - before) / jnp.where(passes, before[MOTOR], 1.0), 0.0)
 

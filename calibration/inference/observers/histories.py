@@ -409,8 +409,9 @@ class Histories(Observer):
                 return jnp.tensordot(by_state, dy, 1) + at_once[:, :, None] * hat(t)
 
             first, begins = at_first(robot, conditions)
-            changed = respond(conditions, along, source, seen)
-            still = seen(clock[0], begins, jnp.zeros_like(source(clock[0], begins, first)), first)
+            unmoved = jnp.zeros((len(begins), len(probes), len(clock)))
+            changed = respond(conditions, along, source, seen, unmoved)
+            still = seen(clock[0], begins, unmoved, first)
             whole = jnp.concatenate([still[None], changed])
             return jnp.moveaxis(whole[instants], (0, 1), (2, 3))  # probes, knots, samples, channels
 
@@ -578,13 +579,17 @@ class Histories(Observer):
 
         wide, points = jnp.concatenate([z, jnp.zeros(len(effects))]), max(len(e.at) for e in effects)
 
+        @jax.jit  # traced once for both that ask
+        def runs_at(point: Array) -> Followed | None:
+            return self.following(at(point, wide)).known
+
         def along(_: Followed, point: Array) -> tuple[Followed | None, tuple[Array, Array]]:
-            known = self.following(at(point, wide))
-            posed = dataclasses.replace(problem, observe=known)
-            return known.known, posed.linearised(lambda x: at(point, x), wide, data)[:2]
+            known = runs_at(point)
+            posed = dataclasses.replace(problem, observe=dataclasses.replace(self, known=known))
+            return known, posed.linearised(lambda x: at(point, x), wide, data)[:2]
 
         # Runs of many steps are large: kept are those at the first point, the last that is looked at.
-        one = jax.eval_shape(lambda: self.following(at(jnp.asarray(0), wide)).known)
+        one = jax.eval_shape(runs_at, jnp.asarray(0))
         nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), one)
         first, (r, slopes) = jax.lax.scan(along, nothing, jnp.arange(points), reverse=True)
         size, shown = z.size, data.measured.size
