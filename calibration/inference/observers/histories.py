@@ -56,7 +56,7 @@ from mmrjax.compiling import OVER_TIME, compiled
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import WAYS
-from mmrjax.fidelities.drive import rates, state_of
+from mmrjax.fidelities.drive import moving, rates, state_of
 from mmrjax.fidelities.histories import (
     CHANGE,
     LONGEST,
@@ -403,7 +403,7 @@ class Histories(Observer):
                 """By the state, and at once: the current follows from torque where the speed is imposed."""
 
                 def reading(y: Array, amplitude: Array) -> Array:
-                    return _reading(robot, balances.moving(probed(amplitude), held, state_of(robot, y)))
+                    return _reading(robot, moving(probed(amplitude), held, state_of(robot, y)))
 
                 by_state, at_once = jax.jacfwd(reading, (0, 1))(y, none)
                 return jnp.tensordot(by_state, dy, 1) + at_once[:, :, None] * hat(t)
