@@ -134,11 +134,10 @@ class Posterior:
 
 def write(posterior: Posterior, path: Path | str) -> None:
     """Write a posterior as NetCDF 3, which `xarray.open_dataset` reads with units and long names."""
-    import xarray as xr
+    from scipy.io import netcdf_file
 
-    p = posterior
-    names = ("coordinate",)
-    columns = {
+    p, square = posterior, ("coordinate", "coordinate_2")
+    numbers = {
         "mean": (p.mean, "of z"),
         "location": (p.location, "u at z = 0, the parameter or its logarithm"),
         "spread": (p.spread, "du/dz"),
@@ -147,21 +146,34 @@ def write(posterior: Posterior, path: Path | str) -> None:
         "softness": (p.softness, "width over which bounds are rounded off, as a share of the spread"),
         "value": (p.at(p.mean)[: len(p)], "parameter at the mean [SI]"),
         "sd": (p.sd[: len(p)], "standard deviation of the parameter, to first order [SI]"),
+        "covariance": (p.covariance, "covariance of z"),
     }
-    data: dict[str, Any] = {
-        key: (names, np.asarray(x, float), {"long_name": words}) for key, (x, words) in columns.items()
-    }
-    square = ("coordinate", "coordinate_2")
-    data["covariance"] = (square, np.asarray(p.covariance, float), {"long_name": "covariance of z"})
-    data["kind"] = (names, np.asarray(p.kinds, "S16"), {"long_name": "transformation of u"})
-    data["units"] = (names, np.asarray([u.encode() for u in p.units]), {"long_name": "of the parameter"})
-    if p.tied:
-        data["tied"] = (("follower",), np.asarray([t[0].encode() for t in p.tied]), {"long_name": "follows another"})
-        data["tied_to"] = (("follower",), np.asarray([t[1] for t in p.tied], np.int32), {"long_name": "its index"})
-        data["tied_ratio"] = (("follower",), np.asarray([t[2] for t in p.tied]), {"long_name": "ratio to that"})
-    coordinates = {"coordinate": np.asarray([n.encode() for n in p.coordinates])}
-    about = {"schema": SCHEMA, "title": "posterior of a calibrated robot, normal in z: u = location + spread z"}
-    xr.Dataset(data, coordinates, about).to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
+    with netcdf_file(path, "w", version=2) as file:
+        file.schema = SCHEMA
+        file.title = "posterior of a calibrated robot, normal in z: u = location + spread z"
+
+        def put(name: str, values: Any, kind: str, dimensions: tuple[str, ...], words: str | None) -> None:
+            values = np.asarray(values, kind)
+            if kind == "S":  # texts are rows of letters
+                dimensions = (*dimensions, f"string{values.itemsize}")
+                values = values.view("S1").reshape(len(values), -1)
+            for dimension, size in zip(dimensions, values.shape, strict=True):
+                if dimension not in file.dimensions:
+                    file.createDimension(dimension, size)
+            variable = file.createVariable(name, values.dtype, dimensions)
+            variable[:] = values
+            if words is not None:
+                variable.long_name = words
+
+        put("coordinate", [n.encode() for n in p.coordinates], "S", square[:1], None)
+        for name, (values, words) in numbers.items():
+            put(name, values, "f8", square[: np.ndim(values)], words)
+        put("kind", [k.encode() for k in p.kinds], "S", square[:1], "transformation of u")
+        put("units", [u.encode() for u in p.units], "S", square[:1], "of the parameter")
+        if p.tied:
+            put("tied", [t[0].encode() for t in p.tied], "S", ("follower",), "follows another")
+            put("tied_to", [t[1] for t in p.tied], "i4", ("follower",), "its index")
+            put("tied_ratio", [t[2] for t in p.tied], "f8", ("follower",), "ratio to that")
 
 
 def read(path: Path | str) -> Posterior:
