@@ -24,6 +24,7 @@ from calibration.data.runs import Runs
 from calibration.discovery.reach import LOADED, RUNNING
 from mmrjax import channels, params, robots
 from mmrjax.balances import BALANCES, absent, added
+from mmrjax.compiling import OVER_TIME, compiled
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.effects.scaled import amplitude_of, scaled, shape_of
@@ -130,6 +131,7 @@ def _steady(robot: Robot, conditions: Conditions) -> Conditions:
     return jax.tree.map(lambda x: x if jnp.ndim(x) < 2 else x[:, x.shape[1] // 2], conditions)
 
 
+@functools.partial(compiled, options=OVER_TIME)
 def _signals(robot: Robot, conditions: Conditions) -> Signals:
     return jax.vmap(lambda c: operating_signals(robot, c))(conditions)
 
