@@ -35,12 +35,9 @@ from mmrjax.signals import Signals
 T = TypeVar("T")
 
 _GAMMA = 1 - 0.5**0.5
-#: Most evaluations of a stage's equations, whose search starts where the last one ended, and what they may leave in
-#: the units of the unknowns (10 A, 1000 rad/s, 1 m/s).
-NEWTON, SOLVED = 60, 1e-9
-#: Shares of a Newton step that are tried until one leaves less: over a kink of the friction law full steps can swing
-#: to and fro for ever.
-SHARES = (1.0, 0.4, 0.1)
+#: Most Newton steps of a stage, which starts where the last one ended, and what its equations may leave in the
+#: units of the unknowns (10 A, 1000 rad/s, 1 m/s).
+NEWTON, SOLVED = 30, 1e-9
 #: The first step [s] and the growth of steps with the time since [1/s · s]: after the start of a robot that may slide
 #: on its ground, and after what drives a run changes by its largest value, or a shaft starts.
 START, CHANGE = (1e-5, 0.02), (1e-4, 0.3)
@@ -217,25 +214,6 @@ def _lag_of(robot: Robot, constant: Conditions, step: _Step, y: Float[Array, " u
     return _lag(_windings(robot, constant, step, y), step.length)
 
 
-class _Search(eqx.Module):
-    """A Newton search.
-
-    Attributes:
-        count: evaluations so far.
-        at: where the equations are next looked at; error: what they left where they were looked at last.
-        begin, step: the place from which the search goes, and the Newton step there; tried: which of `SHARES` of it.
-        least: what is left at `begin`.
-    """
-
-    count: Array
-    at: Float[Array, " unknowns"]
-    error: Float[Array, ""]
-    begin: Float[Array, " unknowns"]
-    step: Float[Array, " unknowns"]
-    tried: Int[Array, ""]
-    least: Float[Array, ""]
-
-
 def _stage(
     robot: Robot, conditions: Conditions, known: Array, guess: Array, h: Array, mean: Array, decay: Array
 ) -> Array:
@@ -245,25 +223,21 @@ def _stage(
     def left(y: Array) -> Array:
         return y - known - _GAMMA * h * rates(robot, conditions, y + mean)
 
-    def turn(search: _Search) -> _Search:
-        """Equations at a place, and the next place."""
-        matrix, value = jax.jacfwd(lambda y: (left(y),) * 2, has_aux=True)(search.at)
-        error = jnp.max(jnp.abs(value))
-        back = ~(error < search.least) & (search.tried < len(SHARES) - 1)
-        tried = jnp.where(back, search.tried + 1, 0)
-        begin = jnp.where(back, search.begin, search.at)
-        step = jnp.where(back, search.step, -solved(matrix, value))
-        at = jnp.where(error <= SOLVED, search.at, begin + jnp.asarray(SHARES, begin.dtype)[tried] * step)
-        return _Search(search.count + 1, at, error, begin, step, tried, jnp.where(back, search.least, error))
+    def newton(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        count, y, _ = state
+        matrix, value = jax.jacfwd(lambda y: (left(y),) * 2, has_aux=True)(y)
+        step = solved(matrix, value)
+        # Over a kink of the friction law full steps can swing to and fro for ever.
+        tried = y - jnp.array([0.1, 0.4, 1.0], y.dtype)[:, None] * step
+        over = jnp.max(jnp.abs(jax.vmap(left)(tried)), 1)
+        best = jnp.where(over[0] < over[1], tried[0], tried[1])
+        return count + 1, jnp.where(over[2] <= jnp.min(over), tried[2], best), jnp.min(over)
 
-    def going(search: _Search) -> Array:
-        return (search.count < NEWTON) & ((search.error > SOLVED) | (search.tried > 0))
+    def going(state: tuple[Array, Array, Array]) -> Array:
+        return (state[0] < NEWTON) & (state[2] > SOLVED)
 
-    far = jnp.asarray(jnp.inf, guess.dtype)
-    last = jnp.asarray(len(SHARES) - 1)
-    begun = _Search(jnp.asarray(0), guess, far, guess, jnp.zeros_like(guess), last, far)
-    found = jax.lax.while_loop(going, turn, begun)
-    return jnp.where(found.error <= SOLVED, found.at, jnp.nan)
+    _, y, error = jax.lax.while_loop(going, newton, (jnp.asarray(0), guess, jnp.asarray(jnp.inf, guess.dtype)))
+    return jnp.where(error <= SOLVED, y, jnp.nan)
 
 
 def states(
