@@ -41,6 +41,11 @@ def test_an_effect_is_explained_by_what_its_class_states(unsimulated):
         assert "on a bench" in lines and list(words_of.tests(effect))
 
 
+def test_an_effect_of_ones_own_may_go_with_anything():
+    own = type("Damp", (effects.BY_NAME["churning"],), {"driver": "humidity"})
+    assert list(words_of.tests(own))[-1] == "Vary the humidity"
+
+
 def test_a_typical_size_is_simulated(robot):
     """0.5 ohm in series take 0.5 V/A · I of 24 V less what drives: the motors slow down by that."""
     changes = list(explain._changes(effects.BY_NAME["series_resistance"]()))

@@ -69,4 +69,5 @@ def tests(effect: type[Effect]) -> Iterator[str]:
                 shafts="the motor shafts",
             )
             yield f"{text[0].upper()}{text[1:].rstrip(',')}, at several voltages"
-    yield f"Vary {VARY[effect.driver]}" + ("; from rest, over time" if effect.transient else "")
+    what = VARY.get(effect.driver, f"the {effect.driver}")  # one's own may go with anything
+    yield f"Vary {what}" + ("; from rest, over time" if effect.transient else "")
