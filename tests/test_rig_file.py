@@ -290,6 +290,18 @@ def test_wheels_lose_nothing_that_is_not_stated_and_tracks_have_to_state_it(tmp_
         read(tmp_path, ROVER.replace('load = "vehicle"', 'movers = "tracks"'))
 
 
+def test_wheels_whose_inertia_is_not_stated_are_disks_of_a_share_of_the_mass(tmp_path):
+    """Over time a shaft without any would have no law, and runs of such a robot `failed`."""
+    robot = read(tmp_path, ROVER)
+    assert float(robot.configurations["rover"].inertia) == pytest.approx(0.5 * 0.05 * 4.0 * 0.04**2 / 2, rel=1e-12)
+    assert same(again(tmp_path, robot), robot)
+    (tmp_path / "rover.toml").write_text(ROVER, encoding="utf-8")
+    found = {o.name: o for o in rig_facts.origins(robot_file.parse(tmp_path / "rover.toml"))}
+    assert found["rover.inertia"].why == "not stated: assumed, wheels that are disks of 5 % of the mass"
+    stated = read(tmp_path, ROVER.replace("radius = 0.04", "radius = 0.04\ninertia = 0.003"))
+    assert float(stated.configurations["rover"].inertia) == 0.003
+
+
 def test_a_robot_that_turns_states_its_wheelbase_and_is_written_with_it(tmp_path):
     turns = f"{ROVER}[rover.turning]\nwidth = 0.3\ninertia = 0.2\n"
     with pytest.raises(BadConfiguration, match=r"running_gear\.wheelbase \[m\] is missing, which a robot with base"):

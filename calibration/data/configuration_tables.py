@@ -90,7 +90,7 @@ def loads(base: Robot | None, content: dict[str, Any], sds: dict[str, float], wh
         if kind in ("linear", "shaft"):
             by_name[name], lacking = _shaft(table)
         elif base is None:
-            by_name[name], lacking = _vehicle(table, here)
+            by_name[name], lacking = _vehicle(table, here, _sides(content, base))
         else:
             by_name[name], lacking = _chassis(base, name, table, here), []
         if lacking and base is not None:
@@ -160,7 +160,7 @@ def _shaft(table: Mapping[str, Any]) -> tuple[Shaft, list[str]]:
     return Shaft(inertia=0.0, loss_coulomb=0.0), missing
 
 
-def _vehicle(table: dict[str, Any], where: str) -> tuple[Chassis, list[str]]:
+def _vehicle(table: dict[str, Any], where: str, sides: float) -> tuple[Chassis, list[str]]:
     """A vehicle that starts from nothing, before the parameters that its table states, and those that it should."""
     if "movers" not in table:
         raise BadConfiguration(
@@ -176,8 +176,7 @@ def _vehicle(table: dict[str, Any], where: str) -> tuple[Chassis, list[str]]:
         radius=0.0,
         inertia=0.0,
     )
-    static = table.get("ground", {}).get("friction", {}) if isinstance(table.get("ground", {}), dict) else {}
-    known = rig_file.vehicle_defaults(on_tracks > 0.5, static.get("static") if isinstance(static, dict) else None)
+    known = rig_file.vehicle_defaults(on_tracks > 0.5, table, sides)
     missing = [p.name for p in params.walk(nothing) if p.name not in known and not _states(table, p.name)]
     return params.replace(nothing, {name: params.as_float(value) for name, value in known.items()}), missing
 

@@ -266,8 +266,8 @@ def _default(name: str, rest: str) -> str:
         return rig_file.CENTRE_WHY
     if name in rig_file.DEFAULTS:
         return rig_file.DEFAULTS[name][1]
-    if rest == rig_file.DYNAMIC:
-        return rig_file.DYNAMIC_WHY
+    if rest in rig_file.FOLLOWS:
+        return rig_file.FOLLOWS[rest]
     if rest in rig_file.VEHICLE:
         return rig_file.VEHICLE[rest][1]
     return "not stated: travel is the angle" if rest == "radius" else "not stated: none"

@@ -51,7 +51,6 @@ WINDING = 2e-4
 WINDING_WHY = f"not stated: assumed, {1e3 * WINDING:g} ms of the resistance"
 #: The same of a vehicle, below its configuration.
 VEHICLE: dict[str, tuple[float, str]] = {
-    "inertia": (0.0, "not stated: what turns with a wheel is small beside the mass"),
     "track.loss_coulomb": (0.0, "not stated: wheels lose nothing beside rolling"),
     "track.loss_viscous": (0.0, "not stated: no loss that rises with speed"),
     "track.guide_friction": (0.0, "not stated: nothing rubs on a guide"),
@@ -70,7 +69,14 @@ CENTRE, CENTRE_WHY = "running_gear.centre_height", "not stated: an example's; in
 #: Those of VEHICLE that tracks have to state.
 _OF_TRACKS = ("track.loss_coulomb",)
 DYNAMIC = "ground.friction.dynamic"
-DYNAMIC_WHY = f"not stated: assumed, {DYNAMIC_SHARE:g} of static"
+#: Share of a vehicle's mass that turns with its wheels, as disks, where none is stated: over time a shaft has to have
+#: an inertia, and beside the mass this is small.
+WHEELS = 0.05
+#: Why those of a vehicle that follow from what it states are what they are.
+FOLLOWS = {
+    DYNAMIC: f"not stated: assumed, {DYNAMIC_SHARE:g} of static",
+    "inertia": f"not stated: assumed, wheels that are disks of {100 * WHEELS:g} % of the mass",
+}
 
 
 def linear(table: dict[str, Any], name: str, where: str, sds: dict[str, float], sides: float) -> None:
@@ -137,14 +143,22 @@ def _shaft(at: Mapping[str, float], sides: float) -> dict[str, float]:
     }
 
 
-def vehicle_defaults(on_tracks: bool, static: Any) -> dict[str, float]:
+def vehicle_defaults(on_tracks: bool, table: Mapping[str, Any], sides: float) -> dict[str, float]:
     """What a vehicle that starts from nothing has where its file says nothing.
 
     Args:
-        static: friction that its file states; no number where it states none.
+        table: that its file states of it; sides: drives that move it together.
     """
+
+    def stated(*keys: str) -> float:
+        at: Any = table
+        for key in keys:
+            at = at.get(key) if isinstance(at, Mapping) else None
+        return float(at) if is_number(at) else 0.0  # what is no number is refused later
+
     found = {name: value for name, (value, _) in VEHICLE.items() if not (on_tracks and name in _OF_TRACKS)}
-    return found | {DYNAMIC: DYNAMIC_SHARE * static if isinstance(static, int | float) else 0.0}
+    wheels = 0.5 * WHEELS * stated("mass") * stated("radius") ** 2 / sides
+    return found | {DYNAMIC: DYNAMIC_SHARE * stated(*DYNAMIC.split(".")[:-1], "static"), "inertia": wheels}
 
 
 def rig(content: dict[str, Any], where: str, loads: Sequence[str], *, travels: bool, inherits: bool) -> Rig:
