@@ -24,9 +24,9 @@ HEAVY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "diffrax", "matplot
 FRONT_DOOR = ("sweeps/__init__.py", "sweeps/cli.py")
 
 
-@functools.lru_cache(maxsize=4)
+@functools.lru_cache(maxsize=10_000)  # of a module and of all functions in it
 def walked(tree: ast.AST) -> list[ast.AST]:
-    """Every node of a module, which all rules go through."""
+    """Every node of a module, which all rules go through, or of a part of one."""
     return list(ast.walk(tree))
 
 
@@ -78,10 +78,11 @@ def prose(tree: ast.Module) -> set[int]:
         elif isinstance(node, ast.Constant) and isinstance(node.value, str) and len(node.value.split()) > 3:
             found.add(id(node))
         elif isinstance(node, ast.keyword) and node.arg in ("help", "description", "meaning", "epilog", "source"):
-            found |= {id(n) for n in ast.walk(node.value)}
+            found |= {id(n) for n in walked(node.value)}
     return found
 
 
+@functools.lru_cache(maxsize=1)
 def places(tree: ast.Module) -> dict[int, str]:
     """Id of every node → name of the function, class or variable at the top of the module that it is in."""
     found = {}
@@ -92,7 +93,7 @@ def places(tree: ast.Module) -> dict[int, str]:
             name = ast.unparse(top.targets[0] if isinstance(top, ast.Assign) else top.target).strip("()")
         else:
             name = ""
-        found |= {id(n): name for n in ast.walk(top)}
+        found |= {id(n): name for n in walked(top)}
     return found
 
 
@@ -118,7 +119,7 @@ def layers_import_those_before_them(path: PurePosixPath, tree: ast.Module) -> It
             [n for n in tree.body if not (isinstance(n, ast.If) and "TYPE_CHECKING" in ast.unparse(n.test))], []
         )
     place, above = places(tree), LAYERS[LAYERS.index(layer) + 1 :]
-    for node in ast.walk(tree):
+    for node in walked(tree):
         named = (
             isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.partition(".")[0] in above
         )
@@ -183,8 +184,8 @@ def observers_alone_know_the_kind_of_data(path: PurePosixPath, tree: ast.Module)
         if isinstance(node, ast.Call):
             called = ast.unparse(node.func)
             if called in ("isinstance", "issubclass") and len(node.args) == 2:
-                asked = {n.id for n in ast.walk(node.args[1]) if isinstance(n, ast.Name)}
-                asked |= {n.attr for n in ast.walk(node.args[1]) if isinstance(n, ast.Attribute)}
+                asked = {n.id for n in walked(node.args[1]) if isinstance(n, ast.Name)}
+                asked |= {n.attr for n in walked(node.args[1]) if isinstance(n, ast.Attribute)}
                 if asked & OBSERVERS:
                     yield node.lineno, "asks for the class of an observer"
             if called.endswith(".has") and any(
@@ -200,7 +201,7 @@ def observers_alone_know_the_kind_of_data(path: PurePosixPath, tree: ast.Module)
         if isinstance(node, ast.Name) and node.id == "is_series":
             yield node.lineno, "asks for is_series"
     for test in _conditions(tree):
-        for node in ast.walk(test):
+        for node in walked(test):
             if isinstance(node, ast.Constant) and node.value == "time_s":
                 yield node.lineno, "a condition on time_s"
 
@@ -228,9 +229,9 @@ def channels_are_counted_in_one_place(path: PurePosixPath, tree: ast.Module) -> 
     for node in walked(tree):
         if id(node) in inner or not isinstance(node, ast.Tuple | ast.List | ast.Set | ast.Dict):
             continue
-        strings = [n.value for n in ast.walk(node) if isinstance(n, ast.Constant) and isinstance(n.value, str)]
+        strings = [n.value for n in walked(node) if isinstance(n, ast.Constant) and isinstance(n.value, str)]
         if len({spelled[s] for s in strings if s in spelled}) > 1:
-            inner |= {id(n) for n in ast.walk(node)}
+            inner |= {id(n) for n in walked(node)}
             if (path.as_posix(), place[id(node)]) not in SPELLED:
                 yield node.lineno, "spells several channels"
 
@@ -400,7 +401,7 @@ def modules_keep_no_state(path: PurePosixPath, tree: ast.Module) -> Iterator[Bre
 
 
 def _rebound(function: Function) -> set[str]:
-    return {name for n in ast.walk(function) if isinstance(n, ast.Global) for name in n.names}
+    return {name for n in walked(function) if isinstance(n, ast.Global) for name in n.names}
 
 
 #: Rooms that compute, and most words of a string of theirs; what is said in more is said in `calibration/words`.
@@ -429,20 +430,20 @@ def of_errors(tree: ast.Module) -> set[int]:
     found, called = set[int](), set[str]()
     functions = [n for n in walked(tree) if isinstance(n, ast.FunctionDef)]
     for function in functions:
-        inside = list(ast.walk(function))
+        inside = list(walked(function))
         made = [
             n
             for n in inside
             if isinstance(n, ast.Raise) or (isinstance(n, ast.Call) and ast.unparse(n.func).startswith("Bad"))
         ]
-        taken = [n for error in made for n in ast.walk(error)]
+        taken = [n for error in made for n in walked(error)]
         names = {n.id for n in taken if isinstance(n, ast.Name)}
         for n in inside:
             if isinstance(n, ast.Assign) and {t.id for t in n.targets if isinstance(t, ast.Name)} & names:
-                taken += ast.walk(n.value)
+                taken += walked(n.value)
         found |= {id(n) for n in taken}
         called |= {ast.unparse(n.func) for n in taken if isinstance(n, ast.Call)}
-    return found | {id(n) for function in functions if function.name in called for n in ast.walk(function)}
+    return found | {id(n) for function in functions if function.name in called for n in walked(function)}
 
 
 def names_are_nouns(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
@@ -490,6 +491,7 @@ def violations(root: Path) -> list[str]:
             path = PurePosixPath(file.relative_to(root).as_posix())
             tree = ast.parse(file.read_text(encoding="utf-8"))
             found += [f"{path}:{line}: {what}" for rule in RULES for line, what in sorted(rule(path, tree))]
+            walked.cache_clear()
     return found
 
 
