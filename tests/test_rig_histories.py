@@ -77,6 +77,29 @@ def history(tmp_path, robot, truth, columns, sd, seed):
     return write(shown / factor + noise)
 
 
+def test_the_speed_at_which_a_run_begins_moves_with_the_robot(tmp_path):
+    """Where a speed is imposed a run begins at it, and what moves with the shafts at what the robot makes of it."""
+    cart = '[cart]\nload = "linear"\nmass_kg = 3.0\nlead_mm = 5.0\n'
+    path = tmp_path / "rig.toml"
+    path.write_text(DRIVE.format(imposed="motor_speed", channels='"speed"', start="rest") + cart)
+    robot, times = robot_file.load(str(path)), jnp.array([0.0, 0.1, 0.2])
+    given = Conditions(motor_speed=100.0, motor_acceleration=0.0)
+    names = ("cart.radius", "gearbox.ratio")
+    values = {p.name: float(p.value) for p in params.walk(robot) if p.name in names}
+
+    @jax.jit
+    def slopes(shares):
+        def speed(shares):
+            changed = {name: values[name] * share for name, share in zip(names, shares, strict=True)}
+            return integrator.histories(params.replace(robot, changed), given, times).speed
+
+        return speed(shares), jax.jacfwd(speed)(shares)
+
+    speed, slope = slopes(jnp.ones(2))
+    np.testing.assert_allclose(speed, 100.0 / 16 * 0.005 / (2 * np.pi), rtol=1e-9)
+    np.testing.assert_allclose(slope, speed[:, None] * np.array([1.0, -1.0]), rtol=1e-9)  # v = r ω / i
+
+
 @pytest.mark.slow
 def test_a_delay_of_the_imposed_speed_is_found(tmp_path):
     path = tmp_path / "rig.toml"

@@ -331,14 +331,15 @@ def _response(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     """With a robot's parameters, which are moved."""
     (robot, conditions, times, known, along), moved = primals, tangents[0]
     along = followed(robot, conditions, times, known) if along is None else along
-    begin = jnp.zeros_like(along.begins[0])
-    if robot.rig.begins is not None:
-        begin = eqx.filter_jvp(lambda r: at_first(r, conditions)[1], (robot,), (moved,))[1]
+
+    def change(of: Callable[[Robot], Array]) -> Array:
+        value, moves = eqx.filter_jvp(of, (robot,), (moved,))
+        return jnp.zeros_like(value) if moves is None else moves
 
     def source(_: Array, y: Array, held: Conditions) -> Array:
-        change = eqx.filter_jvp(lambda r: rates(r, held, y), (robot,), (moved,))[1]
-        return jnp.zeros_like(y) if change is None else change
+        return change(lambda r: rates(r, held, y))
 
+    begin = change(lambda r: at_first(r, conditions)[1])
     return known[1], respond(conditions, along, source, lambda t, y, dy, _: dy, begin)
 
 
