@@ -105,6 +105,21 @@ def test_what_drives_a_run_is_that_of_the_log(drive):
     np.testing.assert_allclose(few.time, some["time_s"], atol=1e-12)
 
 
+def test_a_slope_that_changes_between_readings_acts_from_its_row_on():
+    """Rows are a little off their clock, or the steps between readings would meet them by themselves."""
+    whole = log(1)
+    row = np.round(whole["time_s"] / EVERY).astype(int)
+    time = EVERY * (row + np.where(row > 0, 0.2 * np.random.default_rng(7).random(ROWS)[row], 0.0))
+    whole = dataclasses.replace(whole, columns={**whole.columns, "time_s": time})
+    read = set((thinned(whole, 40)["time_s"] / EVERY).astype(int))
+    change = next(k for k in range(100, ROWS) if not read & {k - 1, k, k + 1})
+    columns = {**whole.columns, "slope_deg": np.where(row < change, 0.0, 5.0)}
+    few = Histories.of(thinned(dataclasses.replace(whole, columns=columns), 40), robots.nominal())
+    times, slopes, at = np.asarray(few.times[0]), np.asarray(few.conditions.slope[0]), time[row == change]
+    np.testing.assert_allclose(np.rad2deg(slopes), np.where(times < at - 1e-9, 0.0, 5.0), atol=1e-9)
+    assert np.abs(times - at).min() < 1e-9
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("drive", DRIVES)
 def test_a_run_shows_what_it_shows_in_the_whole_log(drive):
