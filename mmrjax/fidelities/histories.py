@@ -332,8 +332,8 @@ def _response(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     (robot, conditions, times, known, along), moved = primals, tangents[0]
     along = followed(robot, conditions, times, known) if along is None else along
 
-    def change(of: Callable[[Robot], Array]) -> Array:
-        value, moves = eqx.filter_jvp(of, (robot,), (moved,))
+    def change(law: Callable[[Robot], Array]) -> Array:
+        value, moves = eqx.filter_jvp(law, (robot,), (moved,))
         return jnp.zeros_like(value) if moves is None else moves
 
     def source(_: Array, y: Array, held: Conditions) -> Array:
