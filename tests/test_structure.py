@@ -430,7 +430,7 @@ def of_errors(tree: ast.Module) -> set[int]:
     found, called = set[int](), set[str]()
     functions = [n for n in walked(tree) if isinstance(n, ast.FunctionDef)]
     for function in functions:
-        inside = list(walked(function))
+        inside = walked(function)
         made = [
             n
             for n in inside

@@ -153,8 +153,9 @@ def write(posterior: Posterior, path: Path | str) -> None:
         file.title = "posterior of a calibrated robot, normal in z: u = location + spread z"
 
         def put(name: str, values: Any, kind: str, dimensions: tuple[str, ...], words: str | None) -> None:
-            values = np.asarray(values, kind)
-            if kind == "S":  # texts are rows of letters
+            texts = kind == "S"  # rows of letters
+            values = np.asarray([x.encode() for x in values] if texts else values, kind)
+            if texts:
                 dimensions = (*dimensions, f"string{values.itemsize}")
                 values = values.view("S1").reshape(len(values), -1)
             for dimension, size in zip(dimensions, values.shape, strict=True):
@@ -165,13 +166,13 @@ def write(posterior: Posterior, path: Path | str) -> None:
             if words is not None:
                 variable.long_name = words
 
-        put("coordinate", [n.encode() for n in p.coordinates], "S", square[:1], None)
+        put("coordinate", p.coordinates, "S", square[:1], None)
         for name, (values, words) in numbers.items():
             put(name, values, "f8", square[: np.ndim(values)], words)
-        put("kind", [k.encode() for k in p.kinds], "S", square[:1], "transformation of u")
-        put("units", [u.encode() for u in p.units], "S", square[:1], "of the parameter")
+        put("kind", p.kinds, "S", square[:1], "transformation of u")
+        put("units", p.units, "S", square[:1], "of the parameter")
         if p.tied:
-            put("tied", [t[0].encode() for t in p.tied], "S", ("follower",), "follows another")
+            put("tied", [t[0] for t in p.tied], "S", ("follower",), "follows another")
             put("tied_to", [t[1] for t in p.tied], "i4", ("follower",), "its index")
             put("tied_ratio", [t[2] for t in p.tied], "f8", ("follower",), "ratio to that")
 
