@@ -22,6 +22,7 @@ from mmrjax.ground import Ground
 from mmrjax.rig import Instrument, Rig
 from mmrjax.robot import Configurations
 from mmrjax.shaft import Shaft
+from mmrjax.signals import STALLED
 from mmrjax.track import Track
 from sweeps import config as configuration
 from sweeps.points import run
@@ -441,6 +442,19 @@ def test_readings_in_another_unit_are_refused_with_the_unit(tmp_path):
     off = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": runs["motor_speed_rpm"] * np.pi / 30})
     with pytest.raises(BadData, match=r"motor_speed_rpm: readings are about .* are they in rad/s"):
         check_ranges(off, robot)
+
+
+def test_a_slow_speed_where_the_stated_friction_holds_the_robot_is_no_matter_of_units(tmp_path):
+    # Between a robot that stands and one of a tenth of its friction any speed is possible, also a sixtieth of that
+    # one's, which was refused: "are they in turns/s?".
+    robot = bench("motor_current", ("motor_speed",), load={"loss_coulomb": 0.4, "loss_viscous": 0.04})
+    columns = {"motor_current_A": np.array([0.2, 0.22, 0.24, 0.26])}
+    conditions = Conditions(np.zeros(4, int), motor_current=columns["motor_current_A"])
+    light = {"motor.friction_coulomb": 4e-4, "rig.loss_coulomb": 0.04, "rig.loss_viscous": 0.004}
+    runs = measured(tmp_path, robot, conditions, columns, light)
+    runs = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": runs["motor_speed_rpm"] / 60})
+    assert np.all(np.asarray(steady_batch(robot, conditions).status) == STALLED)
+    assert check_ranges(runs, robot) == []
 
 
 def test_an_arm_has_no_steady_state(tmp_path):

@@ -59,6 +59,9 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
         _check_gear(runs, measured, robot)
     conditions = runs.conditions(robot)
     possible = np.stack([operating_readings(_rubbing(robot, f), conditions) for f in FRICTION])
+    # A robot that moves with less friction and has no speed with more of it stands: any speed is possible between.
+    slow = np.array([c.zero_at_rest for c in robot.channels])
+    possible = np.where(slow & np.isnan(possible) & np.isfinite(possible[0]), 0.0, possible)
     if not np.isfinite(possible).any():
         return []
     factors = {c: _factor(measured[:, k], possible[:, :, k]) for k, c in enumerate(robot.channels)}
@@ -111,7 +114,7 @@ def _factor(measured: np.ndarray, possible: np.ndarray) -> float:
         return 1.0
     low, high, x = low[tells], high[tells], np.abs(measured[finite][tells])
     x = np.maximum(x, 1e-9 * high)
-    return float(np.median(np.where(x > high, x / high, np.where(x < low, x / low, 1.0))))
+    return float(np.median(x / np.clip(x, low, high)))
 
 
 def _units(channel: Channel, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> list[str]:
