@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import concurrent.futures
+import os
 import signal
+import sys
 import time
 from types import SimpleNamespace
 
@@ -70,8 +72,16 @@ def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypat
         keep("verdict", lambda: SimpleNamespace(verdict="class", members=(("iron_loss", "windage"),), families=()))
         raise end
 
+    at_once = []  # what XLA is at then crashes an ordinary end
+
+    def leave(code):
+        at_once.append(code)
+        sys.exit(code)
+
+    monkeypatch.setattr(os, "_exit", leave)
     monkeypatch.setattr(command, "discover", first)
     code, _, err = mmrjax(*rig, "--within", "5min")
+    assert at_once == [ends]
     assert ("no verdict within 300 s\n" in err) == (end is OutOfTime)
     assert code == ends and "kept: verdict; the same command with --out found goes on" in err
     assert "s  verdict: class, iron_loss or windage; next, errors held out and other noises\n" in err  # at once
