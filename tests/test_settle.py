@@ -419,7 +419,12 @@ def test_an_angle_shows_the_speed_of_its_shaft(tmp_path):
     found = settled(tmp_path, whole)
     speeds = [s.mean["output_speed"] for s in found.kept]
     assert speeds == pytest.approx([108.0, 216.0, 324.0], rel=0.01)
-    assert any("add output_speed to channels" in said for said in words.remarks(found, 3))
+    said = words.remarks(found, 3)
+    assert (
+        "output_speed_rpm is the rate of output_angle_deg; add output_speed to channels in the rig's file" in said[0]
+    )
+    named = bench(tmp_path, columns | {"output_angle_deg": angle}, '"total_current", "output_speed", "output_angle"')
+    assert words.remarks(settled(tmp_path, named), 3) == []
 
 
 def test_the_command_leaves_a_table_that_is_read_as_settled_runs(tmp_path, mmrjax):
