@@ -97,6 +97,18 @@ def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypat
     assert code == 2 and "as far as this test goes" in err
 
 
+def test_what_cannot_be_kept_is_not_said_to_be(rig, mmrjax, monkeypatch, tmp_path):
+    def first(*_, keep, **__):
+        keep("verdict", lambda: SimpleNamespace(verdict="none", own=lambda: None))  # which pickle refuses
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "discover", first)
+    monkeypatch.setattr(command.said_of, "verdict", lambda found: found.verdict)
+    code, _, err = mmrjax(*rig)
+    assert code == 130 and "nothing could be kept of verdict; the same command begins anew" in err
+    assert "kept: verdict" not in err and not (tmp_path / "found.partial").exists()
+
+
 @pytest.mark.parametrize("within", ["0s", "0.2s"])
 def test_time_that_is_out_before_the_verdict_ends_it_there_and_says_so(rig, mmrjax, monkeypatch, tmp_path, within):
     """Between two steps, and in the middle of one."""

@@ -176,6 +176,17 @@ class Effect(eqx.Module):
         return math.inf
 
 
+class Made:
+    """Classes of effects that functions make, by their names: where pickle finds them."""
+
+
+def made(kind: type[Effect], name: str) -> type[Effect]:
+    """A class that a function has made, with its name; there is one of a name."""
+    kind.__name__, kind.__module__, kind.__qualname__ = name, Made.__module__, f"{Made.__name__}.{name}"
+    setattr(Made, name, kind)
+    return kind
+
+
 def defined_in(module: ModuleType) -> tuple[type[Effect], ...]:
     """The effects that a module defines, in its order; classes that lack a `term` are none."""
     own = [v for v in vars(module).values() if inspect.isclass(v) and v.__module__ == module.__name__]

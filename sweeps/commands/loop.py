@@ -143,7 +143,11 @@ def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> Non
     """Say which stages are kept, and leave the robot of the base fit where there is one but no verdict."""
     if not stages:
         return
-    tell(f"kept: {', '.join(stages)}; the same command with --out {folder.path} goes on")
+    kept = [name for name in stages if folder.keeps(name)]
+    if not kept:
+        tell(f"nothing could be kept of {', '.join(stages)}; the same command begins anew")
+        return
+    tell(f"kept: {', '.join(kept)}; the same command with --out {folder.path} goes on")
     if "verdict" in stages:
         traced = stages["verdict"]
         tell(f"{said_of.verdict(traced)}; errors held out and other noises are outstanding")
