@@ -109,7 +109,7 @@ class SpeedGain(SensorEffect):
         return self.amplitude * signals.speed
 
 
-def _scale(shown_by: Channel) -> type[SensorEffect]:
+def _scale(shown_by: Channel) -> type[Effect]:
     """The error of the scale of a channel's instrument; of a temperature, whose zero is a convention, of its zero."""
     offset = shown_by.unit_shown == "°C"
 
