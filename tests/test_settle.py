@@ -296,6 +296,15 @@ def test_rig_check_says_of_a_log_that_signs_are_wrong(tmp_path, monkeypatch, cas
         assert re.search(said, doubt) and doubt in found.remarks()
 
 
+@pytest.mark.parametrize("duty", [False, True])
+def test_rig_check_says_which_current_a_total_one_is_beside_a_duty(tmp_path, monkeypatch, duty):
+    columns = both_ways() | ({"duty": np.full(800, 0.5)} if duty else {})
+    bench(tmp_path, columns)
+    monkeypatch.setattr(rig_check.foresight, "foresee", lambda runs, robot: None)
+    said = rig_check.examined(tmp_path / "rig.toml", str(tmp_path / "log.csv")).remarks()
+    assert any("what a sensor in a motor's leads shows is motor_current" in s for s in said) == duty
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_signs_and_times_of_random_logs_are_not_doubted(tmp_path, case):
     seed, kind, imposed, options = CASES[case]
