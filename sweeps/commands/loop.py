@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -94,7 +95,8 @@ def _loop(
                 )  # fmt: skip
         except KeyboardInterrupt as ended:
             if isinstance(ended, OutOfTime):
-                first = "" if stages else ", nor a fit of the base model; give it more, as --within 5min"
+                more = max(5, math.ceil((within or 0.0) / 30))  # twice as much
+                first = "" if stages else f", nor a fit of the base model; give it more, as --within {more}min"
                 tell(f"no verdict within {within:g} s{first}")
             _say_kept(stages, folder, config.robot)
             raise

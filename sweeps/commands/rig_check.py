@@ -91,8 +91,8 @@ class RigCheck:
         said += self.doubts
         if self.runs is not None and self.runs.has("duty") and self.runs.has("total_current_A"):
             said.append(
-                "total_current beside a duty is what the supply gives, the duty's share of the motors' current; what a "
-                "sensor in a motor's leads shows is motor_current"
+                "total_current beside a duty is what the supply gives, the duty's share of the motors' current; what "
+                "a sensor in a motor's leads shows is motor_current"
             )
         said += [f"{fact.what} {fact.value}: {fact.odd}" for fact in self.facts if fact.odd]
         loose = [
@@ -285,12 +285,8 @@ def examined(file: Path, data: str | None, effects: tuple[str, ...] = ()) -> Rig
         return found
     runs = read_runs(data, robot, measured=True, series=True)
     seen = foresight.foresee(runs, robot)
-    doubtful = (
-        settling.doubtful_sign(runs),
-        rig_facts.doubtful_time(runs, robot),
-        rig_facts.doubtful_current(runs, robot),
-    )
-    doubts = tuple(filter(None, doubtful))
+    sign, time = settling.doubtful_sign(runs), rig_facts.doubtful_time(runs, robot)
+    doubts = tuple(filter(None, (sign, time, rig_facts.doubtful_current(runs, robot))))
     return dataclasses.replace(found, runs=runs, foresight=seen, doubts=doubts)
 
 
