@@ -176,14 +176,9 @@ class Effect(eqx.Module):
         return math.inf
 
 
-class Made:
-    """Classes of effects that functions make, by their names: where pickle finds them."""
-
-
 def made(kind: type[Effect], name: str) -> type[Effect]:
-    """A class that a function has made, with its name; there is one of a name."""
-    kind.__name__, kind.__module__, kind.__qualname__ = name, Made.__module__, f"{Made.__name__}.{name}"
-    setattr(Made, name, kind)
+    """A class that a function has made, with its name; pickle finds it by that in `Made` of its module."""
+    kind.__name__, kind.__qualname__ = name, f"Made.{name}"
     return kind
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -264,3 +265,7 @@ CURVES_ROUND: dict[str, type[Effect]] = {
         *(_curve(place, over) for place in ROUND for over in IN_TURNS),
     )
 }
+#: All of them by the names of their classes, see `made`.
+Made = SimpleNamespace(
+    **{e.__name__: e for some in (WAVES, CURVES, CURVES_SHOWN, CURVES_ROUND) for e in some.values()}
+)

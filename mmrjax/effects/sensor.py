@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import jax.numpy as jnp
@@ -144,3 +145,5 @@ def _scale(shown_by: Channel) -> type[Effect]:
 OF_CHANNELS: dict[str, type[Effect]] = {
     effect.name: effect for effect in (_scale(c) for c in channels.EVERY if c not in channels.usual())
 }
+#: The same by the names of their classes, see `made`.
+Made = SimpleNamespace(**{effect.__name__: effect for effect in OF_CHANNELS.values()})
