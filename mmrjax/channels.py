@@ -46,6 +46,7 @@ class Channel:
         settled, over_time: whether settled runs and histories can show it.
         other_units: what is often written in its column by mistake, and the SI value of each.
         side: 0 or 1 of what the left or the right side alone shows; None: what both together do.
+        where: it is measured, where the label does not say.
         rests_on: parameters of the robot without which it is not known, by dotted name.
     """
 
@@ -68,6 +69,7 @@ class Channel:
     over_time: bool = True
     other_units: tuple[tuple[str, float], ...] = ()
     side: int | None = None
+    where: str = ""
     rests_on: tuple[str, ...] = ()
 
     @property
@@ -119,6 +121,7 @@ _EITHER: tuple[Channel, ...] = (
         range=(-2000.0, 2000.0),
         sd_largest=100.0,
         read=lambda robot, signals: signals.total_current,
+        where="drawn from the supply by all motors, with a duty that share of their current",
         rests_on=CURRENT,
         sd_share=0.02,
         resolution=3,
@@ -167,6 +170,7 @@ _EITHER: tuple[Channel, ...] = (
         range=(-2000.0, 2000.0),
         sd_largest=100.0,
         read=lambda robot, signals: signals.current,
+        where="in the leads of one motor",
         rests_on=CURRENT,
         sd_share=0.02,
         resolution=3,

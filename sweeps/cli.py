@@ -574,8 +574,9 @@ def main() -> None:
             code = _fail(f"internal error: {error}", 1)
     kept = sys.modules.get("calibration.discovery.kept")  # whose threads nobody waits for
     beside = kept is not None and any(t.name.startswith(kept.BESIDE) for t in threading.enumerate())
+    spent = code == 3 and "loop" in sys.argv[1:2]  # perhaps out of time, which interrupts a step too
     # XLA may still be at work, and has crashed when Python was taken down around it
-    if code == INTERRUPTED or (beside and isinstance(code, int)):
+    if code == INTERRUPTED or spent or (beside and isinstance(code, int)):
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

@@ -169,7 +169,7 @@ class RunFolder(Folder):
     def stage(self, name: str, make: Callable[[], T]) -> T:
         """The result of a stage: that which an interrupted run of the same identity kept, or made now and kept. What
         cannot be written is not kept."""
-        file = self.partial / "chunks" / f"{re.sub(r'[^a-z0-9.]', '-', name)}.stage"
+        file = self._of_stage(name)
         if file.is_file():
             return pickle.loads(file.read_bytes())
         made = make()
@@ -178,6 +178,13 @@ class RunFolder(Folder):
             aside.write_bytes(pickle.dumps(made))
             aside.replace(file)
         return made
+
+    def keeps(self, name: str) -> bool:
+        """Whether the result of a stage is kept."""
+        return self._of_stage(name).is_file()
+
+    def _of_stage(self, name: str) -> Path:
+        return self.partial / "chunks" / f"{re.sub(r'[^a-z0-9.]', '-', name)}.stage"
 
     def move_into_place(self) -> Path:
         """Drop the chunks, and move the folder to where it is to appear."""

@@ -6,6 +6,7 @@ import ast
 import dataclasses
 import functools
 import importlib
+import pickle
 import pkgutil
 import re
 import subprocess
@@ -25,6 +26,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, BY_NAME, Effect, base
 from mmrjax.effects.contract import readable
 from mmrjax.effects.periodic import Periodic
+from mmrjax.effects.scaled import scaled
 from mmrjax.fidelities import half_robot
 from mmrjax.fidelities.drive import drive, rates, start, state_of
 from mmrjax.fidelities.steady import steady, steady_batch
@@ -703,6 +705,14 @@ def test_every_effect_stands_in_the_file_of_its_balance():
         assert effect.__module__ == f"mmrjax.effects.{effect.balance}"
     found = {e for name in MODULES for e in effects.defined_in(importlib.import_module(name))}
     assert found == {*ALL, *effects.OF_TURNS.values()}
+
+
+def test_every_effect_is_pickled_as_stages_of_the_loop_are():
+    """Those too whose classes are made by functions: of channels' instruments, curves and waves."""
+    for effect in (BY_NAME | effects.BESIDE).values():
+        assert pickle.loads(pickle.dumps(effect)) is effect
+        for kind in (effect, scaled(effect, (2.0, 1.0, 2.0))):
+            assert type(pickle.loads(pickle.dumps(kind()))) is kind
 
 
 def test_name_follows_from_the_class_unless_stated():

@@ -64,6 +64,7 @@ def test_parameters_and_channels_are_explained_by_their_rows():
     lines = dict(said("channel", "speed_mm_s"))
     assert "speed_sd_mm_s" in lines["column"] and lines["other units"].startswith("m/s, km/h")
     assert lines["typical noise"].startswith(f"{100 * channels.find('speed').sd_share:g} %")
+    assert "shows it: drawn from the supply by all motors" in dict(said("channel", "total_current"))["is"]
     assert dict(said("output", "slip"))["equation"].startswith("1 - V / V_theoretical, eq. (33)")
 
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibration.data import robot_file
+from calibration.data import rig_facts, robot_file
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration, BadData
 from calibration.inference import blocks as holdout
@@ -55,6 +55,17 @@ def followed(current, times, dry=DRY):
     inertia = INERTIA + ETA * ROTOR * RATIO**2
     end = RATIO * (RATIO * ETA * K * current - dry) / VISCOUS
     return end * (1 - np.exp(-VISCOUS / inertia * times))
+
+
+@pytest.mark.parametrize(("factor", "doubted"), [(1.0, False), (1e3, True), (1e-3, True)])
+def test_a_current_in_another_unit_is_doubted_with_what_turns_the_load(tmp_path, robot, factor, doubted):
+    """It is 0.67 A that turns the load slowly."""
+    rows = "".join(f"{0.1 * k},{factor * current},0\n" for k, current in enumerate((1.5, 2.0, -1.5)))
+    (tmp_path / "log.csv").write_text(f"time_s,motor_current_A,motor_speed_rpm\n{rows}", encoding="utf-8")
+    said = rig_facts.doubtful_current(records.read(tmp_path / "log.csv", robot=robot), robot)
+    assert bool(said) == doubted
+    if doubted:
+        assert f"up to {2 * factor:g} A, where the file's numbers turn the load slowly with 0.667 A; is it in" in said
 
 
 def test_the_file_says_what_is_imposed_and_needs_no_winding(robot, tmp_path):

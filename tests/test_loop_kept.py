@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import concurrent.futures
+import os
 import signal
+import sys
 import time
 from types import SimpleNamespace
 
@@ -70,8 +72,16 @@ def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypat
         keep("verdict", lambda: SimpleNamespace(verdict="class", members=(("iron_loss", "windage"),), families=()))
         raise end
 
+    at_once = []  # what XLA is at then crashes an ordinary end
+
+    def leave(code):
+        at_once.append(code)
+        sys.exit(code)
+
+    monkeypatch.setattr(os, "_exit", leave)
     monkeypatch.setattr(command, "discover", first)
     code, _, err = mmrjax(*rig, "--within", "5min")
+    assert at_once == [ends]
     assert ("no verdict within 300 s\n" in err) == (end is OutOfTime)
     assert code == ends and "kept: verdict; the same command with --out found goes on" in err
     assert "s  verdict: class, iron_loss or windage; next, errors held out and other noises\n" in err  # at once
@@ -85,6 +95,18 @@ def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypat
     monkeypatch.setattr(command, "discover", again)
     code, _, err = mmrjax(*rig, "--within", "5min")  # which is no other command
     assert code == 2 and "as far as this test goes" in err
+
+
+def test_what_cannot_be_kept_is_not_said_to_be(rig, mmrjax, monkeypatch, tmp_path):
+    def first(*_, keep, **__):
+        keep("verdict", lambda: SimpleNamespace(verdict="none", own=lambda: None))  # which pickle refuses
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "discover", first)
+    monkeypatch.setattr(command.said_of, "verdict", lambda found: found.verdict)
+    code, _, err = mmrjax(*rig)
+    assert code == 130 and "nothing could be kept of verdict; the same command begins anew" in err
+    assert "kept: verdict" not in err and not (tmp_path / "found.partial").exists()
 
 
 @pytest.mark.parametrize("within", ["0s", "0.2s"])
@@ -106,6 +128,17 @@ def test_time_that_is_out_before_the_verdict_ends_it_there_and_says_so(rig, mmrj
     )
     assert said in err
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0) and not (tmp_path / "found.partial").exists()
+
+
+def test_a_budget_that_was_too_small_is_answered_by_a_larger_one(rig, mmrjax, monkeypatch):
+    def late(*_, **__):
+        raise OutOfTime
+
+    monkeypatch.setattr(command, "discover", late)
+    assert (
+        "no verdict within 540 s, nor a fit of the base model; give it more, as --within 18min"
+        in (mmrjax(*rig, "--within", "9min")[2])
+    )
 
 
 def test_a_budget_ends_a_step_that_says_nothing():

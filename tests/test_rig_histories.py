@@ -1,5 +1,6 @@
 """Histories of rigs: an imposed speed with a delay, and beginnings that are measured or free, given back."""
 
+import contextlib
 import csv
 import dataclasses
 
@@ -10,7 +11,7 @@ import pytest
 
 from calibration.data import robot_file
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration
+from calibration.data.errors import BadConfiguration, BadData
 from calibration.inference import noise, observers, priors
 from calibration.inference.calibrate import calibrate
 from calibration.inference.linearization import probe
@@ -98,6 +99,37 @@ def test_the_speed_at_which_a_run_begins_moves_with_the_robot(tmp_path):
     speed, slope = slopes(jnp.ones(2))
     np.testing.assert_allclose(speed, 100.0 / 16 * 0.005 / (2 * np.pi), rtol=1e-9)
     np.testing.assert_allclose(slope, speed[:, None] * np.array([1.0, -1.0]), rtol=1e-9)  # v = r ω / i
+
+
+@pytest.mark.parametrize("duty", [False, True])
+@pytest.mark.parametrize(
+    ("load", "shown", "stated", "said"),
+    [
+        (BENCH, "motor_current", "", "motor_current_A: got 1 A"),
+        (BENCH, "motor_speed", "", "motor_speed_rpm: got 1 rpm"),
+        (BENCH, "motor_speed", "[instruments.motor_speed]\nsigned = false\n", ""),
+        (BENCH, "motor_current", "[instruments.motor_current]\nsigned = false\n", ""),
+        (ARM, "motor_current", "", ""),  # its weight may drive the motor
+        (BENCH, "total_current", "", "total_current_A: got 1 A"),
+    ],
+)
+def test_readings_without_a_sign_are_refused_unless_the_file_says_so(tmp_path, load, shown, stated, said, duty):
+    """Of a log that goes both ways: a speed, and a current that nothing but the voltage drives."""
+    path = tmp_path / "rig.toml"
+    path.write_text(DRIVE.format(imposed="voltage", channels=f'"{shown}"', start="rest") + stated + load)
+    robot, t = robot_file.load(str(path)), np.arange(0, 2, 0.02)
+    way = np.where(t < 1, 1.0, -1.0)
+    driven = {"supply_voltage_V": 12.0, "duty": way / 2} if duty else {"supply_voltage_V": 6 * way}
+    columns = {"time_s": t, **driven, channels.find(shown).column: np.abs(way)}
+    cells = np.stack(np.broadcast_arrays(*columns.values()), 1)
+    np.savetxt(tmp_path / "log.csv", cells, delimiter=",", header=",".join(columns), comments="")
+    runs = records.read(tmp_path / "log.csv", robot=robot)
+    nothing = noise.Noise(*(None for _ in dataclasses.fields(noise.Noise)))
+    cure = rf"expected readings with a sign, negative backward; or state \[instruments.{shown}\] signed = false"
+    bridge = duty and shown == "total_current"  # which turns the supply's current back
+    refused = pytest.raises(BadData, match=rf"{said} at -6 V; {cure}")
+    with refused if said and not bridge else contextlib.nullcontext():
+        assert Histories.check(runs, nothing) == []
 
 
 @pytest.mark.slow

@@ -205,6 +205,17 @@ REFUSED = {
         "time_s,supply_voltage_V,output_angle_deg\n0,9,340\n1,9,350\n2,9,1\n3,9,11\n",
         r"row 3, output_angle_deg: jumps by -349 deg from the sample before, as an angle that wraps",
     ),
+    "a recording after another": (
+        lambda: bench("voltage", ("output_angle",)),
+        "time_s,supply_voltage_V,output_angle_deg\n0,9,340\n1,9,350\n2,9,360\n60,9,1\n61,9,11\n",
+        r"row 4, output_angle_deg: jumps by -359 deg from the sample before, 58 s earlier; give each recording its own run",
+    ),
+    "a log without its time": (
+        lambda: bench("voltage", ("output_speed", "output_angle")),
+        "t,supply_voltage_V,output_angle_deg\n0,9,340\n1,9,350\n",
+        r"column time_s is missing, and output_angle_deg is read over time alone; of settled runs, remove .*; other "
+        r"columns: t; .*\[columns\] time_s = {column",
+    ),
 }
 
 

@@ -294,6 +294,8 @@ def test_all_bad_cells_are_said_at_once_the_first_row_first(tmp_path):
     said = str(error.value)
     assert said.startswith("runs.csv row 2, motor_speed_rpm: got fast; expected a number")
     assert said.index("; also row 4, supply_voltage_V: got -500") < said.index("; row 4, total_current_A: got nan")
+    with pytest.raises(BadData, match=r"expected .* 30000; also row 2, motor_speed_rpm: got fast; row 3"):
+        records.read(written(tmp_path, "\n".join([HEADER, *[ROW.replace("4800", "fast")] * 3])))
     with pytest.raises(BadData, match=r"; and 12 more$"):
         records.read(written(tmp_path, "\n".join([HEADER, *[ROW.replace("4800", "fast")] * 20])))
 

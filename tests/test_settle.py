@@ -296,6 +296,15 @@ def test_rig_check_says_of_a_log_that_signs_are_wrong(tmp_path, monkeypatch, cas
         assert re.search(said, doubt) and doubt in found.remarks()
 
 
+@pytest.mark.parametrize("duty", [False, True])
+def test_rig_check_says_which_current_a_total_one_is_beside_a_duty(tmp_path, monkeypatch, duty):
+    columns = both_ways() | ({"duty": np.full(800, 0.5)} if duty else {})
+    bench(tmp_path, columns)
+    monkeypatch.setattr(rig_check.foresight, "foresee", lambda runs, robot: None)
+    said = rig_check.examined(tmp_path / "rig.toml", str(tmp_path / "log.csv")).remarks()
+    assert any("what a sensor in a motor's leads shows is motor_current" in s for s in said) == duty
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_signs_and_times_of_random_logs_are_not_doubted(tmp_path, case):
     seed, kind, imposed, options = CASES[case]
@@ -419,7 +428,12 @@ def test_an_angle_shows_the_speed_of_its_shaft(tmp_path):
     found = settled(tmp_path, whole)
     speeds = [s.mean["output_speed"] for s in found.kept]
     assert speeds == pytest.approx([108.0, 216.0, 324.0], rel=0.01)
-    assert any("add output_speed to channels" in said for said in words.remarks(found, 3))
+    said = words.remarks(found, 3)
+    assert (
+        "output_speed_rpm is the rate of output_angle_deg; add output_speed to channels in the rig's file" in said[0]
+    )
+    named = bench(tmp_path, columns | {"output_angle_deg": angle}, '"total_current", "output_speed", "output_angle"')
+    assert words.remarks(settled(tmp_path, named), 3) == []
 
 
 def test_the_command_leaves_a_table_that_is_read_as_settled_runs(tmp_path, mmrjax):

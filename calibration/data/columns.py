@@ -134,7 +134,7 @@ class Layout:
     Attributes:
         imposed: on its motors, one of `rig.IMPOSED`.
         has_ground: whether a ground carries it, see `Robot.has_ground`.
-        weight: whether a constant torque acts on it, which may drive its motors either way.
+        weight: whether a weight or a constant torque acts on it, which may drive its motors either way.
         inherits: whether what its file leaves open is a packaged robot's.
         configurations: its names.
         instruments: of channels, where more is known than that they are there.
@@ -157,7 +157,8 @@ class Layout:
         if robot is None:
             return cls()
         rig = robot.rig
-        weight = any(float(load.torque_constant) != 0 for load in robot.configurations.members)
+        loads = robot.configurations.members
+        weight = any(float(x) != 0 for load in loads for x in (load.torque_constant, load.torque_gravity))
         names = robot.configurations.names
         return cls(
             rig.imposed, robot.has_ground, weight, rig.inherits, names, rig.instruments, rig.columns, robot.channels

@@ -23,6 +23,8 @@ MAGNITUDES = {"motor_voltage_V": "motor_voltage"}
 CURRENTS = {"motor_current_A": "motor_current", "total_current_A": "total_current"}
 #: Jump of an angle between samples that is a turn lost [deg], and least multiple of the step that is usual.
 TURN, UNUSUAL = 180.0, 4.0
+#: Usual steps of time beyond which samples are missing.
+GAP = 5.0
 #: Share of rows before which time goes back, up to which they are no rows in another order.
 SELDOM = 0.02
 #: Degrees of a radian, and within what share of that an angle that jumps is in the other unit.
@@ -170,10 +172,14 @@ def _angle(runs: Runs) -> None:
             (np.abs(step) > TURN) & (np.abs(step) < 2 * TURN + UNUSUAL * usual) & (np.abs(step) > UNUSUAL * usual)
         )
         if jumps.size:
-            row = int(mine[jumps[0] + 1])
+            row, passed = int(mine[jumps[0] + 1]), np.diff(runs["time_s"][mine])
+            gap = passed[jumps[0]]
+            why = "as an angle that wraps; expected one that counts on beyond a turn"
+            if gap > GAP * np.median(passed):
+                why = f"{number(float(f'{gap:.3g}'))} s earlier; give each recording its own run_id"
             raise BadData(
                 f"{runs.source} row {row + 1}, output_angle_deg: jumps by {number(float(f'{step[jumps[0]]:.4g}'))} "
-                "deg from the sample before, as an angle that wraps; expected one that counts on beyond a turn"
+                f"deg from the sample before, {why}"
             )
         with np.errstate(divide="ignore", invalid="ignore"):
             times = np.abs(angle[mine][1:] / angle[mine][:-1])

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from calibration.data import rig_file
+from calibration.data.columns import CURRENT
 from calibration.data.courses import stretches
 from calibration.data.errors import rounded
 from calibration.data.robot_file import RobotFile
@@ -199,6 +200,30 @@ def doubtful_time(runs: Runs, robot: Robot) -> str:
                 f'time_ms = "{column}"'
             )
     return ""
+
+
+#: Multiples of the current that turns a load slowly which a log's largest imposed current is between.
+LEAST, MOST = 0.1, 100.0
+
+
+def doubtful_current(runs: Runs, robot: Robot) -> str:
+    """Why an imposed current, or torque, is in another unit: far from what turns the loads of its table slowly; empty
+    where nothing shows that."""
+    column, present = runs.layout.imposed_column, set(runs["configuration"])
+    loads = [x for name, x in robot.configurations.items() if name in present and isinstance(x, Shaft)]
+    if column != CURRENT or not loads:
+        return ""
+    torques = [[float(x) for x in (load.loss_coulomb, load.torque_constant, load.torque_gravity)] for load in loads]
+    needed = max(_current(robot, sum(map(abs, torque))) for torque in torques)
+    largest = float(np.nanmax(np.abs(runs[column])))
+    if needed == 0 or LEAST < largest / needed < MOST:
+        return ""
+    theirs = runs.headings.get(column, column)
+    return (
+        f"{runs.source}, {theirs}: up to {rounded(largest)} A, where the file's numbers turn the load slowly with "
+        f"{rounded(needed)} A; is it in another unit (mA, mN·m)? then state [columns] {column} = "
+        f'{{column = "{theirs}", factor = ...}}'
+    )
 
 
 def time_constant(robot: Robot) -> float:

@@ -114,6 +114,8 @@ def _read(
         layout = _with_channels(name, header, layout, channels.OF_TURNS)
     meanings = layout.meanings(name, header)
     _check_header(name, header, meanings, measured, battery, layout)
+    if measured and not inferred:
+        _check_time(name, header, meanings, layout)
     if below := _row_of_units(name, meanings, rows[1:2]):
         del rows[1]
         notes = (*notes, f"{name}: the row below the header states units; rows are counted from the next")
@@ -188,11 +190,15 @@ LISTED = 8
 
 
 def _listed(name: str, said: list[str]) -> str:
-    """What is wrong with a file's cells, the first row's first."""
+    """What is wrong with a file's cells, the first row's first; what to do about it once."""
     first, *others = said
     if not others:
         return first
-    more = [sentence.removeprefix(f"{name} ") for sentence in others[: LISTED - 1]]
+    more, known = list[str](), {first.partition(";")[2]}
+    for sentence in others[: LISTED - 1]:
+        what, _, cure = sentence.removeprefix(f"{name} ").partition(";")
+        more.append(what if cure in known else f"{what};{cure}")
+        known.add(cure)
     rest = f"; and {len(said) - LISTED} more" if len(said) > LISTED else ""
     return f"{first}; also {'; '.join(more)}{rest}"
 
@@ -416,6 +422,18 @@ def _check_header(
         close = difflib.get_close_matches(column, [c for c in layout.known() if c not in stated], 1, 0.85)
         if close:
             raise BadData(f"{name}: unknown column {column}; did you mean {close[0]}? rename or remove it")
+
+
+def _check_time(name: str, header: list[str], meanings: list[Meaning | None], layout: Layout) -> None:
+    """Refuse readings of a log without its time."""
+    stated = {m.column: m.shown for m in meanings if m is not None}
+    over_time = [stated[c.column] for c in layout.channels if c.column in stated and not c.settled]
+    if over_time and stated.keys().isdisjoint(TIME):
+        strange = [c for c, m in zip(header, meanings, strict=True) if m is None]
+        raise BadData(
+            f"{name}: column {layout.expected('time_s')} is missing, and {over_time[0]} is read over time alone; of "
+            f"settled runs, remove {over_time[0]}{_other_names(strange, 'time_s')}"
+        )
 
 
 #: Most columns of a table that a message names.

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calibration.data.contradictions import GAP
 from calibration.data.courses import applied, differs
 from calibration.data.errors import BadData, number
 from calibration.data.instruments import step_of
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
 STILL = 0.02
 #: Share of a signal's largest size to which it is known at least, beside the share of its own mean.
 FINE = 0.005
-#: A sample that comes so many times the usual step after the one before it: samples between are missing.
-GAP = 5.0
 #: Largest change of a mean within a stretch, as a share of it, where none is stated.
 DRIFT = 0.02
 #: Fewest samples of a stretch, and of its parts between which means are compared.
@@ -640,16 +639,10 @@ def _shows(found: Settled, s: Stretch, channel: Channel) -> str:
 
 
 def _check_signs(found: Settled) -> None:
-    """Refuse speeds and currents of stretches both ways that have one sign; gravity may drive a motor, and a bridge
-    that turns the voltage round turns the supply's current."""
+    """Refuse speeds and currents of stretches both ways that have one sign."""
     layout, runs = found.runs.layout, found.runs
-    pulled = layout.weight or (runs.has("slope_deg") and runs["slope_deg"].any())
-    for signal in found.signals:
+    for signal in (s for s in found.signals if runs.turns_round(s.channel)):
         channel = signal.channel
-        if layout.magnitude(channel.name) or channel.name == "motor_voltage" or not channel.directed:
-            continue
-        if not channel.zero_at_rest and (pulled or (runs.has("duty") and channel.name == "total_current")):
-            continue
         least = {id(s): max(SIGNED * s.sd[channel.name], STILL * signal.largest) for s in found.kept}
         clear = [s for s in found.kept if abs(s.mean[channel.name]) > least[id(s)]]
         back, ahead = ([s for s in clear if way * s.imposed > 0] for way in (-1, 1))
@@ -660,7 +653,7 @@ def _check_signs(found: Settled) -> None:
                 f"{_shows(found, back[0], channel)}; expected readings with their signs, negative backward; or state "
                 f"[instruments.{channel.name}] signed = false in the rig's file, if it shows magnitude alone"
             )
-        if (turned or (wrong and channel.zero_at_rest)) and not pulled:
+        if (turned or (wrong and channel.zero_at_rest)) and not runs.pulled:
             cure = (
                 f"state [columns] {channel.column} = {{column = ..., factor = -1}} in the rig's file"
                 if turned

@@ -105,6 +105,19 @@ class Runs:
         return tuple(c for c in (*self.layout.axes, *duty, *self.layout.sides, *HEADING, *LEVERS) if self.has(c))
 
     @property
+    def pulled(self) -> bool:
+        """Whether gravity, or a constant torque, may drive the motors."""
+        return self.layout.weight or (self.has("slope_deg") and bool(self["slope_deg"].any()))
+
+    def turns_round(self, channel: Channel) -> bool:
+        """Whether a channel's readings have the sign of what drives the motors: a speed's do, and a current's where
+        nothing else drives them; a bridge that turns the voltage turns the supply's current back."""
+        if not channel.directed or channel.name == "motor_voltage" or self.layout.magnitude(channel.name):
+            return False
+        back = self.has("duty") and channel.name == "total_current"
+        return channel.zero_at_rest or not (self.pulled or back)
+
+    @property
     def sampled(self) -> bool:
         """Whether a row is a sample of a run."""
         return all(self.has(column) for column in TIME)

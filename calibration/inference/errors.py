@@ -24,8 +24,9 @@ def sized_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
     Args:
         simulated, measured: shape (rows, ...).
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        size = np.sqrt(np.nanmean(np.square(simulated), 0))
+    with np.errstate(divide="ignore", invalid="ignore"):  # nothing of a channel without readings
+        finite = np.isfinite(simulated)
+        size = np.sqrt(np.sum(np.square(simulated), 0, where=finite) / finite.sum(0))
         return np.asarray(100.0 * (simulated - measured) / size)
 
 
@@ -93,11 +94,13 @@ def channel_errors(
 def rms_by_fit(
     table: Mapping[str, np.ndarray], shown: Sequence[Channel], fits: Iterable[str]
 ) -> dict[str, dict[str, float]]:
-    """rms of simulated less measured in each channel's unit, by fit (of columns `FIT_COLUMN`) and channel."""
+    """rms of simulated less measured in each channel's unit, by fit (of columns `FIT_COLUMN`) and channel that has
+    readings and a simulation."""
     found: dict[str, dict[str, float]] = {}
     for fit in fits:
         for c in shown:
             if f"{fit}_{c.column}" in table:
-                error = table[f"{fit}_{c.column}"] - table[c.column]
-                found.setdefault(fit, {})[c.name] = root_mean_square(error)
+                error = root_mean_square(table[f"{fit}_{c.column}"] - table[c.column])
+                if np.isfinite(error):
+                    found.setdefault(fit, {})[c.name] = error
     return found

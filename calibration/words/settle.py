@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from calibration.data.settling import Settled, Stretch
+from calibration.data.settling import RATES, Settled, Stretch
 from mmrjax.errors import counted
 
 #: Of each of `settling.REASONS`: what is so, and what to do where it is much.
@@ -59,11 +59,12 @@ def remarks(found: Settled, fewest: int) -> list[str]:
     if found.gaps:
         rows = ", ".join(str(k + 1) for k in found.gaps[:5]) + (", ..." if len(found.gaps) > 5 else "")
         said.append(f"samples are missing after row{'s' * (len(found.gaps) > 1)} {rows}; no stretch goes across")
-    for signal in found.signals:
-        if len(signal.angle):
+    angles = {rate: angle for angle, rate, _ in RATES}
+    for channel in (s.channel for s in found.signals):
+        if channel not in found.runs.channels:
             said.append(
-                f"{signal.channel.column} is the rate of the angle; add {signal.channel.name} to channels in "
-                "the rig's file"
+                f"{channel.column} is the rate of {angles[channel.name]}; add {channel.name} to channels in the "
+                "rig's file, or these runs have no reading of it"
             )
     wide = {name: x for name, x in found.scatter.items() if x > 0}
     for signal in (s for s in found.signals if s.channel.name in wide):

@@ -176,6 +176,12 @@ class Effect(eqx.Module):
         return math.inf
 
 
+def made(kind: type[Effect], name: str) -> type[Effect]:
+    """A class that a function has made, with its name; pickle finds it by that in `Made` of its module."""
+    kind.__name__, kind.__qualname__ = name, f"Made.{name}"
+    return kind
+
+
 def defined_in(module: ModuleType) -> tuple[type[Effect], ...]:
     """The effects that a module defines, in its order; classes that lack a `term` are none."""
     own = [v for v in vars(module).values() if inspect.isclass(v) and v.__module__ == module.__name__]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax import channels
-from mmrjax.effects.base import THE_SIDE, Effect, amplitude
+from mmrjax.effects.base import THE_SIDE, Effect, amplitude, made
 from mmrjax.effects.periodic import Periodic, phase_parameter
 from mmrjax.params import Index, Scalar, parameter
 from mmrjax.robot import Robot
@@ -188,8 +189,6 @@ def _curve(place: str, over: str) -> type[Effect]:
             """Long after the start: the curve's last value."""
             return self.high + jnp.zeros_like(signals.speed_motor)
 
-    words = "".join(w.capitalize() for w in Curve.name.split("_"))
-    Curve.__name__ = Curve.__qualname__ = words
     where = f"the readings of `{place}`" if shown else f"the balance `{place}`"
     Curve.__doc__ = f"""Δ = a y(x) along the travel in {where} [{unit}], x = {over} [{unit_x}].
 
@@ -198,7 +197,7 @@ def _curve(place: str, over: str) -> type[Effect]:
     Source: none, a discrepancy without a name; Keys, Cubic convolution interpolation for digital image
     processing, IEEE Trans. ASSP 29 (1981) 1153, eqs. (15), (19), (25) of the interpolation.
     """
-    return Curve
+    return made(Curve, "".join(w.capitalize() for w in Curve.name.split("_")))
 
 
 def _wave(place: str) -> type[Effect]:
@@ -231,14 +230,13 @@ def _wave(place: str) -> type[Effect]:
             angle = signals.memory[self.name] + self.phase
             return self.amplitude * (self.y_sin * jnp.sin(angle) + self.y_cos * jnp.cos(angle))
 
-    Wave.__name__ = Wave.__qualname__ = f"Wave{place.capitalize()}"
     Wave.__doc__ = f"""Δ = a (y_s sin(k θ_k + φ) + y_c cos(k θ_k + φ)) in the balance `{place}` [{unit}].
 
     θ_k is the angle of the driving pulley or wheel; settled travel shows nothing of it.
 
     Source: none, a discrepancy without a name that repeats with the angle of a shaft.
     """
-    return Wave
+    return made(Wave, f"Wave{place.capitalize()}")
 
 
 #: The wave of every balance that carries curves: what a series shows as an order.
@@ -267,3 +265,7 @@ CURVES_ROUND: dict[str, type[Effect]] = {
         *(_curve(place, over) for place in ROUND for over in IN_TURNS),
     )
 }
+#: All of them by the names of their classes, see `made`.
+Made = SimpleNamespace(
+    **{e.__name__: e for some in (WAVES, CURVES, CURVES_SHOWN, CURVES_ROUND) for e in some.values()}
+)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import jax.numpy as jnp
 
 from mmrjax import channels
 from mmrjax.channels import Channel
-from mmrjax.effects.base import Effect, amplitude
+from mmrjax.effects.base import Effect, amplitude, made
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
@@ -109,7 +110,7 @@ class SpeedGain(SensorEffect):
         return self.amplitude * signals.speed
 
 
-def _scale(shown_by: Channel) -> type[SensorEffect]:
+def _scale(shown_by: Channel) -> type[Effect]:
     """The error of the scale of a channel's instrument; of a temperature, whose zero is a convention, of its zero."""
     offset = shown_by.unit_shown == "°C"
 
@@ -131,18 +132,18 @@ def _scale(shown_by: Channel) -> type[SensorEffect]:
             read: Any = shown_by.read(robot, signals)
             return self.amplitude * (jnp.ones_like(read) if offset else read)
 
-    words = "".join(word.capitalize() for word in Scale.name.split("_"))
-    Scale.__name__ = Scale.__qualname__ = words
     Scale.__doc__ = f"""Δx = a{"" if offset else " x"} in the reading x of {shown_by.label}.
 
     The {"zero" if offset else "scale"} of the instrument is off.
 
     Source: {"tolerances of thermocouples, IEC 60584-1" if offset else "limits of error of instruments, IEC 60051-2"}.
     """
-    return Scale
+    return made(Scale, "".join(word.capitalize() for word in Scale.name.split("_")))
 
 
 #: Of every channel that the classes above are not about: a rig that has it.
 OF_CHANNELS: dict[str, type[Effect]] = {
     effect.name: effect for effect in (_scale(c) for c in channels.EVERY if c not in channels.usual())
 }
+#: The same by the names of their classes, see `made`.
+Made = SimpleNamespace(**{effect.__name__: effect for effect in OF_CHANNELS.values()})

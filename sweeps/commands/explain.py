@@ -168,7 +168,7 @@ def _channel(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     if c is None:
         return
     low, high = c.range
-    yield "is", f"{c.label} [{c.unit_shown}], as its instrument shows it"
+    yield "is", f"{c.label} [{c.unit_shown}], as its instrument shows it{c.where and f': {c.where}'}"
     yield "column", f"{c.column}, its standard deviation {c.sd_column}, {number(low)} to {number(high)}"
     if c.other_units:
         yield "other units", ", ".join(unit for unit, _ in c.other_units)

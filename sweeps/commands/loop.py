@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -94,7 +95,8 @@ def _loop(
                 )  # fmt: skip
         except KeyboardInterrupt as ended:
             if isinstance(ended, OutOfTime):
-                first = "" if stages else ", nor a fit of the base model; give it more, as --within 5min"
+                more = max(5, math.ceil((within or 0.0) / 30))  # twice as much
+                first = "" if stages else f", nor a fit of the base model; give it more, as --within {more}min"
                 tell(f"no verdict within {within:g} s{first}")
             _say_kept(stages, folder, config.robot)
             raise
@@ -143,7 +145,11 @@ def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> Non
     """Say which stages are kept, and leave the robot of the base fit where there is one but no verdict."""
     if not stages:
         return
-    tell(f"kept: {', '.join(stages)}; the same command with --out {folder.path} goes on")
+    kept = [name for name in stages if folder.keeps(name)]
+    if not kept:
+        tell(f"nothing could be kept of {', '.join(stages)}; the same command begins anew")
+        return
+    tell(f"kept: {', '.join(kept)}; the same command with --out {folder.path} goes on")
     if "verdict" in stages:
         traced = stages["verdict"]
         tell(f"{said_of.verdict(traced)}; errors held out and other noises are outstanding")

@@ -42,7 +42,7 @@ class RigCheck:
         file: that was read; robot: of it; examples: its lines that still hold an example's number.
         origins: of its numbers; facts: that follow from them.
         runs: of the table, None without one; foresight: what it can determine.
-        doubts: of a log over time, a sentence each: signs that are wrong, time in another unit.
+        doubts: of a log over time, a sentence each: signs that are wrong, time or current in another unit.
     """
 
     file: str
@@ -89,6 +89,11 @@ class RigCheck:
             hold = f"{counted(len(self.examples), 'line')} still hold{'s' * (len(self.examples) == 1)}"
             said.append(f"{hold} the number of an example ({EXAMPLE}): {lines}")
         said += self.doubts
+        if self.runs is not None and self.runs.has("duty") and self.runs.has("total_current_A"):
+            said.append(
+                "total_current beside a duty is what the supply gives, the duty's share of the motors' current; what "
+                "a sensor in a motor's leads shows is motor_current"
+            )
         said += [f"{fact.what} {fact.value}: {fact.odd}" for fact in self.facts if fact.odd]
         loose = [
             _program(self.robot, o) for o in self.origins if o.why.startswith("the file") and o.sd is None and o.value
@@ -280,7 +285,8 @@ def examined(file: Path, data: str | None, effects: tuple[str, ...] = ()) -> Rig
         return found
     runs = read_runs(data, robot, measured=True, series=True)
     seen = foresight.foresee(runs, robot)
-    doubts = tuple(filter(None, (settling.doubtful_sign(runs), rig_facts.doubtful_time(runs, robot))))
+    sign, time = settling.doubtful_sign(runs), rig_facts.doubtful_time(runs, robot)
+    doubts = tuple(filter(None, (sign, time, rig_facts.doubtful_current(runs, robot))))
     return dataclasses.replace(found, runs=runs, foresight=seen, doubts=doubts)
 
 

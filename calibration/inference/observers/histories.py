@@ -878,12 +878,13 @@ def _few(x: np.ndarray) -> np.ndarray:
 
 
 def _check_signs(runs: Runs) -> None:
-    """Refuse speeds without a sign of runs that are driven backward: a rig's inertia may carry it forward for as long
-    as a stretch lasts, but not in all of a table."""
+    """Refuse speeds and currents without a sign of runs that are driven backward: a rig's inertia may carry it on
+    for as long as a stretch lasts, but not in all of a table."""
     volts, measured = applied(runs), runs.measured()
     time, size = runs["time_s"], np.nanmax(np.abs(measured), 0, initial=0.0)
     unsigned = np.nanmin(measured, 0, initial=0.0) >= -RESTING * size
-    unsigned &= [c.zero_at_rest and c.directed for c in runs.channels]
+    unsigned &= [runs.turns_round(c) for c in runs.channels]
+    unit = runs.layout.imposed_column.rpartition("_")[2]
     for run in stretches(runs):
         for s in (s for s in run if volts[s.rows[0]] < 0 and s.lasts >= LASTING):
             rows = s.after(time, 0.5)
@@ -892,8 +893,9 @@ def _check_signs(runs: Runs) -> None:
                 if shown.size and np.median(shown) > RESTING * size[k]:
                     raise BadData(
                         f"{runs.source} row {rows[0] + 1}, {channel.column}: got "
-                        f"{number(runs[channel.column][rows[0]])} {channel.unit} at {number(volts[rows[0]])} V; "
-                        "expected readings with a sign, negative backward"
+                        f"{number(runs[channel.column][rows[0]])} {channel.unit} at {number(volts[rows[0]])} {unit}; "
+                        "expected readings with a sign, negative backward; or state [instruments."
+                        f"{channel.name}] signed = false in the robot's file, if it shows magnitude alone"
                     )
 
 
