@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -73,7 +74,7 @@ def written(tmp_path, robot, columns, sd, readings=0.0):
 def history(tmp_path, robot, truth, columns, sd, seed):
     """A table whose readings are those of `truth` with noise of the sds [the columns' units]."""
     blank = written(tmp_path, robot, columns, sd)
-    shown = np.asarray(observers.kind(blank).of(blank, truth)(truth).reading)
+    shown = np.asarray(eqx.filter_jit(observers.kind(blank).of(blank, truth))(truth).reading)
     factor = np.array([c.factor for c in robot.channels])
     noise = np.array(sd) * np.random.default_rng(seed).standard_normal(shown.shape)
     return written(tmp_path, robot, columns, sd, shown / factor + noise)

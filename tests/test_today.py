@@ -69,7 +69,7 @@ def test_statuses_of_steady_and_drive_agree_where_both_settle(anywhere):
 
 
 def test_a_status_is_mirrored_with_voltage_and_slope():
-    rng, count = np.random.default_rng(3), 200
+    rng, count = np.random.default_rng(3), 400  # whose program is that of `anywhere`
     voltage, slope = rng.uniform(-20, 20, count), rng.uniform(-20, 20, count)
     voltage[:60] = rng.uniform(-2, 2, 60)
     robot, kind = robots.nominal(), np.where(rng.random(count) < 0.5, "6T2A", "4W2T")
