@@ -47,6 +47,8 @@ OF_VEHICLE = ("speed",)
 PEAK = "peak_current_A"
 #: Columns of the currents of the motors of either side, where sides are driven apart.
 _OF_SIDES = tuple(channels.find(f"motor_current_{side}").column for side in channels.SIDES)
+#: Runs are filled up to a multiple of this, so that tables of about one size share what is compiled.
+PAD = 16
 #: Column of the time that a run's current may flow before its windings are at their limit.
 PERMISSIBLE = "permissible_time_s"
 
@@ -158,8 +160,10 @@ def permissible(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
     """How long the current of each run may flow from ambient temperature [s]; inf for ever, NaN without a current."""
     current = amperes(robot, table)
     known = np.isfinite(current)
-    time = _permissible(robot.motor, jnp.asarray(np.where(known, current, 0.0)))
-    return np.where(known, np.asarray(time), np.nan)
+    filled = np.zeros(len(current) + -len(current) % PAD)
+    filled[: len(current)] = np.where(known, current, 0.0)
+    time = _permissible(robot.motor, jnp.asarray(filled))
+    return np.where(known, np.asarray(time)[: len(current)], np.nan)
 
 
 @functools.partial(compiled, options=SELDOM)
