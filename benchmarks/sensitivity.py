@@ -138,7 +138,7 @@ def coverage(seeds: int, size: int, reference_size: int) -> dict[str, Any]:
 
     inputs, model, conditions = ours()
     design = sobol.design(len(NAMES), reference_size, 2**31, second=False)
-    values = np.asarray(inputs.values(inputs.scores(jax.numpy.asarray(design.points))))
+    values = inputs.values(inputs.scores(design.points))
     began = time.perf_counter()
     by = by_scipy(values[:, : len(NAMES)])
     print(f"reference: {len(values)} roots by SciPy in {time.perf_counter() - began:.0f} s", flush=True)
@@ -146,7 +146,7 @@ def coverage(seeds: int, size: int, reference_size: int) -> dict[str, Any]:
     held = np.zeros((3, 2, len(NAMES)))
     for seed in range(seeds):
         design = sobol.design(len(NAMES), size, seed, second=False)
-        values = np.asarray(inputs.values(inputs.scores(jax.numpy.asarray(design.points))))
+        values = inputs.values(inputs.scores(design.points))
         answer = model(values, conditions)
         for j, name in enumerate(OUTPUTS):
             found = sobol.terms(design, answer.values[name])
@@ -178,7 +178,7 @@ def speed(points: int, repeats: int) -> dict[str, Any]:
     inputs, model, conditions = ours()
     blocks = 2 * len(NAMES) + 2
     design = sobol.design(len(NAMES), 2 ** int(np.log2(points / 32 / blocks)), 0)
-    values = np.asarray(inputs.values(inputs.scores(jax.numpy.asarray(design.points))))
+    values = inputs.values(inputs.scores(design.points))
     own = values[:, : len(NAMES)]
     some = own[:: max(len(own) // 2000, 1)]
     began = time.perf_counter()

@@ -229,7 +229,7 @@ def simulate_in_parts(
     while first < runs:
         size = max(1, min(runs, MOST_KEPT // keep))
         rows = np.minimum(np.arange(first, first + size), runs - 1)  # the last ones stand for the last run again
-        some = jax.tree.map(lambda x, rows=rows: x[rows], conditions)
+        some = jax.tree.map(lambda x, rows=rows: jnp.asarray(np.asarray(x)[rows]), conditions)
         found = jax.device_get(simulate_batch(robot, some, _rows_of(profile, rows), start, keep))
         steps = int(np.max(found.steps - found.rejected))
         if steps > keep and keep < MOST_KEPT:

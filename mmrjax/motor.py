@@ -220,7 +220,9 @@ class Motor(eqx.Module):
         low, high = jax.lax.fori_loop(0, 60, halve, (jnp.asarray(1e-6), jnp.asarray(_LONG)))
         found = jax.lax.stop_gradient(jnp.sqrt(low * high))
         # Newton's step from there is nothing but carries the derivative.
-        value, rise = jax.jvp(excess, (found,), (jnp.ones_like(found),))
-        found = found - jnp.where(rise > 0, value / jnp.where(rise > 0, rise, 1.0), 0.0)
+        hot, around = self.temperatures_after(current, found, *begin)
+        rise = self.heating(self.voltage_winding(current, hot) * current, hot, around)[0]
+        rises = jnp.isfinite(hot) & (rise > 0)
+        found = found - jnp.where(rises, (hot - limit) / jnp.where(rises, rise, 1.0), 0.0)
         ever = (self.temperature_settled(current) > limit) & (excess(jnp.asarray(_LONG)) > 0)
         return jnp.where(jnp.asarray(begin[0]) >= limit, 0.0, jnp.where(ever, found, jnp.inf))

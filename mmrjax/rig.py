@@ -164,7 +164,11 @@ class Rig(eqx.Module):
             The values at `at` - delay, of that shape first: on the straight line between the instants about it, held
             before the first and after the last.
         """
-        k, share = self.before(times, at)
+        return self.between(values, *self.before(times, at))
+
+    @staticmethod
+    def between(values: Array, k: Array, share: Array) -> Array:
+        """Values at instants that `before` gives, of what has no values between its own those before."""
         if not jnp.issubdtype(values.dtype, jnp.inexact):
             return values[k]
         return on_line(values[k], values[k + 1], share)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from calibration.data.errors import BadConfiguration
-from mmrjax import SOUND_AT_LEVEL_0
+from mmrjax import SOUND_AT_LEVEL_0, fidelities
 from sweeps import cli, config
 from sweeps.points import scale
 from tests.commands import rows as table
@@ -442,7 +442,7 @@ def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatc
     simulated.clear()
     monkeypatch.setattr(scale.Compiled, "__call__", lambda *a: (simulated.append(len(a[1])), honest(*a))[1])
     assert mmrjax(*arguments)[0] == 0
-    assert simulated == [10] * (6 - kept)  # none twice
+    assert simulated == [fidelities.FEW] * (6 - kept)  # filled up, and none twice
     resumed = (tmp_path / "s" / "runs.csv").read_text()
     assert mmrjax(*arguments[:-2], "--chunk", "60", "--out", "t")[0] == 0
     assert resumed == (tmp_path / "t" / "runs.csv").read_text()

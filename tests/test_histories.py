@@ -35,6 +35,9 @@ def seen(robot, runs=RUNS):
     return jnp.stack([getattr(s, k) for k in STATE], -1)[:, AT]
 
 
+seen_compiled = jax.jit(seen)  # of nominal robots one program
+
+
 def test_grid_holds_the_instants_and_is_fine_where_a_start_is_young():
     step = np.diff(GRID)
     assert GRID[0] == 0.0 and GRID[-1] == TIMES[-1] and np.isin(TIMES, GRID).all()
@@ -48,7 +51,7 @@ def test_histories_follow_drive():
     times = jnp.asarray(np.concatenate([[0.0], TIMES]))
     s = jax.jit(jax.vmap(lambda c: drive(robot, c, times, tolerance=1e-9, max_steps=20000).signals))(RUNS)
     expected = np.stack([np.asarray(getattr(s, k)) for k in STATE], -1)[:, 1:]
-    got = np.asarray(jax.jit(seen)(robot))
+    got = np.asarray(seen_compiled(robot))
     # measured: 5 mA of 50 A, 0.11 rad/s of 1200, 13 µm/s of 1.3 m/s
     assert (np.abs(got - expected) < np.array([8e-3, 0.2, 3e-5])).all()
     assert expected[..., 0].max() > 10 and expected[..., 2].max() > 0.5
@@ -105,7 +108,7 @@ def test_repeated_instants_change_nothing():
 
 def test_run_that_cannot_be_followed_is_not_finite():
     robot = params.replace(robots.nominal(), {"motor.resistance": jnp.asarray(jnp.nan)})
-    assert not np.isfinite(seen(robot)).any()
+    assert not np.isfinite(seen_compiled(robot)).any()
 
 
 def test_known_states_change_neither_values_nor_derivatives():
@@ -118,12 +121,11 @@ def test_known_states_change_neither_values_nor_derivatives():
         return found, found
 
     known = jax.jit(lambda: followed(robot, run, times))()
-    (slope, value), (slope_known, value_known) = (
-        jax.jit(jax.jacfwd(lambda x, s=s: current(x, s), has_aux=True))(friction) for s in (None, known)
-    )
+    by_friction = jax.jit(jax.jacfwd(current, has_aux=True))
+    (slope, value), (slope_known, value_known) = by_friction(friction), by_friction(friction, known)
     assert np.abs(value).max() > 1 and np.abs(slope).max() > 0.1
     np.testing.assert_allclose(value_known, value, rtol=1e-12)
     np.testing.assert_allclose(slope_known, slope, rtol=1e-9, atol=1e-12)
     # And they are what is followed: those of another run are shown as they are.
-    other = current(friction, jax.tree.map(lambda x: 2 * x, known))[0]
+    _, other = by_friction(friction, jax.tree.map(lambda x: 2 * x, known))
     np.testing.assert_allclose(other[1:], 2 * value[1:], rtol=1e-12)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -93,9 +95,10 @@ def test_steady_speeds_follow_from_torque_whatever_the_winding(robot, resistance
 
 def test_a_run_follows_its_first_order_law(robot):
     times = jnp.linspace(0.0, 1.0, 21)
-    found = drive(robot, Conditions(motor_current=2.0), times)
+    driven = jax.jit(lambda current: drive(robot, Conditions(motor_current=current), times))
+    found = driven(2.0)
     assert np.asarray(found.signals.speed_motor) == pytest.approx(followed(2.0, np.asarray(times)), abs=0.15)
-    at_rest = drive(robot, Conditions(motor_current=0.5), times)
+    at_rest = driven(0.5)
     assert np.abs(np.asarray(at_rest.signals.speed_motor)).max() < 1e-6
 
 
@@ -122,7 +125,7 @@ def test_histories_follow_a_current_that_changes(robot, tmp_path):
     runs = log(tmp_path, robot, 0.0)
     made = observers.kind(runs).of(runs, robot)
     assert made.conditions.motor_current.shape == made.times.shape
-    shown = np.asarray(made(robot).reading)[:, 0]
+    shown = np.asarray(eqx.filter_jit(made)(robot).reading)[:, 0]
     assert shown == pytest.approx(runs["motor_speed_rpm"] * np.pi / 30, abs=0.3)
     assert made.times.shape[1] < 800  # no inrush to be followed after a change
 

@@ -279,6 +279,9 @@ def test_large_batches_run_in_chunks(robot, monkeypatch):
     assert sizes == [(("total_current", "motor_speed", "speed", "status"), (4,))] * 3
     np.testing.assert_allclose(by_fours.slip, together.slip, rtol=1e-13)
     assert sizes[3:] == [("run", (4,))] * 3
+    three = mm.simulate(robot, mm.Conditions(voltage=np.reshape(runs.voltage[:3], (3, 1)))).slip
+    np.testing.assert_allclose(three[:, 0], together.slip[:3], rtol=1e-13)
+    assert sizes[6:] == [("run", (4,))]  # fewer are filled up to share the program
 
 
 def test_new_fidelity_answers_at_once(toy, robot):

@@ -4,6 +4,7 @@ import contextlib
 import csv
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -59,23 +60,25 @@ torque_gravity = "0.6 ± 20 %"
 OPTIONS = {"model": "drive", "starts": 4, "blocks": False, "profiles": False}
 
 
+def written(tmp_path, robot, columns, sd, readings=0.0):
+    """A table of readings with their sds [the columns' units]."""
+    rows = len(columns["time_s"])
+    readings = np.broadcast_to(readings, (rows, len(sd)))
+    names = [*columns, *(n for c in robot.channels for n in (c.column, c.sd_column))]
+    cells = [*columns.values(), *(x for k in range(len(sd)) for x in (readings[:, k], np.full(rows, sd[k])))]
+    lines = [",".join(names), *(",".join(str(c[k]) for c in cells) for k in range(rows))]
+    path = tmp_path / "table.csv"
+    path.write_text("\n".join(lines))
+    return records.read(path, robot=robot)
+
+
 def history(tmp_path, robot, truth, columns, sd, seed):
     """A table whose readings are those of `truth` with noise of the sds [the columns' units]."""
-    rows = len(columns["time_s"])
-    path = tmp_path / "table.csv"
-
-    def write(readings):
-        names = [*columns, *(n for c in robot.channels for n in (c.column, c.sd_column))]
-        cells = [*columns.values(), *(x for k in range(len(sd)) for x in (readings[:, k], np.full(rows, sd[k])))]
-        lines = [",".join(names), *(",".join(str(c[k]) for c in cells) for k in range(rows))]
-        path.write_text("\n".join(lines))
-        return records.read(path, robot=robot)
-
-    blank = write(np.zeros((rows, len(sd))))
-    shown = np.asarray(observers.kind(blank).of(blank, truth)(truth).reading)
+    blank = written(tmp_path, robot, columns, sd)
+    shown = np.asarray(eqx.filter_jit(observers.kind(blank).of(blank, truth))(truth).reading)
     factor = np.array([c.factor for c in robot.channels])
     noise = np.array(sd) * np.random.default_rng(seed).standard_normal(shown.shape)
-    return write(shown / factor + noise)
+    return written(tmp_path, robot, columns, sd, shown / factor + noise)
 
 
 def test_the_speed_at_which_a_run_begins_moves_with_the_robot(tmp_path):
@@ -92,11 +95,12 @@ def test_the_speed_at_which_a_run_begins_moves_with_the_robot(tmp_path):
     def slopes(shares):
         def speed(shares):
             changed = {name: values[name] * share for name, share in zip(names, shares, strict=True)}
-            return integrator.histories(params.replace(robot, changed), given, times).speed
+            found = integrator.histories(params.replace(robot, changed), given, times).speed
+            return found, found
 
-        return speed(shares), jax.jacfwd(speed)(shares)
+        return jax.jacfwd(speed, has_aux=True)(shares)
 
-    speed, slope = slopes(jnp.ones(2))
+    slope, speed = slopes(jnp.ones(2))
     np.testing.assert_allclose(speed, 100.0 / 16 * 0.005 / (2 * np.pi), rtol=1e-9)
     np.testing.assert_allclose(slope, speed[:, None] * np.array([1.0, -1.0]), rtol=1e-9)  # v = r ω / i
 
@@ -207,34 +211,36 @@ def test_a_robot_at_rest_has_no_beginnings(tmp_path):
 def test_what_is_imposed_acts_later_by_the_delay():
     rig = Rig(delay=0.2)
     times, values = jnp.asarray([0.0, 1.0, 2.0]), jnp.asarray([3.0, 5.0, 4.0])
-    shown = [float(rig.late(times, values, at)) for at in (-1.0, 0.1, 0.7, 1.2, 1.7, 9.0)]
-    assert shown == pytest.approx([3.0, 3.0, 4.0, 5.0, 4.5, 4.0])
-    assert rig.clock(jnp.asarray([-0.5, 0.0, 0.3])).tolist() == pytest.approx([-0.5, 0.0, 0.5])
+    at, of_run = jnp.asarray([-1.0, 0.1, 0.7, 1.2, 1.7, 9.0]), jnp.asarray([-0.5, 0.0, 0.3])
+    shown, clock = jax.jit(lambda: (rig.late(times, values, at), rig.clock(of_run)))()
+    assert shown.tolist() == pytest.approx([3.0, 3.0, 4.0, 5.0, 4.5, 4.0])
+    assert clock.tolist() == pytest.approx([-0.5, 0.0, 0.5])
 
 
 def test_a_delay_reads_the_run_of_each_row_and_takes_memory_by_rows():
     """Two runs, the rows in no order; a run of 3000 rows takes less than each row's own copy of the run."""
-    times = jnp.asarray([[0.0, 0.5, 1.0], [0.0, 0.25, 0.5]])
-    every = jnp.stack([10 * times, -times], -1)
+    times = np.array([[0.0, 0.5, 1.0], [0.0, 0.25, 0.5]])
+    every = np.stack([10 * times, -times], -1)
     order = [1, 0, 1, 0, 0], [2, 1, 1, 2, 0], [[4, 1, 3], [2, 0, -1]]
     run, instant, rows_of = (jnp.asarray(x) for x in order)
-    steps = every[:, :-1], every[:, :-1], every[:, 1:], jnp.zeros((2, 2))  # on straight lines
-    seen = Histories(Conditions(0, 1.0), times, run, instant, rows_of, rows_of).late(steps, Rig(delay=0.1))
-    at = np.maximum(np.asarray(times)[run, instant] - 0.1, 0.0)
+    steps = every[:, :-1], every[:, :-1], every[:, 1:], np.zeros((2, 2))  # on straight lines
+    made = Histories(Conditions(0, 1.0), jnp.asarray(times), run, instant, rows_of, rows_of)
+    seen = jax.jit(lambda x: made.late(x, Rig(delay=0.1)))(steps)
+    at = np.maximum(times[run, instant] - 0.1, 0.0)
     np.testing.assert_allclose(seen, np.stack([10 * at, -at], -1), rtol=1e-12)
 
     count = 3000
-    along = jnp.arange(count)
+    along, of_first = jnp.asarray(np.arange(count)), jnp.asarray(np.arange(count)[None])
     long = Histories(
-        Conditions(0, 1.0), jnp.linspace(0, 1, count)[None], jnp.zeros(count, int), along, along[None], along[None]
+        Conditions(0, 1.0), np.linspace(0, 1, count)[None], np.zeros(count, int), along, of_first, of_first
     )
     late = jax.jit(lambda x: long.late((x[:, :-1], x[:, :-1], x[:, 1:], x[:, 1:, 0]), Rig(delay=0.1)))
-    program = late.lower(jnp.zeros((1, count, 2))).compile()
+    program = late.lower(np.zeros((1, count, 2))).compile()
     assert program.memory_analysis().temp_size_in_bytes < 8 * 100 * count
 
 
-def imposed_speed(tmp_path, runs):
-    """A rig whose motor's speed is imposed over time, and the table of so many runs of it."""
+def imposed_speed(tmp_path, runs, filled=written):
+    """A rig whose motor's speed is imposed over time, and the table of so many runs of it, whatever it reads."""
     path = tmp_path / "rig.toml"
     text = DRIVE.format(imposed="motor_speed", channels='"total_current"', start="measured") + BENCH
     path.write_text(text.replace('delay = "0 ± 0.05"', "delay = 0.0"))
@@ -243,7 +249,7 @@ def imposed_speed(tmp_path, runs):
     run = np.repeat(np.arange(runs), 20)
     speed = (200 * np.sin(6 * t + run) + 50 * np.sin(14 * t)) / channels.RPM
     columns = {"time_s": t, "run_id": run, "motor_speed_rpm": speed}
-    return robot, history(tmp_path, robot, robot, columns, [0.01], 3)
+    return robot, filled(tmp_path, robot, columns, [0.01])
 
 
 def test_a_defect_moves_the_current_of_an_imposed_speed_at_once(tmp_path):
@@ -282,8 +288,8 @@ def test_curves_of_a_drive_that_reverses_count_along_its_travel(tmp_path):
                 seen += 1
     assert seen >= 2
     curve = UNNAMED["curve_track_speed_motor"](amplitude=1.0, y1=2.0, y3=-1.0)
-    at = [balances.begin(robot, Conditions(0), State(0.0, way * 300.0, 0.0, 0.0)) for way in (1, -1)]
-    ahead, back = (float(curve.term(robot, s)) for s in at)
+    term = jax.jit(lambda speed: curve.term(robot, balances.begin(robot, Conditions(0), State(0.0, speed, 0.0, 0.0))))
+    ahead, back = (float(term(way * 300.0)) for way in (1, -1))
     assert ahead == pytest.approx(-back) and abs(ahead) > 0.1
 
 
@@ -302,7 +308,7 @@ def test_an_imposed_speed_changes_within_each_run_and_nothing_else_does(tmp_path
 
 @pytest.mark.slow
 def test_histories_are_compared_with_a_robot(tmp_path, mmrjax):
-    imposed_speed(tmp_path, 2)
+    imposed_speed(tmp_path, 2, lambda path, robot, *told: history(path, robot, robot, *told, 3))
     code, _, err = mmrjax("compare", "table.csv", "--robot", "rig.toml", "--no-report", "--out", "found")
     assert code == 0, err
     with (tmp_path / "found" / "comparison.csv").open(encoding="utf-8") as file:
@@ -461,50 +467,64 @@ def test_a_jump_of_the_voltage_is_exact_in_one_step(tmp_path):
         text.replace("[gearbox]", "inductance = 0.01\n[gearbox]").replace("0.02", "1e3")
     )
     robot = robot_file.load(str(tmp_path / "rig.toml"))
-    times = jnp.array([0.0, 0.03, 0.035, 0.04])
-    driven = dataclasses.replace(Conditions(voltage=6.0), voltage=jnp.array([6.0, 9.0, 9.0, 9.0]))
+    times = jnp.array([0.0, 0.03, 0.035, 0.04, 0.04])  # the last instant begins a step, as the observer has it
+    driven = Conditions(voltage=np.array([6.0, 9.0, 9.0, 9.0, 9.0]))
 
     def of(resistance):
         changed = params.replace(robot, {"motor.resistance": resistance})
         steps = integrator.within(changed, driven, times)
         currents = tuple(x.current for x in (steps.first, steps.begin, steps.end))
-        between = integrator.Within.read((*currents, steps.decays), jnp.array([0.5, 0.4, 0.5]))
-        return jnp.append(integrator.histories(changed, driven, times).current, between[1])
+        between = integrator.Within.read((*currents, steps.decays), jnp.array([0.5, 0.4, 0.5, 0.5]))
+        found = jnp.append(steps.first.current, between[1])
+        return found, found
 
     def exact(resistance):
         left = np.exp(-resistance / 0.01 * np.array([0.03, 0.005, 0.01, 0.002]))
         return 6 / resistance * (1 - left[0]), *((9 - (3 + 6 * left[0]) * left[1:]) / resistance)
 
-    shown, slope = jax.jit(lambda r: (of(r), jax.jacfwd(of)(r)))(3.0)
-    np.testing.assert_allclose(shown[jnp.array([1, 2, 4])], np.take(exact(3.0), [0, 1, 3]), rtol=1e-4)
+    slope, shown = map(np.asarray, jax.jit(jax.jacfwd(of, has_aux=True))(3.0))
+    np.testing.assert_allclose(shown[[1, 2, 4]], np.take(exact(3.0), [0, 1, 3]), rtol=1e-4)
     assert abs(shown[3] - exact(3.0)[2]) < 0.01
     expected = (np.array(exact(3.003)) - np.array(exact(2.997))) / 0.006
-    np.testing.assert_allclose(slope[jnp.array([1, 2, 4])], expected[[0, 1, 3]], rtol=2e-3)
+    np.testing.assert_allclose(slope[[1, 2, 4]], expected[[0, 1, 3]], rtol=2e-3)
 
 
-@pytest.mark.parametrize("name", ["bench.inertia", "bench.loss_coulomb", "motor.friction_coulomb"])
-def test_derivatives_through_rest_are_those_of_steps_without_end(tmp_path, name):
-    """Where a direction turns friction jumps, by what no stage of a step shows: the derivative of what the stages
-    compute forgets that the moment of rest moves."""
-    path = tmp_path / "robot.toml"
+THROUGH_REST = ("bench.inertia", "bench.loss_coulomb", "motor.friction_coulomb")
+
+
+@pytest.fixture(scope="module")
+def through_rest(tmp_path_factory):
+    """Derivatives of the speeds of a run by shares of its parameters, and differences of steps without end."""
+    path = tmp_path_factory.mktemp("rig") / "robot.toml"
     path.write_text(DRIVE.format(imposed="voltage", channels='"motor_current", "motor_speed"', start="rest") + BENCH)
     robot = robot_file.read(path)
     every = np.arange(0, 1.2, 0.02)
-    value = {p.name: float(p.value) for p in params.walk(robot)}[name]
+    values = {p.name: float(p.value) for p in params.walk(robot)}
 
     def speeds(longest):
         times = integrator.grid(every, longest=longest)
         volts = 6.0 * np.where(np.sin(2 * np.pi * (1.3 * times + 0.4 * times**2)) >= 0, 1.0, -1.0)
-        held = dataclasses.replace(Conditions(voltage=8.0), voltage=jnp.asarray(volts))
+        held = Conditions(voltage=volts)
 
-        @jax.jit
-        def of(share):
-            there = params.replace(robot, {name: value * (1 + share)})
-            return integrator.histories(there, held, jnp.asarray(times)).speed_motor[np.searchsorted(times, every)]
+        def of(shares):
+            changed = {name: values[name] * (1 + share) for name, share in zip(THROUGH_REST, shares, strict=True)}
+            found = integrator.histories(params.replace(robot, changed), held, jnp.asarray(times))
+            return found.speed_motor[np.searchsorted(times, every)]
 
         return of
 
-    fine, usual = speeds(4e-5), speeds(6e-4)
-    assert (np.diff(np.sign(fine(0.0))) != 0).sum() >= 4
-    wide = (fine(0.02) - fine(-0.02)) / 0.04
-    assert np.linalg.norm(jax.jacfwd(usual)(0.0) - wide) < 0.05 * np.linalg.norm(wide)
+    fine, one = speeds(4e-5), np.eye(len(THROUGH_REST))
+    still, ahead, behind = np.split(
+        np.asarray(jax.jit(jax.vmap(fine))(np.concatenate([0 * one[:1], 0.02 * one, -0.02 * one]))), [1, 4]
+    )
+    assert (np.diff(np.sign(still[0])) != 0).sum() >= 4
+    slopes = jax.jit(jax.jacfwd(speeds(6e-4)))(np.zeros(len(THROUGH_REST)))
+    return np.asarray(slopes).T, (ahead - behind) / 0.04
+
+
+@pytest.mark.parametrize("name", THROUGH_REST)
+def test_derivatives_through_rest_are_those_of_steps_without_end(through_rest, name):
+    """Where a direction turns friction jumps, by what no stage of a step shows: the derivative of what the stages
+    compute forgets that the moment of rest moves."""
+    slope, wide = (x[THROUGH_REST.index(name)] for x in through_rest)
+    assert np.linalg.norm(slope - wide) < 0.05 * np.linalg.norm(wide)

@@ -8,6 +8,7 @@ import tomllib
 from pathlib import Path
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import jsonschema
 import numpy as np
@@ -89,13 +90,22 @@ def test_inputs_are_those_of_the_priors(robot, study):
     from scipy.stats import norm
 
     np.testing.assert_allclose(
-        study.inputs.values(study.inputs.scores(jnp.asarray(u)))[:, :4], coordinates.value(norm.ppf(u)), rtol=1e-9
+        study.inputs.values(study.inputs.scores(u))[:, :4], coordinates.value(norm.ppf(u)), rtol=1e-9
     )
+
+
+def test_values_of_a_design_compile_nothing(study, compilations):
+    """In NumPy they are the same as traced, row for row."""
+    unit = np.random.default_rng(1).uniform(size=(3, len(study.inputs)))
+    values = study.values_at(study.inputs.scores(unit))
+    assert isinstance(values, np.ndarray) and not compilations
+    traced = jax.jit(study.inputs.values)(study.inputs.scores(unit))
+    np.testing.assert_allclose(values, traced, rtol=1e-9)
 
 
 def test_conditions_vary_uniformly_beside_parameters(robot):
     inputs = room.of_priors(robot, NAMES[:1], {"voltage": (20.0, 28.0)})
-    values = np.asarray(inputs.values(inputs.scores(jnp.asarray([[0.5, 0.25]]))))
+    values = np.asarray(inputs.values(inputs.scores(np.array([[0.5, 0.25]]))))
     assert inputs.columns == (NAMES[0], "voltage")
     np.testing.assert_allclose(values, [[0.0259, 22.0]], rtol=1e-3)
 

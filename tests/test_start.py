@@ -13,7 +13,7 @@ from worlds import paper
 
 from mmrjax import robots, stages
 from mmrjax.channels import MM
-from mmrjax.fidelities.base import History
+from mmrjax.fidelities.base import History, as_tables
 from mmrjax.params import replace
 from mmrjax.rig import Rig
 from mmrjax.signals import Signals
@@ -136,11 +136,13 @@ def test_the_delay_of_histories_is_the_one_of_fits():
     x = np.stack([np.sin(40 * t), t**2], 1)
     rig = Rig(delay=delay)
     at = np.array([0.0, 0.003, 0.004, 0.014, 0.02, 0.07, 0.2])
-    got = jax.vmap(lambda a: rig.late(jnp.asarray(t), jnp.asarray(x), a))(at)
-    np.testing.assert_allclose(got, np.stack([np.interp(at - delay, t, c) for c in x.T], 1), rtol=1e-12, atol=1e-15)
     ended = jnp.asarray(np.where(t > 0.02, np.nan, t))
-    assert float(rig.late(jnp.asarray(t), ended, 0.01 + delay)) == pytest.approx(0.01)
-    slope = jax.grad(lambda d: Rig(delay=d).late(jnp.asarray(t), jnp.asarray(x[:, 1]), 0.05))(delay)
+    got, last = jax.jit(
+        lambda: (rig.late(jnp.asarray(t), jnp.asarray(x), at), rig.late(jnp.asarray(t), ended, 0.01 + delay))
+    )()
+    np.testing.assert_allclose(got, np.stack([np.interp(at - delay, t, c) for c in x.T], 1), rtol=1e-12, atol=1e-15)
+    assert float(last) == pytest.approx(0.01)
+    slope = jax.jit(jax.grad(lambda d: Rig(delay=d).late(jnp.asarray(t), jnp.asarray(x[:, 1]), 0.05)))(delay)
     assert float(slope) == pytest.approx(-(0.08**2 - 0.03**2) / 0.05)
 
 
@@ -153,6 +155,14 @@ def test_a_delay_that_is_none_changes_no_number():
     np.testing.assert_allclose(late.time[0], [0, 0.5, 0.75, 1.0, 1.25])
     np.testing.assert_allclose(late.reading["speed"][0], t[0])
     np.testing.assert_allclose(late.signals.speed_theoretical[0], 2 * t[0])
+
+
+def test_what_a_delay_moves_is_moved_by_one_program(compilations):
+    t = jnp.asarray(np.linspace(0, 1, 6)[None])
+    values = {str(k): t + k for k in range(30)}
+    _, late = as_tables(Rig(delay=0.1), t, values)
+    assert len(compilations) < 10
+    np.testing.assert_allclose(late["7"][0, 2:], t[0, 2:] + 7)
 
 
 def test_a_vehicle_whose_rig_shows_no_speed_has_that_of_the_robot_in_its_history():

@@ -261,7 +261,8 @@ def test_chunks_that_workers_compute_are_those_of_this_process(job, monkeypatch)
         here = compiled(compiled.points(chunk))
         assert set(arrays_there) == set(here)
         for name, values in here.items():
-            np.testing.assert_array_equal(np.asarray(arrays_there[name]), np.asarray(values))
+            own = np.asarray(values)[: job.blocks.count(chunk)]  # the rest fills the chunk up
+            np.testing.assert_array_equal(np.asarray(arrays_there[name]), own)
 
 
 def test_workers_that_come_later_get_chunks(job, monkeypatch):

@@ -135,7 +135,9 @@ def test_what_takes_long_runs_in_parts_and_says_how_far_it_is(robot, runs, monke
     assert said.count(1.0) == 4 and sum(said) == 4  # two chunks, two parts each
 
 
-def test_chunks_of_many_points_are_filled_up_to_share_programs(robot, runs):
+def test_chunks_are_filled_up_to_share_programs(robot, runs):
+    """Of settled points those of few too; what runs over time takes longer than its program does to compile."""
     many = dataclasses.replace(runs, columns={k: np.tile(v, 4200) for k, v in runs.columns.items()})
     sizes = [scale.Compiled(run.job_of(robot, r, chunked(None))).size for r in (runs, many)]
-    assert sizes == [4, 2 * scale.SHARED]
+    assert sizes == [fidelities.FEW, 2 * scale.SHARED]
+    assert scale.Compiled(run.job_of(robot, runs, config.Simulate(model="drive"))).size == 4

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from calibration.data.errors import BadConfiguration
@@ -123,7 +121,7 @@ def _by_method(study: Study, method: str, moving: np.ndarray, evaluations: int, 
 
 
 def _described(inputs: Inputs, idle: np.ndarray) -> dict[str, Input]:
-    slope = np.asarray(jax.jacfwd(inputs.values)(jnp.asarray(inputs.centre)))[inputs.places]
+    slope = inputs.slope[inputs.places]
     uniform = np.arange(len(inputs)) >= len(inputs.parameters)
     sd = np.where(uniform, np.abs(slope).sum(1) / np.sqrt(12), np.sqrt(np.sum(slope**2, 1)))
     along = directions(inputs)
@@ -135,8 +133,7 @@ def _described(inputs: Inputs, idle: np.ndarray) -> dict[str, Input]:
             rows[side][k] = inputs.centre
             rows[side][k, k] = 0.5 + side * 0.475
     at = {
-        q: np.asarray(inputs.values(jnp.asarray(x)))[:, inputs.places][np.arange(len(inputs)), np.arange(len(inputs))]
-        for q, x in rows.items()
+        q: inputs.values(x)[:, inputs.places][np.arange(len(inputs)), np.arange(len(inputs))] for q, x in rows.items()
     }
     found = {}
     for k, name in enumerate(inputs.names):
@@ -150,7 +147,7 @@ def _described(inputs: Inputs, idle: np.ndarray) -> dict[str, Input]:
 def _study_of(row: OutputRow, study: Study, found: Local, part: Part | None) -> OutputStudy:
     name, points = row.name, len(study.points)
     value, slopes, scores = found.value[name], found.derivative[name], found.by_score[name]
-    median = np.asarray(study.inputs.values(jnp.asarray(study.inputs.centre)))[study.inputs.places]
+    median = study.inputs.values(study.inputs.centre)[study.inputs.places]
     with np.errstate(divide="ignore", invalid="ignore"):
         elasticity = slopes * median / value[:, None]
     elasticity = np.where(np.isfinite(elasticity), elasticity, np.nan)

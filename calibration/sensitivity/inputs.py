@@ -6,11 +6,13 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import ndtri
-from jaxtyping import Array, Float
+from jaxtyping import Float
+from scipy.special import ndtri
 
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.posterior import Posterior
@@ -66,18 +68,34 @@ class Inputs:
     def _root(self) -> np.ndarray:
         return self.parameters.root
 
-    def values(self, scores: Float[Array, "... inputs"]) -> Float[Array, "... columns"]:
-        """Values of `columns` at independent scores: standard normal for parameters, in 0..1 for conditions."""
-        p = len(self.parameters)
-        theta = self.parameters.at(jnp.asarray(self.parameters.mean) + scores[..., :p] @ jnp.asarray(self._root).T)
-        stated = jnp.asarray(self.low) + jnp.asarray(self.high - self.low) * scores[..., p:]
-        return jnp.concatenate([theta, stated], -1)
+    def values(self, scores: Any) -> Any:
+        """Values of `columns` at independent scores: standard normal for parameters, in 0..1 for conditions; in NumPy
+        of an array of NumPy, which compiles nothing, else traceable.
 
-    def scores(self, unit: Float[Array, "... inputs"]) -> Float[Array, "... inputs"]:
+        Args:
+            scores: shape (..., inputs).
+
+        Returns:
+            Shape (..., columns).
+        """
+        p = len(self.parameters)
+        theta = self.parameters.at(self.parameters.mean + scores[..., :p] @ self._root.T)
+        stated = self.low + (self.high - self.low) * scores[..., p:]
+        return (np if isinstance(scores, np.ndarray) else jnp).concatenate([theta, stated], -1)
+
+    def jacobian(self, scores: Float[np.ndarray, "rows inputs"]) -> Float[np.ndarray, "rows columns inputs"]:
+        """d values / d scores of each row."""
+        return np.asarray(jax.jit(jax.vmap(jax.jacfwd(self.values)))(scores))
+
+    @cached_property
+    def slope(self) -> Float[np.ndarray, "columns inputs"]:
+        """The same in the middle."""
+        return self.jacobian(self.centre[None])[0]
+
+    def scores(self, unit: Float[np.ndarray, "... inputs"]) -> Float[np.ndarray, "... inputs"]:
         """Scores of points of the unit cube."""
         p = len(self.parameters)
-        inside = jnp.clip(unit[..., :p], EDGE, 1 - EDGE)
-        return jnp.concatenate([ndtri(inside), unit[..., p:]], -1)
+        return np.concatenate([ndtri(np.clip(unit[..., :p], EDGE, 1 - EDGE)), unit[..., p:]], -1)
 
     @property
     def centre(self) -> np.ndarray:

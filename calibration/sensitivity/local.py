@@ -5,13 +5,12 @@ from __future__ import annotations
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from calibration.inference.identifiability import Z95
 from calibration.sensitivity import derivative
 from calibration.sensitivity.inputs import Inputs
-from calibration.sensitivity.study import Study, jacobian_of, source_words
+from calibration.sensitivity.study import Study, source_words
 
 #: Random robots at which derivatives are looked at before an input is taken for inert, and at how many points.
 LOOKS, PLACES = 4, 12
@@ -51,12 +50,11 @@ def local(study: Study) -> Local:
     values = study.values_at(centre)
     answer = study.model(values, study.conditions)
     by_columns = study.model.derivatives(values, study.conditions)
-    inner = np.asarray(jacobian_of(inputs, centre))
     derivative, by_score, swing = {}, {}, {}
     for name, moved in by_columns.items():
         finite = np.isfinite(answer.values[name])[:, None]
         derivative[name] = np.where(finite, _by_inputs(inputs, moved), np.nan)
-        by_score[name] = np.where(finite, np.einsum("pc,pci->pi", moved, inner), np.nan)
+        by_score[name] = np.where(finite, moved @ inputs.slope, np.nan)
     along = directions(inputs)
     p = len(inputs.parameters)
     ends = []
@@ -66,7 +64,7 @@ def local(study: Study) -> Local:
         for k in range(p, d):
             scores[:, k, k] = 0.5 + side * 0.475
         rows = scores.reshape(-1, d)
-        spread = jax.tree.map(lambda x: jnp.repeat(x, d), study.conditions)
+        spread = jax.tree.map(lambda x: np.repeat(np.asarray(x), d), study.conditions)
         ends.append({n: x.reshape(points, d) for n, x in study.model(study.values_at(rows), spread).values.items()})
     for name in by_columns:
         swing[name] = np.stack([end[name] for end in ends])
@@ -87,15 +85,15 @@ def _in_words(counts: dict[str, dict[str, int]]) -> dict[str, dict[str, int]]:
 
 def inert(study: Study, found: Local, seed: int) -> np.ndarray:
     """Inputs by which the derivative of every output is exactly zero wherever it was taken, shape (inputs,)."""
-    scores = study.inputs.scores(jnp.asarray(derivative.design(len(study.inputs), 1, seed, LOOKS)))
+    scores = study.inputs.scores(derivative.design(len(study.inputs), 1, seed, LOOKS))
     moving = np.zeros(len(study.inputs), bool)
     for g in found.derivative.values():  # not by scores: those of a posterior mix its parameters
         moving |= (np.nan_to_num(g) != 0).any(0)
     if moving.all():
         return ~moving
     points = np.unique(np.linspace(0, len(study.points) - 1, PLACES).astype(int))
-    rows = np.repeat(np.asarray(scores), len(points), 0)
-    conditions = jax.tree.map(lambda x: jnp.tile(x[points], len(scores)), study.conditions)
+    rows = np.repeat(scores, len(points), 0)
+    conditions = jax.tree.map(lambda x: np.tile(np.asarray(x)[points], len(scores)), study.conditions)
     for g in study.model.derivatives(study.values_at(rows), conditions).values():
         moving |= (np.nan_to_num(_by_inputs(study.inputs, g)) != 0).any(0)
     return ~moving

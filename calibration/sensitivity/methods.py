@@ -6,8 +6,8 @@ import dataclasses
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
+from scipy.special import ndtr
 
 from calibration.inference.identifiability import Z95
 from calibration.sensitivity import derivative, morris, shapley, sobol
@@ -41,7 +41,7 @@ def _sampled(study: Study, unit: np.ndarray, which: np.ndarray) -> np.ndarray:
     """Scores of all inputs at points of the unit cube of some of them."""
     whole = np.full((len(unit), len(study.inputs)), 0.5)
     whole[:, which] = unit
-    return np.asarray(study.inputs.scores(jnp.asarray(whole)))
+    return study.inputs.scores(whole)
 
 
 def groups(study: Study, moving: np.ndarray) -> dict[tuple[int, ...], list[int]]:
@@ -193,9 +193,9 @@ def derivative_bounds(study: Study, moving: np.ndarray, seed: int) -> dict[str, 
     normal = np.arange(d) < len(study.inputs.parameters)
     replicates, size = GRADIENTS
     unit = derivative.design(d, size, seed, replicates)
-    scores = np.asarray(study.inputs.scores(jnp.asarray(unit)))
+    scores = study.inputs.scores(unit)
     rows = np.tile(scores, (points, 1))
-    conditions = jax.tree.map(lambda x: jnp.repeat(x, len(scores)), study.conditions)
+    conditions = jax.tree.map(lambda x: np.repeat(np.asarray(x), len(scores)), study.conditions)
     values, gradients = study.gradients(rows, conditions)
     answer = {}
     for name in names:
@@ -247,7 +247,7 @@ def shapley_effects(study: Study, moving: np.ndarray, evaluations: int, seed: in
         design = shapley.design(mean[places], covariance[np.ix_(places, places)], pairs, seed)
         z = np.tile(mean, (len(design.points), 1))
         z[:, places] = design.points
-        values = np.asarray(_at_coordinates(study.inputs, z))
+        values = _at_coordinates(study.inputs, z)
         for k, made in study.sample(values, group):
             for name in names:
                 found = shapley.terms(design, made[name])
@@ -278,9 +278,8 @@ def shapley_effects(study: Study, moving: np.ndarray, evaluations: int, seed: in
     return answer
 
 
-def _at_coordinates(inputs: Inputs, z: np.ndarray) -> jax.Array:
+def _at_coordinates(inputs: Inputs, z: np.ndarray) -> np.ndarray:
     """Columns of the model at coordinates: of the posterior, and normal scores of conditions."""
     p = len(inputs.parameters)
-    theta = inputs.parameters.at(jnp.asarray(z[:, :p]))
-    share = jax.scipy.stats.norm.cdf(jnp.asarray(z[:, p:]))
-    return jnp.concatenate([theta, jnp.asarray(inputs.low) + jnp.asarray(inputs.high - inputs.low) * share], -1)
+    stated = inputs.low + (inputs.high - inputs.low) * ndtr(z[:, p:])
+    return np.concatenate([inputs.parameters.at(z[:, :p]), stated], -1)

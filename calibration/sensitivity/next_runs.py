@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from calibration.sensitivity import information
 from calibration.sensitivity.local import Local
 from calibration.sensitivity.model import known_outputs
 from calibration.sensitivity.result import NextRuns, Points
-from calibration.sensitivity.study import Study, jacobian_of
+from calibration.sensitivity.study import Study
 from mmrjax.conditions import Conditions
 
 #: Runs proposed.
@@ -74,8 +72,8 @@ def next_runs(study: Study, found: Local, candidates: Candidates) -> NextRuns | 
             values[:, first + j] = np.asarray(stated)
     answer = model(values, conditions)
     moved = model.derivatives(values, conditions)
-    inner = np.asarray(jacobian_of(study.inputs, rows))[:, :, :p]
-    jacobian = np.stack([np.einsum("pc,pci->pi", moved[o.name], inner) for o in shown], 1)
+    inner = study.inputs.slope[:, :p]
+    jacobian = np.stack([moved[o.name] @ inner for o in shown], 1)
     reading = np.stack([answer.values[o.name] for o in shown], 1)
     finite = np.isfinite(reading).all(1)
     if not finite.any():
@@ -83,7 +81,7 @@ def next_runs(study: Study, found: Local, candidates: Candidates) -> NextRuns | 
     information_of = information.fisher(jacobian[finite], candidates.deviations(reading)[finite])
     choice = information.choose(information_of, candidates.count)
     picked = np.flatnonzero(finite)[list(choice.rows)]
-    slope = np.asarray(jax.jacfwd(study.inputs.values)(jnp.asarray(study.inputs.centre)))[study.inputs.places][:, :p]
+    slope = study.inputs.slope[study.inputs.places][:, :p]
     after = np.sqrt(np.einsum("ij,kjl,il->ki", slope, choice.covariance, slope))
     outputs = {}
     for name, g in found.by_score.items():

@@ -70,7 +70,7 @@ class Study:
 
     def at(self, k: int) -> Conditions:
         """Conditions of one point."""
-        return jax.tree.map(lambda x: x[k], self.conditions)
+        return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[k]), self.conditions)
 
     def acting(self, k: int) -> np.ndarray:
         """Inputs that are not of another configuration than that of a point."""
@@ -78,7 +78,7 @@ class Study:
 
     def values_at(self, scores: np.ndarray) -> np.ndarray:
         """Columns of the model at scores of all inputs."""
-        return np.asarray(values_of(self.inputs, scores))
+        return np.asarray(self.inputs.values(scores))
 
     def sample(self, values: np.ndarray, points: Sequence[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
         """Outputs at the same values of the model's columns, at one point after the other; counted and timed.
@@ -130,20 +130,11 @@ class Study:
         values = self.values_at(scores)
         answer = self.model(values, conditions)
         by_columns = self.model.derivatives(values, conditions)
-        inner = np.asarray(jacobian_of(self.inputs, scores))
+        inner = self.inputs.jacobian(scores)
         moved = {name: np.einsum("pc,pci->pi", x, inner) for name, x in by_columns.items()}
         finite = {name: np.isfinite(x)[:, None] for name, x in answer.values.items()}
         self._count(answer, len(scores), began)
         return answer.values, {name: np.where(finite[name], g, np.nan) for name, g in moved.items()}
-
-
-def values_of(inputs: Inputs, scores: np.ndarray) -> jax.Array:
-    return inputs.values(jnp.asarray(scores))
-
-
-def jacobian_of(inputs: Inputs, scores: np.ndarray) -> jax.Array:
-    """d columns / d scores of each row, shape (rows, columns, inputs)."""
-    return jax.vmap(jax.jacfwd(inputs.values))(jnp.asarray(scores))
 
 
 def source_words(source: str) -> str:

@@ -47,6 +47,10 @@ class Effort:
     blocks: bool
 
 
+#: Settled runs that make one program for all batches of fewer.
+FEW = 256
+
+
 @dataclasses.dataclass(frozen=True)
 class Facts:
     """What is known of a fidelity before it is imported.
@@ -80,6 +84,11 @@ class Facts:
     def at_once(self, accelerator: bool) -> int:
         """Runs in one call where there are many, on processors or on an accelerator."""
         return self.chunk if isinstance(self.chunk, int) else self.chunk[accelerator]
+
+    def filled(self, runs: int) -> int:
+        """How many runs a batch is filled up to, so that small ones share a program: settled runs take less time than
+        that does to compile."""
+        return runs if self.rollout else max(runs, FEW)
 
     def resolved(self, **given: float | None) -> dict[str, float]:
         """Every option by name: as given, else (absent or None) its default.

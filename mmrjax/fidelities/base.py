@@ -54,10 +54,9 @@ class History(eqx.Module):
         """A history with its readings, of runs known at `time` since what is imposed acts; of signals with a further
         axis for left and right side their means."""
         if jnp.ndim(signals.current) > jnp.ndim(time):
-            shown, signals = balances.shown(robot, signals), balances.together(signals)
+            reading, signals = _shown(robot, signals, apart=True), balances.together(signals)
         else:
-            shown = balances.sensor(robot, signals)
-        reading = {c.name: shown[c.name] for c in channels.EVERY if c.over_time}
+            reading = _shown(robot, signals)
         if not robot.knows(channels.VOLTAGE):
             nan = jnp.full_like(signals.current, jnp.nan)
             volts = ("voltage", "voltage_source", "voltage_drop", "voltage_left", "inductance")
@@ -82,12 +81,26 @@ def as_tables(rig: Rig, time: Float[Array, "runs samples"], values: T) -> tuple[
         return time, values
     values = jax.tree.map(lambda x: jnp.broadcast_to(x, time.shape) if jnp.ndim(x) < 2 else jnp.asarray(x), values)
     clock = rig.clock(time)
-    return clock, _late(rig, time, values, clock)
+    places = _before(rig, time, clock)
+    return clock, jax.tree.map(lambda x: _between(x, *places), values)
 
 
 @compiled
-def _late(rig: Rig, time: Array, values: T, clock: Array) -> T:
-    return jax.tree.map(lambda x: jax.vmap(rig.late)(time, x, clock), values)
+def _shown(robot: Robot, signals: Signals, apart: bool = False) -> dict[str, Scalar]:
+    """Readings of the channels that change in a history; `apart`: of signals of left and right side."""
+    every = balances.shown(robot, signals) if apart else balances.sensor(robot, signals)
+    return {c.name: every[c.name] for c in channels.EVERY if c.over_time}
+
+
+@compiled
+def _before(rig: Rig, time: Array, clock: Array) -> tuple[Array, Array]:
+    return jax.vmap(rig.before)(time, clock)
+
+
+@compiled
+def _between(values: Array, k: Array, share: Array) -> Array:
+    """One program for all that has a shape."""
+    return jax.vmap(Rig.between)(values, k, share)
 
 
 class Run(eqx.Module):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,14 +11,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from rich.table import Table
 
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration
 from mmrjax import channels, fidelities, ground, outputs, stages
 from mmrjax.channels import Channel
+from mmrjax.compiling import SELDOM, compiled
 from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.result import result
+from mmrjax.motor import Motor
+from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import BATTERY_EMPTY, STATUSES
 from sweeps import capabilities
@@ -42,6 +47,8 @@ OF_VEHICLE = ("speed",)
 PEAK = "peak_current_A"
 #: Columns of the currents of the motors of either side, where sides are driven apart.
 _OF_SIDES = tuple(channels.find(f"motor_current_{side}").column for side in channels.SIDES)
+#: Runs are filled up to a multiple of this, so that tables of about one size share what is compiled.
+PAD = 16
 #: Column of the time that a run's current may flow before its windings are at their limit.
 PERMISSIBLE = "permissible_time_s"
 
@@ -153,8 +160,15 @@ def permissible(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
     """How long the current of each run may flow from ambient temperature [s]; inf for ever, NaN without a current."""
     current = amperes(robot, table)
     known = np.isfinite(current)
-    time = jax.vmap(robot.motor.time_permissible)(jnp.asarray(np.where(known, current, 0.0)))
-    return np.where(known, np.asarray(time), np.nan)
+    filled = np.zeros(len(current) + -len(current) % PAD)
+    filled[: len(current)] = np.where(known, current, 0.0)
+    time = _permissible(robot.motor, jnp.asarray(filled))
+    return np.where(known, np.asarray(time)[: len(current)], np.nan)
+
+
+@functools.partial(compiled, options=SELDOM)
+def _permissible(motor: Motor, currents: Float[Array, " runs"]) -> Scalar:
+    return jax.vmap(motor.time_permissible)(currents)
 
 
 def amperes(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:

@@ -98,6 +98,7 @@ class Compiled:
         self.mesh = Mesh(np.array(devices), (POINTS,))
         # Every device has the same number of points; the last ones stand for the chunk's last point again.
         each = -(-job.blocks.points // len(devices))
+        each = each if job.task.run is not None else fidelities.facts(job.task.model).filled(each)
         each = each if each < SHARED else -(-each // SHARED) * SHARED
         self.size = each * len(devices)
         everywhere = NamedSharding(self.mesh, PartitionSpec())

@@ -14,7 +14,7 @@ import re
 import threading
 import warnings
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -451,9 +451,11 @@ class Histories(Observer):
         return angle[self.run, self.instant]
 
     @property
-    def of_rows(self) -> Conditions:
-        """The conditions of every row, shape (rows,)."""
-        return jax.tree.map(lambda x: x[self.run] if x.ndim == 1 else x[self.run, self.instant], self.conditions)
+    def of_rows(self) -> Any:
+        """The conditions of every row, with fields of NumPy, shape (rows,)."""
+        run, instant = np.asarray(self.run), np.asarray(self.instant)
+        held = jax.tree.map(np.asarray, self.conditions)
+        return jax.tree.map(lambda x: x[run] if x.ndim == 1 else x[run, instant], held)
 
     @property
     def varying(self) -> bool:
@@ -462,8 +464,7 @@ class Histories(Observer):
 
     def stretches(self) -> list[list[Stretch]]:
         """Of each run, the stretches of unchanged conditions."""
-        rows_of, time = np.asarray(self.rows_of), np.asarray(self.time)
-        of_rows = jax.tree.map(np.asarray, self.of_rows)
+        rows_of, time, of_rows = np.asarray(self.rows_of), np.asarray(self.time), self.of_rows
         volts = np.where(of_rows.open > 0.5, 0.0, of_rows.voltage * of_rows.duty)
         volts = volts if of_rows.motor_current is None else of_rows.motor_current
         values = [x for name in CHANGING if (x := getattr(of_rows, name)) is not None]
@@ -475,7 +476,7 @@ class Histories(Observer):
         conditions change, levels that lie close together are one."""
         if not self.varying:
             return self.conditions
-        rows = jax.tree.map(np.asarray, self.of_rows)
+        rows = self.of_rows
         if rows.voltage_follows:
             own = "motor_current" if rows.motor_speed is None else "motor_speed"
             levels = _few(getattr(rows, own))
@@ -484,7 +485,7 @@ class Histories(Observer):
             cases = np.flatnonzero(levels != 0)[cases] if len(cases) else np.arange(1)
             held = {} if rows.motor_speed is None else {"motor_acceleration": np.zeros_like(levels)}
             steady = dataclasses.replace(rows, **{own: levels}, **held)
-            return jax.tree.map(lambda x: jnp.asarray(x[cases]), steady)
+            return _some(steady, cases)
         applied = np.where(rows.open > 0.5, 0.0, rows.voltage * rows.duty)
         some = np.flatnonzero(applied != 0) if (applied != 0).any() else np.arange(1)
         turned = dataclasses.replace(
@@ -497,7 +498,7 @@ class Histories(Observer):
         )
         which = np.stack([turned.configuration, turned.voltage, turned.slope_deg, turned.payload], 1)[some]
         cases = some[np.unique(which, axis=0, return_index=True)[1]]
-        return jax.tree.map(lambda x: jnp.asarray(x[cases]), turned)
+        return _some(turned, cases)
 
     def late(self, every: tuple[Array, ...], rig: Rig) -> Float[Array, "rows ..."]:
         """Of every row, what is there within a step, less the rig's delay.
@@ -706,7 +707,7 @@ class Histories(Observer):
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
         """Curves and windows as of settled runs, over time too, and waves in the angle of a shaft. Over the voltage
         are those over the motors' voltage where that is not the supply's."""
-        rows = jax.tree.map(np.asarray, self.of_rows)
+        rows = self.of_rows
         angle, electromotive, ways = jax.tree.map(lambda x: np.nan_to_num(np.asarray(x)), _turning(self, robot))
         if (rows.duty != 1).any():
             at_motors = np.where(rows.open > 0.5, electromotive, rows.voltage * rows.duty)
@@ -788,12 +789,11 @@ def _in_time(
             for rows, t in zip(each, times, strict=True)
         ]
     )
-    first = np.array([rows[0] for rows in each])
-    conditions = jax.tree.map(lambda x: x[first], of_rows)
+    conditions = _some(of_rows, np.array([rows[0] for rows in each]))
     for name in CHANGING:
-        x = getattr(of_rows, name)
-        if x is not None and any(np.ptp(np.asarray(x)[rows]) > 0 for rows in each):
-            values = x[at] if name not in on_lines else _on_lines(np.asarray(x), each, time, middle)
+        x = None if getattr(of_rows, name) is None else np.asarray(getattr(of_rows, name))
+        if x is not None and any(np.ptp(x[rows]) > 0 for rows in each):
+            values = x[at] if name not in on_lines else _on_lines(x, each, time, middle)
             conditions = eqx.tree_at(operator.attrgetter(name), conditions, jnp.asarray(values))
     if of_rows.motor_speed is None:
         return conditions
@@ -808,6 +808,11 @@ def _in_time(
         (jnp.asarray(speed), jnp.asarray(slope)),
         is_leaf=lambda x: x is None,
     )
+
+
+def _some(conditions: Conditions, rows: np.ndarray) -> Conditions:
+    """Those of some rows; NumPy takes them, for which nothing is compiled."""
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), conditions)
 
 
 def _on_lines(x: np.ndarray, each: list[np.ndarray], time: np.ndarray, at: np.ndarray) -> np.ndarray:
