@@ -117,6 +117,11 @@ def test_a_log_is_reproducible_and_its_effect_has_its_strength():
     left = remainder(change.ravel(), np.stack([b.ravel() for b in base], 1))
     assert np.linalg.norm(left) == pytest.approx(9.0, rel=0.1)
     assert np.sqrt(np.mean((one.measured - y - change) ** 2)) == pytest.approx(1.0, abs=0.05)
+    # A resistor before a winding is more of its resistance: a refit leaves what that one's tolerance says.
+    taken_up = one.terms[0].amplitude / rig.p["resistance"]
+    assert one.label["effects"][0]["sigmas"] == pytest.approx(
+        np.log1p(taken_up) / logs.RELATIVE["resistance"], rel=0.1
+    )
 
 
 def line(kind, seed, verdict="none", classes=(), **more):

@@ -45,6 +45,8 @@ CHANNELS = {
 LAWS = laws.LOGS | laws.OUTSIDE_LOGS
 #: Turn over which the contacts of `presliding` yield [rad], the library's own.
 YIELDS = 0.02
+#: Steps of one's own least squares, at most.
+STEPS = 12
 #: Of a sum of squares, what one more step of one's own least squares may still gain.
 CONVERGED = 0.1
 
@@ -276,7 +278,8 @@ def oracle(r: Rig, term: Term, y: np.ndarray, columns: np.ndarray) -> dict[str, 
 
 
 def case(r: Rig, name: str, sigmas: float, seed: int) -> Case:
-    """A case; `name` empty is a clean one. Effects are sized so that a refit of the constants leaves `sigmas`."""
+    """A case; `name` empty is a clean one. Effects are sized so that a linear refit of the constants leaves `sigmas`;
+    the label says how many a refit really leaves."""
     rng = np.random.default_rng([98, seed])
     terms: tuple[Term, ...] = ()
     effects = []
@@ -292,7 +295,7 @@ def case(r: Rig, name: str, sigmas: float, seed: int) -> Case:
             change = whitened(r, histories(r, [r.p], [[term]])[0]) - y
             left = float(np.linalg.norm(remainder(np.nan_to_num(change, nan=1e3).ravel(), columns)))
         terms = (term,)
-        effects.append(term.label | {"sigmas": left, **oracle(r, term, y, columns)})
+        effects.append(term.label | {"sigmas": left_over(r, term), **oracle(r, term, y, columns)})
     shown = histories(r, [r.p], [terms])[0]
     measured = {n: x + r.sd[n] * rng.standard_normal(x.shape) for n, x in shown.items()}
     column = {"voltage": "supply_voltage_V", "motor_current": "motor_current_A", "motor_speed": "motor_speed_rpm"}
@@ -314,66 +317,103 @@ def case(r: Rig, name: str, sigmas: float, seed: int) -> Case:
     return Case(table, label, toml(r), r, terms, whitened(r, measured))
 
 
-def least_squares(c: Case, steps: int = 12) -> tuple[float, float]:
+def left_over(r: Rig, term: Term) -> float:
+    """How many sigmas of a term a refit of the constants leaves, with their tolerances as priors. What a constant takes
+    up that moves the readings in the same way, as a winding does a resistor, is taken up however large it is."""
+    shown = np.nan_to_num(whitened(r, histories(r, [r.p], [[term]])[0]), nan=1e3)
+    everything = np.ones(RUNS, bool)
+    (fit,) = _fits(r, r.p, shown, {(): (everything, ())}).values()
+    return float(np.sqrt(fit.cost))
+
+
+def least_squares(c: Case) -> tuple[float, float]:
     """Rms of the whitened error of runs held out, one after the other, by least squares of one's own without and with
-    the true term, which then is one more unknown: Levenberg and Marquardt from what the file states, whose tolerances
-    are priors. The delay is known to it. All fits go through the simulation together.
+    the true term, which then is one more unknown, from what the file states, whose tolerances are priors. The delay is
+    known to it."""
+    kinds = (False, True) if c.terms else (False,)
+    jobs = {
+        (with_term, out): (np.arange(RUNS) != out, c.terms if with_term else ())
+        for with_term in kinds for out in range(RUNS)
+    }  # fmt: skip
+    fits = _fits(c.rig, c.rig.stated, c.measured, jobs)
+    found = [
+        float(np.sqrt(np.mean(np.concatenate([fits[with_term, out].off[out] for out in range(RUNS)]) ** 2)))
+        for with_term in kinds
+    ]
+    return found[0], found[-1]
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """The best that a search has found.
+
+    Attributes:
+        at: constants in their sds, then the term's amplitude in a tenth of its size; cost: what is left of readings
+            inside and priors, squared; left: the same one by one, slopes: by the unknowns; off: of all readings.
     """
-    r, count = c.rig, len(c.rig.names)
-    jobs = [(out, with_term) for with_term in ((False, True) if c.terms else (False,)) for out in range(RUNS)]
+
+    at: np.ndarray
+    cost: float
+    left: np.ndarray
+    slopes: np.ndarray
+    off: np.ndarray
+
+
+def _fits(
+    r: Rig, start: Mapping[str, float], measured: np.ndarray, jobs: Mapping[Any, tuple[np.ndarray, Sequence[Term]]]
+) -> dict[Any, Fit]:
+    """Fits by Levenberg and Marquardt, which go through the simulation together.
+
+    Args:
+        start: constants from which they begin, means of their priors; measured: whitened, shape (runs, readings).
+        jobs: of each fit the runs that it sees, and the terms (one at most) whose amplitude is one more unknown.
+    """
+    count = len(r.names)
 
     def constants(at: np.ndarray) -> dict[str, float]:
-        p = dict(r.stated)
+        p = dict(start)
         for name, x in zip(r.names, at, strict=True):
             p = moved(p, name, x)
         return {**p, "efficiency": min(p["efficiency"], 1.0)}
 
-    def terms(size: float, with_term: bool) -> tuple[Term, ...]:
-        return tuple(dataclasses.replace(t, amplitude=0.1 * t.law.size * size) for t in c.terms if with_term)
+    def sized(terms: Sequence[Term], size: float) -> tuple[Term, ...]:
+        return tuple(dataclasses.replace(t, amplitude=0.1 * t.law.size * size) for t in terms)
 
-    # Of each fit: unknowns (constants in their sds, the term in a tenth of its size), the best of them with what is left
-    # there, its derivatives and its error held out, and the damping.
-    at = {job: np.zeros(count + job[1]) for job in jobs}
-    best: dict[tuple[int, bool], tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = {}
+    at = {job: np.zeros(count + len(terms)) for job, (_, terms) in jobs.items()}
+    best: dict[Any, Fit] = {}
     damping, going = dict.fromkeys(jobs, 1e-3), list(jobs)
-    for _ in range(steps):
+    for _ in range(STEPS):
         if not going:
             break
         members: list[Mapping[str, float]] = []
         theirs: list[Sequence[Term]] = []
         for job in going:
-            x = at[job]
-            size = x[count] if job[1] else 0.0
-            p, have = constants(x[:count]), terms(size, job[1])
-            members += [p, *(moved(p, n, 1e-2) for n in r.names), *[p] * job[1]]
-            theirs += [have] * (1 + count) + [terms(size + 1.0, True)] * job[1]
+            own, x = jobs[job][1], at[job]
+            p, size = constants(x[:count]), float(x[count]) if own else 0.0
+            members += [p, *(moved(p, n, 1e-2) for n in r.names), *[p] * len(own)]
+            theirs += [sized(own, size)] * (1 + count) + [sized(own, size + 1.0)] * len(own)
         shown = [whitened(r, x) for x in histories(r, members, theirs)]
         for job in tuple(going):
-            own, shown = shown[: 1 + count + job[1]], shown[1 + count + job[1] :]
-            x, inside = at[job], np.arange(RUNS) != job[0]
-            off = c.measured - own[0]
-            prior = np.eye(len(x))[:count]
+            inside, x = jobs[job][0], at[job]
+            own, shown = shown[: 1 + len(x)], shown[1 + len(x) :]
+            off = measured - own[0]
             left = np.concatenate([off[inside].ravel(), -x[:count]])
             cost = float(left @ left) if np.isfinite(left).all() else np.inf
-            gained = best[job][0] - cost if job in best else np.inf
+            gained = best[job].cost - cost if job in best else np.inf
             if gained > 0:
                 slope = [(y - own[0])[inside].ravel() for y in own[1:]]
                 columns = np.stack([*(1e2 * y for y in slope[:count]), *slope[count:]], 1)
-                best[job] = cost, x, left, np.concatenate([columns, prior]), off[job[0]]
+                best[job] = Fit(x, cost, left, np.concatenate([columns, np.eye(len(x))[:count]]), off)
                 damping[job] *= 0.2
             else:
                 damping[job] *= 10.0
             if abs(gained) < CONVERGED:
                 going.remove(job)
-            _, x, left, columns, _ = best[job]
-            normal = columns.T @ columns
-            move = np.linalg.solve(normal + damping[job] * np.diag(np.diag(normal)), columns.T @ left)
-            at[job] = x + np.clip(move, -3, 3)
-    found = [
-        float(np.sqrt(np.mean(np.concatenate([best[j][4] for j in jobs if j[1] == with_term]) ** 2)))
-        for with_term in dict.fromkeys(j[1] for j in jobs)
-    ]
-    return found[0], found[-1]
+            fit = best[job]
+            normal = fit.slopes.T @ fit.slopes
+            move = np.linalg.solve(normal + damping[job] * np.diag(np.diag(normal)), fit.slopes.T @ fit.left)
+            at[job] = fit.at + np.clip(move, -3, 3)
+    return best
 
 
 def toml(r: Rig) -> str:
