@@ -420,6 +420,10 @@ OVER = CurveOver("slip", ("slope",))
             "equation",
         ),
         (
+            NameSupport(False, "none by itself", tests=(NameTest("a", 1.2, 3.41, (), 0.0),)),
+            "a explains 1.2 σ, and chance reaches 3.4",
+        ),
+        (
             NameSupport(
                 True,
                 "beside",

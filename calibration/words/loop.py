@@ -290,7 +290,7 @@ def _strength(test: notes.NameTest) -> str:
 
 #: What speaks against an effect by itself: short, and in words.
 DOUBTS = {
-    "chance": ("chance", "explains {0.root:.1f} σ beside smooth curves ({over}), and chance reaches {0.needed:.1f}"),
+    "chance": ("chance", "explains {0.root:.1f} σ{beside}, and chance reaches {0.needed:.1f}"),
     "curve": ("a curve", "is a worse explanation than a smooth curve in its place"),
     "row": ("{0.what} {0.rests_on}", "rests on {0.what} {0.rests_on}"),
     "blocks": ("blocks", "is chosen again in {again:.0f} % of the data with a block left out"),
@@ -304,8 +304,9 @@ def doubts(test: notes.NameTest | None) -> str:
     """What speaks against an effect by itself; empty for nothing."""
     if test is None or not test.fails:
         return ""
-    over, larger = ", ".join(_over(c.place, *c.variables) for c in test.curves), " and ".join(test.larger)
-    *first, last = [DOUBTS[d][1].format(test, over=over, larger=larger, again=100 * test.again) for d in test.fails]
+    over = ", ".join(_over(c.place, *c.variables) for c in test.curves)
+    said = {"beside": over and f" beside smooth curves ({over})", "larger": " and ".join(test.larger)}
+    *first, last = [DOUBTS[d][1].format(test, **said, again=100 * test.again) for d in test.fails]
     return f"{', '.join(first)} and {last}" if first else last
 
 
