@@ -228,9 +228,9 @@ def _in_chunks(fidelity: Fidelity, function: Callable[[Conditions], T], conditio
     filled = min(fidelity.facts.filled(runs), size)
     if 0 < runs < filled:
         rows = np.minimum(np.arange(filled), runs - 1)  # the last ones stand for the last run again
-        found = function(jax.tree.map(lambda x: jnp.asarray(np.ravel(x)[rows]), conditions))
-        return jax.tree.map(
-            lambda x: jnp.asarray(np.asarray(x)[:runs].reshape((*conditions.shape, *x.shape[1:]))), found
+        found = function(jax.device_put(jax.tree.map(lambda x: np.ravel(x)[rows], conditions)))
+        return jax.device_put(
+            jax.tree.map(lambda x: np.asarray(x)[:runs].reshape((*conditions.shape, *x.shape[1:])), found)
         )
     flat = _flat(conditions)
     if runs <= size:
