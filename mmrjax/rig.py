@@ -153,33 +153,25 @@ class Rig(eqx.Module):
             self, instruments=rectified, columns=(), priors=(), start=STARTS[0], between_rows=BETWEEN[0], surfaces=()
         )
 
-    def late(self, times: Float[Array, " times"], values: Array, at: Scalar | Float[Array, "..."]) -> Array:
-        """What happens at instants, by the clock of tables, whose column of what is imposed acts `delay` later.
+    def before(self, times: Float[Array, " times"], at: Scalar | Float[Array, "..."]) -> tuple[Array, Array]:
+        """Which of `times` is the last before what happens at instants, and how far on the way to the next one that
+        is [-], held before the first and after the last; what is imposed acts `delay` later than its column says.
 
         Args:
-            times: since what is imposed acts [s], increasing; values: at those, shape (times, ...).
-            at: instants of the tables' clock [s], of any shape.
-
-        Returns:
-            The values at `at` - delay, of that shape first: on the straight line between the instants about it, held
-            before the first and after the last.
+            times: since what is imposed acts [s], increasing; at: instants of the tables' clock [s], of any shape.
         """
-        return self.between(values, *self.before(times, at))
-
-    @staticmethod
-    def between(values: Array, k: Array, share: Array) -> Array:
-        """Values at instants that `before` gives, of what has no values between its own those before."""
-        if not jnp.issubdtype(values.dtype, jnp.inexact):
-            return values[k]
-        return on_line(values[k], values[k + 1], share)
-
-    def before(self, times: Float[Array, " times"], at: Scalar | Float[Array, "..."]) -> tuple[Array, Array]:
-        """Which of `times` is the last before what happens at `at`, as in `late`, and how far on the way to the next
-        one that is [-]."""
         wanted = at - self.delay
         k = jnp.clip(jnp.searchsorted(times, wanted, side="right") - 1, 0, times.shape[0] - 2)
         gap = times[k + 1] - times[k]
         return k, jnp.clip(jnp.where(gap > 0, (wanted - times[k]) / jnp.where(gap > 0, gap, 1.0), 0.0), 0.0, 1.0)
+
+    @staticmethod
+    def between(values: Array, k: Array, share: Array) -> Array:
+        """Values, shape (times, ...), where `before` says, of its shape first: on the straight line between the
+        instants about it, of what has no values between its own those before."""
+        if not jnp.issubdtype(values.dtype, jnp.inexact):
+            return values[k]
+        return on_line(values[k], values[k + 1], share)
 
     def clock(self, times: Float[Array, " times"]) -> Array:
         """Instants of the tables' clock [s] at which a run is shown that is known at `times` since what is imposed

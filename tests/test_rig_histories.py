@@ -212,7 +212,7 @@ def test_what_is_imposed_acts_later_by_the_delay():
     rig = Rig(delay=0.2)
     times, values = jnp.asarray([0.0, 1.0, 2.0]), jnp.asarray([3.0, 5.0, 4.0])
     at, of_run = jnp.asarray([-1.0, 0.1, 0.7, 1.2, 1.7, 9.0]), jnp.asarray([-0.5, 0.0, 0.3])
-    shown, clock = jax.jit(lambda: (rig.late(times, values, at), rig.clock(of_run)))()
+    shown, clock = jax.jit(lambda: (rig.between(values, *rig.before(times, at)), rig.clock(of_run)))()
     assert shown.tolist() == pytest.approx([3.0, 3.0, 4.0, 5.0, 4.5, 4.0])
     assert clock.tolist() == pytest.approx([-0.5, 0.0, 0.5])
 

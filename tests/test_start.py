@@ -131,18 +131,19 @@ def test_a_history_is_written_by_the_rigs_clock(written, delay):
 
 
 def test_the_delay_of_histories_is_the_one_of_fits():
-    """`Rig.late` is the straight line between instants, held beyond them, also where a run ends in no numbers."""
+    """What is between instants is the straight line between instants, held beyond them, also where a run ends in no numbers."""
     t, delay = np.array([0.0, 0.01, 0.03, 0.08]), 0.004
     x = np.stack([np.sin(40 * t), t**2], 1)
-    rig = Rig(delay=delay)
+
+    def late(delay, values, at):
+        return Rig.between(jnp.asarray(values), *Rig(delay=delay).before(jnp.asarray(t), at))
+
     at = np.array([0.0, 0.003, 0.004, 0.014, 0.02, 0.07, 0.2])
-    ended = jnp.asarray(np.where(t > 0.02, np.nan, t))
-    got, last = jax.jit(
-        lambda: (rig.late(jnp.asarray(t), jnp.asarray(x), at), rig.late(jnp.asarray(t), ended, 0.01 + delay))
-    )()
+    ended = np.where(t > 0.02, np.nan, t)
+    got, last = jax.jit(lambda: (late(delay, x, at), late(delay, ended, 0.01 + delay)))()
     np.testing.assert_allclose(got, np.stack([np.interp(at - delay, t, c) for c in x.T], 1), rtol=1e-12, atol=1e-15)
     assert float(last) == pytest.approx(0.01)
-    slope = jax.jit(jax.grad(lambda d: Rig(delay=d).late(jnp.asarray(t), jnp.asarray(x[:, 1]), 0.05)))(delay)
+    slope = jax.jit(jax.grad(lambda d: late(d, x[:, 1], 0.05)))(delay)
     assert float(slope) == pytest.approx(-(0.08**2 - 0.03**2) / 0.05)
 
 

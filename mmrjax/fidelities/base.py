@@ -75,7 +75,7 @@ def as_tables(rig: Rig, time: Float[Array, "runs samples"], values: T) -> tuple[
         time: since what is imposed acts [s]; values: at those instants, a tree of shape (runs, samples, ...).
 
     Returns:
-        Instants of the tables' clock and values at those (`Rig.clock`, `Rig.late`).
+        Instants of the tables' clock and values at those (`Rig.clock`, `Rig.before`).
     """
     if rig.prompt:
         return time, values
