@@ -258,24 +258,28 @@ def _pulled(robot: Robot, signals: Signals, traction: Scalar) -> Signals:
     return _fill(signals, traction=traction, acceleration=acceleration)
 
 
-def moving(robot: Robot, conditions: Conditions, state: State) -> Signals:
+def moving(robot: Robot, conditions: Conditions, state: State, way: Scalar | None = None) -> Signals:
     """All signals of a robot in motion: traction follows from sliding by the friction law, and the current from
-    torque where the speed of the motors is imposed."""
-    if conditions.motor_speed is None:
-        return _moving(robot, conditions, state)
-    return _moving(robot, conditions, dataclasses.replace(state, current=_current(robot, conditions, state)))
+    torque where the speed of the motors is imposed.
+
+    Args:
+        way: in which dry friction acts as of motion, ±1 [-]; None, or 0: it follows the speeds, smooth through rest.
+    """
+    if conditions.motor_speed is not None:
+        state = dataclasses.replace(state, current=_current(robot, conditions, state, way))
+    return _moving(robot, conditions, state, way)
 
 
 #: Newton steps of the current at an imposed speed: its torque is linear but for which way power flows, and effects.
 CURRENT_STEPS = 4
 
 
-def _current(robot: Robot, conditions: Conditions, state: State) -> Scalar:
+def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar | None) -> Scalar:
     """Current with which the motors accelerate as the imposed speed does [A]."""
 
     def at(given: tuple[Robot, Conditions, State], current: Scalar) -> Signals:
         robot, conditions, state = given
-        return _moving(robot, conditions, dataclasses.replace(state, current=current))
+        return _moving(robot, conditions, dataclasses.replace(state, current=current), way)
 
     return _current_of(at, (robot, conditions, state))
 
@@ -315,10 +319,14 @@ def _current_of(signals: Callable[[Any, Scalar], Signals], given: tuple) -> Scal
     return current
 
 
-def _moving(robot: Robot, conditions: Conditions, state: State) -> Signals:
+def _moving(robot: Robot, conditions: Conditions, state: State, way: Scalar | None) -> Signals:
     robot = robot.within(conditions.configuration)
     chassis = robot.chassis(conditions.configuration)
-    signals = _to_slip(robot, conditions, chassis, begin(robot, conditions, state))
+    begun = begin(robot, conditions, state)
+    if way is not None:
+        directions = "direction", "direction_travel"
+        begun = _fill(begun, **{d: jnp.where(way == 0, getattr(begun, d), way) for d in directions})
+    signals = _to_slip(robot, conditions, chassis, begun)
     if isinstance(chassis, Shaft):
         signals = _fill(signals, traction=signals.demand)
         if state.gap is not None:

@@ -80,9 +80,11 @@ moving = compiled(balances.moving)
 
 
 @compiled
-def rates(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
-    """Rates of the unknowns, in their units [1/s]."""
-    signals = moving(robot, conditions, state_of(robot, y))
+def rates(
+    robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"], way: Scalar | None = None
+) -> Float[Array, " unknowns"]:
+    """Rates of the unknowns, in their units [1/s]; `way` as of `balances.moving`."""
+    signals = moving(robot, conditions, state_of(robot, y), way)
     winding = signals.voltage_left / signals.inductance
     shaft = signals.acceleration_wheel * robot.gearbox.ratio
     if conditions.motor_speed is not None:  # the current follows from torque, the shaft from what is imposed

@@ -14,6 +14,7 @@ SIAM J. Numer. Anal. 4 (1967)).
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -47,6 +48,8 @@ LOOSE, LONGEST = (1e-5, 0.08), 2.5e-3
 STEPS = 8000
 #: More current at which its rate shows how soon it follows its voltage [10 A].
 MORE = 1e-3
+#: Looks for the moment at which a shaft comes to rest, each on a line from where the step begins.
+TURNS = 2
 #: Steps of a run whose equations are made linear side by side.
 BLOCK = 32
 
@@ -115,13 +118,14 @@ class Followed(eqx.Module):
 
     Attributes:
         begins, ends: unknowns at the beginning and end of every step, shape (steps, unknowns).
-        places: where the equations are made linear, at both stages, shape (steps, 2, unknowns); clock: when a step
-            begins, and when it is there [s], shape (steps, 3).
+        places: where the equations are made linear, at both stages, shape (steps, 2, unknowns); sides: see `States`.
+        clock: when a step begins, and when it is there [s], shape (steps, 3).
     """
 
     begins: Float[Array, "steps unknowns"]
     ends: Float[Array, "steps unknowns"]
     places: Float[Array, "steps 2 unknowns"]
+    sides: Float[Array, "steps 2"]
     clock: Float[Array, "steps 3"]
     carries: Float[Array, "steps unknowns unknowns"]
     gains: Float[Array, "steps 2 unknowns unknowns"]
@@ -191,11 +195,15 @@ def _steps(conditions: Conditions, times: Float[Array, " times"]) -> tuple[_Step
 def _lag(rate: Float[Array, " rates"], h: Array) -> Lag:
     """Of a step, by the rates at its start."""
     if not len(rate):
-        return Lag(jnp.zeros(()), jnp.zeros(2), jnp.zeros(()), jnp.zeros(()))
+        return _decaying(jnp.zeros(()), jnp.zeros(()), h)
     slope = (rate[1] - rate[2]) / MORE
     follows = slope > 0  # but where a diode begins to block
     decay = jnp.where(follows, slope, 1.0)
-    begin = jnp.where(follows, (rate[0] - rate[1]) / decay, 0.0)
+    return _decaying(jnp.where(follows, (rate[0] - rate[1]) / decay, 0.0), decay, h)
+
+
+def _decaying(begin: Array, decay: Array, h: Array) -> Lag:
+    """Of a part of a step, by what there is of it at its start."""
     parts = jnp.array([1 - _GAMMA, _GAMMA]) * h
     at = begin * jnp.exp(-decay * jnp.stack([jnp.zeros(()), parts[0]]))
     z = decay * parts
@@ -214,14 +222,12 @@ def _lag_of(robot: Robot, constant: Conditions, step: _Step, y: Float[Array, " u
     return _lag(_windings(robot, constant, step, y), step.length)
 
 
-def _stage(
-    robot: Robot, conditions: Conditions, known: Array, guess: Array, h: Array, mean: Array, decay: Array
-) -> Array:
+def _stage(law: Callable[[Array], Array], known: Array, guess: Array, h: Array, mean: Array, decay: Array) -> Array:
     """Y = known + γ h f(Y) of the unknowns without a lag, which acts by its mean."""
     known = known + _GAMMA * h * decay * mean
 
     def left(y: Array) -> Array:
-        return y - known - _GAMMA * h * rates(robot, conditions, y + mean)
+        return y - known - _GAMMA * h * law(y + mean)
 
     def newton(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         count, y, _ = state
@@ -240,62 +246,131 @@ def _stage(
     return jnp.where(error <= SOLVED, y, jnp.nan)
 
 
-def states(
-    robot: Robot, conditions: Conditions, times: Float[Array, " times"]
-) -> tuple[Float[Array, "steps 2 unknowns"], Float[Array, "steps unknowns"]]:
-    """Unknowns of one run from standstill at both stages of every step, without lags, and at its end.
+class States(eqx.Module):
+    """What is known of a run, step by step.
+
+    Attributes:
+        stages: unknowns at both stages of every step, without lags; ends: at its end.
+        sides: the way in which a shaft turns (±1; 0 where friction holds it) to begin with, and at last: two ways where
+            it comes to rest within the step; share: of that step before it does.
+    """
+
+    stages: Float[Array, "steps 2 unknowns"]
+    ends: Float[Array, "steps unknowns"]
+    sides: Float[Array, "steps 2"]
+    before: Float[Array, " steps"]
+
+
+class _Part(eqx.Module):
+    """A step, or as much of it as there is before a shaft comes to rest, or after that.
+
+    Attributes:
+        turn: 0 of the whole step; 1 to `TURNS` of the part before rest, each closer to its moment; then the rest.
+        begin: unknowns where it begins; lag: that of the current there; length: [s]; side: way in which a shaft turns.
+        stages, end: see `States`.
+    """
+
+    turn: Array
+    begin: Float[Array, " unknowns"]
+    lag: Array
+    length: Array
+    side: Array
+    stages: Float[Array, "2 unknowns"]
+    end: Float[Array, " unknowns"]
+
+
+def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) -> States:
+    """One run from standstill.
+
+    Friction jumps where a shaft turns through rest. So within a step it is that of one way, and a step in which the
+    shaft comes to rest is taken in two, to that moment and from it (Filippov systems; Leine and Nijmeijer, Dynamics and
+    Bifurcations of Non-Smooth Mechanical Systems, 2004).
 
     Args: as of `histories`.
     """
     steps, constant = _steps(conditions, times)
+    of_first, first_state = at_first(robot, conditions)
+    edge, along = _edge(robot, of_first)
 
-    def taken(y: Array, step: _Step) -> tuple[Array, tuple[Array, Array]]:
-        h, held, lag = step.length, step.held(constant), _lag_of(robot, constant, step, y)
-        first = y - lag.begin * _current(y)
+    def taken(y: Array, step: _Step) -> tuple[Array, States]:
+        held, lag = step.held(constant), _lag_of(robot, constant, step, y)
 
-        def stage(given: tuple[Array, Array], mean: Array) -> tuple[tuple[Array, Array], Array]:
-            found = _stage(robot, held, *given, h, mean * _current(y), lag.decay)
-            return (first + (1 - _GAMMA) / _GAMMA * (found - first), found), found
+        law = functools.partial(rates, robot, held)
 
-        both = jax.lax.scan(stage, (first, first), lag.means)[1]
-        end = both[1] + lag.end * _current(y)
-        return end, (both, end)
+        def turned(part: _Part) -> _Part:
+            mine = _decaying(part.lag, lag.decay, part.length)
+            first = part.begin - mine.begin * _current(y)
 
-    return jax.lax.scan(taken, at_first(robot, conditions)[1], steps)[1]
+            def stage(given: tuple[Array, Array], mean: Array) -> tuple[tuple[Array, Array], Array]:
+                found = _stage(functools.partial(law, way=part.side), *given, part.length, mean * _current(y), mine.decay)
+                return (first + (1 - _GAMMA) / _GAMMA * (found - first), found), found
+
+            stages = jax.lax.scan(stage, (first, first), mine.means)[1]
+            end = stages[1] + mine.end * _current(y)
+            before, after = part.begin[MOTOR], end[MOTOR]
+            nears = jnp.where(part.turn == 0, part.side * after < 0, part.turn < TURNS)
+            rests, rest = part.turn == TURNS, end - after * along
+            to_rest = part.length * jnp.clip(before / (before - after), 0.0, 1.0)
+            return _Part(
+                jnp.where(nears | rests, part.turn + 1, TURNS + 2),
+                jnp.where(rests, rest, part.begin),
+                jnp.where(rests, mine.end, part.lag),
+                jnp.where(nears, to_rest, step.length - part.length),
+                jnp.where(rests, _side(robot, law, rest, edge), part.side),
+                stages,
+                end,
+            )
+
+        side = _side(robot, law, y, edge)
+        whole = _Part(jnp.asarray(0), y, lag.begin, step.length, side, jnp.stack([y, y]), y)
+        found = jax.lax.while_loop(lambda part: part.turn < TURNS + 2, turned, whole)
+        return found.end, States(found.stages, found.end, jnp.stack([side, found.side]), found.length)
+
+    return jax.lax.scan(taken, first_state, steps)[1]
+
+
+def _side(robot: Robot, law: Callable[[Array, Array], Array], y: Array, edge: Scalar) -> Array:
+    """The way in which a shaft turns or leaves rest, 0 where it is held there; of shafts and a robot that do not move as
+    one, with a backlash or a ground to slip on, 0: their moments of rest are apart."""
+    if robot.loose or robot.has_ground:
+        return jnp.zeros(())
+    backward, forward = law(y, -jnp.ones(()))[MOTOR] < 0, law(y, jnp.ones(()))[MOTOR] > 0
+    way = jnp.where(y[MOTOR] == 0, 1.0 * forward - 1.0 * backward, jnp.sign(y[MOTOR]))
+    return jnp.where(forward | backward | (jnp.abs(y[MOTOR]) >= edge), way, 0.0)
 
 
 def followed(
-    robot: Robot, conditions: Conditions, times: Float[Array, " times"], known: tuple[Array, Array] | None = None
+    robot: Robot, conditions: Conditions, times: Float[Array, " times"], known: States | None = None
 ) -> Followed:
     """A run and its equations made linear along it.
 
     Args: as of `histories`; known: its states, where they are.
     """
-    found, ends = states(robot, conditions, times) if known is None else known
+    run = states(robot, conditions, times) if known is None else known
     steps, constant = _steps(conditions, times)
     of_first, first_state = at_first(robot, conditions)
-    at = jnp.concatenate([first_state[None], ends])
-    through, h = _through_rest(robot, of_first, at), steps.length
-    # Through rest: Euler's implicit steps to and from it, by the equations as they are off it.
-    shares = jnp.stack([through.before, 1 - through.before], 1)
-    spans = jnp.where(through.any[:, None], shares, _GAMMA) * h[:, None]
-    middle = times[:-1] + jnp.where(through.any, through.before, _GAMMA) * h
+    edge, along = _edge(robot, of_first)
+    begins = jnp.concatenate([first_state[None], run.ends[:-1]])
+    # A step to rest and from it: Euler's implicit ones.
+    passes, turns = run.sides[:, 0] != run.sides[:, 1], run.sides[:, 0] * run.sides[:, 1] < 0
+    h = steps.length
+    spans = jnp.where(passes[:, None], jnp.stack([run.before, h - run.before], 1), _GAMMA * h[:, None])
+    middle = times[:-1] + spans[:, 0]
     clock = jnp.stack([times[:-1], middle, times[1:]], 1)
-    late = jnp.stack([through.before <= 0, through.before < 1], 1)
 
     def linear(given: tuple) -> tuple[Array, Array, Array, Array]:
-        begin, end, found, spans, late, passes, turns, step = given
+        begin, end, stages, sides, spans, passes, turns, step = given
         held = step.held(constant)
         one = jnp.eye(len(end), dtype=end.dtype)
         current = _current(end)
 
         by_begin, rate = jax.jacfwd(lambda y: (_windings(robot, constant, step, y),) * 2, has_aux=True)(begin)
         by_rate, lag = jax.jacfwd(lambda r: (_lag(r, step.length),) * 2, has_aux=True)(rate)
-        off_rest = jnp.where(late[:, None], end - lag.end * current, begin - lag.begin * current)
-        places = jnp.where(passes, off_rest, found) + lag.means[:, None] * current
-        slopes = jax.vmap(jax.jacfwd(lambda y: rates(robot, held, y)))(places)
+        ends = jnp.stack([begin - lag.begin * current, end - lag.end * current])
+        places = jnp.where(passes, ends, stages) + lag.means[:, None] * current
+        slopes = jax.vmap(jax.jacfwd(lambda y, way: rates(robot, held, y, way)))(places, sides)
         first, second = jax.vmap(inverted)(one - spans[:, None, None] * slopes)
-        jump = rarely(turns, _jump, (robot, held, places[1]), jnp.zeros_like(end))
+        jump = rarely(turns, _jump, (robot, held, places[1], sides), jnp.zeros_like(end))
         # What the second stage starts from, by the first stage and by the change before the step.
         by_first = jnp.where(passes, one + jump[:, None] * one[MOTOR], (1 - _GAMMA) / _GAMMA * one)
         by_before = jnp.where(passes, 0.0, 1 - (1 - _GAMMA) / _GAMMA) * one
@@ -308,9 +383,9 @@ def followed(
         lags = lags + jnp.outer(by_rate.end, current) + jnp.outer(by_rate.decay, by_decay)
         return places, carries + lags.T @ by_begin, gains, lags
 
-    each = at[:-1], ends, found, spans, late, through.any, through.turns, steps
+    each = begins, run.ends, run.stages, run.sides, spans, passes, turns, steps
     places, carries, gains, lags = _of_steps(jax.lax.map(jax.vmap(linear), _in_blocks(each)), len(h))
-    return Followed(at[:-1], ends, places, clock, carries, gains, lags)
+    return Followed(begins, run.ends, places, run.sides, clock, carries, gains, lags)
 
 
 @eqx.filter_custom_jvp
@@ -318,35 +393,33 @@ def _ends(
     robot: Robot,
     conditions: Conditions,
     times: Float[Array, " times"],
-    known: tuple[Array | None, Array],
-    along: Followed | None,
+    known: States | Followed,
 ) -> Array:
-    """Unknowns at the end of every step, of states that are known (or how they are followed, `along`), with their
-    derivatives by the robot."""
-    return known[1]
+    """Unknowns at the end of every step of a run that is known, with their derivatives by the robot."""
+    return known.ends
 
 
 @_ends.def_jvp
 def _response(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     """With a robot's parameters, which are moved."""
-    (robot, conditions, times, known, along), moved = primals, tangents[0]
-    along = followed(robot, conditions, times, known) if along is None else along
+    (robot, conditions, times, known), moved = primals, tangents[0]
+    along = known if isinstance(known, Followed) else followed(robot, conditions, times, known)
 
     def change(law: Callable[[Robot], Array]) -> Array:
         value, moves = eqx.filter_jvp(law, (robot,), (moved,))
         return jnp.zeros_like(value) if moves is None else moves
 
-    def source(_: Array, y: Array, held: Conditions) -> Array:
-        return change(lambda r: rates(r, held, y))
+    def source(_: Array, y: Array, held: Conditions, way: Array) -> Array:
+        return change(lambda r: rates(r, held, y, way))
 
     begin = change(lambda r: at_first(r, conditions)[1])
-    return known[1], respond(conditions, along, source, lambda t, y, dy, _: dy, begin)
+    return known.ends, respond(conditions, along, source, lambda t, y, dy, _: dy, begin)
 
 
 def respond(
     conditions: Conditions,
     along: Followed,
-    source: Callable[[Array, Array, Conditions], Array],
+    source: Callable[[Array, Array, Conditions, Array], Array],
     seen: Callable[[Array, Array, Array, Conditions], Array],
     begin: Array,
 ) -> Array:
@@ -354,7 +427,7 @@ def respond(
 
     Args:
         conditions: as of `histories`; along: the run.
-        source: (time, state, conditions) → change of the rates there, shape (unknowns, ...).
+        source: (time, state, conditions, way of `balances.moving`) → change of the rates there, shape (unknowns, ...).
         seen: (time, state, its change, conditions) → what is kept of the change at the end of every step.
         begin: change of the state at the first instant.
 
@@ -365,9 +438,10 @@ def respond(
     def added(along: Followed, step: _Step) -> Array:
         """By the sources of a step, at its end."""
         held = step.held(constant)
-        both = jax.vmap(lambda t, y: source(t, y, held))(along.clock[1:], along.places)
+        both = jax.vmap(lambda t, y, way: source(t, y, held, way))(along.clock[1:], along.places, along.sides)
         found = jnp.tensordot(along.gains, both, ((0, 2), (0, 1)))
-        of_lag = step.rates_at_start(constant, lambda y, held: source(along.clock[0], y, held)[CURRENT], along.begins)
+        at_start = lambda y, held: source(along.clock[0], y, held, along.sides[0])[CURRENT]  # noqa: E731
+        of_lag = step.rates_at_start(constant, at_start, along.begins)
         return found + jnp.tensordot(along.lags, of_lag, ((0,), (0,)))
 
     def after(dy: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -399,20 +473,6 @@ def _of_steps(blocks: T, count: int) -> T:
     return jax.tree.map(lambda x: x.reshape(x.shape[0] * BLOCK, *x.shape[2:])[:count], blocks)
 
 
-class _Through(eqx.Module):
-    """Steps in which a shaft turns through rest, where friction jumps: what a step remembers of the one before it is
-    not in what its own stages show, however short it is.
-
-    Attributes:
-        any: whether it does in a step; turns: whether its direction changes within it.
-        before: share of the step before it is at rest.
-    """
-
-    any: Bool[Array, " steps"]
-    turns: Bool[Array, " steps"]
-    before: Float[Array, " steps"]
-
-
 def _edge(robot: Robot, conditions: Conditions) -> tuple[Scalar, Array]:
     """Motor speed from which on a direction is one, in the unit of the unknowns; and by what the unknowns change with
     it where shafts and robot move as one."""
@@ -422,32 +482,13 @@ def _edge(robot: Robot, conditions: Conditions) -> tuple[Scalar, Array]:
     return load.speed_still / (per_speed * size[MOTOR]), along
 
 
-def _through_rest(robot: Robot, conditions: Conditions, at: Float[Array, "instants unknowns"]) -> _Through:
-    """Of a run's states: a step from one direction to the other, or two of them with one state at rest between.
-
-    None where shafts and robot do not move as one, with a backlash or a ground to slip on: their moments of rest are
-    apart.
-    """
-    edge, _ = _edge(robot, conditions)
-    speed = at[:, MOTOR]
-    way = jnp.where(jnp.abs(speed) < edge, 0.0, jnp.sign(speed)) * (0.0 if robot.loose or robot.has_ground else 1.0)
-    a, b = way[:-1], way[1:]
-    before, after = jnp.concatenate([a[:1], a[:-1]]), jnp.concatenate([b[1:], b[-1:]])
-    across, into, out = a * b < 0, (a != 0) & (b == 0) & (a * after < 0), (a == 0) & (b != 0) & (before * b < 0)
-    shares = jnp.abs(speed[:-1]) / jnp.maximum(jnp.abs(speed[:-1]) + jnp.abs(speed[1:]), 1e-300)
-    share = jnp.where(across, shares, jnp.where(into, 1.0, 0.0))
-    return _Through(across | into | out, across | out, share)
-
-
-def _jump(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+def _jump(
+    robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"], sides: Float[Array, " 2"]
+) -> Float[Array, " unknowns"]:
     """By what the unknowns change with the motor speed before it passes through rest: (f⁺ - f⁻) / f⁻, as the moment
-    of rest moves by -1 / f⁻ (Filippov systems; Leine and Nijmeijer 2004, Section 7.3); 0 where it does not pass."""
-    edge, along = _edge(robot, conditions)
-    way = jnp.sign(y[MOTOR])
-    sides = jnp.stack([-way, way])
-    before, after = jax.vmap(lambda side: rates(robot, conditions, y + (side * edge - y[MOTOR]) * along))(sides)
-    passes = before[MOTOR] * after[MOTOR] > 0
-    return jnp.where(passes, (after - before) / jnp.where(passes, before[MOTOR], 1.0), 0.0)
+    of rest moves by -1 / f⁻ (Filippov systems; Leine and Nijmeijer 2004, Section 7.3)."""
+    before, after = jax.vmap(lambda way: rates(robot, conditions, y, way))(sides)
+    return (after - before) / before[MOTOR]
 
 
 def histories(
@@ -484,8 +525,7 @@ def _nodes(
 ) -> Float[Array, "times unknowns"]:
     """Unknowns at every instant."""
     still = jax.lax.stop_gradient(robot)
-    found = states(still, conditions, times) if known is None else (None, known.ends)
-    ends = _ends(robot, conditions, times, found, known)
+    ends = _ends(robot, conditions, times, states(still, conditions, times) if known is None else known)
     return jnp.concatenate([at_first(robot, conditions)[1][None], ends])
 
 

@@ -396,8 +396,8 @@ class Histories(Observer):
                 falling = jnp.where(after > clock, (after - t) / jnp.where(after > clock, after - clock, 1.0), 1.0)
                 return real * jnp.clip(jnp.minimum(rising, falling), 0.0, 1.0)
 
-            def source(t: Array, y: Array, held: Conditions) -> Array:
-                return jax.jacfwd(lambda a: rates(probed(a), held, y))(none)[:, :, None] * hat(t)
+            def source(t: Array, y: Array, held: Conditions, way: Array) -> Array:
+                return jax.jacfwd(lambda a: rates(probed(a), held, y, way))(none)[:, :, None] * hat(t)
 
             def seen(t: Array, y: Array, dy: Array, held: Conditions) -> Array:
                 """By the state, and at once: the current follows from torque where the speed is imposed."""
@@ -954,11 +954,12 @@ def _longest(runs: Runs, rig: Rig) -> list[np.ndarray]:
 
     Where the speed is imposed only what effects remember is followed. Where what drives a run changes its sign,
     friction jumps as the speed passes through zero, within a step, which has to be short beside the time from reading
-    to reading: where the table's speeds are low or change their sign, and as much earlier as the rig's delay may be.
-    Where it shows no speed, all along.
+    to reading: where the table's speeds, or the rates of its angles and positions, are low or change their sign, and
+    as much earlier as the rig's delay may be. Where it shows neither, all along.
     """
     whole, exact = runs.whole, rig.imposed == "motor_speed"
-    speeds = whole.measured()[:, [c.zero_at_rest and c.directed and c.settled for c in runs.channels]]
+    moved = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and (c.directed or not c.settled)]
+    measured, rates = whole.measured()[:, moved], [k for k, at in enumerate(moved) if not runs.channels[at].settled]
     driven = None if exact else applied(whole)
     early, found = DELAYED * np.max(np.asarray(rig.delay)) + EARLIER.get(rig.imposed, 0.0), []
     for name in np.unique(runs.run_names):
@@ -974,7 +975,9 @@ def _longest(runs: Runs, rig: Rig) -> list[np.ndarray]:
             since = time - time[np.maximum.accumulate(begins)]
             longest = np.maximum(longest, np.minimum(LATER * since[:-1], wait / BETWEEN))
         if both_ways:
-            slow = _slow(speeds[rows], SLOW[rig.imposed])
+            speeds = measured[rows]
+            speeds[:, rates] = np.gradient(speeds[:, rates], time, axis=0)
+            slow = _slow(speeds, SLOW[rig.imposed])
             before = int(np.ceil(early / _usual(apart)))
             slow = np.convolve(slow, np.ones(before + 1))[before:] > 0
             longest[slow] = min(LONGEST, wait / FINE)
@@ -986,7 +989,8 @@ def _slow(speeds: np.ndarray, share: float) -> np.ndarray:
     """Whether a run may pass through rest between each of its rows and the next; all along where nothing is shown.
 
     Args:
-        speeds: readings that are 0 at rest, shape (rows, channels); share: of their largest, below which it may.
+        speeds: readings that are 0 at rest or their rates, shape (rows, channels); share: of their largest, below
+            which it may.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
