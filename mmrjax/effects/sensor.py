@@ -112,29 +112,29 @@ class SpeedGain(SensorEffect):
     )
 
 
-def _error(of: Channel, of_zero: bool) -> type[Effect]:
+def _error(read: Channel, of_zero: bool) -> type[Effect]:
     """The error of the scale of a channel's instrument, or of its zero."""
-    largest, unit = (10 * of.zero_error, of.unit_si or of.unit) if of_zero else (0.2, "-")
+    largest, unit = (10 * read.zero_error, read.unit_si or read.unit) if of_zero else (0.2, "-")
     source = "limits of error of instruments, IEC 60051-2", "class of the instrument: 0.5 to 2.5 %"
-    if of.unit_shown == "°C":
+    if read.unit_shown == "°C":
         source = "tolerances of thermocouples, IEC 60584-1", "class of the instrument: 1 to 3 K"
-    odd, zero = of_zero and of.directed, of_zero
+    odd, zero = of_zero and read.directed, of_zero
 
     class Error(SensorEffect):
-        name = f"{of.name}_{'offset' if zero else 'gain'}"
-        channel = of.name
+        name = f"{read.name}_{'offset' if zero else 'gain'}"
+        channel = read.name
         of_zero = zero
         odd_in_travel = odd
 
         amplitude: Scalar = amplitude(
             unit=unit,
-            meaning=f"error of the {of.label} reading" if zero else f"relative error of the {of.label} reading",
+            meaning=f"error of the {read.label} reading" if zero else f"relative error of the {read.label} reading",
             bounds=(-largest, largest),
-            sd=of.zero_error if zero else 0.02,
+            sd=read.zero_error if zero else 0.02,
             source=source[1],
         )
 
-    Error.__doc__ = f"""Δx = a{"" if zero else " x"} in the reading x of {of.label}.
+    Error.__doc__ = f"""Δx = a{"" if zero else " x"} in the reading x of {read.label}.
 
     The {"zero" if zero else "scale"} of the instrument is off.
 
@@ -148,7 +148,7 @@ def _errors() -> Iterator[type[Effect]]:
     convention; then of its zero. Random numbers go by position: new ones stand at the end."""
     own = [c for c in channels.EVERY if c not in channels.usual()]
     yield from (_error(c, of_zero=c.unit_shown == "°C") for c in own)
-    yield from (_error(c, of_zero=True) for c in own if c.zero_error and c.unit_shown != "°C")
+    yield from (_error(c, of_zero=True) for c in own if c.zero_error and c.directed)
 
 
 #: A rig has those of its channels.
