@@ -37,8 +37,7 @@ def reversed_(robot: Robot, brake: Scalar = 0.0) -> Robot:
     follow the travel. What is odd in travel flips: a slope that is steeper than stated stays so, and now drives. So
     does the zero error of an instrument that shows signs.
     """
-    shown = {i.channel for i in robot.rig.instruments if i.signed is False}
-    odd = (e for e in robot.effects if e.odd_in_travel and e.channel not in shown)
+    odd = (e for e in robot.effects if e.odd_in_travel and e.channel not in robot.rig.magnitudes)
     biased = {f"effects.{e.name}.amplitude": -e.amplitude for e in odd}
     return _with(robot, biased)
 
