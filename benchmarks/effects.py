@@ -17,7 +17,7 @@ import numpy as np
 from calibration.words import effects as words
 from mmrjax import balances, channels, params, robots
 from mmrjax.conditions import Conditions
-from mmrjax.effects import ALL, OF_TURNS, Effect
+from mmrjax.effects import ALL, OF_CHANNELS, OF_TURNS, Effect
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.steady import steady
 from mmrjax.robot import Robot
@@ -48,7 +48,7 @@ ALIKE = 0.95
 ABSORBED = 1e-9
 STARTS = np.concatenate([[0.0], np.geomspace(1e-4, 0.05, 40), np.linspace(0.06, 2.0, 98)])  # [s]
 
-EVERY = (*ALL, *OF_TURNS.values())
+EVERY = (*ALL, *OF_TURNS.values(), *OF_CHANNELS.values())
 SETTLED = tuple(e for e in ALL if not e.transient and not e.needs_battery)
 PASSING = tuple(e for e in ALL if e not in SETTLED)
 
@@ -190,8 +190,10 @@ def page() -> str:
         "",
         "Effects of one equation that change with one and the same thing are a family: forms of a law that data may",
         "not tell apart. Where no single name is sure, the loop names the family. Those that act in turns alone the",
-        "loop looks for in tables of turns; `calibrate --free effects.NAME.amplitude` frees one of a robot file that",
-        "states `[effects.NAME]`.",
+        "loop looks for in tables of turns, errors of an instrument (`CHANNEL_gain`, `CHANNEL_offset`) in those of a",
+        "rig that has it. An error is added to what the instrument shows, a magnitude where it has `signed = false`;",
+        "what counts or times (a speed, an angle, a position) misses no zero.",
+        "`calibrate --free effects.NAME.amplitude` frees one of a robot file that states `[effects.NAME]`.",
         "",
         "| effect | balance | family | equation | unit | plausible: sd, bounds | shape parameters | declares |",
         "|---|---|---|---|---|---|---|---|",

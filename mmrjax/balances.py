@@ -595,7 +595,7 @@ def turning(
 def sensor(robot: Robot, signals: Signals) -> dict[str, Scalar]:
     """What the instruments show of every channel [SI], by its name; NaN where that rests on what is not known."""
     return {
-        c.name: robot.rig.instrument(c.name).shows(c.read(robot, signals) + added(robot, signals, "sensor", c.name))
+        c.name: robot.rig.instrument(c.name).shows(c.read(robot, signals)) + added(robot, signals, "sensor", c.name)
         if robot.knows(c.rests_on)
         else jnp.full_like(signals.speed, jnp.nan)
         for c in channels.EVERY

@@ -45,6 +45,8 @@ class Channel:
         directed: whether its sign is that of the motion; an angle counts on from where it was.
         settled, over_time: whether settled runs and histories can show it.
         other_units: what is often written in its column by mistake, and the SI value of each.
+        zero_error: sd of what its instrument may show where there is nothing to show [SI]; 0: it counts or times, and
+            misses no zero.
         side: 0 or 1 of what the left or the right side alone shows; None: what both together do.
         where: it is measured, where the label does not say.
         rests_on: parameters of the robot without which it is not known, by dotted name.
@@ -68,6 +70,7 @@ class Channel:
     settled: bool = True
     over_time: bool = True
     other_units: tuple[tuple[str, float], ...] = ()
+    zero_error: float = 0.0
     side: int | None = None
     where: str = ""
     rests_on: tuple[str, ...] = ()
@@ -172,6 +175,7 @@ _EITHER: tuple[Channel, ...] = (
         read=lambda robot, signals: signals.current,
         where="in the leads of one motor",
         rests_on=CURRENT,
+        zero_error=0.05,
         sd_share=0.02,
         resolution=3,
         other_units=(("mA", 1e-3),),
@@ -243,6 +247,7 @@ _EITHER: tuple[Channel, ...] = (
         sd_largest=100.0,
         read=lambda robot, signals: signals.voltage,
         rests_on=VOLTAGE,
+        zero_error=0.1,
         sd_share=0.01,
         resolution=2,
         other_units=(("mV", 1e-3),),
@@ -258,6 +263,7 @@ _EITHER: tuple[Channel, ...] = (
         range=(-1e4, 1e4),
         sd_largest=1e3,
         read=lambda robot, signals: signals.torque_output,
+        zero_error=0.05,
         sd_share=0.01,
         resolution=4,
         unit_si="N·m",
@@ -275,6 +281,7 @@ _EITHER: tuple[Channel, ...] = (
         sd_largest=100.0,
         read=_winding_temperature,
         rests_on=HEAT,
+        zero_error=2.0,
         sd_share=0.02,
         unit_si="°C",
         over_time=False,
@@ -297,6 +304,7 @@ OF_TURNS: tuple[Channel, ...] = (
         range=(-100.0, 100.0),
         sd_largest=10.0,
         read=lambda robot, signals: signals.yaw_rate,
+        zero_error=0.01,
         sd_share=0.02,
         resolution=3,
         zero_at_rest=True,

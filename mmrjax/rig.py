@@ -210,6 +210,11 @@ class Rig(eqx.Module):
         """Whether the motors' voltage is imposed or read."""
         return self.imposed == "voltage" or "motor_voltage" in self.channels
 
+    @property
+    def magnitudes(self) -> frozenset[str]:
+        """Channels whose instruments show the magnitude alone."""
+        return frozenset(i.channel for i in self.instruments if i.signed is False)
+
     def instrument(self, channel: str) -> Instrument:
         """That of a channel."""
         return next((i for i in self.instruments if i.channel == channel), Instrument(channel))

@@ -133,6 +133,25 @@ def test_curve_of_a_run_in_mirror_image_is_the_mirror_image(effect):
     np.testing.assert_allclose(there, -laws.terms(made), rtol=1e-12, atol=1e-15)
 
 
+def test_a_curve_of_what_shows_magnitudes_is_the_same_in_mirror_image():
+    """As it is written in a robot, and as the loop looks for it."""
+    made = params.replace(UNNAMED["curve_motor_current_current"](), {n: jnp.asarray(v) for n, v in SHAPE.items()})
+    made = params.replace(made, {"amplitude": jnp.asarray(0.3)})
+    robot = laws.metered(signed=False)
+    flipped = {f.name: -getattr(laws.STATES, f.name) for f in dataclasses.fields(Signals) if f.name not in laws.EVEN}
+    turned = dataclasses.replace(laws.STATES, **flipped)
+    each = [laws.terms(made, robot, s) for s in (laws.STATES, turned)]
+    np.testing.assert_allclose(*each, rtol=1e-12, atol=1e-15)
+    robot = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, channels=("motor_current", "speed")))
+    columns = {"order": np.tile(np.arange(9.0), 2), "supply_voltage_V": np.repeat([12.0, -12.0], 9)}
+    columns |= {"configuration": np.repeat("6T2A", 18), "slope_deg": np.zeros(18), "payload_kg": np.zeros(18)}
+    ways = dict.fromkeys(curve.WAYS, np.repeat([1.0, -1.0], 9))
+    for looked in (curves.families, curves.windows):
+        (basis,) = (b for b in looked(columns, np.ones(18), robot, None, ways) if b.places[0] in curve.READINGS)
+        for (place, _), shapes in zip(basis.names, np.asarray(basis.columns), strict=True):
+            np.testing.assert_allclose(shapes[:9], (1 if place == "motor_current" else -1) * shapes[9:])
+
+
 @EACH
 def test_curve_has_finite_derivatives_by_everything_at_rest(effect):
     made = params.replace(effect(), {"amplitude": jnp.asarray(0.3)})

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 import mmrjax
+from calibration.discovery import setups
 from mmrjax import balances, channels, effects, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, BY_NAME, Effect, base
@@ -32,7 +33,7 @@ from mmrjax.fidelities.drive import drive, rates, start, state_of
 from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.fidelities.track import track
 from mmrjax.params import Scalar, parameter
-from mmrjax.rig import Begin, Begins
+from mmrjax.rig import Begin, Begins, Instrument
 from mmrjax.robot import Configurations
 from mmrjax.shaft import Shaft
 from mmrjax.signals import CONVERGED, STALLED, Signals, State
@@ -426,23 +427,68 @@ SHOWN_BY_STATES = ("motor_current", "output_torque", "motor_voltage", "yaw_rate"
 @pytest.mark.parametrize("law", (law_declared, law_family, law_linear, law_unit), ids=lambda law: law.__name__[4:])
 @pytest.mark.parametrize(
     "effect",
-    [*effects.OF_TURNS.values(), *(effects.OF_CHANNELS[f"{n}_gain"] for n in SHOWN_BY_STATES)],
+    [
+        *effects.OF_TURNS.values(),
+        *(effects.OF_CHANNELS[f"{n}_{what}"] for n in SHOWN_BY_STATES for what in ("gain", "offset")),
+    ],
     ids=lambda effect: effect.name,
 )
 def test_effect_of_turns_and_of_channels_obeys(effect, law):
     law(effect)
 
 
-def test_every_channel_has_an_error_of_its_scale():
-    errors = {e.channel: e for e in (*effects.OF_CHANNELS.values(), *effects.ALL) if e.channel}
-    assert set(errors) == {c.name for c in channels.EVERY} and not set(effects.OF_CHANNELS) & set(BY_NAME)
+#: Instruments that count or time, from a start that is 0, have no error of their zero.
+COUNTED = re.compile(r"(motor|output|lateral)?_?speed(_left|_right)?|output_angle|position|yaw|place_[xy]")
+
+
+def test_every_channel_has_an_error_of_its_scale_and_of_a_zero_that_it_may_miss():
+    errors = [e for e in (*effects.OF_CHANNELS.values(), *effects.ALL) if e.channel]
+    of_zero, of_scale = ({e.channel for e in errors if e.of_zero == zero} for zero in (True, False))
+    assert of_scale == {c.name for c in channels.EVERY} - {"winding_temperature"}
+    assert of_zero == {c.name for c in channels.EVERY if not COUNTED.fullmatch(c.name)}
+    assert len(errors) == len(of_zero) + len(of_scale) and not set(effects.OF_CHANNELS) & set(BY_NAME)
+    # Random numbers go by position: the errors of zeros stand behind those that were before.
+    behind = [e.of_zero for e in effects.OF_CHANNELS.values() if e.channel != "winding_temperature"]
+    assert behind == sorted(behind)
     values = {f.name: 0.5 for f in dataclasses.fields(Signals) if f.name not in ("memory", "configuration")}
     signals = Signals(**values)
     for effect in effects.OF_CHANNELS.values():
         law_declared(effect)
         shown = float(channels.find(effect.channel).read(NOMINAL, signals))
-        size = 1.0 if effect.name == "winding_temperature_offset" else shown
+        size = 1.0 if effect.of_zero else shown
         assert shown and float(effect(amplitude=0.02).term(NOMINAL, signals)) == pytest.approx(0.02 * size)
+
+
+#: Readings of a motor current of 2 A both ways and at rest, of a meter 5 % and 0.18 A too high.
+WITH_A_SIGN, MAGNITUDE = (2.28, -1.92, 0.18), (2.28, 2.28, 0.18)
+
+
+def metered(signed, gain=0.05, offset=0.18):
+    off = {"motor_current_gain": gain, "motor_current_offset": offset}
+    rig = dataclasses.replace(NOMINAL.rig, instruments=(Instrument("motor_current", signed=signed),))
+    return dataclasses.replace(with_effects(*(effects.OF_CHANNELS[n](amplitude=a) for n, a in off.items())), rig=rig)
+
+
+@pytest.mark.parametrize(("signed", "expected"), [(True, WITH_A_SIGN), (False, MAGNITUDE)])
+def test_an_instruments_errors_are_added_to_what_it_shows(signed, expected):
+    """So that what an effect changes of a reading is its term, to which the loop's scores hold."""
+    robot, without = metered(signed), metered(signed, 0.0, 0.0)
+    for current, shown in zip((2.0, -2.0, 0.0), expected, strict=True):
+        signals = jax.tree.map(lambda x: x[0], dataclasses.replace(STATES, current=jnp.full(400, current)))
+        read, ideal = (float(balances.sensor(r, signals)["motor_current"]) for r in (robot, without))
+        assert read == pytest.approx(shown, rel=1e-12)
+        assert read - ideal == pytest.approx(float(balances.added(robot, signals, "sensor", "motor_current")))
+
+
+@pytest.mark.parametrize("signed", [True, False])
+def test_a_run_backward_is_read_as_one_forward_of_the_robot_turned_about(signed):
+    """A zero error keeps its sign in space; one of an instrument that shows magnitudes is the same both ways."""
+    volts, slope = np.array([12.0, 24.0]), np.array([3.0, 8.0])
+    back = steady_batch(metered(signed), Conditions(voltage=-volts, slope_deg=-slope))
+    ahead = steady_batch(setups.reversed_(metered(signed)), Conditions(voltage=volts, slope_deg=slope))
+    read, as_forward = (np.asarray(r.reading["motor_current"]) for r in (back, ahead))
+    assert (read * (-1 if signed else 1) > 0).all()
+    np.testing.assert_allclose(as_forward, np.abs(read), rtol=1e-9)
 
 
 @pytest.mark.parametrize(

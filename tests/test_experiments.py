@@ -22,7 +22,7 @@ from calibration.discovery.reach import reach
 from calibration.discovery.stated_values import Shift
 from mmrjax import channels, params, robots
 from mmrjax.conditions import Conditions
-from mmrjax.effects import BY_NAME
+from mmrjax.effects import BY_NAME, OF_CHANNELS
 from mmrjax.fidelities.steady import IMPLICIT
 
 PAIRS = {
@@ -385,6 +385,14 @@ def test_channels_that_the_bench_lacks_are_not_read(rover):
     assert "timing" in names and not names & {"shunt", "strobe", "zero current", "stall", "lifted, rover"}
 
 
+def test_the_zero_of_a_meter_is_read_at_rest_as_well_as_its_table_is(rover):
+    off = OF_CHANNELS["motor_current_offset"](amplitude=0.18), OF_CHANNELS["motor_current_gain"](amplitude=0.05)
+    robot = dataclasses.replace(rover, effects=off)
+    (zero,) = (e for e in menu.menu(reach(rover, ROVERS_TABLE, ("motor_current",))) if "zero reading" in e.kinds)
+    assert np.asarray(zero.reading(robot, jnp.asarray(zero.at))) == pytest.approx([0.18])
+    assert predicted.sds([zero], {"motor_current": 0.1}) == pytest.approx([0.1 / np.sqrt(zero.repeats)])
+
+
 def test_robot_with_one_motor_is_not_told_to_disconnect_the_other(rover):
     one = dataclasses.replace(rover, sides=jnp.asarray(1.0))
     made = menu.menu(reach(one, ROVERS_TABLE, channels.USUAL))
@@ -457,7 +465,8 @@ def test_harmless_run_has_nothing_to_watch():
 
 
 def test_every_kind_is_on_the_packaged_menu_and_no_other():
-    kinds = {k for e in MENU for k in e.kinds}
+    metered = menu.menu(dataclasses.replace(REACH, measured=("motor_current",)))
+    kinds = {k for e in (*MENU, *metered) for k in e.kinds}
     assert kinds == {*menu.KINDS, "6T2A", "4W2T"}
 
 

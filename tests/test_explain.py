@@ -8,7 +8,7 @@ from mmrjax.errors import choices, near
 from sweeps.commands import explain
 from sweeps.pages import words
 
-EVERY = effects.BY_NAME | effects.OF_TURNS
+EVERY = effects.BY_NAME | effects.OF_TURNS | effects.OF_CHANNELS
 
 
 def said(kind, name):

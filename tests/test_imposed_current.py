@@ -11,8 +11,9 @@ import pytest
 from calibration.data import rig_facts, robot_file
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration, BadData
+from calibration.discovery import discover
 from calibration.inference import blocks as holdout
-from calibration.inference import observers
+from calibration.inference import checks, observers
 from calibration.inference.calibrate import calibrate
 from mmrjax import params
 from mmrjax.balances import absent
@@ -68,6 +69,22 @@ def test_a_current_in_another_unit_is_doubted_with_what_turns_the_load(tmp_path,
     assert bool(said) == doubted
     if doubted:
         assert f"up to {2 * factor:g} A, where the file's numbers turn the load slowly with 0.667 A; is it in" in said
+
+
+@pytest.mark.parametrize(("factor", "doubted"), [(1.0, False), (1e3, True)])
+def test_a_loop_and_a_calibration_say_so_before_they_fit(tmp_path, robot, factor, doubted, monkeypatch):
+    current = np.array([1.0, 1.5, 2.0, -1.0, -1.5, -2.0, 1.2, 1.8])
+    rows = [f"{factor * i},{x * 9.549}\n" for i, x in zip(current, settles(current), strict=True)]
+    (tmp_path / "runs.csv").write_text("motor_current_A,motor_speed_rpm\n" + "".join(rows), encoding="utf-8")
+    runs = records.read(tmp_path / "runs.csv", robot=robot)
+    monkeypatch.setattr(checks, "check_ranges", lambda runs, robot: [])  # which refuses it where speeds show it too
+    ready = discover.prepared(runs, robot)
+    assert any("is it in another unit" in str(note) for note in ready.at_first) == doubted
+    said = []
+    monkeypatch.setattr(observers, "pose", lambda *given: said.append("fit") or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        calibrate(runs, robot, tell=said.append)
+    assert any("is it in another unit" in text for text in said[: said.index("fit")]) == doubted
 
 
 def test_the_file_says_what_is_imposed_and_needs_no_winding(robot, tmp_path):

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import re
+from importlib import resources
 
 import jax
+import jinja2
 import numpy as np
 import pytest
 
@@ -17,6 +19,7 @@ from mmrjax import channels, fidelities, params
 from mmrjax.robots import nominal
 from sweeps import capabilities
 from sweeps.commands import rig_new
+from sweeps.pages.page import number
 from sweeps.points import imposed
 from tests.commands import rows as rows_of
 
@@ -501,3 +504,16 @@ def test_the_packaged_robots_parameters_keep_their_sources(tmp_path):
 def test_forbidden_words_are_seen():
     assert len(words_of_others("<p>the nominal robot of Table 8</p>")) == 2
     assert words_of_others('<img src="data:image/svg+xml;base64,paper">') == []
+
+
+@pytest.mark.parametrize("page", ["loop", "calibration"])
+def test_a_page_shows_a_dash_for_a_channel_without_readings(page):
+    """Of the row of errors by fit, which knows nothing of it."""
+    text = (resources.files("sweeps.pages") / "templates" / f"{page}.html.j2").read_text("utf-8")
+    (row,) = re.findall(r"{% for c in columns %}<td>{{ by.*?</td>{% endfor %}", text)
+    environment = jinja2.Environment(undefined=jinja2.StrictUndefined)
+    environment.filters["number"] = number
+    assert (
+        environment.from_string(row).render(columns=["speed", "position"], by={"speed": 1.0})
+        == "<td>1</td><td>–</td>"
+    )

@@ -235,6 +235,9 @@ def test_the_loop_looks_for_an_error_of_every_instrument(tmp_path):
     runs, robot = metered(tmp_path, 0.0)
     scored = [e for e in discover.prepared(runs, robot).library.values() if e.balance == "sensor"]
     assert {e.channel for e in scored} == set(robot.rig.channels)
+    (torque,) = (e for e in scored if e.name == "output_torque_offset")
+    size = np.sqrt(np.mean(runs["output_torque_Nm"] ** 2))
+    assert amplitude_of(torque()).spec.bounds == pytest.approx(np.array([-1, 1]) * scales.MOST_OFF * size, rel=0.01)
 
 
 @pytest.mark.slow
@@ -243,3 +246,25 @@ def test_a_torque_meters_gain_is_named(tmp_path):
     found = mm.discover(runs, robot)
     assert found.verdict == "named" and [e.name for e in found.effects] == ["output_torque_gain"]
     assert found.effects[0].parameters["amplitude"].value == pytest.approx(0.05, abs=0.015)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("signed", [True, False])
+def test_a_current_sensors_offset_is_named(tmp_path, signed):
+    """Of a bench driven both ways; where the sensor shows magnitudes a friction may look alike."""
+    shown = f"[instruments.motor_current]\nsigned = {str(signed).lower()}\n"
+    (tmp_path / "rig.toml").write_text(METERED.replace(', "output_torque"', ', "motor_current"') + shown)
+    robot = robot_file.read(tmp_path / "rig.toml")
+    off = effects.OF_CHANNELS["motor_current_offset"](amplitude=0.02)
+    volts = np.linspace(4.0, 24.0, 8)[:, None] * [1.0, -1.0]
+    seen = mm.simulate(dataclasses.replace(robot, effects=(off,)), mm.Conditions(voltage=volts.ravel()))
+    read = np.stack([seen.total_current, np.asarray(seen.motor_speed) / RPM, seen.motor_current])
+    sd = 0.003 * np.abs(read).mean(1, keepdims=True)
+    read += sd * np.random.default_rng(1).standard_normal(read.shape)
+    heads = "supply_voltage_V,total_current_A,motor_speed_rpm,motor_current_A,"
+    heads += "total_current_sd_A,motor_speed_sd_rpm,motor_current_sd_A"
+    rows = np.column_stack([volts.ravel(), read.T, np.broadcast_to(sd.T, read.T.shape)])
+    np.savetxt(tmp_path / "runs.csv", rows, "%.6g", ",", header=heads, comments="")
+    found = mm.discover(records.read(tmp_path / "runs.csv", robot=robot), robot)
+    assert found.verdict in ("named", "class") and [e.name for e in found.effects] == [off.name]
+    assert found.effects[0].parameters["amplitude"].value == pytest.approx(0.02, abs=0.005)

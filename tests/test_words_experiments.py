@@ -46,6 +46,16 @@ def test_acts_say_what_to_set_and_to_read():
     assert on(three)["weigh"].startswith("Weigh the robot in each configuration, unladen and")
 
 
+def test_the_zero_of_every_meter_is_read_at_rest():
+    """Of whatever shows a value that is none: not of what counts, nor of a temperature."""
+    shown = ("motor_speed", "motor_current", "position", "output_torque", "winding_temperature")
+    said = {n: text for n, text in on(dataclasses.replace(BENCH, measured=shown)).items() if n.startswith("zero")}
+    assert said == {
+        f"zero of {label}": f"Switch the motors off, at rest and with no load; read the {label}"
+        for label in ("motor current", "output torque")
+    }
+
+
 def test_runs_follow_their_conditions():
     said = on(REACH)
     read = "read total current, motor speed and speed"
@@ -188,5 +198,6 @@ def test_more_runs_are_said_within_reach(reach, variable, said):
 def test_every_kind_of_runs_has_words():
     reaches = (REACH, ONE, BENCH, DRIVEN)
     assert {e.doing for r in reaches for e in menu.menu(r) if isinstance(e, menu.Run)} == set(words.DOING)
-    acts = {e.name for e in menu.menu(REACH) if isinstance(e, menu.Act)}
-    assert acts == {"weigh", *words.ACTS} and set(words.ACTS) == set(words.UNITS)
+    metered = dataclasses.replace(BENCH, measured=("motor_current", "output_torque"))
+    acts = {k for r in (REACH, metered) for e in menu.menu(r) if isinstance(e, menu.Act) for k in e.kinds}
+    assert acts == {"weigh", *words.ACTS} and set(words.ACTS) == {*words.UNITS, "zero reading"}

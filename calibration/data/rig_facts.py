@@ -226,6 +226,11 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
     )
 
 
+def doubts(runs: Runs, robot: Robot) -> tuple[str, ...]:
+    """Why a table's time, or the current that it imposes, is in another unit, a sentence each."""
+    return tuple(filter(None, (doubtful_time(runs, robot), doubtful_current(runs, robot))))
+
+
 def time_constant(robot: Robot) -> float:
     """Of the speed of the motors with the slowest of their loads J R/k² [s]; infinite where that is not known."""
     motor, sides, found = robot.motor, float(robot.sides), 0.0

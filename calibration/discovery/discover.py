@@ -138,7 +138,7 @@ def discover(
         forbidden=forbidden, rows=rows,
     )  # fmt: skip
     distinct, known = ready.runs, ready.noise
-    for note in ready.foreign:
+    for note in ready.at_first:
         tell(note)
     space = pose(distinct, ready.robot, known.sd, ready.settings, ready.stated, ready.library)
     with ahead(space, functools.partial(bases_at, distinct), ready.settings) as later:
@@ -188,7 +188,7 @@ class LoopInput:
         runs: without copies; numbers: of the rows, as messages call them.
         robot: as `preparation.prepare` leaves it; noise: of the readings; stated: priors (mean, sd) [SI].
         settings: statistical; library: effects to look for.
-        notes: what to say of all that; foreign: those of priors of another robot.
+        notes: what to say of all that; at_first: those that are said before the first fit.
     """
 
     runs: Runs
@@ -199,7 +199,7 @@ class LoopInput:
     settings: Settings
     library: Library
     notes: Notes
-    foreign: Notes
+    at_first: Notes
 
     def trace(
         self,
@@ -243,15 +243,14 @@ def prepared(
             f"{kind.fewest} are needed"
         )
     ready = preparation.prepare(distinct, robot, noise, stated)
-    said: Notes = (*notes, *ready.former, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign)
+    at_first = (*ready.foreign, *ready.doubted)
+    said: Notes = (*notes, *ready.former, *ready.checked, *ready.begins, *ready.weighed, *at_first)
     turned = scales.turned_in(distinct, ready.robot)
     own = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
     library = {**library, **kind.library, **own}
     library = scales.library_for(ready.robot, distinct.conditions(ready.robot), library, turned)
     settings = dataclasses.replace(settings_for(kind, replicates, seed, prefer), forbidden=tuple(forbidden))
-    return LoopInput(
-        distinct, numbers, ready.robot, ready.noise, ready.stated, settings, library, said, ready.foreign
-    )
+    return LoopInput(distinct, numbers, ready.robot, ready.noise, ready.stated, settings, library, said, at_first)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,7 +17,7 @@ from calibration.discovery import setups
 from calibration.discovery.notes import Heat, Overspeed, Overvoltage, Watch
 from calibration.discovery.reach import SLOPE, Reach, Used
 from calibration.discovery.setups import Setup
-from mmrjax import balances
+from mmrjax import balances, channels
 from mmrjax.channels import RPM
 from mmrjax.conditions import Conditions
 from mmrjax.robot import Robot
@@ -25,8 +25,8 @@ from mmrjax.signals import Signals, State
 
 #: What a user may forbid, beside configurations: every experiment is of one or more of these kinds.
 KINDS = (
-    "weigh", "zero current", "shunt", "strobe", "timing", "bare motor", "stall", "one motor", "braked motor",
-    "reverse", "downhill", "lifted", "payload", "other voltages", "steepest slope", "crawl",
+    "weigh", "zero current", "zero reading", "shunt", "strobe", "timing", "bare motor", "stall", "one motor",
+    "braked motor", "reverse", "downhill", "lifted", "payload", "other voltages", "steepest slope", "crawl",
 )  # fmt: skip
 #: Share of the adhesion that a slope steeper than the table's may take by the fitted robot [-].
 GRIP = 0.95
@@ -47,15 +47,18 @@ class Act:
         name: of it; kinds: of `KINDS`.
         reading: of a robot and of what is set [SI], shape (readings,).
         at: what is set, one tuple a reading [SI]; of `weigh`, the configuration's index and the payload.
-        sd: of a single reading [SI]; repeats: readings that are averaged.
+        sd: of a single reading [SI]; None: that of the table's readings of `channel`.
+        repeats: readings that are averaged.
+        channel: whose instrument is read where nothing is to be shown, "" for another act.
     """
 
     name: str
     kinds: tuple[str, ...]
     reading: Callable[[Robot, Array], Array]
     at: tuple[tuple[float, ...], ...]
-    sd: float
+    sd: float | None
     repeats: int = 10
+    channel: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,6 +153,16 @@ def _timed(robot: Robot, at: Array) -> Array:
     return _show(robot, "speed", [Signals(speed=v) for (v,) in at])
 
 
+@dataclasses.dataclass(frozen=True)
+class _Zero:
+    """What the instrument of a channel shows of a robot at rest whose motors are off."""
+
+    channel: str
+
+    def __call__(self, robot: Robot, at: Array) -> Array:
+        return _show(robot, self.channel, [Signals(current=0.0, voltage=0.0, torque_output=0.0)])
+
+
 def acts(reach: Reach) -> tuple[Act, ...]:
     """The calibration acts, the least effort first; none of an instrument that the table's bench lacks."""
     payload = round_significant(max(u.payloads[-1] for u in reach.used))
@@ -168,6 +181,10 @@ def acts(reach: Reach) -> tuple[Act, ...]:
     timing = Act("timing", ("timing",), _timed, _each(paces), 3e-3)
     found = [weighing] * reach.has_ground
     found += ammeter * ("total_current" in reach.measured)
+    meters = [c for c in channels.rows(reach.measured) if c.zero_error and c.directed]
+    found += [
+        Act(f"zero of {c.label}", ("zero reading",), _Zero(c.name), ((0.0,),), None, channel=c.name) for c in meters
+    ]
     found += [strobe] * ("motor_speed" in reach.measured)
     found += [timing] * ("speed" in reach.measured)
     return tuple(found)

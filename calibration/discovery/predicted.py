@@ -164,7 +164,7 @@ def spans(experiments: Sequence[Experiment]) -> dict[str, slice]:
 
 
 def sds(experiments: Sequence[Experiment], of_channels: Mapping[str, float]) -> np.ndarray:
-    """Sd of every reading [SI], repeats averaged; runs are read with the instruments of the table.
+    """Sd of every reading [SI], repeats averaged; runs, and zeros, are read with the instruments of the table.
 
     Args:
         of_channels: sds of its channels [SI], by name.
@@ -172,7 +172,7 @@ def sds(experiments: Sequence[Experiment], of_channels: Mapping[str, float]) -> 
     found = [np.zeros(0)]
     for e in experiments:
         one = (
-            [e.sd] * len(e.at)
+            [of_channels[e.channel] if e.sd is None else e.sd] * len(e.at)
             if isinstance(e, Act)
             else np.tile([of_channels[c] for c in e.channels], len(e.voltage))
         )

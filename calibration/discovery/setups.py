@@ -34,9 +34,11 @@ def reversed_(robot: Robot, brake: Scalar = 0.0) -> Robot:
     """The robot turned about, so that its travel is forward again.
 
     With the negative of the slope in the command, friction, slip and what meters show stay as they are: they
-    follow the travel. What is odd in travel flips: a slope that is steeper than stated stays so, and now drives.
+    follow the travel. What is odd in travel flips: a slope that is steeper than stated stays so, and now drives. So
+    does the zero error of an instrument that shows signs.
     """
-    biased = {f"effects.{e.name}.amplitude": -e.amplitude for e in robot.effects if e.odd_in_travel}
+    odd = (e for e in robot.effects if e.odd_in_travel and e.channel not in robot.rig.magnitudes)
+    biased = {f"effects.{e.name}.amplitude": -e.amplitude for e in odd}
     return _with(robot, biased)
 
 

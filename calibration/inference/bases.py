@@ -19,7 +19,7 @@ from calibration.inference.linearization import Linearization
 from mmrjax import channels
 from mmrjax.balances import absent
 from mmrjax.channels import Channel
-from mmrjax.effects.curve import DRIFT, READ_BY, WAYS, acts_along, in_travel
+from mmrjax.effects.curve import DRIFT, READ_BY, WAYS, acts_along, counted_by, in_travel
 from mmrjax.robot import Robot
 
 #: Balances that carry curves: one for each equation that the channels close, and the ground's, whose defect
@@ -210,6 +210,7 @@ def families(
     scope = Scope.of(robot) if scope is None else scope
     balances = scope.balances
     ways = forward(len(weight)) if ways is None else ways
+    unsigned = robot.rig.magnitudes if robot else ()
     over: dict[str, str] = {}  # a variable, and that which has its place
     for variable, column in VARIABLES.items():
         if column not in columns or (column in EVERY_AXIS and column not in scope.axes):
@@ -219,7 +220,7 @@ def families(
         over[variable] = next(iter(over)) if drift else variable
 
     def curve(place: str, variable: str) -> np.ndarray:
-        x, way = in_travel(place, variable, np.asarray(columns[VARIABLES[variable]]), ways.__getitem__)
+        x, way = in_travel(place, variable, np.asarray(columns[VARIABLES[variable]]), ways.__getitem__, unsigned)
         return way[:, None] * legendre.legvander(scaled(x, weight), TERMS - 1) * np.exp(-0.35 * np.arange(TERMS))
 
     names = [(balance, variable) for variable in over.values() for balance in balances]
@@ -330,9 +331,12 @@ def windows(
     # The first again for those that hold too few or too many rows: tables of one size share what is compiled.
     shapes += shapes[:1] * (len(offered) - len(shapes))
     read = [c.name for c in channels_of(robot)]
+    unsigned = robot.rig.magnitudes if robot else ()
     return tuple(
         Basis.of(
-            np.stack([s * ways[acts_along(place)] for place in places for s, _ in shapes])[:, :, None],
+            np.stack([s * counted_by(place, ways.__getitem__, unsigned) for place in places for s, _ in shapes])[
+                :, :, None
+            ],
             [(place, name) for place in places for _, name in shapes],
         )
         for places in (scope.balances, read)

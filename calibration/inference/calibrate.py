@@ -132,7 +132,7 @@ def calibrate(
 
     ready = prepare(runs, robot, noise, stated, assume=False, choose=chosen)
     robot, known, stated, names = ready.robot, ready.noise, ready.stated, ready.names
-    for note in (*ready.former, *ready.foreign):
+    for note in (*ready.former, *ready.foreign, *ready.doubted):
         told(note)
     base = robot
     of_product: dict[str, tuple[float, float]] = {}
@@ -140,7 +140,7 @@ def calibrate(
         present = {robot.configurations.names[k] for k in runs.configurations(robot)}
         base, of_product = _guided(robot, present, names, stated)
     coordinates = priors.coordinates(base, names, {**of_product, **stated})
-    notes: list[Note | str] = [*ready.foreign, *ready.checked, *ready.weighed]
+    notes: list[Note | str] = [*ready.foreign, *ready.doubted, *ready.checked, *ready.weighed]
     notes += [PriorOfProduct(name, mean, sd, priors.GUIDED) for name, (mean, sd) in of_product.items()]
     notes += ready.begins
     posed = observers.pose(runs, base, coordinates, known.sd, model)

@@ -136,7 +136,7 @@ class Linearization(eqx.Module):
         defects: by a defect of each balance of `probed` [its unit]; what further axes are is the observer's.
         scale: of what is added to a reading [1/SI], 0 where it does not count, shape (rows, channels).
         signals: of every row, at the fit.
-        channels: names of those that readings are of, in order.
+        channels: names of those that readings are of, in order; magnitudes: of those shown without a sign.
         probed: balances whose defects are known.
 
     A defect of a balance may be at every point: of each row, and of a robot whose sides are driven apart of each side
@@ -152,6 +152,7 @@ class Linearization(eqx.Module):
     scale: Float[Array, "rows channels"]
     signals: Signals
     channels: tuple[str, ...] = eqx.field(static=True, kw_only=True)
+    magnitudes: frozenset[str] = eqx.field(default=frozenset(), static=True, kw_only=True)
 
     @property
     def rows(self) -> int:
@@ -211,7 +212,7 @@ class Linearization(eqx.Module):
 
     def in_travel(self, place: str, variable: str) -> tuple[np.ndarray, np.ndarray]:
         """What a curve in a place is over [SI] and by what it counts, by point, as `effects.curve` takes both."""
-        x, way = in_travel(place, variable, self.variable(variable), self.variable)
+        x, way = in_travel(place, variable, self.variable(variable), self.variable, self.magnitudes)
         return np.asarray(x), np.broadcast_to(way, (self.points,))
 
     def runs(self) -> list[np.ndarray]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 
-from calibration.data import instruments, own_mass, robot_file, surfaces
+from calibration.data import instruments, own_mass, rig_facts, robot_file, surfaces
 from calibration.data.runs import Runs
 from calibration.inference import checks, observers
 from calibration.inference import noise as noise_room
@@ -31,7 +31,8 @@ class Prepared:
         stated: priors by the names that parameters now have, (mean, sd) [SI].
         names: free parameters that were chosen, see `prepare`.
         former: remarks on names as they were called before; foreign: on priors of another robot; checked: on the
-            table; begins: on how its runs begin; weighed: on the masses that it states.
+            table; begins: on how its runs begin; weighed: on the masses that it states; doubted: on units that may be
+            others, to be said before a fit.
     """
 
     robot: Robot
@@ -44,6 +45,7 @@ class Prepared:
     checked: Notes
     begins: Notes
     weighed: Notes
+    doubted: Notes = ()
 
 
 def prepare(
@@ -87,4 +89,5 @@ def prepare(
         foreign=tuple(inherited_priors(robot, priors)),
         checked=tuple(checked),
         begins=tuple(begins),
+        doubted=rig_facts.doubts(runs, as_stated),
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from calibration.words.experiments import ACTS, DOING
+from mmrjax.channels import find
 from mmrjax.effects import OF_TURNS, Effect
 from mmrjax.effects.base import THE_SIDE
 
@@ -15,6 +16,8 @@ ISOLATED_BY = {
     "inertia": ("lifted",), "inductance": ("held",),
 }  # fmt: skip
 CHECKED_BY = {"total_current": ("zero current", "shunt"), "motor_speed": ("strobe",), "speed": ("timing",)}
+#: Of any other channel.
+COMPARE = "Read a second instrument beside that of the {}, at several values"
 #: What to change, all else alike, so that a term changes that goes with it.
 VARY = {
     "speed": "the speed (the supply voltage)", "current": "the current (slope or payload at one voltage)",
@@ -56,6 +59,10 @@ def tests(effect: type[Effect]) -> Iterator[str]:
     if effect.channel:
         for name in CHECKED_BY.get(effect.channel, ()):
             yield ACTS[name].format("several values")
+        if effect.channel not in CHECKED_BY:
+            shown = find(effect.channel)
+            yield from [ACTS["zero reading"].format(shown.label)] * bool(shown.zero_error and shown.directed)
+            yield COMPARE.format(shown.label)
         return
     for name in ISOLATED_BY.get(effect.balance, ()):
         if name == "weigh":

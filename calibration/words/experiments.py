@@ -50,6 +50,7 @@ def slopes(angles: Sequence[float]) -> str:
 #: How each calibration act is done, by its name; what is set fills the gap.
 ACTS = {
     "zero current": "Switch the motors off; read the ammeter",
+    "zero reading": "Switch the motors off, at rest and with no load; read the {}",
     "shunt": "Put a precision shunt and a load in the place of the robot, set {} by the shunt; read the ammeter",
     "strobe": "Set the motor to {} by a stroboscope; read the tachometer",
     "timing": "Time the robot by light gates over a distance measured with a tape, at {}; read the speed that the "
@@ -82,7 +83,10 @@ def experiment(e: menu.Experiment) -> str:
 def _act(act: menu.Act) -> str:
     if act.name == "weigh":
         return _weigh(act)
-    return ACTS[act.name].format(amounts([v for (v,) in act.at], UNITS[act.name]))
+    (kind,) = act.kinds
+    if act.channel:
+        return ACTS[kind].format(channels.find(act.channel).label)
+    return ACTS[kind].format(amounts([v for (v,) in act.at], UNITS[kind]))
 
 
 def _weigh(act: menu.Act) -> str:

@@ -51,7 +51,8 @@ class Effect(eqx.Module):
         name: its name in files and reports; by default that of the class, `MassError` as `mass_error`.
         balance: the balance it enters, one of `balances.BALANCES`, whose unit its term has; has no default. A
             positive term takes away: a voltage drop, a loss torque, a resisting force, a lost speed; in `mass`,
-            `inertia` and `inductance` it adds, and in `sensor` it adds to the reading of `channel`.
+            `inertia` and `inductance` it adds, and in `sensor` it adds to what the instrument of `channel` shows,
+            which may be the magnitude alone.
         driver: what its term changes with: `speed`, `current`, `load`, ...; `direction` if it is the way round that
             it is about, `the side` if it is not the same on both sides. Effects
             of one equation with one driver are a family: the forms of a law that data may not tell apart. Empty where

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
@@ -75,20 +75,33 @@ def acts_along(place: str) -> str:
     return PLACES[place][2]
 
 
-def in_travel(place: str, variable: str, x: Any, way: Callable[[str], Any]) -> tuple[Any, Any]:
-    """A variable of a curve in the frame of travel, and by what the curve counts: a run in mirror image shows a
-    discrepancy in mirror image. What is over none of `VARIABLES`, as a wave, counts as it is.
+def counted_by(place: str, way: Callable[[str], Any], magnitudes: Container[str] = ()) -> Any:
+    """By what a discrepancy in a place counts: a run in mirror image shows it in mirror image; in what an instrument
+    shows of magnitudes alone, as it is.
 
     Args:
-        x: the variable [its unit], an array of either library; way: gives the signal of `WAYS` of a name.
+        way: gives the signal of `WAYS` of a name; magnitudes: channels of such instruments.
+    """
+    counts = way(acts_along(place))
+    return abs(counts) if place in magnitudes else counts
+
+
+def in_travel(
+    place: str, variable: str, x: Any, way: Callable[[str], Any], magnitudes: Container[str] = ()
+) -> tuple[Any, Any]:
+    """A variable of a curve in the frame of travel, and by what the curve counts, see `counted_by`. What is over none
+    of `VARIABLES`, as a wave, counts as it is.
+
+    Args:
+        x: the variable [its unit], an array of either library; way, magnitudes: as of `counted_by`.
     """
     if variable not in VARIABLES | VARIABLES_ROUND:
         return x, 1.0
-    counts = way(acts_along(place))
+    counts = counted_by(place, way, magnitudes)
     if variable in SIGNED:
         return x, counts
-    ahead = way("direction_turn") if variable == "yaw_rate" else way("direction") if place in ROUND else counts
-    return x * ahead, counts
+    along = "direction_turn" if variable == "yaw_rate" else "direction" if place in ROUND else acts_along(place)
+    return x * way(along), counts
 
 
 _LAST = len(ORDINATES) - 1
@@ -177,7 +190,8 @@ def _curve(place: str, over: str) -> type[Effect]:
 
         def term(self, robot: Robot, signals: Signals) -> Scalar:
             x = self.recall(robot, signals) if over == "time" else getattr(signals, over)
-            x, way = in_travel(place, over, x, lambda name: jnp.asarray(getattr(signals, name)))
+            ways = lambda name: jnp.asarray(getattr(signals, name))  # noqa: E731
+            x, way = in_travel(place, over, x, ways, robot.rig.magnitudes)
             y = jnp.stack(jnp.broadcast_arrays(*(getattr(self, n) for n in ORDINATES)), -1)
             return self.amplitude * jnp.sum(weights(x, self.low, self.high) * y, -1) * way
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import abc
+from collections.abc import Iterator
 from types import SimpleNamespace
-from typing import Any
 
 import jax.numpy as jnp
 
@@ -16,9 +17,19 @@ from mmrjax.signals import Signals
 
 
 class SensorEffect(Effect):
-    """What is added to the reading of one channel."""
+    """An error of the instrument of one channel, added to what it shows: of its scale, a x, or of its zero, a."""
 
     balance = "sensor"
+
+    @property
+    @abc.abstractmethod
+    def of_zero(self) -> bool:
+        """Whether it is the same whatever is shown."""
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        shown = robot.rig.instrument(self.channel).shows(channels.find(self.channel).read(robot, signals))
+        # Times one of the signals' shape, so that a batch stays a batch.
+        return self.amplitude * (jnp.ones_like(shown) if self.of_zero else shown)
 
 
 class AmmeterGain(SensorEffect):
@@ -30,6 +41,7 @@ class AmmeterGain(SensorEffect):
     """
 
     channel = "total_current"
+    of_zero = False
 
     amplitude: Scalar = amplitude(
         unit="-",
@@ -38,9 +50,6 @@ class AmmeterGain(SensorEffect):
         sd=0.02,
         source="class 2.5 meter, shunt of 1 %",
     )
-
-    def term(self, robot: Robot, signals: Signals) -> Scalar:
-        return self.amplitude * signals.total_current
 
 
 class AmmeterOffset(SensorEffect):
@@ -52,6 +61,7 @@ class AmmeterOffset(SensorEffect):
     """
 
     channel = "total_current"
+    of_zero = True
 
     amplitude: Scalar = amplitude(
         unit="A",
@@ -60,10 +70,6 @@ class AmmeterOffset(SensorEffect):
         sd=0.1,
         source="control electronics on the line: 0.05 to 0.2 A",
     )
-
-    def term(self, robot: Robot, signals: Signals) -> Scalar:
-        # Times one of the signals' shape, so that a batch stays a batch.
-        return self.amplitude * jnp.ones_like(signals.total_current)
 
 
 class EncoderScale(SensorEffect):
@@ -75,6 +81,7 @@ class EncoderScale(SensorEffect):
     """
 
     channel = "motor_speed"
+    of_zero = False
 
     amplitude: Scalar = amplitude(
         unit="-",
@@ -83,9 +90,6 @@ class EncoderScale(SensorEffect):
         sd=0.01,
         source="optical tachometer 0.1 %, analogue one 1 to 2 %",
     )
-
-    def term(self, robot: Robot, signals: Signals) -> Scalar:
-        return self.amplitude * signals.speed_motor
 
 
 class SpeedGain(SensorEffect):
@@ -97,6 +101,7 @@ class SpeedGain(SensorEffect):
     """
 
     channel = "speed"
+    of_zero = False
 
     amplitude: Scalar = amplitude(
         unit="-",
@@ -106,44 +111,47 @@ class SpeedGain(SensorEffect):
         source="1 to 2 cm in 1 m, a tenth of a second by hand",
     )
 
-    def term(self, robot: Robot, signals: Signals) -> Scalar:
-        return self.amplitude * signals.speed
 
+def _error(read: Channel, of_zero: bool) -> type[Effect]:
+    """The error of the scale of a channel's instrument, or of its zero."""
+    largest, unit = (10 * read.zero_error, read.unit_si or read.unit) if of_zero else (0.2, "-")
+    source = "limits of error of instruments, IEC 60051-2", "class of the instrument: 0.5 to 2.5 %"
+    if read.unit_shown == "°C":
+        source = "tolerances of thermocouples, IEC 60584-1", "class of the instrument: 1 to 3 K"
+    odd, zero = of_zero and read.directed, of_zero
 
-def _scale(shown_by: Channel) -> type[Effect]:
-    """The error of the scale of a channel's instrument; of a temperature, whose zero is a convention, of its zero."""
-    offset = shown_by.unit_shown == "°C"
-
-    class Scale(SensorEffect):
-        name = f"{shown_by.name}_{'offset' if offset else 'gain'}"
-        channel = shown_by.name
+    class Error(SensorEffect):
+        name = f"{read.name}_{'offset' if zero else 'gain'}"
+        channel = read.name
+        of_zero = zero
+        odd_in_travel = odd
 
         amplitude: Scalar = amplitude(
-            unit="°C" if offset else "-",
-            meaning=f"error of the {shown_by.label} reading"
-            if offset
-            else f"relative error of the {shown_by.label} reading",
-            bounds=(-20.0, 20.0) if offset else (-0.2, 0.2),
-            sd=2.0 if offset else 0.02,
-            source="class of the instrument: 1 to 3 K" if offset else "class of the instrument: 0.5 to 2.5 %",
+            unit=unit,
+            meaning=f"error of the {read.label} reading" if zero else f"relative error of the {read.label} reading",
+            bounds=(-largest, largest),
+            sd=read.zero_error if zero else 0.02,
+            source=source[1],
         )
 
-        def term(self, robot: Robot, signals: Signals) -> Scalar:
-            read: Any = shown_by.read(robot, signals)
-            return self.amplitude * (jnp.ones_like(read) if offset else read)
+    Error.__doc__ = f"""Δx = a{"" if zero else " x"} in the reading x of {read.label}.
 
-    Scale.__doc__ = f"""Δx = a{"" if offset else " x"} in the reading x of {shown_by.label}.
+    The {"zero" if zero else "scale"} of the instrument is off.
 
-    The {"zero" if offset else "scale"} of the instrument is off.
-
-    Source: {"tolerances of thermocouples, IEC 60584-1" if offset else "limits of error of instruments, IEC 60051-2"}.
+    Source: {source[0]}.
     """
-    return made(Scale, "".join(word.capitalize() for word in Scale.name.split("_")))
+    return made(Error, "".join(word.capitalize() for word in Error.name.split("_")))
 
 
-#: Of every channel that the classes above are not about: a rig that has it.
-OF_CHANNELS: dict[str, type[Effect]] = {
-    effect.name: effect for effect in (_scale(c) for c in channels.EVERY if c not in channels.usual())
-}
+def _errors() -> Iterator[type[Effect]]:
+    """Of every channel that the classes above are not about: of its scale, but of a temperature, whose zero is a
+    convention; then of its zero. Random numbers go by position: new ones stand at the end."""
+    own = [c for c in channels.EVERY if c not in channels.usual()]
+    yield from (_error(c, of_zero=c.unit_shown == "°C") for c in own)
+    yield from (_error(c, of_zero=True) for c in own if c.zero_error and c.directed)
+
+
+#: A rig has those of its channels.
+OF_CHANNELS: dict[str, type[Effect]] = {effect.name: effect for effect in _errors()}
 #: The same by the names of their classes, see `made`.
 Made = SimpleNamespace(**{effect.__name__: effect for effect in OF_CHANNELS.values()})

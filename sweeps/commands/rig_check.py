@@ -285,8 +285,7 @@ def examined(file: Path, data: str | None, effects: tuple[str, ...] = ()) -> Rig
         return found
     runs = read_runs(data, robot, measured=True, series=True)
     seen = foresight.foresee(runs, robot)
-    sign, time = settling.doubtful_sign(runs), rig_facts.doubtful_time(runs, robot)
-    doubts = tuple(filter(None, (sign, time, rig_facts.doubtful_current(runs, robot))))
+    doubts = (*filter(None, (settling.doubtful_sign(runs),)), *rig_facts.doubts(runs, robot))
     return dataclasses.replace(found, runs=runs, foresight=seen, doubts=doubts)
 
 

@@ -615,6 +615,7 @@ class Histories(Observer):
             self.time,
             self.angle(runs),
             channels=channels.names(problem.channels),
+            magnitudes=robot.rig.magnitudes,
         )
 
     def replicate(

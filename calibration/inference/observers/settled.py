@@ -263,7 +263,10 @@ class SettledRuns(Observer):
 
         signatures = jnp.concatenate([e.each(signature) for e in effects]).T
         defects = defects.reshape(len(probes), *self.shape_sides, rows, count)
-        return kind(residual, jacobian[:, :size], finite(signatures), defects, scale, signals, channels=shown)
+        return kind(
+            residual, jacobian[:, :size], finite(signatures), defects, scale, signals, channels=shown,
+            magnitudes=robot.rig.magnitudes,
+        )  # fmt: skip
 
     def draws(
         self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray
