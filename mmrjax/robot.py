@@ -167,6 +167,11 @@ class Robot(eqx.Module):
         """Whether its load can turn within a backlash, as a body of its own."""
         return self.rig.loose
 
+    @property
+    def moves_as_one(self) -> bool:
+        """Whether its shafts and its load come to rest at one moment: without a backlash or a ground to slip on."""
+        return not (self.loose or self.has_ground)
+
     def chassis(self, configuration: Index) -> Any:
         """The load of the configuration with this index; traceable and batchable."""
         if self.configurations.chosen is not None:

@@ -18,6 +18,7 @@ from calibration.inference.calibrate import calibrate
 from mmrjax import params
 from mmrjax.balances import absent
 from mmrjax.conditions import Conditions
+from mmrjax.fidelities import histories as integrator
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.steady import steady
 
@@ -117,6 +118,38 @@ def test_a_run_follows_its_first_order_law(robot):
     assert np.asarray(found.signals.speed_motor) == pytest.approx(followed(2.0, np.asarray(times)), abs=0.15)
     at_rest = driven(0.5)
     assert np.abs(np.asarray(at_rest.signals.speed_motor)).max() < 1e-6
+
+
+def test_a_shaft_turns_through_rest_and_is_held_there_at_its_very_moment(tmp_path):
+    """Friction jumps there; by steps of 5 ms from 3 A to -2 A to 0.1 A, against the law of either way. Its derivative by
+    the dry friction too: it goes on from the first way to the second, and what friction holds forgets it."""
+    (tmp_path / "rig.toml").write_text(RIG.replace(f"load = {ETA}", "load = 1.0"), encoding="utf-8")
+    robot = robot_file.read(tmp_path / "rig.toml")
+    times = np.arange(0.0, 0.9001, 0.005)
+    levels = np.select([times < 0.3, times < 0.6], [3.0, -2.0], 0.1)
+    rate = VISCOUS / (INERTIA + ROTOR * RATIO**2)
+
+    def law(dry):
+        shown, speed = [0.0], 0.0
+        for level, h in zip(levels, np.diff(times), strict=False):
+            for _ in range(2):  # to rest, and from it
+                way = np.sign(speed) or np.sign(level) * (RATIO * K * abs(level) > dry)
+                end = RATIO * (RATIO * K * level - way * dry) / VISCOUS if way else 0.0
+                at_rest = np.log1p(-speed / end) / rate if speed * end < 0 else np.inf
+                speed, h = (0.0, h - at_rest) if at_rest < h else (end + (speed - end) * np.exp(-rate * h), 0.0)
+            shown.append(speed)
+        return np.array(shown)
+
+    def ours(dry):
+        changed = params.replace(robot, {"bench.loss_coulomb": dry, "motor.inductance": 1e-9})
+        found = integrator.histories(changed, Conditions(motor_current=jnp.asarray(levels)), jnp.asarray(times))
+        return found.speed_motor, found.speed_motor
+
+    slope, shown = map(np.asarray, jax.jit(jax.jacfwd(ours, has_aux=True))(DRY))
+    exact, expected = law(DRY), (law(DRY + 1e-4) - law(DRY - 1e-4)) / 2e-4
+    passed = exact.max() > 40 and exact.min() < -20 and exact[-1] == 0
+    assert passed and np.abs(shown - exact).max() < 1e-4 * np.abs(exact).max()
+    assert np.abs(slope - expected).max() < 0.02 * np.abs(expected).max()
 
 
 def log(tmp_path, robot, noise, dry=DRY):

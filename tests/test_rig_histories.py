@@ -374,28 +374,36 @@ def test_a_log_of_an_imposed_speed_soon_has_even_steps(tmp_path, faster, step):
 
 @pytest.mark.parametrize("imposed", ["voltage", "motor_current"])
 def test_steps_are_short_where_a_drive_passes_through_rest(tmp_path, imposed):
-    """Of a current from a higher speed on and earlier; where no speed is shown, all along."""
-    text = DRIVE.format(imposed=imposed, channels='"motor_speed"', start="rest") + BENCH
-    (tmp_path / "rig.toml").write_text(text.replace('delay = "0 ± 0.05"', "delay = 0.02"))
-    robot = robot_file.load(str(tmp_path / "rig.toml"))
+    """Of a current from a higher speed on and earlier; by the rates of an angle where no speed is shown, all along where
+    neither is. Without a backlash the moment of rest is found within a step, which may be as long as elsewhere."""
+    text = DRIVE.format(imposed=imposed, channels='"motor_speed", "output_angle"', start="rest") + BENCH
+    text = text.replace('delay = "0 ± 0.05"', "delay = 0.02")
+    (tmp_path / "stiff.toml").write_text(text)
+    (tmp_path / "rig.toml").write_text(text + "backlash = 0.01\n")
+    robot, stiff = (robot_file.load(str(tmp_path / name)) for name in ("rig.toml", "stiff.toml"))
     t, column = np.arange(0, 2, 0.02), {"voltage": "supply_voltage_V", "motor_current": "motor_current_A"}[imposed]
     speed = 2000 * np.clip((1.5 - t) / 0.3, -1, 1) * np.minimum(t / 0.2, 1)  # through rest at 1.5 s
-    rows = [f"{a:.2f},{8 if a < 1.2 else -8},{s:.1f}" for a, s in zip(t, speed, strict=True)]
-    (tmp_path / "log.csv").write_text(f"time_s,{column},motor_speed_rpm\n" + "\n".join(rows))
+    angle = np.cumsum(speed) * 0.02 * 6
+    rows = [f"{a:.2f},{8 if a < 1.2 else -8},{s:.1f},{x:.2f}" for a, s, x in zip(t, speed, angle, strict=True)]
+    (tmp_path / "log.csv").write_text(f"time_s,{column},motor_speed_rpm,output_angle_deg\n" + "\n".join(rows))
     runs = records.read(tmp_path / "log.csv", robot=robot)
 
-    def longest(runs, begin, end):
+    def longest(runs, begin, end, robot=robot):
         times = np.asarray(Histories.of(runs, robot).times)[0]
         inside = (times[:-1] >= begin - 1e-9) & (times[1:] <= end + 1e-9)
-        return np.diff(times)[inside].max()
+        return np.diff(times)[inside].max().round(9)
 
     fine, usual = 0.02 / 16, 0.005
     # from 0.07 s before a tenth of the largest speed on; of a current from 0.1 s before three tenths
     begin, end = {"voltage": (1.4, 1.54), "motor_current": (1.32, 1.6)}[imposed]
-    assert longest(runs, begin, end) == pytest.approx(fine) and longest(runs, begin - 0.06, end) > 2 * fine
-    assert longest(runs, 0.6, 1.2) == longest(runs, 1.7, 1.98) == pytest.approx(usual)
-    hidden = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": np.full(len(t), np.nan)})
+    none = np.full(len(t), np.nan)
+    by_angle = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": none})
+    for shown in (runs, by_angle):
+        assert longest(shown, begin, end) == pytest.approx(fine) and longest(shown, begin - 0.06, end) > 2 * fine
+        assert longest(shown, 0.6, 1.2) == longest(shown, 1.7, 1.98) == pytest.approx(usual)
+    hidden = dataclasses.replace(by_angle, columns={**by_angle.columns, "output_angle_deg": none})
     assert longest(hidden, 0.6, 1.2) == pytest.approx(fine)
+    assert longest(hidden, 0.6, 1.98, stiff) == longest(runs, begin, end, stiff) == pytest.approx(usual)
 
 
 def test_a_voltage_on_lines_is_the_mean_of_each_step_and_no_jump(tmp_path):

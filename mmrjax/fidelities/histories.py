@@ -22,7 +22,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.drive import CURRENT, GROUND, MOTOR, moving, rates, start, state_of, units, winding
@@ -251,8 +251,8 @@ class States(eqx.Module):
 
     Attributes:
         stages: unknowns at both stages of every step, without lags; ends: at its end.
-        sides: the way in which a shaft turns (±1; 0 where friction holds it) to begin with, and at last: two ways where
-            it comes to rest within the step; share: of that step before it does.
+        sides: the way in which a shaft turns (±1; 0 where friction holds it) to begin with, and at last; these differ
+            where it comes to rest within the step; before: time in such a step until it does [s].
     """
 
     stages: Float[Array, "steps 2 unknowns"]
@@ -266,7 +266,8 @@ class _Part(eqx.Module):
 
     Attributes:
         turn: 0 of the whole step; 1 to `TURNS` of the part before rest, each closer to its moment; then the rest.
-        begin: unknowns where it begins; lag: that of the current there; length: [s]; side: way in which a shaft turns.
+        begin: unknowns where it begins; lag: that of the current there; length: [s].
+        side: the way in which a shaft turns.
         stages, end: see `States`.
     """
 
@@ -283,8 +284,8 @@ def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) 
     """One run from standstill.
 
     Friction jumps where a shaft turns through rest. So within a step it is that of one way, and a step in which the
-    shaft comes to rest is taken in two, to that moment and from it (Filippov systems; Leine and Nijmeijer, Dynamics and
-    Bifurcations of Non-Smooth Mechanical Systems, 2004).
+    shaft comes to rest is taken in two, to that moment and from it (Filippov systems; Leine and Nijmeijer, Dynamics
+    and Bifurcations of Non-Smooth Mechanical Systems, 2004).
 
     Args: as of `histories`.
     """
@@ -302,7 +303,8 @@ def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) 
             first = part.begin - mine.begin * _current(y)
 
             def stage(given: tuple[Array, Array], mean: Array) -> tuple[tuple[Array, Array], Array]:
-                found = _stage(functools.partial(law, way=part.side), *given, part.length, mean * _current(y), mine.decay)
+                now = functools.partial(law, way=part.side)
+                found = _stage(now, *given, part.length, mean * _current(y), mine.decay)
                 return (first + (1 - _GAMMA) / _GAMMA * (found - first), found), found
 
             stages = jax.lax.scan(stage, (first, first), mine.means)[1]
@@ -330,9 +332,9 @@ def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) 
 
 
 def _side(robot: Robot, law: Callable[[Array, Array], Array], y: Array, edge: Scalar) -> Array:
-    """The way in which a shaft turns or leaves rest, 0 where it is held there; of shafts and a robot that do not move as
-    one, with a backlash or a ground to slip on, 0: their moments of rest are apart."""
-    if robot.loose or robot.has_ground:
+    """The way in which a shaft turns or leaves rest, 0 where it is held there; 0 too where shafts and load do not
+    move as one: their moments of rest are apart."""
+    if not robot.moves_as_one:
         return jnp.zeros(())
     backward, forward = law(y, -jnp.ones(()))[MOTOR] < 0, law(y, jnp.ones(()))[MOTOR] > 0
     way = jnp.where(y[MOTOR] == 0, 1.0 * forward - 1.0 * backward, jnp.sign(y[MOTOR]))
@@ -348,18 +350,17 @@ def followed(
     """
     run = states(robot, conditions, times) if known is None else known
     steps, constant = _steps(conditions, times)
-    of_first, first_state = at_first(robot, conditions)
-    edge, along = _edge(robot, of_first)
+    first_state = at_first(robot, conditions)[1]
     begins = jnp.concatenate([first_state[None], run.ends[:-1]])
     # A step to rest and from it: Euler's implicit ones.
-    passes, turns = run.sides[:, 0] != run.sides[:, 1], run.sides[:, 0] * run.sides[:, 1] < 0
+    passes = run.sides[:, 0] != run.sides[:, 1]
     h = steps.length
     spans = jnp.where(passes[:, None], jnp.stack([run.before, h - run.before], 1), _GAMMA * h[:, None])
     middle = times[:-1] + spans[:, 0]
     clock = jnp.stack([times[:-1], middle, times[1:]], 1)
 
     def linear(given: tuple) -> tuple[Array, Array, Array, Array]:
-        begin, end, stages, sides, spans, passes, turns, step = given
+        begin, end, stages, sides, spans, passes, step = given
         held = step.held(constant)
         one = jnp.eye(len(end), dtype=end.dtype)
         current = _current(end)
@@ -370,7 +371,7 @@ def followed(
         places = jnp.where(passes, ends, stages) + lag.means[:, None] * current
         slopes = jax.vmap(jax.jacfwd(lambda y, way: rates(robot, held, y, way)))(places, sides)
         first, second = jax.vmap(inverted)(one - spans[:, None, None] * slopes)
-        jump = rarely(turns, _jump, (robot, held, places[1], sides), jnp.zeros_like(end))
+        jump = rarely(passes, _jump, (robot, held, places[1], sides), jnp.zeros_like(end))
         # What the second stage starts from, by the first stage and by the change before the step.
         by_first = jnp.where(passes, one + jump[:, None] * one[MOTOR], (1 - _GAMMA) / _GAMMA * one)
         by_before = jnp.where(passes, 0.0, 1 - (1 - _GAMMA) / _GAMMA) * one
@@ -383,7 +384,7 @@ def followed(
         lags = lags + jnp.outer(by_rate.end, current) + jnp.outer(by_rate.decay, by_decay)
         return places, carries + lags.T @ by_begin, gains, lags
 
-    each = begins, run.ends, run.stages, run.sides, spans, passes, turns, steps
+    each = begins, run.ends, run.stages, run.sides, spans, passes, steps
     places, carries, gains, lags = _of_steps(jax.lax.map(jax.vmap(linear), _in_blocks(each)), len(h))
     return Followed(begins, run.ends, places, run.sides, clock, carries, gains, lags)
 
@@ -427,7 +428,7 @@ def respond(
 
     Args:
         conditions: as of `histories`; along: the run.
-        source: (time, state, conditions, way of `balances.moving`) → change of the rates there, shape (unknowns, ...).
+        source: (time, state, conditions, way of `balances.moving`) → change of the rates, shape (unknowns, ...).
         seen: (time, state, its change, conditions) → what is kept of the change at the end of every step.
         begin: change of the state at the first instant.
 

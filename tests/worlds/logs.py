@@ -7,6 +7,7 @@ perturbed rigs go through the classical Runge-Kutta method at once, with steps o
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -22,8 +23,8 @@ from worlds.tables import told_apart
 IMPOSED = ("voltage", "motor_current", "motor_speed")
 RUNS, ROWS = 4, 200
 EVERY = (0.005, 0.01, 0.02)  # [s]
-STEP = 2.5e-4  # [s]; the winding's time constant is 2e-4 s, and the method is stable to 2.7 of them
-REST = 0.01  # of the output, within which friction is smoothed [rad/s]
+STEP = 1e-4  # [s]; the winding's time constant is 2e-4 s, and the method is stable to 2.7 of them
+REST = 0.01  # of the output, within which friction at an imposed speed is smoothed [rad/s]
 RELATIVE = {
     "resistance": 0.05, "torque_constant": 0.03, "friction": 0.3, "viscous": 0.3, "efficiency": 0.04,
     "rotor": 0.1, "inertia": 0.2, "dry": 0.3, "damping": 0.3,
@@ -150,12 +151,12 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
     every = _side_by_side(terms or ())
     J_w, J_d, C, R, i = p["inertia"], p["rotor"], p["torque_constant"], p["resistance"], r.ratio
 
-    def signals(time, y, given, slope):
+    def signals(time, y, given, slope, way=None):
         s = SimpleNamespace(time=time, C=C, fast=r.w_k, I=y[0], w=y[1], turn=y[2], b=y[3])
         if r.imposed == "motor_speed":
             s.w = given
         s.w_k = s.w / i
-        s.d = soft_sign(s.w_k, REST)
+        s.d = soft_sign(s.w_k, REST) if way is None else way
 
         def extra(balance):
             return laws.total(every, balance, s)
@@ -181,13 +182,14 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
             s.dI = (given - s.I) / 2e-4
         return s
 
-    def rates(time, y, given, slope):
-        s = signals(time, y, given, slope)
+    def rates(time, y, given, slope, way=None):
+        s = signals(time, y, given, slope, way)
         b = (s.w_k - s.w_k * s.d * s.b) / YIELDS
         if r.imposed == "motor_speed":
             return np.stack([0 * s.w, 0 * s.w, s.w_k, b])
-        return np.stack([s.dI, i * s.rate, s.w_k, b])
+        return np.stack([s.dI, i * s.rate * (way != 0), s.w_k, b])
 
+    way = np.zeros(count * RUNS)  # in which dry friction acts as of motion; 0 where it holds the shaft
     y = np.zeros((4, count * RUNS))
     lines = r.imposed == "motor_speed"
     h, late = r.every / per, round(r.delay / (r.every / per))
@@ -205,11 +207,45 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
             if row * per + n in wanted:
                 s = at(0.0, y, signals) if lines else SimpleNamespace(I=y[0], w=y[1])
                 kept[row * per + n] = [s.I, s.w, y[2]]
-            y = runge_kutta(at, y, h)
+            if lines:
+                y = runge_kutta(at, y, h)
+                continue
+            y, way = _step(lambda way, x, y: at(x, y, functools.partial(rates, way=way)), y, way, h)
     rows = np.array([kept[max(row * per - late, 0)] for row in range(ROWS)])  # (rows, 3, columns)
     shown = np.moveaxis(rows, 0, -1).reshape(3, count, RUNS, ROWS)
     order = {"total_current": 0, "motor_speed": 1, "output_angle": 2}
     return [{n: shown[order[n], k] / CHANNELS[n][1] for n in r.channels} for k in range(count)]
+
+
+def _step(rates: Any, y: np.ndarray, way: np.ndarray, h: float) -> tuple[np.ndarray, np.ndarray]:
+    """A step with dry friction, which jumps at rest: a step on a line to that moment, and one of Euler's from it. What it
+    holds begins to move when it holds no longer, with a torque that then rises on a line.
+
+    Args:
+        rates: (way, share of the step, y) → rates; y: its second row are speeds.
+        way: in which friction acts as of motion, 0 where it holds.
+    """
+
+    def leaves(x: Any, y: np.ndarray) -> np.ndarray:
+        forward, backward = (rates(d, x, y)[1] for d in (1.0, -1.0))
+        return np.where(forward > 0, 1.0, np.where(backward < 0, -1.0, 0.0))
+
+    held, new = way == 0, runge_kutta(functools.partial(rates, way), y, h)
+    if held.any():
+        then = leaves(1.0, new)
+        first, last = (rates(then, x, z)[1] for x, z in ((0.0, y), (1.0, new)))
+        rises = np.where(first * then > 0, first + last, last * last / np.where(then, last - first, 1.0))
+        new[1] = np.where(held & (then != 0), rises * h / 2, new[1])
+        way = np.where(held, then, way)
+    rests = new[1] * way < 0
+    if rests.any():
+        share = np.where(rests, y[1] / np.where(rests, y[1] - new[1], 1.0), 0.0)
+        still = y + share * (new - y)
+        still[1] = 0.0
+        then = leaves(share, still)
+        new = np.where(rests, still + (1 - share) * h * rates(then, share, still), new)
+        way = np.where(rests, then, way)
+    return new, way
 
 
 def _side_by_side(terms: Sequence[Sequence[Term]]) -> list[Term]:

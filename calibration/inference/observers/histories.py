@@ -96,9 +96,9 @@ CHANGING = ("voltage", "motor_current", "slope_deg", "payload", "adhesion", "tot
 ON_LINES = ("voltage", "motor_current", "duty")
 #: A stretch of unchanged conditions so long may show steady travel [s].
 LASTING = 0.25
-#: Fewest steps from sample to sample of a run that is driven both ways, as it passes through rest: while a speed is
-#: below a share of its largest, and before that for so long [s], by what is imposed (when a current brings a shaft to
-#: rest depends more on what is calibrated), and for so many of the rig's delay.
+#: Fewest steps from sample to sample of a run that is driven both ways as it passes through rest, where shafts and load
+#: do not move as one: while a speed is below a share of its largest, and before that for so long [s], by what is
+#: imposed (when a current brings a shaft to rest depends more on what is calibrated), and for so many of the delay.
 FINE, DELAYED = 16, 2.0
 SLOW, EARLIER = {"voltage": 0.1, "motor_current": 0.3}, {"voltage": 0.03, "motor_current": 0.06}
 #: How many of the usual longest steps one may be elsewhere.
@@ -236,8 +236,7 @@ class Histories(Observer):
             for rows, t in zip(every, given, strict=True)
         ]
         steps = [
-            np.minimum.reduceat(h, np.flatnonzero(n)[:-1])
-            for h, n in zip(_longest(runs, robot.rig), noted, strict=True)
+            np.minimum.reduceat(h, np.flatnonzero(n)[:-1]) for h, n in zip(_longest(runs, robot), noted, strict=True)
         ]
         change = LOOSE if robot.loose else CHANGE
         grids = [
@@ -330,7 +329,7 @@ class Histories(Observer):
         said: list[Note | str] = []
         step = runs["time_s"].max() / STEPS
         if robot.rig.imposed != "motor_speed":
-            step = max(step, *(h.max(initial=0.0) for h in _longest(runs, robot.rig)))
+            step = max(step, *(h.max(initial=0.0) for h in _longest(runs, robot)))
         if step > FAST * LONGEST:
             said.append(CoarseSteps(float(runs["time_s"].max()), float(step)))
         return said
@@ -950,15 +949,15 @@ def _usual(apart: np.ndarray) -> float:
     return float(np.median(apart)) if len(apart) else np.inf
 
 
-def _longest(runs: Runs, rig: Rig) -> list[np.ndarray]:
+def _longest(runs: Runs, robot: Robot) -> list[np.ndarray]:
     """Longest step after each row of its log but the last, of each run in the order of their names [s].
 
-    Where the speed is imposed only what effects remember is followed. Where what drives a run changes its sign,
-    friction jumps as the speed passes through zero, within a step, which has to be short beside the time from reading
-    to reading: where the table's speeds, or the rates of its angles and positions, are low or change their sign, and
-    as much earlier as the rig's delay may be. Where it shows neither, all along.
+    Where the speed is imposed only what effects remember is followed. Where what drives a run changes its sign and
+    shafts and load do not move as one, friction jumps within a step as a speed passes through zero, so it has to be
+    short beside the time from reading to reading: where the table's speeds, or the rates of its angles and positions,
+    are low or change their sign, and as much earlier as the rig's delay may be. Where it shows neither, all along.
     """
-    whole, exact = runs.whole, rig.imposed == "motor_speed"
+    whole, rig, exact = runs.whole, robot.rig, robot.rig.imposed == "motor_speed"
     moved = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and (c.directed or not c.settled)]
     measured, rates = whole.measured()[:, moved], [k for k, at in enumerate(moved) if not runs.channels[at].settled]
     driven = None if exact else applied(whole)
@@ -975,7 +974,7 @@ def _longest(runs: Runs, rig: Rig) -> list[np.ndarray]:
             begins = np.where(_changed(whole, rows, SMALL), np.arange(len(rows)), 0)
             since = time - time[np.maximum.accumulate(begins)]
             longest = np.maximum(longest, np.minimum(LATER * since[:-1], wait / BETWEEN))
-        if both_ways:
+        if both_ways and not robot.moves_as_one:
             speeds = measured[rows]
             speeds[:, rates] = np.gradient(speeds[:, rates], time, axis=0)
             slow = _slow(speeds, SLOW[rig.imposed])
