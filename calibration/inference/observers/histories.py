@@ -96,8 +96,8 @@ CHANGING = ("voltage", "motor_current", "slope_deg", "payload", "adhesion", "tot
 ON_LINES = ("voltage", "motor_current", "duty")
 #: A stretch of unchanged conditions so long may show steady travel [s].
 LASTING = 0.25
-#: Fewest steps from sample to sample of a run that is driven both ways as it passes through rest, where shafts and load
-#: do not move as one: while a speed is below a share of its largest, and before that for so long [s], by what is
+#: Fewest steps from sample to sample of a run that is driven both ways as it passes through rest, where shafts and
+#: load do not move as one: while a speed is below a share of its largest, and before that for so long [s], by what is
 #: imposed (when a current brings a shaft to rest depends more on what is calibrated), and for so many of the delay.
 FINE, DELAYED = 16, 2.0
 SLOW, EARLIER = {"voltage": 0.1, "motor_current": 0.3}, {"voltage": 0.03, "motor_current": 0.06}
