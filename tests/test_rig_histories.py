@@ -352,10 +352,10 @@ def test_steps_follow_the_rows_of_a_log_whose_input_changes_at_each(tmp_path, mo
     made = observers.kind(runs).of(runs, robot)
     shown = np.asarray(made(robot).reading)
     monkeypatch.setattr(histories_room, "CHANGE", (1e-6, 0.1))
-    monkeypatch.setattr(histories_room, "FINE", 256)
+    monkeypatch.setattr(histories_room, "LONGEST", 5e-5)
     fine = observers.kind(runs).of(runs, robot)
     exact = np.asarray(fine(robot).reading)
-    assert made.times.size < 18 * len(runs) and 10 * made.times.size < fine.times.size
+    assert made.times.size < 7 * len(runs) and 25 * made.times.size < fine.times.size
     error = np.sqrt(np.mean((shown - exact) ** 2, 0) / np.mean(exact**2, 0))
     assert (error < 2e-3).all() and (error > 1e-6).all()
 

@@ -729,7 +729,8 @@ def test_chunk_is_split_along_the_points_among_all_devices(tmp_path):
     )
     environment = {**os.environ, "XLA_FLAGS": FOUR, "JAX_PLATFORMS": "cpu"}
     done = subprocess.run([sys.executable, "-c", probe], env=environment, capture_output=True, text=True)
-    said = ["4 [(2,), (2,), (2,), (2,)] ('points',)", "4 True"]  # a plan; the rows of a table
+    # A plan, few points of which are filled up on each device; the rows of a table.
+    said = ["4 [(256,), (256,), (256,), (256,)] ('points',)", "4 True"]
     assert done.stdout.splitlines() == said, done.stderr
 
 

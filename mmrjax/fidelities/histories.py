@@ -41,7 +41,7 @@ _GAMMA = 1 - 0.5**0.5
 NEWTON, SOLVED = 30, 1e-9
 #: The first step [s] and the growth of steps with the time since [1/s · s]: after the start of a robot that may slide
 #: on its ground, and after what drives a run changes by its largest value, or a shaft starts.
-START, CHANGE = (1e-5, 0.02), (1e-4, 0.3)
+START, CHANGE = (1e-5, 0.02), (1e-4, 0.25)
 #: The latter where a backlash is crossed; and the longest step [s].
 LOOSE, LONGEST = (1e-5, 0.08), 2.5e-3
 #: Most steps of a run that LONGEST may ask for; a longer run has longer steps.
