@@ -1,6 +1,7 @@
 """Programs are shared by what equations cannot tell apart, and by nothing else."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -90,20 +91,29 @@ def candidate(active, cost):
 
 
 def test_a_fit_that_ends_above_the_one_it_builds_on_starts_again_there(monkeypatch):
-    """A start where no solution exists keeps no effect from being found."""
+    """A start where no solution exists keeps no effect from being found; nor does a base in another valley, which what it
+    lacks led there: the lowest is fitted from the prior mean too."""
     asked = []
+    # By an effect, a coordinate of the base and an amplitude: from a large one the second is lost beyond a fold.
+    costs = {("a", 1, 9): 10.0, ("b", 1, 9): 5000.0, ("b", 1, 0): 30.0}
 
     def fit(space, proposals, settings):
-        asked.append([(names, float(z)) for names, z in proposals])
-        # from a large amplitude the second one is lost beyond a fold; from 0 it is found
+        asked.append([(*names, *map(float, z)) for names, z in proposals])
+        ends = [costs[*names, *z] for names, z in proposals]
         return [
-            candidate(n, {("a", 9.0): 10.0, ("b", 9.0): 5000.0, ("b", 0.0): 3.0}[n[0], float(z)])
-            for n, z in proposals
+            dataclasses.replace(candidate(p[0], c), z=np.array([1.0, 7.0]))
+            for p, c in zip(proposals, ends, strict=True)
         ]
 
+    def start(space, at, names, settings, scores=None):
+        return np.array([1.0, 9.0 if scores else 0.0])
+
     monkeypatch.setattr(candidates, "fit_candidates", fit)
-    monkeypatch.setattr(candidates, "start", lambda space, at, names, settings, scores=None: 9.0 if scores else 0.0)
-    base = candidate((), 20.0)
-    found = candidates.fit_beside(None, [(("a",), base, "scores"), (("b",), base, "scores")], None)
-    assert [c.cost for c in found] == [10.0, 3.0]
-    assert asked == [[(("a",), 9.0), (("b",), 9.0)], [(("b",), 0.0)]]
+    monkeypatch.setattr(candidates, "start", start)
+    base, space = candidate((), 20.0), SimpleNamespace(free=1)
+    for lowest, kept in ((3.0, 3.0), (11.0, 10.0)):
+        costs["a", 0, 7] = lowest
+        found = candidates.fit_beside(space, [(("a",), base, "scores"), (("b",), base, "scores")], None)
+        assert [c.cost for c in found] == [kept, 30.0]
+        assert asked.pop() == [("b", 1, 0), ("a", 0, 7)] and asked.pop() == [("a", 1, 9), ("b", 1, 9)]
+    assert candidates.fit_beside(space, [], None) == []

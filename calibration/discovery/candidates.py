@@ -171,18 +171,20 @@ def fit_beside(
     space: CandidateSpace, wanted: Sequence[tuple[tuple[str, ...], Candidate, ScoreTable]], settings: Settings
 ) -> list[Candidate]:
     """Fit effects beside those of another fit, from where their scores say; what then explains less than that fit,
-    which has them at amplitude 0, has started beyond where a solution exists and is fitted again from there.
+    which has them at amplitude 0, has started beyond where a solution exists and is fitted again from there. The lowest
+    is fitted from the prior mean too: what a model lacks may have led the search without it into another valley.
 
     Args:
         wanted: (active effects, the other fit, scores of what that leaves); all of its effects are active.
     """
     found = fit_candidates(space, [(w, start(space, at, w, settings, by)) for w, at, by in wanted], settings)
     stuck = [k for k, (_, at, _) in enumerate(wanted) if not found[k].cost <= at.cost + STUCK]
-    again = fit_candidates(
-        space, [(wanted[k][0], start(space, wanted[k][1], wanted[k][0], settings)) for k in stuck], settings
-    )
-    for k, other in zip(stuck, again, strict=True):
-        found[k] = min(found[k], other, key=lambda c: c.cost)
+    again = [(k, start(space, wanted[k][1], wanted[k][0], settings)) for k in stuck]
+    for k in sorted(range(len(found)), key=lambda k: found[k].cost)[:1]:
+        again.append((k, np.where(np.arange(len(found[k].z)) < space.free, 0.0, found[k].z)))
+    others = fit_candidates(space, [(wanted[k][0], z) for k, z in again], settings)
+    for (k, _), other in zip(again, others, strict=True):
+        found[k] = other if other.cost < found[k].cost - STUCK else found[k]
     return found
 
 
