@@ -171,8 +171,8 @@ def fit_beside(
     space: CandidateSpace, wanted: Sequence[tuple[tuple[str, ...], Candidate, ScoreTable]], settings: Settings
 ) -> list[Candidate]:
     """Fit effects beside those of another fit, from where their scores say; what then explains less than that fit,
-    which has them at amplitude 0, has started beyond where a solution exists and is fitted again from there. The lowest
-    is fitted from the prior mean too: what a model lacks may have led the search without it into another valley.
+    which has them at amplitude 0, has started beyond where a solution exists and is fitted again from there. The
+    lowest is fitted from the prior mean too: what a model lacks may have led the search without it elsewhere.
 
     Args:
         wanted: (active effects, the other fit, scores of what that leaves); all of its effects are active.
