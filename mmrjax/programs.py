@@ -231,7 +231,7 @@ def _name(function: Callable[..., Any], arguments: Any) -> str:
         raise Unnamed
     file = io.BytesIO()
     _Describer(file).dump((named, _settings(), arguments))
-    return hashlib.sha256(_sources().encode() + file.getvalue()).hexdigest()
+    return hashlib.sha256(sources().encode() + file.getvalue()).hexdigest()
 
 
 def _settings() -> tuple[tuple[str, str], ...]:
@@ -242,7 +242,7 @@ def _settings() -> tuple[tuple[str, str], ...]:
 
 
 @functools.cache
-def _sources(root: Path = Path(__file__).resolve().parents[1]) -> str:  # noqa: B008 (a constant)
+def sources(root: Path = Path(__file__).resolve().parents[1]) -> str:  # noqa: B008 (a constant)
     """A hash of the source of our packages, which lie in a folder, of the versions of the libraries and of Python."""
     digest = hashlib.sha256(sys.version.encode())
     for library in LIBRARIES:

@@ -202,7 +202,8 @@ class RunFolder(Folder):
 def open_folder(
     command: str, config: RobotPart, robot: Robot, out: Path | None, force: bool, runs: Runs | None = None
 ) -> RunFolder:
-    """The run folder of a command, whose identity is what it was told.
+    """The run folder of a command, whose identity is what it was told and the program's source: it does not go on with
+    what another version has kept.
 
     Args:
         command: its name; config: its configuration; robot: the one that the configuration names, changes and all.
@@ -211,9 +212,11 @@ def open_folder(
     """
     import jax
 
+    from mmrjax.programs import sources
+
     identity = {
         "command": command,
-        "program": f"{__version__}, jax {jax.__version__}, {jax.default_backend()}",
+        "program": f"{sources()}, {jax.default_backend()}",
         "config": config.model_dump(exclude={"report"}),
         "robot": {p.name: float(p.value) for p in params.walk(robot)},
         "runs": None if runs is None else {key: value.tolist() for key, value in runs.columns.items()},

@@ -20,9 +20,10 @@ from calibration.discovery import discover as room
 from calibration.discovery import kept
 from calibration.discovery.kept import OutOfTime
 from calibration.discovery.notes import Outstanding
+from mmrjax import programs, robots
 from sweeps import config
 from sweeps.commands import loop as command
-from sweeps.store import RunFolder
+from sweeps.store import RunFolder, open_folder
 
 
 def refuse():
@@ -39,6 +40,26 @@ def test_a_stage_is_made_once_and_read_after_an_interrupt(tmp_path):
         raise KeyboardInterrupt
     with RunFolder(tmp_path / "x", {"seed": 2}) as folder:  # another command's are not taken
         assert folder.stage("noise 0.5", lambda: 7) == 7
+
+
+def test_a_stage_of_another_version_is_made_again(tmp_path, monkeypatch):
+    """What is named by a hash of the source: the release's number does not change with a mended line."""
+    told = SimpleNamespace(model_dump=lambda **_: {})
+
+    def stage(make):
+        with (
+            pytest.raises(KeyboardInterrupt),
+            open_folder("loop", told, robots.nominal(), tmp_path / "x", False) as folder,
+        ):
+            found.append(folder.stage("base", make))
+            raise KeyboardInterrupt
+
+    found = []
+    stage(lambda: 1)
+    stage(refuse)
+    monkeypatch.setattr(programs, "sources", lambda: "mended")
+    stage(lambda: 2)
+    assert found == [1, 1, 2]
 
 
 def test_nothing_kept_leaves_nothing_behind(tmp_path):

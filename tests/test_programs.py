@@ -113,7 +113,7 @@ def test_settings_and_source_are_part_of_a_name(monkeypatch, tmp_path):
         patch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
         assert named(sine, MATRIX) != before
     with monkeypatch.context() as patch:
-        patch.setattr(programs, "_sources", lambda: "other")
+        patch.setattr(programs, "sources", lambda: "other")
         assert named(sine, MATRIX) != before
     assert named(sine, MATRIX) == before
     found = set()
@@ -121,7 +121,7 @@ def test_settings_and_source_are_part_of_a_name(monkeypatch, tmp_path):
         (tmp_path / package / "room").mkdir(parents=True)
         for content in ("x = 1\n", "x = 2\n"):
             (tmp_path / package / "room" / "module.py").write_text(content)
-            found.add(programs._sources.__wrapped__(tmp_path))
+            found.add(programs.sources.__wrapped__(tmp_path))
     assert len(found) == 2 * len(programs.OWN)
 
 

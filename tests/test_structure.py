@@ -310,7 +310,7 @@ KEPT = {
     ): "a worker's compiled job, by its name; computes the same when compiled again",
     ("sweeps/points/cluster.py", "_start"): "prepares jax, once a process",
     ("sweeps/points/cluster.py", "jax.config"): "a switch of jax, once a process",
-    ("mmrjax/programs.py", "_sources"): "a hash of the files of this program",
+    ("mmrjax/programs.py", "sources"): "a hash of the files of this program",
     ("mmrjax/programs.py", "_linear_algebra"): "lets jax find LAPACK, once a process",
     ("sweeps/compilation_cache.py", "os.environ"): "set for jax, before it is imported",
     ("sweeps/compilation_cache.py", "jax.config"): "where jax keeps programs",
