@@ -202,8 +202,8 @@ class RunFolder(Folder):
 def open_folder(
     command: str, config: RobotPart, robot: Robot, out: Path | None, force: bool, runs: Runs | None = None
 ) -> RunFolder:
-    """The run folder of a command, whose identity is what it was told and the program's source: it does not go on with
-    what another version has kept.
+    """The run folder of a command, whose identity is what it was told and the program's source: what another version
+    has kept is not gone on with.
 
     Args:
         command: its name; config: its configuration; robot: the one that the configuration names, changes and all.
