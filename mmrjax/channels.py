@@ -76,6 +76,11 @@ class Channel:
     rests_on: tuple[str, ...] = ()
 
     @property
+    def misses_zero(self) -> bool:
+        """Whether its instrument may miss zero; that of a temperature is a convention."""
+        return self.zero_error > 0 and self.directed
+
+    @property
     def unit_shown(self) -> str:
         """Unit of the columns as people write it: C is a coulomb, °C a temperature."""
         return self.unit_si if self.unit_si and self.factor == 1.0 else self.unit

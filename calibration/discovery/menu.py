@@ -181,7 +181,7 @@ def acts(reach: Reach) -> tuple[Act, ...]:
     timing = Act("timing", ("timing",), _timed, _each(paces), 3e-3)
     found = [weighing] * reach.has_ground
     found += ammeter * ("total_current" in reach.measured)
-    meters = [c for c in channels.rows(reach.measured) if c.zero_error and c.directed]
+    meters = [c for c in channels.rows(reach.measured) if c.misses_zero]
     found += [
         Act(f"zero of {c.label}", ("zero reading",), _Zero(c.name), ((0.0,),), None, channel=c.name) for c in meters
     ]

@@ -61,7 +61,7 @@ def tests(effect: type[Effect]) -> Iterator[str]:
             yield ACTS[name].format("several values")
         if effect.channel not in CHECKED_BY:
             shown = find(effect.channel)
-            yield from [ACTS["zero reading"].format(shown.label)] * bool(shown.zero_error and shown.directed)
+            yield from [ACTS["zero reading"].format(shown.label)] * shown.misses_zero
             yield COMPARE.format(shown.label)
         return
     for name in ISOLATED_BY.get(effect.balance, ()):

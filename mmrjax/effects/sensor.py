@@ -148,7 +148,7 @@ def _errors() -> Iterator[type[Effect]]:
     convention; then of its zero. Random numbers go by position: new ones stand at the end."""
     own = [c for c in channels.EVERY if c not in channels.usual()]
     yield from (_error(c, of_zero=c.unit_shown == "°C") for c in own)
-    yield from (_error(c, of_zero=True) for c in own if c.zero_error and c.directed)
+    yield from (_error(c, of_zero=True) for c in own if c.misses_zero)
 
 
 #: A rig has those of its channels.

@@ -295,7 +295,6 @@ def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) 
 
     def taken(y: Array, step: _Step) -> tuple[Array, States]:
         held, lag = step.held(constant), _lag_of(robot, constant, step, y)
-
         law = functools.partial(rates, robot, held)
 
         def turned(part: _Part) -> _Part:
