@@ -9,6 +9,7 @@ import dataclasses
 import gc
 import os
 import sys
+from collections import Counter
 from pathlib import Path
 
 os.environ["MMRJAX_PROGRAMS"] = ""  # what tests put in the place of a function is traced, not read
@@ -105,8 +106,18 @@ def pytest_collection_finish():
     gc.set_threshold(50_000, 20, 50)
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Files that share results come first."""
+    """Mark as slow the parameter sets that `quick` leaves to `make test-all`; files that share results come first."""
+    met: Counter[str] = Counter()
+    for item in items:
+        mark = item.get_closest_marker("quick")
+        if mark is not None:
+            test = item.nodeid.partition("[")[0]
+            met[test] += 1
+            quick = met[test] <= mark.args[0] if isinstance(mark.args[0], int) else item.callspec.id in mark.args
+            if not quick:
+                item.add_marker("slow")
     items.sort(key=lambda item: list(SHARING).index(g) if (g := GROUP.get(item.path.stem)) else len(SHARING))
 
 

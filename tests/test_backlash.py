@@ -41,6 +41,7 @@ def driven(robot):
     return histories(robot, conditions, jnp.asarray(TIMES))
 
 
+@pytest.mark.slow
 def test_a_little_backlash_is_a_rigid_gear_once_things_have_settled():
     rigid, tight = driven(bench(0.0)), driven(bench(1e-4))
     ends = np.searchsorted(TIMES, [0.49, 0.99, 1.49, 1.99])
@@ -70,6 +71,7 @@ def test_at_a_reversal_the_motor_turns_through_the_backlash_before_the_load():
     assert 0.05 < apart[0] < 0.052
 
 
+@pytest.mark.slow
 def test_the_derivative_by_the_backlash_is_the_difference():
     def speed(x):
         return driven(params.replace(bench(0.05), {"bench.backlash": x})).speed_motor

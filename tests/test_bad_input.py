@@ -53,11 +53,13 @@ def written(path, runs):
         out.writerows(zip(*runs.columns.values(), strict=True))
 
 
+@pytest.mark.slow
 def test_histories_that_grip_have_nothing_said(histories):
     assert conduct(histories, CLIMBING) == []
     assert conduct(table(tables.narrow(seed=3)), CLIMBING) == []
 
 
+@pytest.mark.slow
 def test_histories_that_never_grip_are_said(sliding, histories):
     which, none = conduct(sliding, CLIMBING)
     assert which == NeverGrips(RUNS, which.share) and 0 <= which.share < 0.7 and none == Fact("no grip")

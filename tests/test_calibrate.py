@@ -364,6 +364,7 @@ def found_with_gaps(gaps):
     return calibrate(gaps, robots.nominal(), starts=4, noise="current=9%", profiles=False, blocks=("slope",))
 
 
+@pytest.mark.slow
 def test_a_table_with_missing_readings_calibrates_and_says_so(found_with_gaps):
     made = found_with_gaps
     assert made.converged and (made.status == "converged").all()
@@ -502,6 +503,7 @@ def test_a_fourth_channel_is_one_row_of_the_table():
 # --- from Python ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_public_names_load_no_jax_until_they_are_asked_for():
     code = (
         "import calibration, sys; print('jax' in sys.modules, calibration.read_runs.__name__, len(dir(calibration)))"
@@ -513,6 +515,7 @@ def test_public_names_load_no_jax_until_they_are_asked_for():
         calibration.calibrat  # noqa: B018
 
 
+@pytest.mark.slow
 def test_single_precision_is_refused():
     code = (
         "import calibration\n"
@@ -525,6 +528,7 @@ def test_single_precision_is_refused():
     assert 'set jax.config.update("jax_enable_x64", True) first' in done.stderr
 
 
+@pytest.mark.slow
 def test_clusters_are_in_the_document_and_on_the_page_of_a_calibration(tmp_path):
     found, plain = clustered(), calibrated()
     made = dataclasses.replace(plain, residual_clusters=(found,))

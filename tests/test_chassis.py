@@ -24,6 +24,7 @@ def test_normal_load_matches_reference():
         np.testing.assert_allclose(chassis.normal_load(mass, alpha, paper.G, 2), expected, rtol=1e-9)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("wheeled", [0.0, 1.0])
 def test_mass_factor_is_that_of_acceleration_without_sliding(robot, wheeled):
     """(1) with (2), (4): where wheel and robot accelerate alike, m δ a = M_d i η / r - M_t / r - F_f - G."""

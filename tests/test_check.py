@@ -75,11 +75,13 @@ def row(result, name, k=0):
     return [r for r in result["requirements"] if r["name"] == name][k]
 
 
+@pytest.mark.slow
 def test_result_is_as_its_schema_says(result):
     jsonschema.validate(result, SCHEMA)
     assert result["met"] + result["missed"] == len(result["requirements"]) and result["missed"] > 0
 
 
+@pytest.mark.slow
 def test_papers_robot_misses_the_papers_aims(values):
     """0.95 m/s on a full battery; 2200 mAh with 1.5 A for other consumers last 88 minutes standing still."""
     speed, standing = row(values, "speed_m_s"), row(values, "endurance_min")
@@ -97,6 +99,7 @@ def test_papers_robot_misses_the_papers_aims(values):
             assert r["margin"] == pytest.approx((r["value"] - r["required"]) * (1 if r["sense"] == "least" else -1))
 
 
+@pytest.mark.slow
 def test_speed_is_that_of_steady(values, robot):
     for name, charge in (("speed_m_s", 1.0), ("speed_end_of_charge_m_s", 0.0)):
         discharge = float(robot.battery.capacity) * (1 - charge) * (1 - 1e-9)
@@ -104,6 +107,7 @@ def test_speed_is_that_of_steady(values, robot):
         assert row(values, name)["value"] == pytest.approx(float(run.speed[0]), rel=1e-7)
 
 
+@pytest.mark.slow
 def test_worst_corner_is_the_worst_of_a_finer_grid(values, robot):
     """The hottest winding of a grid four times finer is the sheet's."""
     found = row(values, "winding_C")
@@ -115,6 +119,7 @@ def test_worst_corner_is_the_worst_of_a_finer_grid(values, robot):
     assert found["at"]["payload_kg"] == 8 and found["at"]["slope_deg"] == 10
 
 
+@pytest.mark.slow
 def test_every_change_meets_its_requirement_and_breaks_what_it_says(folder, result, robot):
     """Each stated value, put into the robot as `--set` does, and checked anew; and half of the change does not."""
     asked, tried = requirements.load(folder / "requirements.toml"), 0
@@ -137,6 +142,7 @@ def test_every_change_meets_its_requirement_and_breaks_what_it_says(folder, resu
     assert tried > (8 if len(names) > 5 else 1)
 
 
+@pytest.mark.slow
 def test_change_follows_the_derivative(result):
     speed = row(result, "speed_m_s")
     by = {c["parameter"]: c for c in speed["change"]}
@@ -154,6 +160,7 @@ def point(**given):
     return Point(**{k: jnp.asarray(v, int if k == "configuration" else float) for k, v in {**usual, **given}.items()})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -245,6 +252,7 @@ def test_endurance_is_the_integral_over_the_charge(robot):
     assert int(found.outcome) == CONVERGED
 
 
+@pytest.mark.slow
 def test_points_without_value_are_missed_in_words(robot, tmp_path, capsys):
     """What slides or stalls has no value: missed, with the status in words and no NaN anywhere."""
     slides = evaluate(robot, point(slope_deg=16.0), ratings(robot), "speed_m_s")
@@ -285,6 +293,7 @@ def test_external_supply_and_another_configuration(tmp_path):
     assert again == found and (tmp_path / "run" / "requirements.toml").read_text() == file.read_text()
 
 
+@pytest.mark.slow
 def test_report_shows_the_sheet(folder, result):
     page = (folder / "report.html").read_text()
     tables = Tables(page)
@@ -447,6 +456,7 @@ def test_stairs_need_friction_reach_and_a_tread(robot):
         requirements.read("step_mm = { least = 100, tread_mm = 290 }", "stairs.toml")
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_highest_step_are_differences(robot):
     given = (
         "running_gear.lever_length",

@@ -25,6 +25,7 @@ HEADER = (
 CLIMBS = ["--set", "6T2A.ground.friction.static=0.6", "--set", "4W2T.ground.friction.static=0.6"]
 
 
+@pytest.mark.slow
 def test_sweep_is_table_8_in_both_configurations(mmrjax, tmp_path):
     code, out, _ = mmrjax("sweep", "--no-report", "--out", "s")
     assert code == 0  # that some slide is an answer

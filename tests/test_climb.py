@@ -138,6 +138,7 @@ def test_motors_of_levers_load_the_battery():
     assert 0.01 < share < 1 and float(end.drawn) == pytest.approx(share * float(passed.lever_current[0]))
 
 
+@pytest.mark.slow
 def test_a_positive_voltage_raises_either_lever():
     """Angles are positive up; of the rear pair ψ falls then."""
     volts = jnp.full(2, 6.0)
@@ -197,6 +198,7 @@ def test_largest_step_is_the_same_to_a_millimetre_with_half_the_step_of_time():
     assert abs(largest[0] - largest[1]) < 1.01e-3
 
 
+@pytest.mark.slow
 def test_how_a_run_ends_is_read_off_its_motion():
     run = system(ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.step(0.08), still(0.5, 0.3))
     motion, _, progress = climb.begin(run)
@@ -404,6 +406,7 @@ def test_level_ground_is_travelled_as_settled_balances_have_it():
     assert speed == pytest.approx(float(settled.speed), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_pairs_of_the_paper_s_full_model_are_counted_on_the_belts_of_its_geometry():
     """1680 (Section 3.4.5): grousers on the ground and teeth on two guides, of two main and four levers' belts. The climb
     resolves the grousers alone, each beside corners of the ground; its teeth run rigidly."""

@@ -33,6 +33,7 @@ def drawn(mask, count, seed=1):
     return np.random.default_rng(seed).choice(np.flatnonzero(mask), count, replace=False)
 
 
+@pytest.mark.slow
 def test_scattered_outliers_are_no_cluster(monkeypatch):
     """As seldom as stated, over 200 draws; a test of the test: of outliers that lie together, nearly always."""
     monkeypatch.setattr(clusters, "PERMUTATIONS", 400)

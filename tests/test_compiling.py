@@ -53,6 +53,7 @@ def effects_sd(effect):
     return next(p.spec.prior_sd(0.0) for p in params.walk(effect) if p.spec.amplitude)
 
 
+@pytest.mark.slow
 def test_what_equations_read_keeps_programs_apart():
     bare = robots.nominal()
     alike = dataclasses.replace(bare, rig=Rig(priors=(("motor.resistance", 0.6, 0.01),), columns=(("a", "b", 2.0),)))

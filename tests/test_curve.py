@@ -108,6 +108,7 @@ def _driven(amplitudes):
     return jax.vmap(one)(STARTS)
 
 
+@pytest.mark.slow
 def test_settled_travel_shows_nothing_of_a_wave():
     waves = robot(jnp.asarray([laws.size(w) for w in WAVES.values()]), WAVES)
     # but for rounding: a program with effects sums in another order

@@ -52,6 +52,7 @@ def differences(f, theta, step):
     return {n: np.array([row[n] for row in rows]) for n in rows[0]}
 
 
+@pytest.mark.slow
 def test_table_names_modules_that_compute_them(robot):
     for module in dict.fromkeys(d.module for d in derived.TABLE):
         made = jax.eval_shape(derived.compute(module), robot, Conditions(0, 24.0))
@@ -62,6 +63,7 @@ def test_table_names_modules_that_compute_them(robot):
 # --- the steepest slope -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("configuration", [0, 1])
 def test_steepest_slope_that_sliding_ends_is_where_adhesion_is_used_up(robot, configuration):
     found = steepest_slope.compute(robot, asked(configuration, 24.0, slope_deg=17.0, payload=3.0))
@@ -156,6 +158,7 @@ def test_start_derivatives_are_finite_differences(robot):
         assert np.abs(exact[name]).max() > 0
 
 
+@pytest.mark.slow
 def test_start_of_a_run_that_does_not_settle_has_no_numbers(robot):
     steep = dataclasses.replace(CONDITIONS, slope_deg=jnp.asarray(25.0))
     found = start.compute(robot, steep)
@@ -178,6 +181,7 @@ def test_crossing_is_exact_for_a_cubic():
 # --- posture ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_steps_of_a_posture_and_of_any_are_those_of_the_static_limits(robot):
     found = posture.compute(robot, asked(0, 24.0, payload=8.0, levers_front_deg=-30.0, levers_rear_deg=180.0))
     assert math.degrees(float(found["pitch"])) == pytest.approx(8.57, abs=0.01)

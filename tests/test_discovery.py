@@ -105,6 +105,7 @@ def test_result_is_that_of_the_stages(clean, churning, looks):
         assert found.verdict != "none" or found.alternatives == found.implausible == ()
 
 
+@pytest.mark.slow
 def test_churning_is_found_with_its_amplitude(churning, looks):
     found, left = churning.traced, churning.left
     assert found.verdict in ("named", "class")

@@ -288,6 +288,7 @@ def test_knots_of_a_short_run_in_any_order_end_with_its_last_sample(runs):
 # --- input checks ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_histories_that_do_not_start_from_rest_are_refused(runs):
     late = runs.where(runs["time_s"] > 0.3)
     late.columns["time_s"] = late["time_s"] - 0.32

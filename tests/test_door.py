@@ -39,6 +39,7 @@ def primitives(monkeypatch):
     return seen
 
 
+@pytest.mark.slow
 def test_what_instruments_show_is_that_of_the_whole(robot, whole):
     """Whichever is asked first: two programs give the same numbers and codes."""
     shown_first = mm.simulate(robot, mm.Conditions(**MIXED))
@@ -75,6 +76,7 @@ def test_nothing_is_computed_outside_of_compiled_code(robot, primitives):
     assert primitives == []
 
 
+@pytest.mark.slow
 def test_chunks_and_shapes_are_made_by_compiled_code_too(robot, primitives, monkeypatch):
     facts = dataclasses.replace(fidelities.facts("steady"), chunk=(4, 4))
     monkeypatch.setitem(fidelities.TABLE, "steady", facts)

@@ -67,6 +67,7 @@ def expected_runs(grid):
     return np.stack(runs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("tolerance", "error"), [(1e-6, 2e-6), pytest.param(1e-9, 5e-9, marks=pytest.mark.slow)])
 def test_drive_matches_solve_ivp(robot, grid, expected_runs, tolerance, error):
     """To `error` of each state's largest value in the run, at every instant; SciPy's Radau at 1e-10."""
@@ -116,6 +117,7 @@ def energies(robot, grid, run):
     return powers, integral
 
 
+@pytest.mark.slow
 def test_drive_energy_in_is_losses_work_and_stored(robot, grid, drive_table8):
     """Along every one of the 180 runs, from the first tenth of a millisecond to the end."""
     powers, energy = energies(robot, grid, drive_table8)
@@ -162,6 +164,7 @@ def test_drive_settles_on_steady_over_table8(robot, table8, drive_table8, steady
     check_settled(longer, steady_table8, point == CONVERGED)
 
 
+@pytest.mark.slow
 def test_drive_that_breaks_away_between_static_and_dynamic_friction_never_regains_grip(small):
     """6T2A on 12 degrees needs μ = 0.27, between μ_d = 0.256 and μ_s = 0.32: `steady` travels, `drive` spins.
 

@@ -66,6 +66,7 @@ def stating(*lines):
     return GOOD.replace("    dissipative = True\n", "    dissipative = True\n" + "".join(f"    {x}\n" for x in lines))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", [GOOD, EXPLICIT], ids=["derived", "explicit"])
 def test_user_effect_is_usable_by_name_in_a_robot_file(tmp_path, text):
     library = effect_file.library([written(tmp_path, text)])
@@ -204,6 +205,7 @@ def test_missing_effect_file_is_refused(tmp_path):
         effect_file.library([tmp_path / "none.py"])
 
 
+@pytest.mark.slow
 def test_packaged_effects_pass_the_users_checks():
     for effect in BY_NAME.values():
         effect_file._check(Path("library"), effect)

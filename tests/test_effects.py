@@ -897,6 +897,7 @@ def test_drive_without_amplitudes_is_drive_without_effects(without_amplitudes):
     np.testing.assert_allclose(without_amplitudes, expected, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "k",
     [k if e.name in FELT else pytest.param(k, marks=pytest.mark.slow) for k, e in enumerate(ALL)],
@@ -937,6 +938,7 @@ def _same(a, b, channels=("total_current", "motor_speed", "speed")):
         np.testing.assert_allclose(getattr(a, channel), getattr(b, channel), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_series_resistance_is_winding_resistance():
     _same(_steady_with(series_resistance=0.4), _steady_with({"motor.resistance": 0.611 + 0.4}))
 
@@ -985,6 +987,7 @@ def _travel(voltage, slope_deg=0.0, changes=None, gearbox=None, **amplitudes):
     return runs, steady_batch(with_effects(*present, robot=robot), runs)
 
 
+@pytest.mark.slow
 def test_directional_friction_is_dry_loss_with_a_size_for_each_direction():
     def with_loss(change, voltage):
         loss = {f"{c}.track.loss_coulomb": m + change for c, m in (("6T2A", 0.350), ("4W2T", 0.070))}
@@ -1003,6 +1006,7 @@ def test_directional_friction_fades_at_rest_and_does_not_turn_round():
     assert (turning > 0.99).any() and (turning < -0.99).any() and (np.abs(turning) < 0.5).any()
 
 
+@pytest.mark.slow
 def test_backdriving_loss_is_a_share_of_a_load_that_drives():
     """Against the load of each state, and steady travel: (C_m I - losses) i = η_b (1 - a) M_load down, M_load / η up."""
     load = np.asarray(STATES.torque_track_loss) + np.where(STATES.configuration == 0, 0.24 / (2 * np.pi), 0.05) * (
@@ -1068,6 +1072,7 @@ def test_stribeck_exponent_has_finite_derivatives_through_rest(exponent):
     np.testing.assert_allclose(found[0, 5], (at[1] - at[0]) / (2 * step), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_backdriving_loss_changes_nothing_where_no_load_drives():
     _, plain = _travel([15.0, 33.0], [0.0, 5.0])
     _, found = _travel([15.0, 33.0], [0.0, 5.0], backdriving_loss=0.5)
@@ -1084,6 +1089,7 @@ def _on_shaft(torque_constant, *present):
     return np.asarray(steady_batch(with_effects(*present, robot=robot), runs).total_current)
 
 
+@pytest.mark.slow
 def test_new_effects_of_a_load_on_a_shaft_are_torques_at_its_output():
     """C_m I i = M / η where the motor drives M, η M (1 - a) where it is driven; M = M_c + dry, viscous and added loss."""
     speed = np.array([100.0, -100.0, 300.0, -300.0])
@@ -1201,6 +1207,7 @@ def test_effect_acts_on_the_configurations_that_it_names(name, configurations, a
     assert [moved[np.asarray(STATES.configuration) == k].any() for k in (0, 1)] == [bool(a) for a in acts]
 
 
+@pytest.mark.slow
 def test_mass_offset_of_named_configurations_is_mass_of_those():
     offset = dataclasses.replace(fitted(BY_NAME["mass_offset"], 1.6), configurations=("6T2A",))
     heavier = params.replace(NOMINAL, {"6T2A.mass": 13.1 + 1.6})

@@ -13,6 +13,7 @@ from sweeps.points import run
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(("status", "code"), [(status, 3 if status == "failed" else 0) for status in words.STATUSES])
 def test_only_a_solver_that_failed_ends_with_3(status, code, mmrjax, monkeypatch):
     honest = run.evaluate

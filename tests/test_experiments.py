@@ -71,6 +71,7 @@ def shown():
     return of
 
 
+@pytest.mark.quick(8)
 @pytest.mark.parametrize("name", [None, *laws.LIBRARY])
 def test_menu_agrees_with_the_generators_own_physics(name, shown):
     p, term = settled.perturbed(np.random.default_rng(5), scale=0.5), None
@@ -333,6 +334,7 @@ def runs_of(table):
     return [e for e in table if isinstance(e, menu.Run)]
 
 
+@pytest.mark.slow
 def test_menu_stays_within_the_reach_of_a_small_robot(rover):
     made = menu.menu(reach(rover, ROVERS_TABLE, channels.USUAL))
     runs = runs_of(made)
@@ -346,6 +348,7 @@ def test_menu_stays_within_the_reach_of_a_small_robot(rover):
     assert max(stall.voltage) / 1.2 < 3.0  # of the current of steady travel, not of 12 V / 1.2 ohm
 
 
+@pytest.mark.slow
 def test_configurations_without_rows_are_not_on_the_menu():
     wheels_alone = settled.table8(configurations=(1,))
     made = menu.menu(reach(CLIMBING, conditions(wheels_alone), channels.USUAL))
@@ -400,6 +403,7 @@ def test_robot_with_one_motor_is_not_told_to_disconnect_the_other(rover):
     assert {r.motors for r in runs_of(made)} == {1}
 
 
+@pytest.mark.slow
 def test_voltages_without_load_stay_below_the_permissible_speed():
     slow = robot_file.change(CLIMBING, {"motor.speed_limit": 900.0, "gearbox.speed_limit": 500.0}, where="test")
     within = reach(slow, conditions(settled.table8(voltages=(12.0,))), channels.USUAL)
@@ -428,6 +432,7 @@ def test_only_levels_that_the_robot_manages_are_left():
     assert [steepest.slope[k] for k in np.flatnonzero(kept)] == [21.5]
 
 
+@pytest.mark.slow
 def test_steepest_slope_is_one_that_the_robot_climbs():
     slippery = params.replace(CLIMBING, {f"{c}.ground.friction.static": 0.40 for c in ("6T2A", "4W2T")})
     found = eqx.filter_jit(foreseen)(slippery, predicted.batch(MENU, channels.USUAL))

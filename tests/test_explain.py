@@ -46,6 +46,7 @@ def test_an_effect_of_ones_own_may_go_with_anything():
     assert list(words_of.tests(own))[-1] == "Vary the humidity"
 
 
+@pytest.mark.slow
 def test_a_typical_size_is_simulated(robot):
     """0.5 ohm in series take 0.5 V/A · I of 24 V less what drives: the motors slow down by that."""
     changes = list(explain._changes(effects.BY_NAME["series_resistance"]()))

@@ -46,6 +46,7 @@ def test_comparison_can_fail(missions: dict[str, dict[str, Any]]) -> None:
     assert abs(ours["battery_J"] / lossless - 1) > 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slope_deg", [0.0, 4.0])
 @pytest.mark.parametrize("case", range(len(comparison.CASES)))
 def test_vehicle_travels_by_the_force_and_the_power_of_the_integral(case: int, slope_deg: float) -> None:

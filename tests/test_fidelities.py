@@ -91,6 +91,7 @@ def checks_and_cautions(fidelity: Fidelity, robot) -> None:
 CONTRACT = (knows_itself, settles_traceably, runs_batches, keeps_histories, checks_and_cautions)
 
 
+@pytest.mark.quick(3)
 @pytest.mark.parametrize(
     ("name", "law"),
     [

@@ -111,6 +111,7 @@ def test_run_that_cannot_be_followed_is_not_finite():
     assert not np.isfinite(seen_compiled(robot)).any()
 
 
+@pytest.mark.slow
 def test_known_states_change_neither_values_nor_derivatives():
     robot, run, times = robots.nominal(), jax.tree.map(lambda x: x[0], RUNS), jnp.asarray(GRID[:60])
     friction = float(robot.motor.friction_coulomb)

@@ -72,6 +72,7 @@ def test_a_current_in_another_unit_is_doubted_with_what_turns_the_load(tmp_path,
         assert f"up to {2 * factor:g} A, where the file's numbers turn the load slowly with 0.667 A; is it in" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "doubted"), [(1.0, False), (1e3, True)])
 def test_a_loop_and_a_calibration_say_so_before_they_fit(tmp_path, robot, factor, doubted, monkeypatch):
     current = np.array([1.0, 1.5, 2.0, -1.0, -1.5, -2.0, 1.2, 1.8])
@@ -111,6 +112,7 @@ def test_steady_speeds_follow_from_torque_whatever_the_winding(robot, resistance
     assert float(steady(robot, Conditions(motor_current=0.5)).reading["motor_speed"]) == 0.0  # friction holds it
 
 
+@pytest.mark.slow
 def test_a_run_follows_its_first_order_law(robot):
     times = jnp.linspace(0.0, 1.0, 21)
     driven = jax.jit(lambda current: drive(robot, Conditions(motor_current=current), times))

@@ -77,6 +77,7 @@ def judged(made, estimated=False):
     return adequacy(made.rescaled() if estimated else made, known=not estimated)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimated", [False, True])
 def test_complete_models_are_called_inadequate_as_often_as_stated(estimated):
     rng = np.random.default_rng(1)

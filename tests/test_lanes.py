@@ -16,6 +16,7 @@ def halves(own):
     return lanes.until(begun, lambda own, s: (s[0] / own[1], s[1] + 1), lambda s: s[0] < 1.0, own)
 
 
+@pytest.mark.quick("50")
 @pytest.mark.parametrize("size", [1, 3, 8, 50])
 def test_members_of_a_batch_end_as_each_by_itself(monkeypatch, size):
     monkeypatch.setattr(lanes, "LANES", 8)

@@ -75,6 +75,7 @@ def test_worm_up_to_one_half_holds_and_a_better_one_lets_the_lever_sink():
     assert done.current == pytest.approx((back * 60.0 / (30 * 23.04) - 2.7e-3) / 25.9e-3)
 
 
+@pytest.mark.slow
 def test_rate_that_is_asked_for_is_had_until_the_voltage_or_the_current_ends():
     rate, done = turned(ROBOT, 20.0, -12.0, 12.0, asked=0.3, time=0.1)
     assert rate == pytest.approx(0.3) and 0 < done.voltage < 12

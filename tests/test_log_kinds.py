@@ -96,6 +96,7 @@ def test_a_carriages_log_of_current_and_position_settles(tmp_path):
     assert found.table()["motor_current_A"] == pytest.approx(current)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "make", "column", "least"), [
     ("servo", servo, "output_angle_deg", 0.05), ("carriage", carriage, "position_mm", 0.005),
 ])  # fmt: skip

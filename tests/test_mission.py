@@ -118,6 +118,7 @@ def test_mission_matches_scipy_through_a_reversal(robot):
 # --- energy -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("configuration", [0, 1])
 @pytest.mark.parametrize("battery", [0.0, 1.0])
 def test_energy_in_is_where_it_went_and_what_is_stored(robot, configuration, battery):

@@ -144,6 +144,7 @@ def test_other_cutoffs_end_where_an_independent_integration_does(robot, followed
     beside(followed(changed), changed, changed.battery.voltage_cutoff)
 
 
+@pytest.mark.slow
 def test_steps_land_on_the_crossing_and_the_delay_counts_from_there(cut, robot):
     course, count = cut.course, int(cut.steps - cut.rejected)
     marks = [MARKS[k] if k >= 0 else "" for k in course.event[:count]]
@@ -155,6 +156,7 @@ def test_steps_land_on_the_crossing_and_the_delay_counts_from_there(cut, robot):
     assert course.time[count - 1] - course.time[k] == pytest.approx(1.0, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_endurance_and_range_are_those_of_the_cut_off(cut, robot):
     at = mm.Conditions(configuration=0, battery=1.0)
     numbers = missions.numbers(with_battery(robot), at, cut)
@@ -195,6 +197,7 @@ def test_moment_of_the_cut_off_has_the_derivative_of_differences(robot):
         assert abs(float(apart[0])) > 1.0  # s: the moment moves
 
 
+@pytest.mark.slow
 def test_charge_that_is_off_shows_in_what_is_unaccounted_for(cut):
     """The energy of a battery follows from its charge: one that has drifted by 1.3e-4 is not overlooked."""
     through = float(cut.total.of["drawn"])

@@ -120,6 +120,7 @@ def test_mode_over_an_octave_is_no_frequency_to_meet():
     assert mode._replace(low=60.0).resonant
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recess", [3.5e-4, *(pytest.param(x, marks=pytest.mark.slow) for x in (0.0, 3e-3))])
 def test_standing_robot_is_in_balance_wherever_its_belt_stands(robot, recess):
     """Normal force to the weight; with a recess some grousers bear alone."""

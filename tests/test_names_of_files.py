@@ -356,6 +356,7 @@ def swept(made):
     return made("sweep", "sweep", *POINTS)
 
 
+@pytest.mark.slow
 def test_files_of_a_sweep_and_of_its_runs_simulated_hold_the_same_numbers(made, swept):
     sound(swept)
     simulated = made("simulate", "simulate", "--runs", swept / "runs.csv", "--no-report")
@@ -364,6 +365,7 @@ def test_files_of_a_sweep_and_of_its_runs_simulated_hold_the_same_numbers(made, 
     assert len(same(one, other)) > 15
 
 
+@pytest.mark.slow
 def test_a_store_and_its_export_hold_the_numbers_of_a_table(made, swept):
     """A store's arrays have the names of outputs, and the units of their columns as attributes."""
     import zarr

@@ -132,6 +132,7 @@ def bent():
     return posed, members, eqx.filter_jit(alone)(posed, members, 40)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("places", [2, 16])
 def test_searches_do_not_depend_on_those_beside_them(bent, places):
     """Whatever waits, ends and takes whose place, each search is what it is alone; steps included."""
@@ -188,6 +189,7 @@ def test_steps_are_those_of_another_implementation(bent, monkeypatch):
     assert bool(at.over) and rejected > 0
 
 
+@pytest.mark.slow
 def test_search_has_its_model_in_one_place_of_its_program(posed):
     """What a search costs to compile is one evaluation of the model with its Jacobian, not one for each use of it."""
 
@@ -243,6 +245,7 @@ def test_the_objective_is_finite_where_the_robot_slides_and_leads_back(posed):
     assert np.all(np.asarray(posed.observation(found.z).status) == CONVERGED)
 
 
+@pytest.mark.slow
 def test_a_penalty_that_holds_nothing_moves_nothing(clean, truth):
     found = solve(clean, truth + 0.3, clean.data)
     softer = dataclasses.replace(clean.data, stiffness=clean.data.stiffness * 100)
@@ -279,6 +282,7 @@ def to_the_end(start, held):
 STARTS = np.random.default_rng(3).uniform(0.3, 0.8, (6, 3))
 
 
+@pytest.mark.slow
 def test_search_is_short_where_residuals_are_large(monkeypatch):
     mixed = [to_the_end(jnp.asarray(z), False) for z in STARTS]
     monkeypatch.setattr(fit, "NEAR", 0.0)

@@ -109,6 +109,7 @@ def shown(name):
     return pytest.param(name, marks=[] if name in ("", "mass_offset", "sinkage") else pytest.mark.slow)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [shown(n) for n in ("", *SEEN)])
 def test_robot_that_the_loop_writes_is_the_one_that_it_fitted(name, fits):
     reading, status, again, status_again = fits(name)
@@ -130,6 +131,7 @@ def test_shape_that_a_fit_reaches_is_one_that_a_file_may_state(effect):
         assert np.all(np.diff(value) >= 0) and value[30] == pytest.approx(float(shape.value))
 
 
+@pytest.mark.slow
 def test_comparison_can_fail(tmp_path):
     """What was wrong: the mass of the table was fitted with, the robot's own was written."""
     runs, robot = table(), robots.nominal()

@@ -30,6 +30,7 @@ def judged(robot, run, peak=-95.3):
     return {line["words"]: line for line in page.limits(robot, run, [start])}
 
 
+@pytest.mark.slow
 def test_a_winding_is_judged_by_what_it_may_warm_up_by():
     """28 of 125 °C in a room of 25 °C were once 23 % used."""
     assert page.warmed(28.0, 125.0, 25.0) == pytest.approx(3.0) and page.warmed(125.0, 125.0, 25.0) == 100.0
@@ -94,6 +95,7 @@ def test_every_page_warns_of_curves_that_nobody_has_named(robot):
     assert "curve-warning" not in frame._with_contents("<h1>a</h1><h2>b</h2>", {"curve-warning": words.of_curves([])})
 
 
+@pytest.mark.slow
 def test_legend_of_the_energy_split_has_what_is_drawn():
     fig, _ = paper_runs.energy(robots.nominal(), dict.fromkeys((TRACKED, WHEELED), 1.5))
     shown = {text.get_text() for text in fig.legends[0].get_texts()}

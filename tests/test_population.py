@@ -83,6 +83,7 @@ def found(posed, known):
     return evolve(posed, known)
 
 
+@pytest.mark.slow
 def test_generations_come_down_to_the_truth(found, truth):
     best = found.z[found.order[0]]
     assert found.cost.min() < 0.5 and np.abs(best - truth).max() < 0.5
@@ -91,6 +92,7 @@ def test_generations_come_down_to_the_truth(found, truth):
     assert len(found.z) == sum(g.members for g in found.generations)
 
 
+@pytest.mark.slow
 def test_same_seed_same_members_and_another_seed_others(posed, known, found):
     again = evolve(posed, known)
     np.testing.assert_array_equal(again.z, found.z)
@@ -98,6 +100,7 @@ def test_same_seed_same_members_and_another_seed_others(posed, known, found):
     assert not np.array_equal(evolve(posed, known, 1, seed=4).z, found.z[:SIZE])
 
 
+@pytest.mark.slow
 def test_objective_is_the_misfit_where_the_noise_is_known(posed, known, found):
     rows = Rows(found.reading[:3], found.adhesion_used[:3], found.status[:3], found.flags[:3])
     for z, cost in zip(found.z[:3], population.objective(posed, known)(found.z[:3], rows), strict=True):
@@ -108,6 +111,7 @@ def test_objective_is_the_misfit_where_the_noise_is_known(posed, known, found):
             assert cost == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_objective_with_noise_to_be_estimated_takes_the_most_probable(posed, runs, found):
     """n ln s is, but for a constant, ½ Σ (e/σ)² + n ln σ at the σ that makes it smallest."""
     unknown = noise.from_table(runs, SettledRuns.sizes(runs))
@@ -133,6 +137,7 @@ def test_objective_with_noise_to_be_estimated_takes_the_most_probable(posed, run
 GRID = np.geomspace(1.2e-3, 1.0, 80)
 
 
+@pytest.mark.slow
 def test_row_that_is_not_reached_costs_and_a_reading_that_is_missing_ends_it(posed, known, found):
     status = found.status[:1].copy()
     status[0, 0] = 2
@@ -147,6 +152,7 @@ def test_row_that_is_not_reached_costs_and_a_reading_that_is_missing_ends_it(pos
 # --- kept ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_kept_members_are_not_run_again_and_an_ended_search_goes_on(posed, known, found, tmp_path, monkeypatch):
     file = tmp_path / "members.npz"
     evolve(posed, known, 2, file)
@@ -199,6 +205,7 @@ def test_full_disk_is_said_and_leaves_what_was_there(posed, known, tmp_path, mon
 # --- derivatives and differences -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_regression_over_members_is_the_derivative_of_a_smooth_model(posed, found):
     at = int(found.order[0])
     about = identifiability.analyse(posed, jnp.asarray(found.z[at]))
@@ -208,6 +215,7 @@ def test_regression_over_members_is_the_derivative_of_a_smooth_model(posed, foun
     assert not population.apart(posed, members, found.z[at], about.jacobian, about.sd).any()
 
 
+@pytest.mark.slow
 def test_parameter_across_whose_threshold_differences_lead_is_named(posed, found):
     """The derivative by the resistance says nothing of the jump; that by the other parameters is right."""
     stepped = eqx.tree_at(
@@ -218,6 +226,7 @@ def test_parameter_across_whose_threshold_differences_lead_is_named(posed, found
     assert off.tolist() == [True, False, False, False]
 
 
+@pytest.mark.slow
 def test_statements_say_whether_it_settled_and_what_derivatives_are_worth(found):
     at = int(found.order[0])
     calm = population.Searched(found, at, (), None, np.nan)
@@ -237,6 +246,7 @@ def test_parameter_at_the_edge_of_its_prior_or_at_a_bound_is_named(posed):
     assert [*said.values()] == [Edge("", 2.6), Edge("", -3.0), Edge("upper", 9.0)]
 
 
+@pytest.mark.slow
 def test_what_members_did_is_counted_and_said(found):
     at = int(found.order[0])
     status, flags = np.zeros_like(found.status), np.zeros_like(found.flags)
@@ -286,6 +296,7 @@ def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch):
         calibrate(runs, robots.nominal(), model="drive", free=(name,), population=4, generations=1)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     ("options", "says"),
     [

@@ -83,6 +83,7 @@ def test_draws_have_mean_and_covariance_of_the_posterior(posterior):
     np.testing.assert_array_equal(values, posterior.draw(20_000, 0))
 
 
+@pytest.mark.slow
 def test_draws_reproduce_the_linear_standard_error_of_readings(posterior, fitted):
     runs = read("measured").where(np.array([0, 1, 5, 6]))
     found = uncertainty.intervals(fitted, posterior, runs, config.Compare(), 500)
@@ -104,6 +105,7 @@ def test_draws_reproduce_the_linear_standard_error_of_readings(posterior, fitted
     assert np.all(found.columns[uncertainty.SHARE] == 1)
 
 
+@pytest.mark.slow
 def test_draws_that_do_not_travel_are_counted_and_leave_the_rest(robot):
     names = ("6T2A.ground.friction.static",)
     coordinates = priors.coordinates(robot, names)
@@ -224,6 +226,7 @@ def test_a_value_is_said_to_two_digits_of_its_sd(value, sd, most, said):
     assert uncertainty.with_sd(value, sd, most) == said
 
 
+@pytest.mark.slow
 def test_saved_calibration_has_its_posterior(tmp_path):
     found = calibrated()
     found.save(tmp_path)

@@ -56,6 +56,7 @@ def test_highest_step_is_that_of_its_closed_form(robot, rear, up, tail, reach, m
     assert 1e3 * float(found.height) == pytest.approx(millimetres, abs=1)
 
 
+@pytest.mark.slow
 def test_highest_step_falls_by_what_the_levers_mass_moves(robot):
     """By hand 229 mm: the centre of mass as high as with folded levers, 12.5 mm further back."""
     moved = 2 * 0.495 / 13.1 * 0.083 * (1 + math.cos(math.radians(FLUSH)))
@@ -126,6 +127,7 @@ def test_loads_balance_the_moment_of_gravity(robot):
     assert float(rests.line) == 0
 
 
+@pytest.mark.slow
 def test_on_wheels_a_robot_rests_on_them(robot):
     rests = posture.posture(robot, mm.Conditions("4W2T").resolved(robot))
     assert (float(rests.pitch), float(rests.height), float(rests.line)) == (0.0, 0.05, 0.0)
@@ -197,6 +199,7 @@ def test_no_posture_stands_on_a_higher_step_than_the_best(robot, least):
         assert front == pytest.approx(-pitch, abs=1e-3) and 0 < pitch - rear - 90 < 5
 
 
+@pytest.mark.slow
 def test_map_over_levers_is_that_of_single_postures(robot):
     found, margin = static_limits.over_levers(
         robot, run(payload=2.0), np.array([-54.0, 180.0]), np.array([-39.0, 0.0, 180.0])
@@ -220,6 +223,7 @@ def test_folded_levers_stand_as_none_stated(robot, name):
     assert float(getattr(folded, name)) == pytest.approx(float(getattr(plain, name)), abs=1e-12)
 
 
+@pytest.mark.slow
 def test_straight_travel_does_not_change_with_posture(robot):
     speeds = [steady.operating(robot, c)[0].speed for c in (run(), run(180.0, 180.0), run(-30.0, 40.0))]
     assert float(speeds[0]) == float(speeds[1]) == float(speeds[2])

@@ -40,6 +40,7 @@ def test_posture_of_a_run(flush):
     assert "steps up to 232 mm" in posture_words.stands(flush) and posture_words.remarks(flush) == []
 
 
+@pytest.mark.slow
 def test_a_run_that_would_tip_is_said_to(flush):
     tipping = posture.Postures({**flush.table, "margin_mm": np.array([-3.0])}, flush.rest, flush.step, flush.over)
     assert posture_words.remarks(tipping) == [

@@ -46,6 +46,7 @@ def python(code: str, **environment: str) -> str:
     return answer.stdout
 
 
+@pytest.mark.slow
 def test_five_lines():
     printed = python(FIVE_LINES).splitlines()
     current, header = printed[0].split(maxsplit=1)
@@ -110,6 +111,7 @@ def test_a_wrong_name_of_a_parameter_is_answered_by_what_is_near(robot):
         mm.replace(robot, {"friction_coulomb": 0.5})
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     ("before", "variable", "precision"),
     [("", {}, "float64"), ("import jax; ", {"JAX_ENABLE_X64": "0"}, "float32"),
@@ -284,6 +286,7 @@ def test_large_batches_run_in_chunks(robot, monkeypatch):
     assert sizes[6:] == [("run", (4,))]  # fewer are filled up to share the program
 
 
+@pytest.mark.slow
 def test_new_fidelity_answers_at_once(toy, robot):
     many = mm.simulate(robot, mm.Conditions(voltage=[15.0, 24.0]), model=toy, patience=5.0)
     assert many.patience.tolist() == [5.0, 5.0] and "patience" in many.table()

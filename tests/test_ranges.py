@@ -51,6 +51,7 @@ def scaled(runs, column, factor):
     return Runs("runs.csv", {**runs.columns, column: runs[column] * factor})
 
 
+@pytest.mark.slow
 def test_right_units_pass_in_silence(runs, histories):
     robot = robots.nominal()
     assert check_ranges(runs, robot) == check_ranges(histories, robot) == []

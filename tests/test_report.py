@@ -103,6 +103,7 @@ def test_extremes_are_those_of_the_settled_runs(small):
         assert float(shown[f"largest {channel.label}"].split()[0]) == pytest.approx(largest, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_sweep_that_slides_everywhere_says_so(tmp_path):
     runs = _runs("6T2A", (15.0, 33.0), (0.0, 4.0), (25.0, 30.0))
     assert (runs["status"] == "slides").all()
@@ -111,6 +112,7 @@ def test_sweep_that_slides_everywhere_says_so(tmp_path):
     assert drawn(page) == SWEEP_FIGURES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "shape",
     [
@@ -242,6 +244,7 @@ def test_report_shows_the_runs_own_history_with_its_peak(driven):
     assert float(rows[0][5]) > 90  # the inrush is resolved, some 33 V over two windings in parallel
 
 
+@pytest.mark.slow
 def test_report_escapes_a_title(tmp_path):
     path = comparison_page.write(
         tmp_path,

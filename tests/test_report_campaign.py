@@ -24,6 +24,7 @@ def page(mmrjax, tmp_path):
     return write
 
 
+@pytest.mark.slow
 def test_page_is_offline_and_shows_counts_names_and_ranges_of_the_store(page, tmp_path):
     tables = page()
     store = xr.open_zarr(tmp_path / "s" / "results.zarr").load()
@@ -57,6 +58,7 @@ def test_page_of_one_axis_has_one_band(page):
     page("[axes]\nvoltage = '15:33:1'\n")
 
 
+@pytest.mark.slow
 def test_points_of_the_page_are_drawn_from_all_chunks_where_there_are_many(page, tmp_path, monkeypatch):
     monkeypatch.setattr(campaign_page, "THINNED", 60)
     monkeypatch.setattr(campaign_page, "CHUNKS", 6)

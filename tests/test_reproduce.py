@@ -148,6 +148,7 @@ def test_row_table_shows_bench_paper_and_own_numbers(paper):
     assert [r[1] for r in tables.tables["rowtable"][2:] if not r[0]] == [""] * 10  # 4W2T with Table 7's mass
 
 
+@pytest.mark.slow
 def test_raised_adhesion_makes_every_measured_row_climb():
     rows = data.rows(ROBOTS["nominal"]())
     assert (rows.plain["status"] == "slides").sum() == 6
@@ -161,6 +162,7 @@ def test_raised_adhesion_leaves_a_robot_that_climbs_alone():
     assert rows.ratio == {"6T2A": 1.0, "4W2T": 1.0}
 
 
+@pytest.mark.slow
 def test_energy_split_sums_to_the_supply():
     robot = ROBOTS["nominal"]()
     effects = (BY_NAME["series_resistance"](amplitude=0.4), BY_NAME["churning"](amplitude=1e-3))
@@ -182,6 +184,7 @@ def test_idle_current_balances_the_losses_by_hand():
         np.testing.assert_allclose(found, at_motor / 25.9e-3, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_stages_follow_the_slide():
     for start in data.starts(ROBOTS["nominal"]()):
         assert 0 < start.starting < start.slipping < start.time[-1]

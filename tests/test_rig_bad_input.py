@@ -102,6 +102,7 @@ def test_noise_about_zero_and_a_weight_are_no_wrong_signs(tmp_path):
     assert len(records.read(table(tmp_path, "900,-0.6", "1800,0.7"), robot=robot)) == 2
 
 
+@pytest.mark.slow
 def test_rig_check_does_not_call_runs_backward_unsettled(tmp_path, capsys):
     rig_of(tmp_path, BRAKE)
     data = table(tmp_path, "900,0.62", "-900,-0.61", "2000,0.64", "-2000,-0.65")
@@ -119,6 +120,7 @@ def test_rig_check_says_what_a_file_without_base_takes(tmp_path, capsys):
     )
 
 
+@pytest.mark.slow
 def test_histories_of_a_shaft_have_bases_of_what_may_be_missing(tmp_path):
     """None of them a wave of a belt's: a shaft runs on no tracks."""
     text = BRAKE.replace('imposed = "motor_speed"', "").replace(

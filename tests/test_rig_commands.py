@@ -406,6 +406,7 @@ def test_what_explains_all_of_precise_readings_is_named(mmrjax, tmp_path):
     assert abs(amplitude["value"] - 6e-9) < 3 * amplitude["sd"] < 1e-9
 
 
+@pytest.mark.slow
 def test_check_says_what_columns_of_an_own_table_are(mmrjax, tmp_path):
     (tmp_path / "motor.toml").write_text(MOTOR, encoding="utf-8")
     data = precise_table(tmp_path / "runs.csv")
@@ -415,6 +416,7 @@ def test_check_says_what_columns_of_an_own_table_are(mmrjax, tmp_path):
     assert re.search(r"motor_current_A, yours Strom \[mA\] +channel motor_current", told)
 
 
+@pytest.mark.slow
 def test_compare_shows_a_vehicles_conditions(mmrjax, tmp_path, rover):
     rig, data = rover
     code, out, err = mmrjax("compare", data, "--robot", rig, "--out", "compared")
@@ -434,6 +436,7 @@ def test_calibrate_shows_a_vehicles_conditions(mmrjax, tmp_path, rover):
     assert words_of_others(said, err, *left_in(tmp_path / "fitted")) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["linear", pytest.param("tracked", marks=pytest.mark.slow)])
 def test_compare_takes_a_table_by_voltage(mmrjax, tmp_path, kind):
     rig = of_kind(tmp_path, kind)

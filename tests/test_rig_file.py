@@ -96,6 +96,7 @@ def test_template_reads_as_written_and_back(tmp_path, kind):
     assert same(again(tmp_path, robot), robot)
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_line_of_a_template_that_is_commented_out_reads(tmp_path, kind):
     """Each example line, and the table that it stands in, is valid where its comment sign is taken away."""
@@ -317,6 +318,7 @@ def test_a_robot_that_turns_states_its_wheelbase_and_is_written_with_it(tmp_path
 LIMIT, PATH = "temperature_limit = 125.0\n", "resistance_thermal_winding = 1.7\nresistance_thermal_housing = 6.0\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stated", "flagged", "lacking"),
     [("", False, False), (LIMIT, False, True), (PATH, False, False), (LIMIT + PATH, True, False)],

@@ -53,6 +53,7 @@ def test_a_size_is_a_size_however_small():
     assert np.isnan(scales._size([0.0, np.nan]))
 
 
+@pytest.mark.slow
 def test_a_mass_that_was_weighed_is_off_by_no_more_than_that_of_the_packaged_robot(tmp_path):
     """Of a rig, as a share of its mass: a table of turns had been explained by -18 of its robot's 34 kg."""
     robot, _, library = rig("wheeled", "voltage", tmp_path)
@@ -61,6 +62,7 @@ def test_a_mass_that_was_weighed_is_off_by_no_more_than_that_of_the_packaged_rob
     assert 0.2 < offset.bounds[1] / float(robot.configurations.members[0].mass) < 0.5
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(("kind", "imposed"), RIGS)
 def test_every_effect_of_a_rigs_size_is_read_again_as_it_was_written(tmp_path, kind, imposed):
     robot, _, library = rig(kind, imposed, tmp_path)
@@ -90,6 +92,7 @@ def test_effects_of_turns_of_a_rigs_size_are_read_again_as_they_were_written(tmp
     assert library and eqx.tree_equal(whole.effects, robot_file.read(tmp_path / "robot.toml").effects)
 
 
+@pytest.mark.slow
 def test_a_robot_with_effects_of_its_size_is_compared_and_swept(tmp_path, mmrjax):
     robot, _, library = rig("bench", "voltage", tmp_path)
     some = {name: library[name] for name in list(library)[:4]}
@@ -103,6 +106,7 @@ def test_a_robot_with_effects_of_its_size_is_compared_and_swept(tmp_path, mmrjax
     )
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(("kind", "imposed"), RIGS)
 def test_an_instrument_is_off_by_no_more_than_a_share_of_what_it_shows(tmp_path, kind, imposed):
     robot, runs, library = rig(kind, imposed, tmp_path)
@@ -138,6 +142,7 @@ def test_what_grows_with_the_load_is_judged_at_the_rated_current_of_the_motor(tm
     assert library["torque_constant_saturation"].factors[2] < 0.1 * library["torque_constant_saturation"].factors[0]
 
 
+@pytest.mark.slow
 def test_a_motor_that_states_what_it_bears_is_judged_by_that(tmp_path):
     robot, runs, _ = rig("bench", "voltage", tmp_path)
     limits = []
@@ -164,6 +169,7 @@ def test_factors_are_three_positive_numbers(tmp_path, stated):
         robot_file.read(tmp_path / "robot.toml")
 
 
+@pytest.mark.slow
 def test_friction_along_the_travel_is_sized_by_the_travel_and_looked_for_where_a_channel_shows_it(tmp_path):
     robot = servo(tmp_path)
     rows = ["0.4,0,0", "0.7,1.5,360", "1,3.0,720", "-0.9,4.0,-720"]

@@ -64,6 +64,7 @@ def test_a_calibration_states_the_delay_that_its_profile_shows(coarse):
     assert high - low == pytest.approx(4 * delay.sd, rel=0.35)
 
 
+@pytest.mark.slow
 def test_a_scan_sees_the_misfit_of_runs_at_each_delay(coarse):
     """A delay shifts one run: where the others are held, the scan's objective is that of a run of its own."""
     robot, runs = coarse

@@ -56,6 +56,7 @@ CASES = {
 }
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("case", CASES)
 def test_means_are_those_of_the_levels_within_their_sds(tmp_path, case):
     seed, kind, imposed, options = CASES[case]
@@ -305,6 +306,7 @@ def test_rig_check_says_which_current_a_total_one_is_beside_a_duty(tmp_path, mon
     assert any("what a sensor in a motor's leads shows is motor_current" in s for s in said) == duty
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("case", CASES)
 def test_signs_and_times_of_random_logs_are_not_doubted(tmp_path, case):
     seed, kind, imposed, options = CASES[case]
@@ -457,6 +459,7 @@ def test_the_command_leaves_a_table_that_is_read_as_settled_runs(tmp_path, mmrja
     )
 
 
+@pytest.mark.slow
 def test_25_000_rows_are_settled_in_seconds(tmp_path):
     _, _, robot = made(tmp_path, 9, "bench", "voltage", rate=250.0)
     text = (tmp_path / "log.csv").read_text().splitlines()

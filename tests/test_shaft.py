@@ -58,6 +58,7 @@ def test_a_load_that_drives_the_motor_loses_in_the_gearbox_the_other_way():
     np.testing.assert_allclose(answer.motor_current, expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_voltage_and_speed_impose_the_same_point():
     for robot, more in ((bench(), {}), (robots.nominal(), {"slope_deg": 5.0, "payload": 3.0})):
         speeds = np.array([150.0, 300.0, 400.0, 500.0])  # four, here and elsewhere: one program
@@ -68,6 +69,7 @@ def test_voltage_and_speed_impose_the_same_point():
             np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12, err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_run_settles_where_steady_says():
     conditions = Conditions(voltage=np.array([24.0, 6.0, -12.0, 12.0]))
     steady = steady_batch(bench(torque_constant=0.1), conditions)
@@ -102,6 +104,7 @@ def test_derivatives_at_an_imposed_speed_are_those_of_the_formula():
     np.testing.assert_array_equal(found["motor.resistance"], 0.0)
 
 
+@pytest.mark.slow
 def test_a_pendulum_swings_as_the_textbook_says():
     """Motors open, no friction: small swings with ω² = m g l / (J + i² J_d)."""
     load = {"inertia": 0.02, "loss_coulomb": 0.0, "loss_viscous": 0.0, "torque_gravity": 0.5}

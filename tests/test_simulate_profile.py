@@ -85,6 +85,7 @@ def done(mmrjax, capsys, monkeypatch):
 # --- what comes out -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_result_has_the_numbers_of_the_mission(done):
     result = json.loads((done / "result.json").read_text())
     table = {key: value[0] for key, value in rows(done / "runs.csv").items()}
@@ -103,6 +104,7 @@ def test_result_has_the_numbers_of_the_mission(done):
     assert result["profile"]["cycles"] == 2 and len(result["profile"]["sha256"]) == 64
 
 
+@pytest.mark.slow
 def test_endurance_and_range_are_those_of_the_mean_current(done):
     result = json.loads((done / "result.json").read_text())
     used = 1 - result["state_of_charge"]
@@ -110,12 +112,14 @@ def test_endurance_and_range_are_those_of_the_mean_current(done):
     assert result["range_m"] == pytest.approx(result["distance_m"] / used, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_conditions_that_the_run_does_not_have_are_empty(done):
     table = rows(done / "runs.csv")
     assert np.isnan(table["supply_voltage_V"]) and np.isnan(table["slope_deg"])  # on the battery; of the profile
     assert table["payload_kg"] == 0
 
 
+@pytest.mark.slow
 def test_segments_add_up_to_the_mission(done):
     segments, table = rows(done / "segments.csv"), rows(done / "runs.csv")
     assert list(segments["cycle"]) == [1] * 7 + [2] * 7 and list(segments["segment"]) == [*range(1, 8)] * 2
@@ -128,6 +132,7 @@ def test_segments_add_up_to_the_mission(done):
     np.testing.assert_allclose(segments["time_s"], np.cumsum(segments["duration_s"]) - segments["duration_s"])
 
 
+@pytest.mark.slow
 def test_history_follows_the_demand_and_holds_each_segments_peak(done):
     history, segments = rows(done / "history.csv"), rows(done / "segments.csv")
     assert (np.diff(history["time_s"]) > 0).all() and history["time_s"][-1] == pytest.approx(10)
@@ -146,6 +151,7 @@ def test_history_follows_the_demand_and_holds_each_segments_peak(done):
     assert history["energy_Wh"][-1] == pytest.approx(segments["energy_Wh"].sum(), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_console_says_the_numbers_and_the_status(done):
     said = (done.parent / "said.txt").read_text()
     assert "profile mission.csv: 10 s, 2 cycles, 7 segments each" in said
@@ -154,6 +160,7 @@ def test_console_says_the_numbers_and_the_status(done):
     assert re.search(r"status +│ converged", said)
 
 
+@pytest.mark.slow
 def test_report_shows_course_energy_and_segments(done):
     page = (done / "report.html").read_text()
     assert drawn(page) == {"course", "energy"}

@@ -178,6 +178,7 @@ def test_paper_parts_make_the_papers_robot(robot, asked):
     assert {n for n in own if not math.isclose(own[n], other[n], rel_tol=1e-9)} == set()
 
 
+@pytest.mark.slow
 def test_command_leaves_what_its_schema_says(folder):
     result = json.loads((folder / "result.json").read_text())
     jsonschema.validate(result, SCHEMA)
@@ -205,6 +206,7 @@ def test_command_leaves_what_its_schema_says(folder):
     )
 
 
+@pytest.mark.slow
 def test_report_shows_designs_and_what_binds_where(folder):
     page = (folder / "report.html").read_text()
     tables = Tables(page)

@@ -114,6 +114,7 @@ def test_stages_are_seen_through_the_ripple_of_a_running_gear():
 # --- the rig's delay --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.05, -0.02])
 def test_a_history_is_written_by_the_rigs_clock(written, delay):
     """What is imposed acts that much later than its column says, and all that is read with it."""

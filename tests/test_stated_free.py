@@ -57,6 +57,7 @@ def test_everything_stated_with_a_width_is_freed_that_the_data_show(tmp_path):
     assert "motor.resistance" not in priors.stated_names(exact, ["bench"])
 
 
+@pytest.mark.slow
 def test_a_calibration_frees_what_its_rig_states(tmp_path, monkeypatch):
     world = rigs.world(np.random.default_rng(4), "bench", "voltage", rows=(16, 24))
     rigs.case(world).write(tmp_path)
@@ -75,6 +76,7 @@ def test_a_calibration_frees_what_its_rig_states(tmp_path, monkeypatch):
     assert {"motor.resistance", "motor.torque_constant"} < stated <= set(asked)
 
 
+@pytest.mark.slow
 def test_a_prior_is_shown_as_it_is_stated(tmp_path):
     robot = bench(tmp_path)
     names = ("motor.friction_coulomb", "motor.resistance")

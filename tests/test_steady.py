@@ -126,6 +126,7 @@ def test_steady_power_chain_only_loses(steady_table8):
     np.testing.assert_allclose(np.asarray(product)[on], chain[3] / chain[0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_steady_downhill_gearbox_never_gives_power(robot):
     slopes = np.linspace(-0.25, 0.0, 26)
     answer = steady_batch(robot, Conditions(voltage=24.0, slope_deg=np.degrees(slopes), configuration=1))
@@ -222,6 +223,7 @@ def test_steady_flags(robot, conditions, flags):
 # --- batches ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_steady_batch_equals_loop(robot, table8, steady_table8):
     single = jax.jit(steady)
     for k in (0, 37, 64, 90, 131, 179):

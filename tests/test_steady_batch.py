@@ -74,6 +74,7 @@ def test_comparison_with_numpy_can_fail(robot):
 # --- outputs that are asked for ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effects", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_steady_outputs_are_those_of_steady_batch(robot, effects):
     robot, runs = with_effects(robot) if effects else robot, Conditions(**MIXED)
@@ -90,6 +91,7 @@ def test_steady_outputs_are_those_of_steady_batch(robot, effects):
         np.testing.assert_allclose(steady_outputs(robot, runs, (name,))[name], found[name], rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_steady_outputs_take_robots_of_a_batch(robot):
     runs = Conditions(**{**MIXED, "slope_deg": 5.0})
     values = {"motor.resistance": jnp.linspace(0.5, 0.9, 6), "6T2A.mass": jnp.linspace(12.0, 14.0, 6)}
@@ -107,6 +109,7 @@ def test_steady_outputs_name_what_there_is(robot):
         steady_outputs(robot, runs, ("speed", "velocity"))
 
 
+@pytest.mark.slow
 def test_steady_outputs_compile_once_for_other_numbers(robot, compilations):
     runs = Conditions(**MIXED)
     jax.block_until_ready(steady_outputs(robot, runs, ALL))

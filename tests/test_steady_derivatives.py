@@ -43,6 +43,7 @@ def derivatives(steady_numbers, scales):
     return evaluate
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("point", sorted(POINTS))
 def test_steady_derivatives_are_central_differences(point, theta, derivatives):
     values, forward, reverse, central = (np.asarray(x) for x in derivatives(theta, Conditions(**POINTS[point])))

@@ -33,6 +33,7 @@ def exact(radius):
     return np.array([radius / 2**0.5, radius / 2**0.5, radius**2 / 2**0.5])
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("linear", [False, True])
 def test_root_and_derivatives_are_exact(linear):
     """A circle is not linear: one pass is then not all, whatever was said."""
@@ -100,6 +101,7 @@ def holds_callback(program: str) -> bool:
     return "callback" in program
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev, jax.hessian])
 def test_steady_programs_hold_no_host_callback(rebuild, theta, derivative):
     runs = Conditions(voltage=[15.0, 24.0, 33.0], slope_deg=5.0)

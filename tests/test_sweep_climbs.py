@@ -170,6 +170,7 @@ def test_interrupted_map_goes_on_after_its_last_chunk(mmrjax, tmp_path, monkeypa
     assert store["energy_J"][:].tolist() == [[60, 560 - 60], [90, 530], [120, 560]]
 
 
+@pytest.mark.slow
 def test_page_says_the_largest_obstacle_and_where_it_is_got_over(mmrjax, tmp_path, monkeypatch):
     """Climbs in closed form: the steeper the levers the higher, up to the last, which falls."""
 

@@ -114,6 +114,7 @@ def test_store_is_opened_by_xarray_with_units_and_long_names(whole):
     assert [meanings[k] for k in range(len(STATUSES))] == list(STATUSES) and found.status.dtype == np.uint8
 
 
+@pytest.mark.slow
 def test_store_holds_each_point_as_it_is_by_itself(whole):
     found = xr.open_zarr(whole / zarr_store.STORE).load()
     for which, slope, sample in [(0, 0, 0), (1, 1, 49), (0, 2, 17)]:
@@ -167,6 +168,7 @@ def test_large_grid_of_options_leaves_a_store_with_the_numbers_of_the_table(mmrj
     assert robots_[0] == robots_[1]
 
 
+@pytest.mark.slow
 def test_large_grid_of_a_file_leaves_a_store_too(mmrjax, tmp_path, monkeypatch):
     monkeypatch.setattr("sweeps.commands.sweep.TABLE", 3)
     (tmp_path / "grid.toml").write_text("slopes_deg = [0, 5]\npayloads_kg = [0]\nbattery = true\nreport = false\n")
@@ -174,6 +176,7 @@ def test_large_grid_of_a_file_leaves_a_store_too(mmrjax, tmp_path, monkeypatch):
     assert code == 0 and "4 points: results.zarr" in said and (tmp_path / "s" / zarr_store.STORE).is_dir()
 
 
+@pytest.mark.slow
 def test_outputs_of_a_grid_are_chosen_by_an_option(mmrjax, tmp_path):
     grid = ["sweep", "--slopes", "0,5", "--payloads", "0", "--voltages", "24", "--no-report"]
     assert mmrjax(*grid, "--outputs", "slip, flags", "--out", "s")[0] == 0
@@ -195,6 +198,7 @@ def test_large_grid_that_is_refused_leaves_nothing(mmrjax, tmp_path, monkeypatch
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_store_agrees_with_the_table_of_the_same_grid(mmrjax, tmp_path):
     grid = ["--slopes", "0,5,20", "--voltages", "24", "--payloads", "0,3", "--surface", "asphalt", "--no-report"]
     assert (
@@ -226,6 +230,7 @@ def test_exports_hold_the_store_row_by_row(sweep, tmp_path, whole):
     assert one["speed_mm_s"].null_count > 0  # a run that slides has no speed
 
 
+@pytest.mark.slow
 def test_outputs_storage_and_compression_are_as_stated(sweep, tmp_path, whole):
     config = 'outputs = ["slip", "efficiency_motor", "flags"]\nstorage = "float32"\ncompression = "zstd"\n' + CONFIG
     assert sweep("s", config=config)[0] == 0
@@ -237,12 +242,14 @@ def test_outputs_storage_and_compression_are_as_stated(sweep, tmp_path, whole):
     assert found["motor.resistance"].dtype == np.float64
 
 
+@pytest.mark.slow
 def test_resolved_configuration_and_robot_repeat_the_sweep(sweep, whole, tmp_path):
     assert sweep("s", config=(whole / "config.resolved.toml").read_text())[0] == 0
     assert sweep("t", "--robot", tmp_path / "s" / "robot.toml")[0] == 0
     assert arrays("s") == arrays(whole) == arrays("t")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk", [7, *(pytest.param(k, marks=pytest.mark.slow) for k in (50, 1000))])
 def test_chunks_change_no_sample_and_results_by_1e_12(sweep, whole, tmp_path, chunk):
     assert sweep("s", "--chunk", chunk)[0] == 0
@@ -312,6 +319,7 @@ def stopping(monkeypatch, at, error):
     return lambda: monkeypatch.setattr(zarr_store, "write_file", honest)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("at", [2, 6, 20, *(pytest.param(k, marks=pytest.mark.slow) for k in (5, 7, 33, 40))])
 def test_interrupted_sweep_goes_on_to_the_same_bits(sweep, whole, monkeypatch, tmp_path, at):
     heal = stopping(monkeypatch, at, KeyboardInterrupt())
@@ -521,6 +529,7 @@ def test_interrupt_is_not_replaced_where_the_writer_empties_the_queue(monkeypatc
 # --- shares -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_shares_make_the_same_store_in_any_order(sweep, whole, tmp_path):
     for k in (3, 1):
         code, out, _ = sweep("s", "--shard", f"{k}/3")
@@ -547,6 +556,7 @@ def test_shares_started_at_once_finish_one_store(whole, tmp_path):
     assert arrays(tmp_path / "s") == arrays(whole) and not (tmp_path / "s.partial").exists()
 
 
+@pytest.mark.slow
 def test_rest_of_lost_shares_is_done_by_the_command_without(sweep, whole):
     assert sweep("s", "--shard", "2/5")[0] == 0
     code, _, err = sweep("s")
@@ -745,6 +755,7 @@ def test_dry_run_states_points_chunks_bytes_and_time_and_writes_nothing(sweep, t
     assert [p.name for p in tmp_path.iterdir()] == ["plan.toml"]
 
 
+@pytest.mark.slow
 def test_grid_too_large_for_the_disk_is_refused_with_figures(sweep, monkeypatch, tmp_path):
     usage = shutil.disk_usage(tmp_path)._replace(free=10**9)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
@@ -810,6 +821,7 @@ def test_layout_counts_its_bytes_without_writing(whole):
     assert dataclasses.replace(layout, variables=()).size == 3 * 8
 
 
+@pytest.mark.slow
 def test_plan_of_the_page_is_accepted(mmrjax, tmp_path):
     page = (Path(__file__).resolve().parents[1] / "docs" / "sweeps.md").read_text(encoding="utf-8")
     (tmp_path / "plan.toml").write_text(page.split("```toml\n")[1].split("```")[0])
@@ -821,6 +833,7 @@ def test_plan_of_the_page_is_accepted(mmrjax, tmp_path):
 # --- last, since it forgets what was compiled ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_chunks_share_one_compilation(sweep, compilations):
     jax.clear_caches()
     assert sweep("t", "--chunk", "40")[0] == 0

@@ -65,6 +65,7 @@ def test_points_of_a_table_are_its_runs_each_with_every_draw(robot, runs, poster
     np.testing.assert_array_equal(points[:, 1:], np.tile(posterior.draw(DRAWS, 0)[2:5], (2, 1)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk", [None, 3])
 def test_table_has_each_run_as_it_is_by_itself(robot, runs, chunk):
     found = run.evaluate(robot, runs, chunked(chunk), None)
@@ -74,6 +75,7 @@ def test_table_has_each_run_as_it_is_by_itself(robot, runs, chunk):
     assert found["total_mass_kg"][1] == float(robot.configurations.members[1].mass) + 3
 
 
+@pytest.mark.slow
 def test_draws_have_the_intervals_of_robots_simulated_one_by_one(robot, runs, posterior):
     found = uncertainty.intervals(robot, posterior, runs, chunked(None), DRAWS)
     each = [
@@ -118,6 +120,7 @@ def test_interrupted_draws_are_taken_up(robot, runs, posterior, tmp_path, monkey
     same(again.columns, whole.columns)
 
 
+@pytest.mark.slow
 def test_what_takes_long_runs_in_parts_and_says_how_far_it_is(robot, runs, monkeypatch):
     from mmrjax.fidelities import steady
 

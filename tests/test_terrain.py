@@ -41,6 +41,7 @@ def brute(points, at):
     return np.array(found)
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("name", NAMED)
 def test_signed_distance_is_that_of_brute_force_and_normal_its_gradient(name):
     ground, points = NAMED[name]
@@ -55,6 +56,7 @@ def test_signed_distance_is_that_of_brute_force_and_normal_its_gradient(name):
     assert normal[~kinks] == pytest.approx(np.stack(slope, 1)[~kinks], abs=1e-5)
 
 
+@pytest.mark.slow
 def test_rounded_nose_is_a_circle_that_touches_riser_and_tread():
     ground = terrain.step(0.1, nose=0.02)
     on = np.array(
@@ -72,6 +74,7 @@ def test_only_convex_corners_are_corners():
     assert found[found[:, 1] > -1] == pytest.approx(np.array([[0, 0], [0.15, 0]]))
 
 
+@pytest.mark.slow
 def test_distance_of_points_on_an_edge_has_a_finite_derivative():
     ground = terrain.step(0.1)
     slope = jax.jacfwd(lambda p: ground.distance(p[None])[0][0])(jnp.array([-0.3, 0.0]))
@@ -102,6 +105,7 @@ def test_levers_track_closes_and_its_pitch_is_that_of_the_main_track():
     assert float(lever().pitch) == pytest.approx(0.035, abs=5e-5)
 
 
+@pytest.mark.slow
 def test_belt_of_equal_pulleys_is_the_main_track_of_the_track_model():
     robot = nominal()
     gear = robot.running_gear
@@ -121,6 +125,7 @@ def test_belt_of_equal_pulleys_is_the_main_track_of_the_track_model():
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_points_project_on_the_belt_where_they_came_from_and_tips_move_as_they_say():
     belt_ = lever()
     place = jnp.linspace(0, float(belt_.length), 500)[:-1]

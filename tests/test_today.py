@@ -35,6 +35,7 @@ def anywhere():
     return voltage, slope, settled, api.simulate(robot, conditions, "drive", history=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["steady", "drive"])
 def test_a_status_agrees_with_the_numbers(anywhere, model):
     voltage, slope, *results = anywhere
@@ -56,6 +57,7 @@ def test_a_status_agrees_with_the_numbers(anywhere, model):
     assert (status[(voltage == 0) & (slope >= 0)] != "converged").all()
 
 
+@pytest.mark.slow
 def test_statuses_of_steady_and_drive_agree_where_both_settle(anywhere):
     voltage, _, steady, drive = anywhere
     settles = {"converged", "reverses", "rolls_back", "stalled"}

@@ -25,6 +25,7 @@ def test_belt_is_840_mm_with_grousers_every_35(path):
     assert TEETH_BELT / GROUSERS == 7
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("recess", [0.0, 3e-4])
 def test_tip_rates_are_derivatives_of_its_place(path, recess):
     gear = params.replace(path.gear, {"guide_recess": jnp.asarray(recess)})
@@ -36,6 +37,7 @@ def test_tip_rates_are_derivatives_of_its_place(path, recess):
     np.testing.assert_allclose(slope[:, 1], at.rate_up, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_tip_is_continuous_round_the_whole_path(path):
     places = jnp.linspace(0.0, path.length, 8401)
     at = tips(path, places)
@@ -106,6 +108,7 @@ def _posture(path, wheeled, robot):
     return jnp.asarray([0.0, axle - 3e-4, 2e-3, 0.3012, 0.3]), jnp.asarray([0.9, -0.01, 0.02, 25.0, 24.9])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wheeled", [0.0, 1.0])
 def test_generalized_forces_do_the_work_of_the_contacts(path, robot, wheeled):
     """Power of the generalized forces = power at the contact points - friction on the guide + belt, rate by rate."""

@@ -53,6 +53,7 @@ def scenes(request, robot):
     return one
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", [0, 1])
 def test_picture_shows_robot_and_forces(scenes, tmp_path, k):
     file = render(scenes(k), tmp_path / "robot.png", begin=0.03)

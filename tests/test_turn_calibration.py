@@ -73,6 +73,7 @@ def of_world(robot, tmp_path_factory):
 TRUE = {LATERAL: 1.45, WIDTH: 0.236}
 
 
+@pytest.mark.slow
 def test_settled_turns_are_observed_as_turns(robot, of_world):
     assert observers.kind(of_world) is SettledTurns
     names = tuple(f"6T2A.{n}" for n in (LATERAL, WIDTH))

@@ -371,6 +371,7 @@ def test_currents_of_a_turn_on_the_spot_do_not_cancel_on_the_page_of_a_mission()
     np.testing.assert_allclose(mission_figures.of_motors(rows, "motor_current", "_A"), [0.0, 1.0])
 
 
+@pytest.mark.slow
 def test_compare_sets_both_sides_and_the_yaw_rate_of_turns_beside_their_readings(tmp_path, mmrjax):
     path, read = tmp_path / "turns.csv", ("motor_current_left_A", "motor_current_right_A", "yaw_rate_rad_s")
     path.write_text(

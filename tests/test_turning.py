@@ -98,6 +98,7 @@ def test_every_turn_settles(turns):
     assert set(turns[1]) == {"converged"}
 
 
+@pytest.mark.slow
 def test_nothing_is_settled_on_a_slope_where_the_heading_changes(robot, monkeypatch):
     run = mm.Conditions("6T2A", voltage=33.0, duty_left=1.0, duty_right=0.5, slope_deg=5.0).resolved(robot)
     motion = turning.motion_of(robot, turning.start(robot, run).at[4].set(0.5))
@@ -114,6 +115,7 @@ def flat(m):
 PLANE = ("speed", "speed_lateral", "yaw_rate", "heading", "place_x", "place_y", "discharge")
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("configuration", CONFIGURATIONS)
 def test_energy_in_is_what_sinks_take_and_what_is_stored(robot, configuration):
     run = mm.Conditions(
@@ -157,6 +159,7 @@ def test_rates_are_those_of_a_second_implementation(robot, configuration):
         np.testing.assert_allclose(mine[place][:10], theirs[:10], rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("configuration", CONFIGURATIONS)
 def test_settled_turns_of_a_second_implementation_are_settled(robot, configuration):
     other = of_world(robot, configuration)
@@ -243,6 +246,7 @@ def width_on_the_spot(wheeled, friction, lateral, speed, nodes=16):
     return 2 * speed / rate / width
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(("wheeled", "share"), [(False, 1 / 3), (True, 1.0)], ids=["tracks", "wheels"])
 @pytest.mark.parametrize("lateral", [1.0, 1.1875])
 def test_spot_turn_in_creep_has_the_width_of_its_closed_form(wheeled, share, lateral):
@@ -251,6 +255,7 @@ def test_spot_turn_in_creep_has_the_width_of_its_closed_form(wheeled, share, lat
     assert found == pytest.approx(1 + lateral * share * (0.3 / 0.243) ** 2, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_spot_turn_under_coulomb_friction_has_the_width_of_its_closed_form():
     coulomb = Friction(static=0.32, dynamic=0.32, speed_static=1e-7, speed_dynamic=1e-6)
     assert width_on_the_spot(True, coulomb, 1.0, 1.0) == pytest.approx(1 + (0.3 / 0.243) ** 2, rel=1e-6)
@@ -262,6 +267,7 @@ def test_spot_turn_under_coulomb_friction_has_the_width_of_its_closed_form():
     assert width_on_the_spot(False, coulomb, 1.0, 1.0) == pytest.approx(1 + u / b, rel=3e-5)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(("wheeled", "share"), [(False, 1 / 4), (True, 1 / 2)], ids=["tracks", "wheels"])
 def test_lateral_sliding_has_the_moment_of_its_closed_form(wheeled, share):
     coulomb = Friction(static=0.32, dynamic=0.32, speed_static=1e-9, speed_dynamic=1e-8)
@@ -293,6 +299,7 @@ def test_load_moves_to_the_outer_side_and_to_the_rear_as_forces_say():
     assert float(held.normal[1] - held.normal[0]) == pytest.approx(2 * float(held.moved), rel=1e-9)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(("height", "lifts"), [(0.06, False), (0.2, True)])
 @pytest.mark.parametrize("on_tracks", [0.0, 1.0])
 def test_forces_and_their_derivatives_are_those_of_loads_in_balance(height, lifts, on_tracks):

@@ -81,6 +81,7 @@ CASES = {
 SLOW = ("current over time", "speeds of a turn", "mission")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [pytest.param(k, marks=pytest.mark.slow) if k in SLOW else k for k in CASES])
 def test_no_number_rests_on_what_is_unknown(tmp_path, case):
     """Results, statuses, flags and histories, of every kind of run that a rig has."""
@@ -152,6 +153,7 @@ def test_a_study_of_what_is_unknown_is_refused(tmp_path):
         chosen_outputs(("power_supply",), robot)
 
 
+@pytest.mark.slow
 def test_commands_leave_out_what_is_unknown_and_say_so(mmrjax, tmp_path):
     read(tmp_path, BENCH, "motor_speed")
     code, out, err = mmrjax("simulate", "--robot", "rig.toml", "--motor-speed", "3000", "--out", "run")

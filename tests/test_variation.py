@@ -71,6 +71,7 @@ def test_evaluate_drive_is_the_run_of_each_robot(names):
         assert int(found["status"][k]) == int(alone.status[0])
 
 
+@pytest.mark.slow
 def test_evaluate_compiles_once_a_shape(variation, compilations):
     def call(shift):
         found = evaluate(variation, "steady", jnp.asarray(VALUES + shift), Conditions(), {}, ("slip",))
@@ -84,6 +85,7 @@ def test_evaluate_compiles_once_a_shape(variation, compilations):
     assert compilations == []
 
 
+@pytest.mark.slow
 def test_derivatives_go_through_evaluate(variation):
     def current(values):
         return evaluate(variation, "steady", values, Conditions(), {}, ("total_current",))["total_current"].sum()
@@ -121,6 +123,7 @@ def test_unknown_and_repeated_names_are_refused_with_those_that_are_near():
         Variation(robot, ("voltage", "voltage"))
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("model", ["steady", "drive"])
 def test_unknown_output_is_refused_with_the_choices(variation, model):
     options = fidelities.facts(model).resolved()

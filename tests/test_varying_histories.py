@@ -165,6 +165,7 @@ def test_grid_is_fine_after_every_change_and_bounded():
     assert len(grid(often, often, np.full(len(often), 0.01))) <= len(grid(often)) + 3
 
 
+@pytest.mark.slow
 def test_constant_values_at_every_instant_are_those_of_a_constant_run():
     robot, g = robots.nominal(), jnp.asarray(grid(np.arange(0.02, 0.3, 0.02)))
     one = Conditions(0, 24.0, 5.0, 2.0)
@@ -421,6 +422,7 @@ def test_a_rig_may_turn_on_forward_while_it_is_driven_backward(runs):
     Histories.check(changed(runs, motor_speed_rpm=speed), nothing)
 
 
+@pytest.mark.slow
 def test_payload_that_changes_acts_from_its_sample_on(runs):
     payload = runs["payload_kg"] + 6.0 * (runs["time_s"] >= 1.25)
     heavier = Histories.of(changed(runs, payload_kg=payload), robots.nominal())

@@ -69,6 +69,7 @@ def test_average_is_that_of_an_independent_sum(swing):
         assert float(vibration.coefficient(LAW, speed, swing)) == pytest.approx(averaged(speed, swing), abs=6e-3)
 
 
+@pytest.mark.slow
 def test_inverse_carries_what_is_demanded_and_has_the_derivative_of_differences():
     for demanded, swing in ((0.1, 0.03), (0.3, 0.01), (0.45, 0.05), (0.2, 0.002)):
 

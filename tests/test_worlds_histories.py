@@ -206,6 +206,7 @@ def test_starts_of_the_papers_robot_pass_the_input_checks_and_are_reproducible(t
     assert len(runs) == 6 * 11 and runs.has("time_s") and "rotating" not in (tmp_path / "table.csv").read_text()
 
 
+@pytest.mark.slow
 def test_table_of_histories_passes_the_input_checks(quick, tmp_path):
     for variety, stratum in ((1, "faults"), (2, "faults"), (2, "robots")):
         w = brief(world(stratum, variety, seed=4))

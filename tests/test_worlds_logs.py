@@ -75,6 +75,7 @@ def test_logs_are_those_of_the_simulator_with_the_same_truth(tmp_path, imposed):
             assert np.sqrt(np.mean((mine - ours[0]) ** 2)) > np.sqrt(np.mean((mine - clean) ** 2)), name
 
 
+@pytest.mark.slow
 def test_reversals_of_a_log_are_followed_within_its_noise(tmp_path):
     case = logs.case(logs.rig(np.random.default_rng([41, 0, 1]), "motor_current", 0.005), "", 0.0, 1)
     clean = logs.whitened(case.rig, logs.histories(case.rig, [case.rig.p])[0])

@@ -67,6 +67,7 @@ def steady(w, *effects):
     return np.stack([np.asarray(found.reading[n])[: len(c)] for n in w.rig.channels]), names
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [k if k == "bench" else pytest.param(k, marks=pytest.mark.slow) for k in rigs.KINDS])
 def test_readings_are_those_of_the_simulator(worlds, kind):
     """Rigs of every kind: voltage, duty or speed imposed, forward and backward, loads that drive the motor."""
@@ -160,6 +161,7 @@ def test_truth_is_as_far_off_as_the_file_says(worlds):
         assert all(w.constants[n] == w.rig.stated[n] for n in exact)
 
 
+@pytest.mark.slow
 def test_noise_is_as_the_table_says():
     pulls = []
     for seed in range(120):
@@ -243,6 +245,7 @@ def _refitted(w, y, start):
     return float(np.sqrt(2 * least_squares(left, start, diff_step=1e-4, max_nfev=60).cost))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "names", [("churning",), pytest.param(tuple(laws.RIGS), marks=pytest.mark.slow)], ids=["one", "every"]
 )

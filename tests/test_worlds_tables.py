@@ -239,12 +239,14 @@ def test_table_and_label_are_separate_files_and_the_table_passes_the_input_check
     assert len(runs) == 90 and runs.has("total_current_sd_A")
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(("factor", "expected"), [(1.0, 1.0), (0.5, 0.5), (2.0, 2.0)])
 def test_noise_is_a_factor_of_what_is_stated(factor, expected):
     cases = [tables.case(w, seed=k) for k, w in enumerate(worlds("plain", 15, noise=factor))]
     assert np.concatenate([residuals(c).ravel() for c in cases]).std() == pytest.approx(expected, rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", tables.NOISES)
 def test_noise_is_as_large_as_stated_by_any_law(law):
     w = tables.world(np.random.default_rng(3), "plain", law=law)
@@ -356,6 +358,7 @@ def test_surfaces_span_adhesion_and_creep(plain):
         np.testing.assert_allclose(share, 0.8)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("stratum", tables.STRATA)
 def test_no_row_of_a_world_slides(stratum):
     for w in worlds(stratum, 20):
@@ -388,6 +391,7 @@ def test_robots_span_their_ranges_and_their_constants_fit_together(made):
         assert dry / p["motor.torque_constant"] < 0.12 * np.median(y[0])  # current at no load
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("roles", [ROLES, *(pytest.param(r, marks=pytest.mark.slow) for r in BUILDS[:-1])])
 def test_robot_file_is_read_and_runs_agree_with_steady(tmp_path, roles):
     m = machines.machine(np.random.default_rng([7, len(roles)]), roles)

@@ -127,6 +127,7 @@ def test_equal_voltages_travel_straight(wheeled, voltage, slope):
     assert found.v_x == pytest.approx(speed, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_run_of_equal_voltages_is_the_half_robots():
     times = np.linspace(0.0, 0.3, 4)
     history = simulate(paper_robot(True), Inputs(15.0, 15.0, slope=0.05), times, rtol=1e-8, atol=1e-10)
@@ -155,6 +156,7 @@ def test_sides_swapped_mirror_and_voltages_reversed_reverse(wheeled):
     assert turn.omega < 0 and turn.instant.ground.N[0] > turn.instant.ground.N[1]  # to the right: the left bears more
 
 
+@pytest.mark.slow
 def test_circling_is_what_a_run_settles_on():
     robot, inputs = paper_robot(True), Inputs(15.0, 12.0)
     end = simulate(robot, inputs, np.array([0.0, 4.0]), method="LSODA", rtol=1e-8, atol=1e-10)
@@ -163,6 +165,7 @@ def test_circling_is_what_a_run_settles_on():
         assert end[name][-1] == pytest.approx(float(expected), rel=1e-5)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     ("wheeled", "inputs", "battery"),
     [
