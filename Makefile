@@ -7,7 +7,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 READY := $(VENV)/ready
 TOOLS := $(VENV)/tools
 
-.PHONY: demo test quick test-all slow lint mutants campaign bench docs clean
+.PHONY: demo test quick test-all slow nightly lint mutants campaign bench docs clean
 
 demo: $(READY)
 	$(BIN)/mmrjax loop measured --out runs/demo/loop --force
@@ -27,12 +27,16 @@ test: $(TOOLS)
 quick: $(TOOLS)
 	PYTHONDONTWRITEBYTECODE= $(QUICK) $(PYTEST) -m "not slow"
 
-# Everything: the tests that compile or run for long too, 70 minutes on two cores.
+# The quick and the slow tests.
 test-all: lint
-	PYTHONDONTWRITEBYTECODE= $(QUICK) $(PYTEST)
+	PYTHONDONTWRITEBYTECODE= $(QUICK) $(PYTEST) -m "not nightly"
 
 slow: $(TOOLS)
-	PYTHONDONTWRITEBYTECODE= $(QUICK) $(PYTEST) -m slow
+	PYTHONDONTWRITEBYTECODE= $(QUICK) $(PYTEST) -m "slow and not nightly"
+
+# Tests of a minute or more each: whole loops on planted truths, campaigns, notebooks, records of every command.
+nightly: $(TOOLS)
+	PYTHONDONTWRITEBYTECODE= $(QUICK) $(PYTEST) -m nightly
 
 lint: $(TOOLS)
 	$(BIN)/ruff check .

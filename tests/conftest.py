@@ -142,16 +142,23 @@ def pytest_runtest_makereport(item, call):
 
 
 def pytest_terminal_summary(terminalreporter):
-    """Name the tests that take longer than a test may that is not marked slow.
+    """Print the processor time of each test file, and name the tests above the limit that are not marked slow.
 
     It fails nothing: processor time too grows on a loaded machine, and by half from one to another.
     """
-    long = []
+    long, files = [], Counter()
     for reports in terminalreporter.stats.values():
         for report in reports:
-            told = dict(getattr(report, "user_properties", ()))
-            if told.get("processor_time", 0.0) > LIMIT and not told.get("slow"):
-                long.append((told["processor_time"], report.nodeid))
+            properties = dict(getattr(report, "user_properties", ()))
+            seconds = properties.get("processor_time", 0.0)
+            files[getattr(report, "nodeid", "").partition("::")[0]] += seconds
+            if seconds > LIMIT and not properties.get("slow"):
+                long.append((seconds, report.nodeid))
+    listed = [f"{s:6.1f} {Path(file).stem.removeprefix('test_'):30}" for file, s in files.most_common() if s >= 0.05]
+    if len(listed) > 1:
+        terminalreporter.section(f"processor time of each test file [s], {sum(files.values()):.0f} in all")
+        for k in range(0, len(listed), 3):
+            terminalreporter.write_line("".join(listed[k : k + 3]).rstrip())
     if long:
         terminalreporter.section(f"not marked slow, and longer than {LIMIT:g} s of processor time")
         for seconds, name in sorted(long, reverse=True):

@@ -114,6 +114,7 @@ def test_a_file_with_backlash_is_followed_with_it_and_needs_inertia(tmp_path):
         robot_file.load(str(path))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_backlash_is_found_in_a_history_of_reversals(tmp_path):
     path = tmp_path / "rig.toml"

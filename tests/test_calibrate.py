@@ -68,6 +68,7 @@ def quick(runs, robot=None, **keywords):
     return calibrate(runs, robot or robots.nominal(), **{"starts": 2, "profiles": False, "blocks": (), **keywords})
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @whole
 def test_packaged_data_calibrate_and_the_report_says_what_it_must(found, document):
@@ -301,6 +302,7 @@ def test_infeasible_starts_are_refused_with_the_rows(measured):
         quick(measured, fix=["6T2A.ground.friction.static"])
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_drive_reads_settled_rows_rolling_and_agrees_with_steady(measured):
     """Among them one on which the calibrated robot could not start: docs/benchmarks.md."""

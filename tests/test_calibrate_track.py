@@ -86,6 +86,7 @@ def posed(base, made):
     return observers.pose(made, guided, coordinates, sd, "track")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_jacobian_through_the_rollout_is_the_central_difference(posed):
     at, step = jnp.asarray([0.5, -0.5]), 1e-4
@@ -97,6 +98,7 @@ def test_jacobian_through_the_rollout_is_the_central_difference(posed):
     assert (np.abs(jacobian[:6]).max(0) > 0.1).all()  # both move the readings
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_track_calibration_recovers_the_guide_friction(found, made, told):
     answer = found.parameters[GUIDE_FRICTION]
@@ -127,6 +129,7 @@ def test_a_belt_too_stiff_for_the_step_is_said(base, made):
     assert "the track model's step of 0.0001 s is above the largest stable one" in said
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_packaged_data_calibrate_through_the_track_model_and_agree_with_steady():
     """docs/benchmarks.md, Calibration through the track model; some ten minutes on two cores."""

@@ -204,6 +204,7 @@ def test_errors_are_of_the_rows_that_both_fits_predict():
     assert loop_findings._rms(before, after, ["speed"]) == {"speed": [3.0, 1.0, 2, 2]}
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_line_holds_what_the_findings_rest_on():
     """A resistance of five sigmas, told nothing of the noise."""

@@ -88,6 +88,7 @@ def test_errors_and_refused_cases_are_listed():
     assert "error: clean: BadData: x: 1" in said and "skipped: library: y: 1" in said
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_clean_rig_goes_through_the_loop():
     from campaign import Task

@@ -244,6 +244,7 @@ def measured_with(robot, folder, changed, sd=0.01):
 OPTIONS = {"starts": 2, "profiles": False, "blocks": False}
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_two_rigs_are_calibrated_side_by_side_as_alone(tmp_path):
     cases = []

@@ -160,6 +160,7 @@ def point(**given):
     return Point(**{k: jnp.asarray(v, int if k == "configuration" else float) for k, v in {**usual, **given}.items()})
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name",

@@ -176,6 +176,7 @@ def ended(step):
     return whole_climbs(WHOLE, duration=14.0, step=step)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_verdicts_of_whole_climbs_and_their_energy_and_half_the_step():
     for step in STEPS:
@@ -187,6 +188,7 @@ def test_verdicts_of_whole_climbs_and_their_energy_and_half_the_step():
             assert np.abs(left[running] / come[running]).max() < 1e-3, k
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_largest_step_is_the_same_to_a_millimetre_with_half_the_step_of_time():
     largest = []
@@ -463,6 +465,7 @@ def nose_up():
     return height.max()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_static_limits_of_steps_and_gaps_are_those_of_the_dynamics():
     """Slow, on a ground that holds. A robot that leans on a step with its rear levers flush gets over where the centre

@@ -58,6 +58,7 @@ def given(values):
     return room.Given(robot, conditions, terrain.step(values[1] / 1000, size=4), climb.still(*angles))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_derivatives_are_the_limits_of_finite_differences_with_contacts_at_the_edge():
     """From standing onto the edge, whose grousers open and close: the same to four digits. Over a stretch slopes tell."""

@@ -58,6 +58,7 @@ def first(tmp_path_factory):
     return cache, process(cache)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_second_process_compiles_nothing_and_answers_the_same(first):
     cache, began = first

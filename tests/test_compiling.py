@@ -34,6 +34,7 @@ def space_of(world, folder):
     return discover.pose(runs, robot, sd, settings_for(observer), library=library)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["wheeled", "bench", "linear"])
 def test_two_rigs_of_one_structure_share_their_programs(tmp_path, kind):

@@ -253,6 +253,7 @@ def test_derivative_by_one_parameter_is_that_of_what_is_computed(recessed, name)
     assert max(float(jnp.abs(x).max()) for x in jax.tree.leaves(theirs[0])) > 0
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_second_derivatives_are_those_of_what_is_computed(recessed):
     run = Conditions(**RUNS["tracked"])

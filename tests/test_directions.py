@@ -75,6 +75,7 @@ def test_what_needs_runs_both_ways_is_looked_for_in_such_alone(kind):
     assert names[0] - names[1] == only and names[1] < names[0]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "amplitude", "voltages"),

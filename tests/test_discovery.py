@@ -87,6 +87,7 @@ def test_clean_table_lacks_nothing(clean):
     assert abs(np.mean(null.chi2) - readings) < 4 * np.sqrt(2 * readings / len(null.chi2))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_result_is_that_of_the_stages(clean, churning, looks):
     for at in (clean, churning):
@@ -178,6 +179,7 @@ def test_reading_that_stands_alone_is_an_outlier(clean, looks):
     assert not found.included[17] and found.included.sum() == len(clean.runs) - 1
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_outliers_of_a_short_table_are_set_aside(clean, looks):
     """A tenth of sixteen rows is one; and what one reading shows, a curve over the order shows too."""

@@ -86,6 +86,7 @@ def oval():
 # --- verdicts ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_clean_histories_lack_nothing(clean):
     found = clean.traced
@@ -95,6 +96,7 @@ def test_clean_histories_lack_nothing(clean):
     assert abs(2 * clean.base.cost - readings) < 4 * np.sqrt(2 * readings)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_eccentric_pulley_is_named_with_its_amplitude_and_phase():
     runs, label = case("pulley_eccentricity", seed=2)

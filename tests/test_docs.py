@@ -78,6 +78,7 @@ def test_extras_of_the_project_are_those_that_the_docs_name():
     assert {"test", "cluster", "bench", "docs"} <= set(extras)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_example_is_what_the_loop_says_today(tmp_path, mmrjax):
     """Else: mmrjax loop measured --out found; python docs/site.py found."""

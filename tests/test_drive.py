@@ -184,6 +184,7 @@ def test_drive_that_breaks_away_between_static_and_dynamic_friction_never_regain
     check_settled(run, point, [1])
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_drive_that_starts_rolling_stays_at_the_operating_point(robot):
     """Also on the slope where a start from standstill slides; above the limit it slides all the same."""

@@ -59,6 +59,7 @@ def jacobians(theta, run_derivatives):
     return {name: jax.tree.map(np.asarray, forward(theta, Conditions(**run))) for name, run in RUNS.items()}
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", sorted(RUNS))
 def test_drive_derivatives_are_central_differences(name, theta, jacobians, run_derivatives):
     """To 1e-5 of a signal's largest value or derivative in the run."""

@@ -1287,6 +1287,7 @@ def test_drive_with_all_effects_has_finite_derivatives_by_every_parameter():
     assert np.isfinite(slopes).all() and np.abs(slopes[0, 1:]).max() > 0
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("rolling", [False, True], ids=["standstill", "rolling"])
 def test_track_with_all_effects_has_finite_derivatives_by_every_parameter(rolling):

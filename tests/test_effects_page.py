@@ -26,6 +26,7 @@ def same(page, other):
     np.testing.assert_allclose(*numbers, rtol=0.06, atol=6e-4)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_effects_page_is_what_the_library_gives(written):
     same((ROOT / "docs" / "effects.md").read_text(encoding="utf-8"), written)

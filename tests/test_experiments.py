@@ -124,6 +124,7 @@ def seen():
     return {p: (c, space, f, experiments.predict(space, f, SETTINGS)) for p, (c, space, f) in answers.items()}
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("pair", PAIRS)
 def test_proposal_is_what_an_engineer_would_do(pair, seen):

@@ -22,6 +22,7 @@ def missions() -> dict[str, dict[str, Any]]:
     return {vehicle.name: comparison.mmrjax_of(vehicle, asked) for vehicle, asked in comparison.CASES}
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("case", range(len(comparison.CASES)))
 def test_mission_follows_the_integral(case: int, missions: dict[str, dict[str, Any]]) -> None:

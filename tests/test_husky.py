@@ -56,6 +56,7 @@ def test_loop_frees_the_friction_that_turns_show(robot, runs):
     assert not of_ground & set(priors.free_names(straight, present))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_base_of_the_loop_fits_currents_as_calibrate_does(robot, runs):
     """18.8 % held out; the currents' own friction held at the file's numbers left 37 and 26 %."""
@@ -67,6 +68,7 @@ def test_base_of_the_loop_fits_currents_as_calibrate_does(robot, runs):
     assert base.candidate.converged and np.all(rms[:2] < 0.20)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_third_of_the_table_has_the_effective_width_of_its_wheels(robot, runs):
     """The difference of the wheels' speeds over the yaw rate is 0.75 to 0.85 m."""

@@ -385,6 +385,7 @@ def started(quick, tmp_path_factory):
     return starts_churning(tmp_path_factory.mktemp("started"))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_histories_go_through_the_command(started):
     assert started.answer.code == 0, started.answer.err
@@ -403,6 +404,7 @@ def test_histories_go_through_the_command(started):
     assert set(r["held_out_by"]) == {"slope", "run"}
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_robot_found_in_histories_starts_with_the_effect(started):
     robot = tomllib.loads((started.folder / "found" / "robot.toml").read_text())
@@ -412,6 +414,7 @@ def test_robot_found_in_histories_starts_with_the_effect(started):
     assert run.code == 0, run.err
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_report_of_histories_shows_what_only_they_tell(started):
     page = (started.folder / "found" / "report.html").read_text()

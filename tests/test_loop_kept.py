@@ -169,6 +169,7 @@ def test_a_budget_ends_a_step_that_says_nothing():
         time.sleep(0.05)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_loop_of_kept_stages_finds_what_it_found(tmp_path):
     world = rigs.world(np.random.default_rng(3), "bench", "voltage", rows=(16, 20))

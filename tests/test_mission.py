@@ -282,6 +282,7 @@ def test_a_demand_that_cannot_be_met_is_followed_as_far_as_possible_and_flagged(
 BY = ("motor.resistance", "gearbox.efficiency_load", "6T2A.track.loss_coulomb", "6T2A.mass", "motor.torque_constant")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_derivatives_through_stops_and_reversals_match_differences(robot):
     """Of energy, path, Wh/m and temperature, by parameters and by times and values of rows, to 1e-4."""
@@ -313,6 +314,7 @@ def test_derivatives_through_stops_and_reversals_match_differences(robot):
         assert (np.abs(np.asarray(exact[:, k]) - apart / (2 * step)) < allowed).all(), k
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_derivatives_by_every_parameter_and_row_match_differences(robot):
     """Of Wh/m and peak temperature of a mission, in one Jacobian; endurance has its closed form below."""

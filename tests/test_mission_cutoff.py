@@ -137,6 +137,7 @@ def test_cutoff_ends_the_mission_where_an_independent_integration_does(cut, robo
     beside(cut, robot, 3.3)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["resistance", "random"])
 def test_other_cutoffs_end_where_an_independent_integration_does(robot, followed, case):
@@ -174,6 +175,7 @@ def test_the_inrush_recovers_in_time_and_a_longer_stay_below_does_not(robot, fol
     assert short.course.time[count - 1] - short.course.time[k] == pytest.approx(0.004, abs=1e-12)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_moment_of_the_cut_off_has_the_derivative_of_differences(robot):
     """By four parameters at once: the implicit function theorem at the event, through heat and charge."""

@@ -95,6 +95,7 @@ def test_numbers_of_either_side_follow_from_their_totals():
     assert float(found["turned_deg"]) == pytest.approx(180.0)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_equal_sides_are_a_mission_of_straight_travel(robot, demanded):
     straight = jax.device_get(simulate_batch(robot, conditions(1), profile(ROWS, MODES, **RAMP), None, 512))
@@ -109,6 +110,7 @@ def test_equal_sides_are_a_mission_of_straight_travel(robot, demanded):
         assert abs(demanded.total.of[name][0]) < 1e-12
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_sides_exchanged_mirror(driven, demanded):
     for found, one, other in ((driven, 0, 1), (demanded, 1, 2)):
@@ -156,6 +158,7 @@ def test_held_duties_are_a_run_of_drive(robot, driven):
     assert float(found.total.of["turned"][0]) == pytest.approx(float(end.heading[0]), rel=1e-5)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_derivatives_of_a_turn_match_differences(robot):
     """Of energy and of what it turns by, by parameters of the robot and by speed and yaw rate that are demanded."""

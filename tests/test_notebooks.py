@@ -21,6 +21,7 @@ def test_there_are_notebooks():
     assert len(SCRIPTS) >= 3
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("script", SCRIPTS, ids=[p.stem for p in SCRIPTS])
 def test_notebook_runs(script, tmp_path):

@@ -326,6 +326,7 @@ def test_stride_is_the_optimum_beyond_and_along_the_edges_of_penalties():
     assert crossed > 5  # where the Gauss-Newton step leads to a higher place
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_search_of_rollouts_ends_at_the_limit_of_adhesion_from_inside(measured):
     """With the noise that is estimated of them the rows pull static friction down to the margin; from just inside of

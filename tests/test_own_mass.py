@@ -142,6 +142,7 @@ def test_comparison_can_fail(tmp_path):
     np.testing.assert_allclose(written(own_mass.with_table_mass(robot, runs))[0], before, rtol=1e-9)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(UNNAMED))
 def test_robot_with_a_curve_is_written_as_it_was_fitted(name, curves):

@@ -262,6 +262,7 @@ def test_what_members_did_is_counted_and_said(found):
     ]  # fmt: skip
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_search_that_ends_at_the_edge_of_a_prior_says_so_in_the_result(runs):
     """A prior far from what the rows say, and narrow."""
@@ -311,6 +312,7 @@ def test_options_of_a_population_that_cannot_be_are_refused(options, says):
         calibrate(records.read("measured"), robots.nominal(), **options)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_running_gear_is_found_through_the_track_model(tmp_path):
     """Readings of a shaking gear; the population comes near its slip, which the flush gear does not."""

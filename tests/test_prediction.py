@@ -130,6 +130,7 @@ def test_nothing_is_chosen_where_nothing_can_be_held_out(runs):
     ) == Gain(0.0, np.inf)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_measured_runs_show_a_voltage_drop_and_a_slip_that_rests_on_a_row(tmp_path):
     """What is written predicts, on the rows that both reach, no worse than this, by kind of block [%]; and swept with

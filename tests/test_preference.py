@@ -119,6 +119,7 @@ def traced():
     return trace()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_held_out_data_choose_the_leader(traced):
     by_fit = SETTLED.trace(RUNS)

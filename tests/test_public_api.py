@@ -166,6 +166,7 @@ def test_fields_broadcast_configurations_among_them(robot):
     np.testing.assert_array_equal(by_index.total_current, many.total_current)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_results_are_those_of_the_fidelities(robot):
     runs = mm.Conditions(configuration=["6T2A", "4W2T"], voltage=[24.0, 15.0])

@@ -113,6 +113,7 @@ def test_loop_is_as_recorded(name):
         assert held[channel]["rms_percent"] == pytest.approx(rms, rel=5e-3), channel
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_calibration_is_as_recorded():
     was = RESULTS["calibrate"]["measured"]

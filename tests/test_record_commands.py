@@ -45,6 +45,7 @@ def test_quick_commands_leave_what_is_recorded(name, folder, monkeypatch):
     assert record.differences(record.record(name), record.run(name, folder), record.CASES[name].rtol) == []
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_every_command_leaves_what_is_recorded():
     command = [sys.executable, str(ROOT / "benchmarks" / "record.py"), "--check"]

@@ -64,6 +64,7 @@ def left(seed, columns=None, shift=None, channel=SPEED):
     return leaving(made, whitened)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_clean_residuals_cluster_no_more_often_than_stated():
     """Of 300 tables of five columns, three channels and tests over all rows and by configuration."""

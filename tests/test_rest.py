@@ -122,6 +122,7 @@ def agree(values, runs, effects, seconds=12.0):
     return [WORDS[np.asarray(s)] for s in (still, *found[:2])], [np.asarray(x) for x in found[2:]]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("effects", [{}, EFFECTS], ids=["plain", "effects"])
 def test_statuses_agree_over_random_robots_slopes_and_voltages(effects):

@@ -334,6 +334,7 @@ def test_compare_and_calibrate_take_one_channel_both_ways(mmrjax, tmp_path, benc
     assert words_of_others(out, said, err) == []
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_loop_takes_one_channel_both_ways(mmrjax, tmp_path, bench):
     rig, data = bench
@@ -391,6 +392,7 @@ def precise_table(path):
     return path
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_what_explains_all_of_precise_readings_is_named(mmrjax, tmp_path):
     """170 σ of it: without the effect the fit is so far off that by its slopes another effect would explain more."""

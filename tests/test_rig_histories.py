@@ -136,6 +136,7 @@ def test_readings_without_a_sign_are_refused_unless_the_file_says_so(tmp_path, l
         assert Histories.check(runs, nothing) == []
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_delay_of_the_imposed_speed_is_found(tmp_path):
     path = tmp_path / "rig.toml"

@@ -246,6 +246,7 @@ def test_the_loop_looks_for_an_error_of_every_instrument(tmp_path):
     assert amplitude_of(torque()).spec.bounds == pytest.approx(np.array([-1, 1]) * scales.MOST_OFF * size, rel=0.01)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_torque_meters_gain_is_named(tmp_path):
     runs, robot = metered(tmp_path, 0.05)
@@ -254,6 +255,7 @@ def test_a_torque_meters_gain_is_named(tmp_path):
     assert found.effects[0].parameters["amplitude"].value == pytest.approx(0.05, abs=0.015)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("signed", [True, False])
 def test_a_current_sensors_offset_is_named(tmp_path, signed):

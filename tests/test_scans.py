@@ -38,6 +38,7 @@ def posed(robot, runs):
     return observers.pose(runs, robot, priors.coordinates(robot, names), noise.from_table(runs, kind.sizes(runs)).sd)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_search_finds_a_delay_between_coarse_samples(coarse):
     """From the prior mean, 1.5 prior sds away and behind two cliffs."""

@@ -126,6 +126,7 @@ def test_size_covers_the_evaluations_that_are_asked_for():
         assert size * REPLICATES * 12 >= evaluations and size & (size - 1) == 0
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [8, 128])
 def test_sobol_intervals_cover_in_ninety_to_ninety_eight_of_a_hundred(size):
@@ -138,6 +139,7 @@ def test_sobol_intervals_cover_in_ninety_to_ninety_eight_of_a_hundred(size):
     assert np.all((held / 200 >= 0.9) & (held / 200 <= 0.98)), held / 200
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_sobol_intervals_cover_those_of_the_steady_model_in_scipy():
     from sensitivity import coverage

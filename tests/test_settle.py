@@ -69,6 +69,7 @@ def test_means_are_those_of_the_levels_within_their_sds(tmp_path, case):
         assert np.ptp(log.settled[log.level[s.rows]], 0) == pytest.approx(np.zeros(z.shape[1]), abs=1e-9)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_sds_hold_over_random_logs(tmp_path):
     """Holds of 1 to 4 s, lags up to 0.4 s, 50 to 250 Hz, noise, steps, delays and clocks that jitter."""

@@ -51,6 +51,7 @@ def is_global(adhesion, creep, seed=3):
     assert abs(2 * fitted.candidate.cost - readings) < 5 * np.sqrt(2 * readings), (adhesion, creep)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("adhesion", "creep"),

@@ -79,6 +79,7 @@ def meets(f, asked):
     assert float(f.robot.chassis(0).mass) == pytest.approx(f.objectives["mass"])
 
 
+@pytest.mark.nightly
 @pytest.mark.slow  # of what the command leaves, `check` says so below
 def test_best_meets_every_requirement_as_check_has_it(asked, found):
     assert found.best is not None and found.best.feasible and found.unmeetable == ()

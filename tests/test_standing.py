@@ -506,6 +506,7 @@ def stood(analyst, runs, effects):
     return standing(space, base, Search((best,), best, after), left, bases, analyst.settings), best, after
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_two_slips_do_not_stand_for_a_law_that_the_library_lacks(monkeypatch):
     got, best, _ = stood(SETTLED, growing(monkeypatch, 20.0, 1), ("rolling_radius", "load_slip"))
@@ -530,6 +531,7 @@ SLIPS = Analyst(
 STANDS_FOR_ONE = ("belt_creep", "load_slip", "rolling_radius")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_three_slips_do_not_stand_for_a_sliding_speed_that_grows(monkeypatch):
     for sigmas, seed in ((12.0, 1), (20.0, 1), (30.0, 2)):
@@ -555,6 +557,7 @@ def test_true_pairs_of_one_balance_keep_their_names(pair):
 # --- histories ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_supply_that_sags_over_time_gets_no_name(monkeypatch):
     """By one volt in 0.8 s, in six starts; it was called a brush drop and an eccentric pulley."""

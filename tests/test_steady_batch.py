@@ -119,6 +119,7 @@ def test_steady_outputs_compile_once_for_other_numbers(robot, compilations):
     assert not compilations
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [96, 97])
 def test_steady_blocks_change_no_number(robot, monkeypatch, size):

@@ -482,6 +482,7 @@ def test_identity_differences_are_few_words():
     assert identity.differences(old, old) == ""
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_killed_at_twenty_random_moments_goes_on_to_equal_stores(tmp_path):
     """SIGKILL at a random moment (after some number of chunks and a few milliseconds), and the same command again:

@@ -120,6 +120,7 @@ def test_a_slope_that_changes_between_readings_acts_from_its_row_on():
     assert np.abs(times - at).min() < 1e-9
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("drive", DRIVES)
 def test_a_run_shows_what_it_shows_in_the_whole_log(drive):

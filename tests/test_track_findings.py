@@ -198,6 +198,7 @@ def test_averages_are_over_whole_periods(runs, robot):
     assert runs.steady.periods[UNPOWERED] == 0
 
 
+@pytest.mark.nightly
 def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
     """Within 1.5 % on current and both speeds, at the share of the weight that the track model puts out.
 

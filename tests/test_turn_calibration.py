@@ -115,6 +115,7 @@ def test_histories_of_turns_are_refused(robot, of_world, tmp_path):
         calibrate(records.read(path, robot=robot), robot, model="drive", free=[f"6T2A.{LATERAL}"], noise=NOISE)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_truth_of_a_second_implementation_is_found(robot, of_world):
     found = calibrate(of_world, robot, noise=NOISE)
@@ -127,6 +128,7 @@ def test_truth_of_a_second_implementation_is_found(robot, of_world):
     assert held["yaw_rate"].rms_percent < 2 < found.errors_before["yaw_rate"].rms_percent
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_truth_of_a_simulated_table_is_found_from_the_command_line(tmp_path, mmrjax):
     friction = {f"4W2T.ground.friction.{k}": v for k, v in (("static", 0.45), ("dynamic", 0.36))}

@@ -146,6 +146,7 @@ def test_robot_files_know_them_and_the_library_of_straight_travel_does_not(tmp_p
         assert "Source:" in (kind.__doc__ or "") and kind.balance in balances.BALANCES
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_sides_that_are_not_alike_are_found(tmp_path):
     """A table of a robot whose left side rubs more, calibrated with that effect's amplitude free."""

@@ -75,6 +75,7 @@ def test_loop_looks_for_effects_of_turns_beside_the_library(posed):
     assert {"6T2A.turning.width", "6T2A.turning.lateral"} < set(space.coordinates.base.names)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", SCORED)
 def test_signature_is_what_the_effect_does(posed, linear, shown, name):
     _, space = posed
@@ -140,6 +141,7 @@ FOUND = {
 }  # fmt: skip
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("case", ["clean", "friction"])
 def test_command_finds_what_a_second_implementation_planted(tmp_path, mmrjax, case):
     table, robot = planted.write(tmp_path, case)

@@ -332,6 +332,7 @@ def test_what_is_wrong_with_a_robot_that_turns_is_said(rig):
         rig(KINEMATIC.replace('["motor_current_left"', '["motor_speed_left"'))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_width_or_ratio_of_a_kinematic_robot_is_calibrated(rig, table):
     robot = rig(KINEMATIC)

@@ -175,6 +175,7 @@ def test_settled_turns_of_a_second_implementation_are_settled(robot, configurati
         assert np.abs(np.asarray(law(left, right, jnp.asarray(y)))[:7]).max() < 1e-5  # of some 1e4 /s that each is of
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_run_over_time_is_that_of_a_second_implementation(robot):
     times = np.array([0.0, 0.05, 0.3, 0.8])
@@ -194,6 +195,7 @@ def test_run_over_time_is_that_of_a_second_implementation(robot):
     np.testing.assert_allclose(signals.speed_motor, expected[:, 8:10], rtol=1e-6, atol=1e-4)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_derivatives_over_time_are_differences(robot):
     """Heading and place of a turn across a slope, by the ratio of frictions, adhesion and the left duty."""

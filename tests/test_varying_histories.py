@@ -324,6 +324,7 @@ def test_conditions_that_change_between_many_levels_are_few(observer, runs):
     assert varying.times.shape[1] < 1.5 * observer.times.shape[1]  # changes of a thousandth need no short steps
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_calibration_finds_the_truth_within_its_intervals(simulated):
     found = calibrate(simulated, robots.nominal(), free=tuple(TRUTH), model="drive", starts=3, profiles=False, blocks=False,
@@ -337,6 +338,7 @@ def test_calibration_finds_the_truth_within_its_intervals(simulated):
     assert sum(isinstance(n, StopsOnSlope) for n in found.remarks) == 1
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_loop_finds_what_was_not_declared_on_a_stair(engine):
     stairs = engine({**NOMINAL, f"effects.{UNDECLARED}.amplitude": 0.4}, ("stair", "reversal"))

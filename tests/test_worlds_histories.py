@@ -84,6 +84,7 @@ def test_series_hold_every_effect_that_only_a_series_shows():
     assert sum(not law.cls for law in SERIES.values()) >= 4
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("battery", [0.0, 1.0])
 def test_clean_histories_agree_with_drive(package, battery):
@@ -93,6 +94,7 @@ def test_clean_histories_agree_with_drive(package, battery):
     assert apart(package(battery), y) > 5 * ERROR
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PASSING)
 def test_effect_of_a_series_agrees_with_drive(package, name):
@@ -138,6 +140,7 @@ def test_steps_are_fine_enough_for_the_stickiest_contact():
     assert apart(finer, y) < 2e-4
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_runs_of_another_robot_end_where_settled_travel_is():
     for variety in range(3):
@@ -268,6 +271,7 @@ def test_each_of_two_leaves_its_sigmas_beside_the_other(quick):
     assert np.linalg.norm(remainder(changes[0], slopes)) > np.linalg.norm(first)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_oracle_finds_a_mimic_and_none_for_a_law_of_its_own(quick):
     made = histories.case(brief(world("plain"), 0.25, 1), ["supply_recovery"], 30.0, seed=1)

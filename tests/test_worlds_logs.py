@@ -49,6 +49,7 @@ def shown(tmp_path, case, terms=()):
     return [with_one(n) for n in ("", *sizes)]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("imposed", logs.IMPOSED)
 def test_logs_are_those_of_the_simulator_with_the_same_truth(tmp_path, imposed):
@@ -106,6 +107,7 @@ def test_logs_of_about_one_length_share_what_is_compiled():
     assert resolved[1] < resolved[0] and slow[0].columns.shape == fast[0].columns.shape
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_log_is_reproducible_and_its_effect_has_its_strength():
     rig = logs.rig(np.random.default_rng(7), "voltage", 0.005)

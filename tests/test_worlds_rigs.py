@@ -210,6 +210,7 @@ def test_posterior_of_what_nothing_shows_is_its_prior(worlds):
     assert all(0 < x <= 1 + 1e-9 for w in worlds for x in w.posterior().values())
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("names", [laws.RIGS, laws.OUTSIDE_RIGS], ids=["library", "outside"])
 def test_effects_leave_the_sigmas_that_are_asked_for(names, worlds):
@@ -245,6 +246,7 @@ def _refitted(w, y, start):
     return float(np.sqrt(2 * least_squares(left, start, diff_step=1e-4, max_nfev=60).cost))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "names", [("churning",), pytest.param(tuple(laws.RIGS), marks=pytest.mark.slow)], ids=["one", "every"]
