@@ -77,7 +77,8 @@ def grid(
     begins, first = np.append(0.0, changes[inside]), np.append(start[0], change[0] / sizes[inside])
     grows = np.append(start[1], np.full(inside.sum(), change[1]))
     given, times = times, np.unique(np.concatenate([begins, np.asarray(times, float)]))
-    longest = np.broadcast_to(np.maximum(longest, last / STEPS), max(len(given) - 1, 1))
+    longest = np.maximum(longest, last / STEPS) if np.size(longest) else LONGEST  # one row has no interval
+    longest = np.broadcast_to(longest, max(len(given) - 1, 1))
     longest = longest[np.clip(np.searchsorted(given, times[:-1], side="right") - 1, 0, len(longest) - 1)]
     which = np.searchsorted(begins, times[:-1], side="right") - 1  # the change that acts from each instant on
     since, first, grows = begins[which], first[which], grows[which]
