@@ -800,7 +800,9 @@ def _in_time(
     speed = _on_lines(np.asarray(of_rows.motor_speed), each, time, times)
     step = np.diff(times, axis=1)
     slope = np.where(step > 0, np.diff(speed, axis=1) / np.where(step > 0, step, 1.0), 0.0)
-    slope = np.concatenate([slope, np.zeros((len(slope), 1))], 1)
+    # An instant accelerates as the step that it begins; the last one begins none, and has that of the step before it.
+    last = np.maximum.accumulate(np.where(step > 0, np.arange(step.shape[1]), 0), 1)
+    slope = np.take_along_axis(slope, np.concatenate([last, last[:, -1:]], 1), 1)
     # Not by `dataclasses.replace`: its constructor broadcasts, and what does not change has no instants.
     return eqx.tree_at(
         lambda c: (c.motor_speed, c.motor_acceleration),
