@@ -296,7 +296,7 @@ class Histories(Observer):
 
     @classmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Note | str]:
-        """Histories begin when the supply is switched on, the robot at rest, and show one sample at a time."""
+        """Histories begin at their first row, mostly at rest, and show one sample at a time."""
         names, measured = runs.run_names, runs.measured()
         # Current rises within a millisecond; what moves does not.
         resting = robot.rig.start == "rest" and robot.rig.imposed != "motor_speed"
@@ -323,8 +323,9 @@ class Histories(Observer):
                     raise BadData(
                         f"{runs.source} row {first + 1}, time_s: run {name or '(no run_id)'} is moving at "
                         f"{number(runs['time_s'][first])} s ({number(runs[column][first])} {unit}); a history "
-                        "starts from rest when the supply is switched on, at 0 s. Settled travel is one row a run, "
-                        'without time_s; a rig\'s file may say start = "measured" or "free"'
+                        "begins at rest at its first row. If it began earlier, add a row at that time without "
+                        'readings; if it began in motion, state start = "measured" or "free" in the robot\'s file; '
+                        "settled travel is one row a run, without time_s"
                     )
         said: list[Note | str] = []
         step = runs["time_s"].max() / STEPS
