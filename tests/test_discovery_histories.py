@@ -294,7 +294,7 @@ def test_knots_of_a_short_run_in_any_order_end_with_its_last_sample(runs):
 def test_histories_that_do_not_start_from_rest_are_refused(runs):
     late = runs.where(runs["time_s"] > 0.3)
     late.columns["time_s"] = late["time_s"] - 0.32
-    with pytest.raises(BadData, match=r"run start0 is moving at 0 s .* starts from rest"):
+    with pytest.raises(BadData, match=r"run start0 is moving at 0 s .* begins at rest"):
         Histories.check_start(late, known(late), robots.nominal())
     Histories.check_start(runs, known(runs), robots.nominal())
 

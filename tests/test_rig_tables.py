@@ -238,10 +238,25 @@ def test_times_of_day_count_from_the_first_of_each_run(tmp_path, column, cells):
     runs = read(tmp_path, f"run_id,{column},supply_voltage_V,total_current_A\n{rows}", robot)
     assert runs["time_s"] == pytest.approx([0, 0.25, 1.25] * 2, abs=1e-6)
     assert any(f"{column} is a time of day; counted from the first of each run" in note for note in runs.notes)
-    usual = read(tmp_path, "time_s,supply_voltage_V,total_current_A\n5,12,0.4\n6,12,0.4\n7,12,0.4\n", robot)
-    assert usual["time_s"] == pytest.approx([5, 6, 7]) and usual.notes == ()
+    usual = read(tmp_path, "time_s,supply_voltage_V,total_current_A\n0,12,0.4\n6,12,0.4\n7,12,0.4\n", robot)
+    assert usual["time_s"] == pytest.approx([0, 6, 7]) and usual.notes == ()
     with pytest.raises(BadData, match=r"row 2, time_s: got 25\.11\.2026 12:00; .*expected a number"):
         read(tmp_path, "time_s,supply_voltage_V,total_current_A\n5,12,0.4\n25.11.2026 12:00,12,0.4\n", robot)
+
+
+def test_a_run_begins_at_its_first_row_whatever_its_clock_shows(tmp_path):
+    """Each run by its own first row, wherever that stands in the file; in any unit; a row without readings too."""
+    rows = "b,0,0.4\na,3600.25,\nb,0.5,0.4\na,3600.5,0.4\nc,12,0.4\n"
+    rows = "".join(f"{run},{cell},12,{amps}\n" for run, cell, amps in (r.split(",") for r in rows.split()))
+    runs = read(tmp_path, f"run_id,time_s,supply_voltage_V,total_current_A\n{rows}", bench("voltage"))
+    assert runs["time_s"].tolist() == [0.0, 0.0, 0.5, 0.25, 0.0]
+    assert any(n.startswith("runs.csv: time_s begins at 3600.25 in run a; a run begins at its") for n in runs.notes)
+    slow = "time_min,supply_voltage_V,total_current_A\n60,12,0.4\n60.5,12,0.4\n"
+    runs = read(tmp_path, slow, bench("voltage"))
+    assert runs["time_s"].tolist() == [0.0, 30.0] and any("time_min begins at 60; a run" in n for n in runs.notes)
+    late = "time_s,supply_voltage_V,total_current_A\n60,12,0.4\n-1,12,0.4\n"
+    with pytest.raises(BadData, match=r"row 2, time_s: got -1; expected 0 to 1e\+06"):
+        read(tmp_path, late, bench("voltage"))
 
 
 def test_a_load_that_drives_its_motors_takes_voltage_from_their_back_emf(tmp_path):

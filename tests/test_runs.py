@@ -338,10 +338,12 @@ def test_a_command_says_it_on_stderr_before_it_fits(mmrjax, tmp_path, monkeypatc
         )
 
 
-def test_pages_order_the_rows_of_a_run_as_the_table_does():
-    """Rows of two runs, mixed and backwards in time."""
+@pytest.mark.parametrize("named", [True, False])
+def test_pages_order_the_rows_of_a_run_as_the_table_does(named):
+    """Rows of two runs, mixed and backwards in time; of one run, where there is no `run_id`."""
     time = np.array([3.0, 2.0, 1.0, 0.0, 5.0, 4.0])
-    columns = {"run_id": np.array(["a", "b", "a", "b", "a", "b"]), "time_s": time, "total_current_A": time}
+    columns = {"run_id": np.array(["a", "b", "a", "b", "a", "b"])} if named else {}
+    columns |= {"time_s": time, "total_current_A": time}
     columns |= {"configuration": np.repeat("6T2A", 6), "supply_voltage_V": 5 * time}
     table = columns | {"after_total_current_A": time, "residual_after_total_current_sigma": time}
     shown = channels.rows(["total_current"])
@@ -352,6 +354,6 @@ def test_pages_order_the_rows_of_a_run_as_the_table_does():
         for fig in (fit, loop)
         for axes in fig.axes
         for line in axes.lines
-        if len(line.get_xdata()) == 3
+        if len(line.get_xdata()) == (3 if named else 6)
     ]
-    assert len(drawn) >= 6 and all((np.diff(x) > 0).all() for x in drawn)
+    assert len(drawn) >= (6 if named else 3) and all((np.diff(x) > 0).all() for x in drawn)

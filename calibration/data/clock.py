@@ -1,4 +1,4 @@
-"""Times of day and dates as loggers write them, counted from the first of each recording."""
+"""Clocks of loggers, counted from the first row of each recording."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from calibration.data import delimited
 from calibration.data.columns import Meaning
+from calibration.data.errors import number
 
 #: What follows a day where a cell holds a time alone, and how long a day lasts [s].
 _SOME_DAY, _DAY = "1970-01-01T", 86400.0
@@ -17,20 +18,23 @@ _WITH_POINTS = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})(?=[ T])")
 
 
 def from_the_first(name: str, meaning: Meaning, cells: Sequence[str], runs: Sequence[str]) -> tuple[list[str], str]:
-    """Cells of a column of time as what has passed since the earliest of their run, and a sentence on that; as they
-    are, and an empty one, where they are no times of day: neither dates and times as ISO 8601 writes them or with
-    a date as 25.11.2026, nor numbers that are all beyond what a time may be (seconds since 1970). Times alone that
-    fall back by more than half a day have passed midnight.
+    """Returns cells of a column of time as the time since the first of their run, and a note where that changes them.
+
+    A run begins at its first row, whatever its clock shows there: the time since a controller started, or a time of
+    day. Times of day are dates and times as ISO 8601 writes them or with a date as 25.11.2026, or numbers that are
+    all beyond the largest time (seconds since 1970). Times without a date that fall back by more than half a day have
+    passed midnight. A column with a cell that is no time is returned as it is, and the reader refuses that cell.
 
     Args:
         name: of the file; meaning: of the column; runs: `run_id` of each cell.
     """
-    clock = [_seconds(cell) for cell in cells]
-    factor = meaning.value(1.0)
-    if not all(map(math.isfinite, clock)):
-        high = meaning.limits()[1]
+    clock, factor = [_seconds(cell) for cell in cells], meaning.value(1.0)
+    of_day = all(map(math.isfinite, clock))
+    if not of_day:
+        low, high = (limit * factor for limit in meaning.limits())
         clock = [delimited.number(cell) * factor for cell in cells]
-        if not all(x > high * factor for x in clock):
+        of_day = all(x > high for x in clock)
+        if not of_day and not all(low <= x <= high for x in clock):
             return list(cells), ""
     first: dict[str, float] = {}
     last: dict[str, float] = {}
@@ -38,8 +42,17 @@ def from_the_first(name: str, meaning: Meaning, cells: Sequence[str], runs: Sequ
         if _alone(cells[k]) and run in last:
             clock[k] = x = x + _DAY * max(math.floor((last[run] - x) / _DAY + 0.5), 0)
         last[run], first[run] = x, min(x, first.get(run, x))
+    if not any(first.values()):
+        return list(cells), ""
     passed = [repr(round(x - first[r], 9) / factor) for x, r in zip(clock, runs, strict=True)]
-    return passed, f"{name}: {meaning.shown} is a time of day; counted from the first of each run"
+    if of_day:
+        return passed, f"{name}: {meaning.shown} is a time of day; counted from the first of each run"
+    run, begins = next((r, x) for r, x in first.items() if x)
+    where = f"{number(begins / factor)}{f' in run {run}' if run else ''}"
+    return passed, (
+        f"{name}: {meaning.shown} begins at {where}; a run begins at its first row, and its time counts from there; "
+        "if it began earlier, add a row at that time without readings"
+    )
 
 
 def _alone(cell: str) -> bool:

@@ -49,7 +49,7 @@ class Runs:
     log: Runs | None = None
 
     def __len__(self) -> int:
-        return len(self.columns["configuration"])
+        return len(next(iter(self.columns.values())))
 
     def __getitem__(self, column: str) -> np.ndarray:
         return self.columns[column]

@@ -7,9 +7,9 @@ of Newton's method at the solution, so that a direction more costs one tangent o
 rollout.
 
 After a jump of the voltage the current lags by L / R, often much less than a step, and SDIRK2 leaves up to a fifth of
-the jump to the end of such a step. So the jump's lag decays by itself, exponentially, and the method follows the rest
-(an integrating factor; Lawson, Generalized Runge-Kutta processes for stable systems with large Lipschitz constants,
-SIAM J. Numer. Anal. 4 (1967)).
+the jump to the end of such a step. So the lag of the last jump decays exponentially in every step, and the method
+follows the rest (an integrating factor; Lawson, Generalized Runge-Kutta processes for stable systems with large
+Lipschitz constants, SIAM J. Numer. Anal. 4 (1967)).
 """
 
 from __future__ import annotations
@@ -46,6 +46,8 @@ START, CHANGE = (1e-5, 0.02), (1e-4, 0.25)
 LOOSE, LONGEST = (1e-5, 0.08), 2.5e-3
 #: Most steps of a run that LONGEST may ask for; a longer run has longer steps.
 STEPS = 8000
+#: Conditions that drive the current.
+DRIVING = ("voltage", "duty", "open", "motor_current")
 #: More current at which its rate shows how soon it follows its voltage [10 A].
 MORE = 1e-3
 #: Looks for the moment at which a shaft comes to rest, each on a line from where the step begins.
@@ -77,7 +79,8 @@ def grid(
     begins, first = np.append(0.0, changes[inside]), np.append(start[0], change[0] / sizes[inside])
     grows = np.append(start[1], np.full(inside.sum(), change[1]))
     given, times = times, np.unique(np.concatenate([begins, np.asarray(times, float)]))
-    longest = np.broadcast_to(np.maximum(longest, last / STEPS), max(len(given) - 1, 1))
+    longest = np.maximum(longest, last / STEPS) if np.size(longest) else LONGEST  # one row has no interval
+    longest = np.broadcast_to(longest, max(len(given) - 1, 1))
     longest = longest[np.clip(np.searchsorted(given, times[:-1], side="right") - 1, 0, len(longest) - 1)]
     which = np.searchsorted(begins, times[:-1], side="right") - 1  # the change that acts from each instant on
     since, first, grows = begins[which], first[which], grows[which]
@@ -155,12 +158,14 @@ class _Step(eqx.Module):
     """A step of a run; or all of them, fields of shape (steps, ...).
 
     Attributes:
-        length: [s]; begun: 0 of the first step, else 1.
-        before, now: what changes of the conditions, before it and in it; before: None where no lag follows a jump of
-            what drives the current.
+        length: [s]; since: time from the last jump of what drives the current to its begin [s].
+        begun: 0 before the first jump of a run from rest, which begins with one; else 1.
+        before, now: what changes of the conditions, before that jump and in the step; before: None where no lag
+            follows a jump.
     """
 
     length: Array
+    since: Array
     begun: Array
     before: Conditions | None
     now: Conditions
@@ -172,34 +177,44 @@ class _Step(eqx.Module):
     def rates_at_start(
         self, constant: Conditions, rate: Callable[[Array, Conditions], Array], y: Float[Array, " unknowns"]
     ) -> Float[Array, "rates ..."]:
-        """Rates of the current where it starts: before what drives the current jumps, after that, and with a little
-        more current, which tells how soon it follows; none where no lag follows. Before a run its current rests."""
+        """Rates of the current where it starts, as before the last jump of what drives it, now, and with a little
+        more current, which tells how soon it follows; none where no lag follows. Before a run nothing drives it."""
         if self.before is None:
             return jnp.zeros((0, *rate(y, self.held(constant)).shape))
-        changing = jax.tree.map(lambda before, now: jnp.stack([before, now, now]), self.before, self.now)
+        now = self.held(constant)
+        before = eqx.combine(self.before, constant)
+        nothing = [x if x is None else self.begun * x for x in (before.duty, before.motor_current)]
+        before = eqx.tree_at(lambda c: [c.duty, c.motor_current], before, nothing, is_leaf=lambda x: x is None)
         at = jnp.stack([y, y, y + MORE * _current(y)])
-        found = jax.vmap(lambda y, now: rate(y, eqx.combine(now, constant)))(at, changing)
-        return found * jnp.reshape(jnp.stack([self.begun, 1.0, 1.0]), (3, *[1] * (found.ndim - 1)))
+        each = jax.tree.map(lambda before, now: jnp.stack([before, now, now]), before, now)
+        return jax.vmap(rate)(at, each)
 
 
 def _steps(conditions: Conditions, times: Float[Array, " times"]) -> tuple[_Step, Conditions]:
     """Every step of a run, and what of its conditions does not change."""
     changing, constant = _in_time(conditions)
-    before = jax.tree.map(lambda x: jnp.concatenate([x[:1], x[:-2]]), changing)
     now = jax.tree.map(lambda x: x[:-1], changing)
-    length = jnp.diff(times)
-    begun = (jnp.arange(len(length)) > 0).astype(length.dtype)
-    return _Step(length, begun, before if conditions.motor_speed is None else None, now), constant
+    jumped = jnp.zeros(len(times) - 1, bool)
+    for x in (getattr(now, name) for name in DRIVING):
+        if x is not None:
+            jumped |= jnp.concatenate([jnp.zeros(1, bool), x[1:] != x[:-1]])
+    jump = jax.lax.cummax(jnp.where(jumped, jnp.arange(len(jumped)), 0))
+    before = jax.tree.map(lambda x: x[jnp.maximum(jump - 1, 0)], now)
+    rests = conditions.begin is None
+    begun = jnp.where((jump == 0) & rests, 0.0, 1.0).astype(times.dtype)
+    since = times[:-1] - times[jump]
+    return _Step(jnp.diff(times), since, begun, before if conditions.motor_speed is None else None, now), constant
 
 
-def _lag(rate: Float[Array, " rates"], h: Array) -> Lag:
-    """Of a step, by the rates at its start."""
+def _lag(rate: Float[Array, " rates"], step: _Step) -> Lag:
+    """Of a step, by the rates at its start: what is left by then of the lag after the last jump."""
     if not len(rate):
-        return _decaying(jnp.zeros(()), jnp.zeros(()), h)
+        return _decaying(jnp.zeros(()), jnp.zeros(()), step.length)
     slope = (rate[1] - rate[2]) / MORE
     follows = slope > 0  # but where a diode begins to block
     decay = jnp.where(follows, slope, 1.0)
-    return _decaying(jnp.where(follows, (rate[0] - rate[1]) / decay, 0.0), decay, h)
+    left = (rate[0] - rate[1]) / decay * jnp.exp(-decay * step.since)
+    return _decaying(jnp.where(follows, left, 0.0), decay, step.length)
 
 
 def _decaying(begin: Array, decay: Array, h: Array) -> Lag:
@@ -219,7 +234,7 @@ def _windings(
 
 
 def _lag_of(robot: Robot, constant: Conditions, step: _Step, y: Float[Array, " unknowns"]) -> Lag:
-    return _lag(_windings(robot, constant, step, y), step.length)
+    return _lag(_windings(robot, constant, step, y), step)
 
 
 def _stage(law: Callable[[Array], Array], known: Array, guess: Array, h: Array, mean: Array, decay: Array) -> Array:
@@ -365,7 +380,7 @@ def followed(
         current = _current(end)
 
         by_begin, rate = jax.jacfwd(lambda y: (_windings(robot, constant, step, y),) * 2, has_aux=True)(begin)
-        by_rate, lag = jax.jacfwd(lambda r: (_lag(r, step.length),) * 2, has_aux=True)(rate)
+        by_rate, lag = jax.jacfwd(lambda r: (_lag(r, step),) * 2, has_aux=True)(rate)
         ends = jnp.stack([begin - lag.begin * current, end - lag.end * current])
         places = jnp.where(passes, ends, stages) + lag.means[:, None] * current
         slopes = jax.vmap(jax.jacfwd(lambda y, way: rates(robot, held, y, way)))(places, sides)

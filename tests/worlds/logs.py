@@ -197,7 +197,8 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
     kept: dict[int, list[np.ndarray]] = {}
     for row in range(ROWS):
         now = inputs[:, row]
-        slope = (inputs[:, min(row + 1, ROWS - 1)] - now) / r.every if lines else 0.0
+        after = min(row + 1, ROWS - 1)  # the last row accelerates as the step that ends there
+        slope = (inputs[:, after] - inputs[:, after - 1]) / r.every if lines else 0.0
         for n in range(per):
             t = (row + n / per) * r.every
 

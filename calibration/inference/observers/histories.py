@@ -296,7 +296,7 @@ class Histories(Observer):
 
     @classmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Note | str]:
-        """Histories begin when the supply is switched on, the robot at rest, and show one sample at a time."""
+        """Histories begin at their first row, mostly at rest, and show one sample at a time."""
         names, measured = runs.run_names, runs.measured()
         # Current rises within a millisecond; what moves does not.
         resting = robot.rig.start == "rest" and robot.rig.imposed != "motor_speed"
@@ -323,8 +323,9 @@ class Histories(Observer):
                     raise BadData(
                         f"{runs.source} row {first + 1}, time_s: run {name or '(no run_id)'} is moving at "
                         f"{number(runs['time_s'][first])} s ({number(runs[column][first])} {unit}); a history "
-                        "starts from rest when the supply is switched on, at 0 s. Settled travel is one row a run, "
-                        'without time_s; a rig\'s file may say start = "measured" or "free"'
+                        "begins at rest at its first row. If it began earlier, add a row at that time without "
+                        'readings; if it began in motion, state start = "measured" or "free" in the robot\'s file; '
+                        "settled travel is one row a run, without time_s"
                     )
         said: list[Note | str] = []
         step = runs["time_s"].max() / STEPS
@@ -800,7 +801,9 @@ def _in_time(
     speed = _on_lines(np.asarray(of_rows.motor_speed), each, time, times)
     step = np.diff(times, axis=1)
     slope = np.where(step > 0, np.diff(speed, axis=1) / np.where(step > 0, step, 1.0), 0.0)
-    slope = np.concatenate([slope, np.zeros((len(slope), 1))], 1)
+    # An instant accelerates as the step that it begins; the last one begins none, and has that of the step before it.
+    last = np.maximum.accumulate(np.where(step > 0, np.arange(step.shape[1]), 0), 1)
+    slope = np.take_along_axis(slope, np.concatenate([last, last[:, -1:]], 1), 1)
     # Not by `dataclasses.replace`: its constructor broadcasts, and what does not change has no instants.
     return eqx.tree_at(
         lambda c: (c.motor_speed, c.motor_acceleration),
