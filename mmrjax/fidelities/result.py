@@ -109,7 +109,7 @@ def slips(robot: Robot, signals: Signals) -> Array:
 def efficiency(out: Scalar, into: Scalar) -> Array:
     """Power out over power in [-]; 0 at rest and where power flows the other way."""
     # What comes back from a slope is no efficiency of the way there.
-    forward = (out > 0) & (into >= out)
+    forward = (out >= 0) & (into >= out)
     return jnp.where(forward, quotient(out, into), 0.0)
 
 
