@@ -21,15 +21,18 @@ OUTPUTS = ("speed", "total_current", "output_torque", "adhesion_used", "efficien
 #: A shaft without friction transmits no power, and its efficiency is 0 over 0.
 OUTPUTS_SHAFT = ("speed", "total_current", "output_torque")
 FORWARD, REVERSE = {"voltage": 24.0, "duty": 1.0}, {"voltage": 24.0, "duty": -1.0}
+STANDS = {"voltage": 24.0, "duty": 0.0}
 #: Tracked robot on level ground: conditions, what is varied, the bound or default at which, into which sides.
 GROUND = [
     (FORWARD, "duty", 1.0, (-1,)),
     (REVERSE, "duty", -1.0, (1,)),
-    *((c, name, 0.0, (1,)) for c in (FORWARD, REVERSE) for name in ("payload", "6T2A.inertia")),
-    *((c, "6T2A.ground.rolling_resistance", 0.0, (1,)) for c in (FORWARD, REVERSE)),
+    *((c, name, 0.0, (1,)) for c in (FORWARD, REVERSE, STANDS) for name in ("payload", "6T2A.inertia")),
+    *((c, "6T2A.ground.rolling_resistance", 0.0, (1,)) for c in (FORWARD, REVERSE, STANDS)),
     *((FORWARD, f"effects.{name}.amplitude", 0.0, (-1, 1)) for name in ("gear_load_loss", "tension_friction")),
     *((FORWARD, name, 0.0, (-1, 1)) for name in ("slope_deg", "running_gear.guide_recess")),
     (REVERSE, "slope_deg", 0.0, (-1, 1)),
+    *((STANDS, name, 0.0, (-1, 1)) for name in ("duty", "voltage")),
+    (STANDS, "slope_deg", 0.0, (1,)),  # of the other side adhesion used falls
     *((FORWARD, name, 0.0, (1,)) for name in ("6T2A.track.loss_coulomb", "6T2A.track.loss_viscous", "motor.inertia")),
     *((FORWARD, "6T2A.track.guide_share", *at) for at in ((0.0, (1,)), (1.0, (-1,)))),
     (FORWARD, "gearbox.efficiency_load", 1.0, (-1,)),

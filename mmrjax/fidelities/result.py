@@ -12,6 +12,7 @@ from jaxtyping import Array, Int
 
 from mmrjax import balances, channels, ground, outputs
 from mmrjax.motor import UNLIMITED
+from mmrjax.one_sided import magnitude
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED, FLAGS, REVERSES, ROLLS_BACK, Result, Signals, quotient
@@ -38,7 +39,7 @@ def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
         voltage=signals.voltage,
         mass=signals.mass,
         traction=sides * signals.traction,
-        adhesion_used=signals.demand / signals.adhesion_limit,
+        adhesion_used=magnitude(signals.demand, signals.direction_travel) / signals.adhesion_limit,
         power_supply=power_supply,
         power_motor=power_motor,
         power_gear=power_gear,
