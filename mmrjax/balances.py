@@ -20,6 +20,7 @@ from mmrjax import channels, contact, ground, masses, posture, power
 from mmrjax import chassis as chassis_room
 from mmrjax.chassis import Chassis
 from mmrjax.conditions import Conditions
+from mmrjax.one_sided import at_least
 from mmrjax.params import Scalar
 from mmrjax.robot import Load, Robot
 from mmrjax.shaft import Shaft
@@ -224,8 +225,9 @@ def gearbox(robot: Robot, chassis: Load, signals: Signals, mover: Scalar | None 
     drive = signals.torque_motor - idle
     inertia_added = added(robot, signals, "inertia")
     # Of shafts without inertia, the side from which power flows and what they transmit are those of next to none.
-    inertia_wheel = jnp.maximum(chassis.inertia + inertia_added, LEAST_INERTIA)
-    side = drive * inertia_wheel + gear.ratio * inertia_motor * load
+    inertia_wheel = LEAST_INERTIA + at_least(chassis.inertia + inertia_added, 0.0)
+    through = gear.ratio * inertia_motor
+    side = (drive * inertia_wheel + through * load) / (inertia_wheel + through)
     efficiency = gear.efficiency_flow(side, signals.direction)
     net = gear.ratio * efficiency * drive - load
     inertia = chassis_room.inertia_reduced(inertia_motor, gear.ratio, efficiency, inertia_wheel)

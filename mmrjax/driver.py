@@ -5,6 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 
+from mmrjax.one_sided import at_least, clip
 from mmrjax.params import Scalar, parameter
 
 #: How fast the duty falls beyond the current limit, per limit exceeded by its own size [-]: 0.1 % over takes 0.5.
@@ -49,8 +50,8 @@ class Driver(eqx.Module):
 
     def duty_limited(self, duty: Scalar, current: Scalar) -> Scalar:
         """Duty D [-] that holds the motor's `current` [A] at the limit, between -1 and 1."""
-        over = jnp.maximum(jnp.abs(current) / self.current_limit - 1, 0.0)
-        return jnp.clip(duty - jnp.sign(current) * STEEPNESS * over, -1.0, 1.0)
+        over = at_least(0.0, jnp.abs(current) / self.current_limit - 1)
+        return clip(duty - jnp.sign(current) * STEEPNESS * over, -1.0, 1.0)
 
     def limits(self, current: Scalar) -> Scalar:
         """Whether the limit acts at a motor's `current` [A]."""

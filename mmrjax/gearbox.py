@@ -8,6 +8,9 @@ import jax.numpy as jnp
 from mmrjax.params import Scalar, parameter
 from mmrjax.signals import quotient
 
+#: Torque below which the gearbox transmits none, so that rounding does not decide which way power flows [N·m].
+NO_TORQUE = 1e-12
+
 
 class Gearbox(eqx.Module):
     """M_r = i η_rm (M_d - M_rf_idle) with M_rf_idle = M_rf0 sign ω + K_fr ω.
@@ -77,9 +80,11 @@ class Gearbox(eqx.Module):
     def efficiency_flow(self, transmitted: Scalar, direction: Scalar) -> Scalar:
         """η_rm where power flows to the wheels, 1/η_b where it flows back, fading to 1 at rest with `direction` [-].
 
-        `transmitted` is the input torque less the idle torque [N·m].
+        `transmitted` is the input torque less the idle torque [N·m]. Without any, the efficiency is that of a load
+        about to grow: power flows to the wheels.
         """
-        flow = jnp.sign(transmitted) * direction
+        way = jnp.where(jnp.abs(transmitted) > NO_TORQUE, jnp.sign(transmitted), jnp.sign(direction))
+        flow = way * direction
         return 1 + flow * jnp.where(flow >= 0, self.efficiency_load - 1, 1 - 1 / self.efficiency_backward)
 
     def torque_output(self, transmitted: Scalar, direction: Scalar) -> Scalar:

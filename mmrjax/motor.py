@@ -11,7 +11,6 @@ from mmrjax.params import Scalar, parameter
 
 _SHEET = "maker's sheet of RE30 310007 (24 V, 60 W)"
 
-ALPHA = 0.00393  # temperature coefficient of copper's resistance at 20 °C [1/K], IEC 60028 (1925)
 #: Temperature for which makers state the resistance of a winding [°C].
 TEMPERATURE_REFERENCE = 25.0
 UNLIMITED = 1e9  # of a limit that nobody states, in its unit
@@ -110,6 +109,8 @@ class Motor(eqx.Module):
         source="reference temperature of the maker's sheet",
     )
     temperature_limit: float = eqx.field(default=125.0, static=True)  # winding [°C], maker's sheet
+    #: α of copper [1/K]: IEC 60028 (1925), at 20 °C; makers take it from 25 °C, where it is 2 % less
+    temperature_coefficient: float = eqx.field(default=0.00393, static=True)
     voltage_limit: float | None = eqx.field(default=None, static=True)  # [V], highest for short; not on this sheet
     speed_limit: float = eqx.field(default=12_000 * 0.10471975511965977, static=True)  # 12 000 rpm, sheet
 
@@ -121,7 +122,11 @@ class Motor(eqx.Module):
         """Voltage across the winding's resistance I R [V], eq. (15); R follows the copper where its `temperature`
         [°C] is given: R (1 + α (T - 25 °C))."""
         drop = current * self.resistance
-        return drop if temperature is None else drop * (1 + ALPHA * (temperature - TEMPERATURE_REFERENCE))
+        return (
+            drop
+            if temperature is None
+            else drop * (1 + self.temperature_coefficient * (temperature - TEMPERATURE_REFERENCE))
+        )
 
     def torque_electromagnetic(self, current: Scalar) -> Scalar:
         """M_de = C_m I [N·m], eq. (17)."""
@@ -146,10 +151,10 @@ class Motor(eqx.Module):
         T = T_a + R_th R I² (1 + α (T - 25 °C)). From R_th R I² α = 1 on every kelvin more brings more than a kelvin.
         """
         rise = self.resistance_thermal * self.resistance * current**2
-        left = 1 - ALPHA * rise
+        left = 1 - self.temperature_coefficient * rise
         finite = left > 0
         settled = self.temperature_ambient + rise * (
-            1 + ALPHA * (self.temperature_ambient - TEMPERATURE_REFERENCE)
+            1 + self.temperature_coefficient * (self.temperature_ambient - TEMPERATURE_REFERENCE)
         ) / jnp.where(finite, left, 1.0)
         return jnp.where(finite, settled, jnp.inf)
 
@@ -157,7 +162,7 @@ class Motor(eqx.Module):
     def current_continuous(self) -> Scalar:
         """Current at which the winding settles at its permissible temperature [A], its resistance risen with it."""
         allowed = jnp.maximum(self.temperature_limit - self.temperature_ambient, 1.0)
-        hot = self.resistance * (1 + ALPHA * (self.temperature_limit - TEMPERATURE_REFERENCE))
+        hot = self.resistance * (1 + self.temperature_coefficient * (self.temperature_limit - TEMPERATURE_REFERENCE))
         return jnp.sqrt(allowed / jnp.maximum(self.resistance_thermal * hot, 1e-9))
 
     def heating(self, power: Scalar, winding: Scalar, housing: Scalar) -> tuple[Scalar, Scalar]:

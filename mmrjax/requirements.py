@@ -18,7 +18,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.derived import steepest_slope
 from mmrjax.fidelities.steady import operating
 from mmrjax.fidelities.turning import circling
-from mmrjax.motor import ALPHA, TEMPERATURE_REFERENCE
+from mmrjax.motor import TEMPERATURE_REFERENCE
 from mmrjax.params import Index, Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED, CUT_OFF, Signals
@@ -158,7 +158,7 @@ def packed(robot: Robot, cells: Scalar) -> Robot:
 
 def _at(robot: Robot, point: Point, rated: Ratings) -> tuple[Robot, Conditions]:
     """The robot with its winding at ambient temperature, as a run begins, and the conditions of a point."""
-    copper = 1 + ALPHA * (point.ambient - TEMPERATURE_REFERENCE)
+    copper = 1 + robot.motor.temperature_coefficient * (point.ambient - TEMPERATURE_REFERENCE)
     motor = dataclasses.replace(robot.motor, resistance=robot.motor.resistance * copper)
     robot = packed(dataclasses.replace(robot, motor=motor), rated.cells)
     return robot, Conditions(
@@ -185,7 +185,7 @@ def heat_left(robot: Robot, point: Point, current: Scalar, limit: Scalar) -> Sca
     1 - I² R_th R (1 + α (T - 25 °C)) / (T - T_a); `robot` as stated, not as `_at` gives it.
     """
     motor = robot.motor
-    hot = motor.resistance * (1 + ALPHA * (limit - TEMPERATURE_REFERENCE))
+    hot = motor.resistance * (1 + motor.temperature_coefficient * (limit - TEMPERATURE_REFERENCE))
     return 1 - current**2 * motor.resistance_thermal * hot / jnp.maximum(limit - point.ambient, 1.0)
 
 

@@ -177,7 +177,7 @@ class Result(eqx.Module):
         voltage: at the motors [V].
         mass: total [kg].
         traction: of both sides [N].
-        adhesion_used: demand over the largest traction of the friction law [-]; above 1 the robot slides.
+        adhesion_used: size of the demand over the largest traction of the friction law [-]; above 1 the robot slides.
         power_supply: P_e taken by the motors [W].
         power_motor: N_d at the motor shafts [W].
         power_gear: N_r at the gearbox outputs [W].

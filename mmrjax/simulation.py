@@ -317,7 +317,8 @@ def _own_mass(own: tuple[Scalar, ...], configuration: jax.Array | np.ndarray, pa
 
 def _check_conditions(conditions: Conditions) -> None:
     stated_names = {f.name for f in dataclasses.fields(conditions) if getattr(conditions, f.name) is not None}
-    if not has_tracer(conditions.duty) and (np.asarray(conditions.duty) == 1).all():  # as where none is stated
+    # A duty that nobody states is 1, and under a transformation a tracer: that is no statement either.
+    if has_tracer(conditions.duty) or (np.asarray(conditions.duty) == 1).all():
         stated_names.remove("duty")
     if why := sides_contradict(stated_names):
         raise UsageError(why)

@@ -263,8 +263,8 @@ def grip(
 ) -> Grip:
     """Forces and loads of both sides, which hang together.
 
-    The load moves to the outer side, T = h ΣF_y / B, and to the rear, N x_p = N x_c - h ΣF_x; no side bears less than
-    nothing.
+    The load moves to the outer side, T = h ΣF_y / B, and to the rear, N x_p = N x_c - h (ΣF_x - ΣR); no side bears
+    less than nothing.
 
     Args:
         stance: how it stands; friction: of the ground; adhesion: the surface's ratio [-].

@@ -288,6 +288,23 @@ def test_drive_statuses(small):
     assert names(short.result)[0] == "not_settled"
 
 
+def test_a_robot_that_stands_ends_as_steady_says(small):
+    """Parked, held on slopes either way, and stalled."""
+    robot, go = small
+    runs = Conditions(
+        voltage=[0.0, 0.0, 0.0, 0.0, 0.5, 0.5, -0.02, 0.3, -0.3],
+        slope_deg=[0.0, 5.0, -5.0, 8.0, 5.0, 17.0, 10.0, -2.0, 0.0],
+        configuration=[0.0] * 9,
+        payload=[0.0, 60.0, 60.0, 60.0, 0, 0, 0, 0, 0],
+        battery=[0.0] * 9,
+        discharge=[0.0] * 9,
+    )
+    driven, still = go(runs, 0.05).result, steady_batch(robot, runs)
+    assert names(driven) == names(still) == ["stalled"] * 9
+    for name in ("traction", "adhesion_used", "output_torque", "total_current", "power_supply", "winding_settled"):
+        np.testing.assert_allclose(getattr(driven, name), getattr(still, name), rtol=1e-6, atol=1e-9, err_msg=name)
+
+
 @pytest.mark.slow
 def test_drive_out_of_steps_has_failed(robot):
     run = drive_batch(robot, Conditions(voltage=[24.0]), jnp.linspace(0.0, 1.0, 3), 1e-6, 5)

@@ -15,7 +15,6 @@ from mmrjax.conditions import Conditions
 from mmrjax.errors import UsageError
 from mmrjax.fidelities import mission_straight, mission_turning
 from mmrjax.fidelities.mission import TOLERANCE, Start, mission
-from mmrjax.motor import ALPHA
 from mmrjax.profile import MODES, Profile, profile
 from mmrjax.signals import FLAGS, STATUSES
 
@@ -220,7 +219,7 @@ def test_temperature_follows_the_two_bodies_in_closed_form(robot):
 
     # With copper: C_w T_w' = U² / (R (1 + α (T_w - 25))) - (T_w - T_h) / R_wh at a constant voltage.
     def rates(t, y):
-        power = 4.0 / (0.611 * (1 + ALPHA * (y[0] - 25)))
+        power = 4.0 / (0.611 * (1 + 0.00393 * (y[0] - 25)))
         flow = (y[0] - y[1]) / 1.7
         return [(power - flow) / C_w, (flow - (y[1] - 25) / 6.0) / C_h]
 

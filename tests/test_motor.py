@@ -6,7 +6,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from worlds import paper
 
-from mmrjax.motor import ALPHA, Motor
+from mmrjax.motor import Motor
 
 RNG = np.random.default_rng(14)
 
@@ -59,7 +59,7 @@ def test_motor_temperature_settles_at_ambient_plus_heat():
 def test_no_temperature_settles_where_every_kelvin_brings_more_than_a_kelvin():
     """α R_th R I² = 1 at 8.1 A for the packaged motor: its stall has no settled temperature."""
     motor = Motor()
-    edge = float((ALPHA * motor.resistance_thermal * motor.resistance) ** -0.5)
+    edge = float((motor.temperature_coefficient * motor.resistance_thermal * motor.resistance) ** -0.5)
     assert np.isfinite(motor.temperature_settled(0.99 * edge)) and np.isinf(motor.temperature_settled(1.01 * edge))
     assert float(motor.temperature_settled(3.91)) == pytest.approx(motor.temperature_limit, rel=5e-3)
 

@@ -332,6 +332,18 @@ def test_vmap_and_jit_go_through(robot):
     assert len(batch.table().splitlines()) == 4
 
 
+@pytest.mark.parametrize(("model", "transform"), [("steady", jax.grad), ("drive", lambda f: f)])
+def test_a_turn_passes_jit_though_its_default_duty_is_a_tracer_there(robot, model, transform):
+    """Traced, not compiled."""
+    options = {} if model == "steady" else dict(model="drive", duration=0.1, history=False)
+
+    def yaw_rate(left):
+        run = mm.Conditions("6T2A", voltage=24.0, duty_left=left, duty_right=1.0)
+        return mm.simulate(robot, run, **options).result.reading["yaw_rate"]
+
+    assert jax.eval_shape(jax.jit(transform(yaw_rate)), 0.5).dtype == float
+
+
 def test_a_delay_is_known_under_jit_where_the_robot_is_no_argument(robot):
     """Or no history passes `jax.jit`."""
     assert jax.eval_shape(lambda x: x if robot.rig.prompt else (x, x), 1.0).shape == ()

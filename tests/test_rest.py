@@ -15,7 +15,7 @@ from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.mission import mission
 from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.profile import profile
-from mmrjax.signals import STATUSES
+from mmrjax.signals import STALLED, STATUSES
 
 WORDS = np.array(STATUSES)
 KINDS = ("6T2A", "4W2T")
@@ -102,8 +102,41 @@ def test_a_robot_that_its_drive_and_the_ground_hold_stands():
     used = np.asarray(found.adhesion_used)
     assert (used[:4] <= 1).all() and (used[4:] > 1).all()  # the ground carries no more than it can
     np.testing.assert_allclose(found.total_current[1], 2 * 0.5 / 0.611, rtol=1e-9)
-    limit = 0.32 * 13.1 / 2 * paper.G * np.cos(np.radians(17.0))
-    np.testing.assert_allclose(found.traction[1], 2 * limit, rtol=1e-9)
+    np.testing.assert_allclose(found.traction[1], 13.1 * paper.G * np.sin(np.radians(17.0)), rtol=1e-9)
+
+
+#: Voltage, slope [deg] and payload [kg] of a 6T2A that stands: parked on level ground and on slopes either way, with
+#: rolling resistance in part, stalled, its motors too weak forward and backward.
+STANDING = [
+    (0.0, 0.0, 0.0), (0.0, 5.0, 60.0), (0.0, -5.0, 60.0), (0.0, 8.0, 60.0), (0.5, 5.0, 0.0), (0.5, 17.0, 0.0),
+    (-0.02, 10.0, 0.0), (0.3, -2.0, 0.0), (-0.3, 0.0, 0.0),
+]  # fmt: skip
+
+
+def test_a_robot_that_stands_is_in_static_equilibrium():
+    """By formulas of their own: traction holds gravity along the slope as far as shafts and ground do, and the output
+    carries what friction between it and the cause does not."""
+    voltage, slope, payload = np.array(STANDING).T
+    runs = Conditions(np.zeros(len(voltage), int), voltage, slope, payload)
+    found = steady_batch(robots.nominal(), runs)
+    assert (np.asarray(found.status) == STALLED).all()
+    normal, pull = ((13.1 + payload) / 2 * paper.G * f(np.radians(slope)) for f in (np.cos, np.sin))
+    radius = 48 * 5e-3 / (2 * np.pi)
+    belt, current = 0.35 + 0.2 * 0.3 * radius * normal, voltage / 0.611
+    drive = [0.0259 * current - way * (2.7e-3 + 0.3e-3) for way in (1, -1)]
+    given = [48 * d * np.where(d * way > 0, 0.74, 1 / 0.74) for d, way in zip(drive, (1, -1), strict=True)]
+    traction = np.clip(pull, (given[0] - belt) / radius, (given[1] + belt) / radius)
+    traction = np.clip(traction, -0.32 * normal, 0.32 * normal)
+    least, most = np.maximum(radius * traction - belt, given[0]), np.minimum(radius * traction + belt, given[1])
+    torque = np.clip(0.0, least, most)
+    assert (np.abs(traction - pull) > 1).sum() == 1 and (torque == 0).sum() == 2  # each part of the formula counts
+    scale = dict(rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.traction, 2 * traction, **scale)
+    np.testing.assert_allclose(found.adhesion_used, np.abs(traction) / (0.32 * normal), **scale)
+    np.testing.assert_allclose(found.output_torque, torque, **scale)
+    np.testing.assert_allclose(found.power_supply, 2 * 0.611 * current**2, rtol=1e-9, atol=1e-12)
+    for name in ("power_motor", "power_gear", "power_ground", "power_lift", "slip", "speed", "efficiency_motor"):
+        np.testing.assert_array_equal(getattr(found, name), 0.0)
 
 
 def agree(values, runs, effects, seconds=12.0):

@@ -19,6 +19,7 @@ from mmrjax.effects import Effect
 from mmrjax.effects.curve import in_travel
 from mmrjax.effects.scaled import amplitude_of as amplitude_of
 from mmrjax.effects.scaled import shape_of as shape_of
+from mmrjax.one_sided import clip
 from mmrjax.params import Parameter, Scalar, parameter
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
@@ -73,7 +74,7 @@ def shaped(scales: Scales, z: Array) -> Array:
     value, spread, sd, low, high = scales
     moved = value * jnp.exp(spread * z) + sd * z
     turned = jnp.remainder(moved + jnp.pi, 2 * jnp.pi) - jnp.pi
-    return jnp.where(jnp.asarray(sd) > 0, turned, jnp.clip(moved, low, high))
+    return jnp.where(jnp.asarray(sd) > 0, turned, clip(moved, low, high))
 
 
 #: Where on the prior of a shape parameter the library is scored, in its sds.

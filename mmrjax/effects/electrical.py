@@ -5,7 +5,6 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from mmrjax.effects.base import Effect, amplitude
-from mmrjax.motor import ALPHA
 from mmrjax.params import Scalar, parameter
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
@@ -103,7 +102,7 @@ class WindingHeating(ElectricalEffect):
             return jnp.zeros_like(signals.current)
         rise = jnp.minimum(motor.temperature_cold(signals.current), motor.temperature_limit)
         rise = rise - motor.temperature_ambient
-        return self.amplitude * ALPHA * rise * motor.voltage_winding(signals.current)
+        return self.amplitude * motor.temperature_coefficient * rise * motor.voltage_winding(signals.current)
 
 
 class ThermalDrift(ElectricalEffect):
@@ -157,4 +156,4 @@ class ThermalDrift(ElectricalEffect):
         if signals.temperature is not None:
             return jnp.zeros_like(signals.current)
         drop = robot.motor.voltage_winding(signals.current)
-        return self.amplitude * ALPHA * self.recall(robot, signals) * drop
+        return self.amplitude * robot.motor.temperature_coefficient * self.recall(robot, signals) * drop

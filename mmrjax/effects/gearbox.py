@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from mmrjax.effects.base import Effect, amplitude
+from mmrjax.one_sided import at_least, magnitude
 from mmrjax.params import Scalar, parameter
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
@@ -43,7 +44,7 @@ class GearLoadLoss(GearboxEffect):
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         load = torque_output(robot, signals)
-        return self.amplitude * jnp.abs(load) * signals.direction
+        return self.amplitude * magnitude(load, signals.direction) * signals.direction
 
 
 class GearQuadraticLoss(GearboxEffect):
@@ -128,5 +129,5 @@ class BackdrivingLoss(GearboxEffect):
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        driving = jnp.maximum(-torque_output(robot, signals) * signals.direction, 0.0)
+        driving = at_least(0.0, -torque_output(robot, signals) * signals.direction)
         return self.amplitude * driving * signals.direction

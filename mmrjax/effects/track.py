@@ -6,6 +6,7 @@ import jax.numpy as jnp
 
 from mmrjax.effects.base import Effect, amplitude
 from mmrjax.effects.periodic import Periodic, phase_parameter
+from mmrjax.one_sided import magnitude
 from mmrjax.params import Index, Scalar, parameter
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
@@ -96,7 +97,7 @@ class TensionFriction(TrackEffect):
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         radius = robot.chassis(signals.configuration).radius
-        return self.amplitude * radius * jnp.abs(signals.traction) * signals.direction
+        return self.amplitude * radius * magnitude(signals.traction, signals.direction) * signals.direction
 
 
 class CentrifugalTension(TrackEffect):

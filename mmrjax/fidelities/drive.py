@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 
@@ -17,7 +16,7 @@ from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import turning
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
-from mmrjax.fidelities.rest import holds, status_moving, voltage_at_rest
+from mmrjax.fidelities.rest import holds, standing, status_moving, voltage_at_rest
 from mmrjax.fidelities.result import result, withhold
 from mmrjax.fidelities.rosenbrock import norm, step_longest
 from mmrjax.fidelities.steady import operating_signals
@@ -194,16 +193,9 @@ def drive(
     moves = jnp.where(parked, jnp.zeros_like(y0).at[jnp.asarray([0, 4])].set(1.0), 1.0)
     ys, went = _integrated(rates, _norm, robot, conditions, moves, y0, times, tolerance, max_steps)
     signals = jax.vmap(lambda y: balances.moving(robot, conditions, state_of(robot, y)))(ys)
-    # Friction at rest carries what gravity and the motors ask of a robot that it holds.
-    still = jnp.zeros_like(signals.acceleration)
-    held = jnp.clip(signals.demand, -signals.adhesion_limit, signals.adhesion_limit)
-    signals = dataclasses.replace(
-        signals,
-        demand=jnp.where(parked, held, signals.demand),
-        traction=jnp.where(parked, held, signals.traction),
-        acceleration=jnp.where(parked, still, signals.acceleration),
-        acceleration_wheel=jnp.where(parked, still, signals.acceleration_wheel),
-    )
+    if not imposed:
+        static = jax.vmap(lambda y: standing(robot, conditions, state_of(robot, y)))(ys)
+        signals = jax.tree.map(lambda here, there: jnp.where(parked, here, there), static, signals)
     end = jax.tree.map(lambda x: x[-1], signals)
     status = _status(robot, conditions, end, parked, went)
     return _kept(

@@ -14,6 +14,7 @@ from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import rest, result, rosenbrock
 from mmrjax.fidelities.mission_steps import Asked
+from mmrjax.one_sided import clip
 from mmrjax.params import Scalar
 from mmrjax.profile import MOTOR_SPEED, SPEED, Profile
 from mmrjax.robot import Robot
@@ -92,10 +93,10 @@ def driven(
     voltage_source = source(robot, conditions, state.discharge)
     voltage = robot.driver.demand(error, integral, demanded, robot.motor.torque_constant)
     wanted = voltage / jnp.maximum(voltage_source, 1e-3)
-    limited = robot.driver.duty_limited(jnp.clip(wanted, -1.0, 1.0), state.current)
+    limited = robot.driver.duty_limited(clip(wanted, -1.0, 1.0), state.current)
     # What the limits take away, the integral gives back: it does not wind up.
     excess = (wanted - limited) * voltage_source / (robot.driver.gain * robot.motor.torque_constant + 1e-12)
-    duty = jnp.clip(jnp.where(controlled, forward(conditions) * wanted, conditions.duty), -1.0, 1.0)
+    duty = clip(jnp.where(controlled, forward(conditions) * wanted, conditions.duty), -1.0, 1.0)
     return duty, jnp.where(controlled, error - excess, 0.0), jnp.where(controlled, error, 0.0)
 
 

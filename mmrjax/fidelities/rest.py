@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from mmrjax import balances
+from mmrjax import balances, one_sided
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.result import slips, travels
 from mmrjax.params import Scalar
@@ -68,6 +68,54 @@ def _carried(robot: Robot, conditions: Conditions, state: State, direction: Scal
     limit = signals.adhesion_limit
     carried = dataclasses.replace(signals, traction=jnp.clip(signals.demand, -limit, limit))
     return balances.gearbox(robot, robot.chassis(conditions.configuration), carried)
+
+
+def standing(robot: Robot, conditions: Conditions, state: State) -> Signals:
+    """All signals of a robot that friction at rest holds, in static equilibrium.
+
+    What friction at rest carries is not determined by the loads alone. Here traction is what gravity along the slope
+    asks for; rolling resistance takes what of it neither shafts nor adhesion hold. The torque at the output is the
+    smallest with which motor side and track side both stand, so friction takes what it can nearest to its cause.
+
+    Args:
+        conditions: their voltage or current imposed, no speed; state: its current is that which flows at rest.
+    """
+    robot = robot.within(conditions.configuration)
+    chassis, gear, still = robot.chassis(conditions.configuration), robot.gearbox, _still(state)
+    # About to turn forward and backward: the two ends of what friction can do.
+    ends = [balances.settled(robot, conditions, still, way)[0] for way in (1.0, -1.0)]
+    ahead, back = ends
+    # Least and most torque that comes through the gearbox, and least and most that the track's friction takes.
+    given = [
+        gear.torque_output(end.torque_motor - end.torque_idle, end.direction)
+        - (end.torque_load - end.torque_track_loss - chassis.radius * end.traction)
+        for end in ends
+    ]
+    lost = [end.torque_track_loss for end in (back, ahead)]
+    traction = ahead.gravity
+    if robot.has_ground:
+        least_, most = ((given[k] - lost[1 - k]) / chassis.radius for k in range(2))
+        traction = one_sided.clip(one_sided.clip(traction, least_, most), -ahead.adhesion_limit, ahead.adhesion_limit)
+    carried = chassis.radius * traction
+    torque = one_sided.clip(0.0, jnp.maximum(carried + lost[0], given[0]), jnp.minimum(carried + lost[1], given[1]))
+    none = jnp.zeros_like(carried)
+    return dataclasses.replace(
+        ahead,
+        direction=none,
+        direction_travel=none,
+        resistance=traction - ahead.gravity,
+        demand=traction,
+        traction=traction,
+        torque_track_loss=torque - carried,
+        torque_load=torque,
+        torque_gear=torque,
+        torque_output=torque,
+        torque_input=torque / gear.ratio,
+        torque_net=none,
+        speed_sliding=none,
+        acceleration_wheel=none,
+        acceleration=none,
+    )
 
 
 def _still(state: State) -> State:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Int
 
 from mmrjax import balances, channels, ground, outputs
 from mmrjax.motor import UNLIMITED
+from mmrjax.one_sided import magnitude
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED, FLAGS, REVERSES, ROLLS_BACK, Result, Signals, quotient
@@ -38,7 +39,7 @@ def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
         voltage=signals.voltage,
         mass=signals.mass,
         traction=sides * signals.traction,
-        adhesion_used=signals.demand / signals.adhesion_limit,
+        adhesion_used=magnitude(signals.demand, signals.direction_travel) / signals.adhesion_limit,
         power_supply=power_supply,
         power_motor=power_motor,
         power_gear=power_gear,
@@ -109,7 +110,7 @@ def slips(robot: Robot, signals: Signals) -> Array:
 def efficiency(out: Scalar, into: Scalar) -> Array:
     """Power out over power in [-]; 0 at rest and where power flows the other way."""
     # What comes back from a slope is no efficiency of the way there.
-    forward = (out > 0) & (into >= out)
+    forward = (out >= 0) & (into >= out)
     return jnp.where(forward, quotient(out, into), 0.0)
 
 

@@ -12,14 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mmrjax import balances, channels, outputs
+from mmrjax import balances, channels, ground, outputs
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import turning
 from mmrjax.fidelities.base import Fidelity, Implicit, Progress, Run
 from mmrjax.fidelities.elimination import Vector
 from mmrjax.fidelities.newton import root
-from mmrjax.fidelities.rest import creeps, direction, slides_in_place, voltage_at_rest
+from mmrjax.fidelities.rest import creeps, direction, slides_in_place, standing, voltage_at_rest
 from mmrjax.fidelities.result import result, travels, turned, withhold
 from mmrjax.params import Scalar
 from mmrjax.rarely import rarely
@@ -150,16 +150,16 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
     # What the contact's law gives a robot that stands as creep, friction at rest holds.
     crept = jnp.abs(point.speed) >= robot.chassis(conditions.configuration).speed_still
     parked = (point.status == STALLED) & ((jnp.abs(point.theoretical_speed) < 1e-9) | crept)
-    reading = {**point.reading, "speed": jnp.where(parked, 0.0, point.speed)}
-    # Nor does the ground of a robot that stands carry more than it can.
-    used = jnp.clip(point.adhesion_used, -1.0, 1.0)
-    held = parked & (used != point.adhesion_used)
-    carried = used / jnp.where(held, point.adhesion_used, 1.0)
+    speed = jnp.where(parked, 0.0, point.speed)
+    reading = {**point.reading, "speed": speed}
+    # Nor does the ground of a robot that stands carry more than it can, though its shafts creep.
+    beyond = parked & (point.adhesion_used > 1)
     point = dataclasses.replace(
         point,
         reading=reading,
-        adhesion_used=jnp.where(held, used, point.adhesion_used),
-        traction=jnp.where(held, carried * point.traction, point.traction),
+        slip=jnp.where(parked, ground.slip(speed, point.theoretical_speed), point.slip),
+        adhesion_used=jnp.where(beyond, 1.0, point.adhesion_used),
+        traction=point.traction / jnp.where(beyond, point.adhesion_used, 1.0),
         power_ground=jnp.where(parked, 0.0, point.power_ground),
         power_lift=jnp.where(parked, 0.0, point.power_lift),
     )
@@ -217,6 +217,10 @@ def _operating_at(
         beyond = jnp.abs(signals.demand) > signals.adhesion_limit
         slides = rarely(beyond, _slides_in_place, given, jnp.zeros_like(beyond)) if stands else beyond
         status = jnp.where(beyond, jnp.where(slides, SLIDES, STALLED), status)
+    if conditions.motor_speed is None:
+        stands_still = (status == STALLED) & (jnp.abs(signals.speed_theoretical) < 1e-9)
+        static = standing(robot, conditions, _state(unknowns, conditions.discharge))
+        signals = jax.tree.map(lambda here, there: jnp.where(stands_still, here, there), static, signals)
     status = jnp.where(solved, status, FAILED)
     empty = (conditions.battery > 0.5) & robot.battery.empty(conditions.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
