@@ -120,6 +120,9 @@ def to_json(found: Settled) -> dict[str, Any]:
         "drift": found.drift,
         "gaps": len(found.gaps),
         "scatter": dict(found.scatter),
+        "glitches": {
+            s.channel.name: sum(k.glitches.get(s.channel.name, 0) for k in found.kept) for s in found.signals
+        },
         "left_out": [dict(zip(("why", "stretches", "samples", "rows", "do"), row, strict=True)) for row in left],
         "notes": words.remarks(found, SettledRuns.fewest),
     }
