@@ -28,6 +28,8 @@ STILL = 0.02
 FINE = 0.005
 #: Largest change of a mean within a stretch, as a share of it, where none is stated.
 DRIFT = 0.02
+#: Shortest stretch where none is stated [s].
+LEAST = 0.3
 #: Fewest samples of a stretch, and of its parts between which means are compared.
 FEWEST, PART = 8, 3
 #: Sds within which means of parts agree.
@@ -41,7 +43,7 @@ COARSE = 0.2
 #: Equal readings one after the other that an instrument with noise does not show, and up to what share of all steps
 #: readings that are equal to the one before are noise's chance.
 STUCK, CHANCE = 20, 0.2
-#: Robust sds, and shares of the largest change of a mean, by which a reading is off its neighbours where it is a glitch.
+#: Robust sds, and steps of the instrument, by which a glitch is off the readings next to it.
 FAR = 6.0
 #: Share of glitches in a stretch up to which the other readings have a mean; samples beside which a reading is held.
 MOST_GLITCHES, BESIDE = 0.25, (21, 101)
@@ -226,7 +228,7 @@ def _divided(runs: Runs, shortest: float | None, drift: float, inertia: Mapping[
         raise BadData(f"{runs.source}: column time_s is missing, and a row is a settled run already; give it to loop")
     each = _in_order(runs)
     step = float(np.median(np.concatenate([np.diff(runs["time_s"][rows]) for rows in each])))
-    shortest = max(0.3, 20 * step) if shortest is None else shortest
+    shortest = max(LEAST, 20 * step) if shortest is None else shortest
     half = max(1, round(shortest / 6 / step))
     drives = applied(runs)
     gaps: list[int] = []
@@ -769,10 +771,19 @@ def _nothing(found: Settled) -> str:
     why = max(dict.fromkeys(whys), key=lambda w: sum(s.lasts for s in found.stretches if s.why == w))
     rows = f"rows {longest.rows[0] + 1} to {longest.rows[-1] + 1}"
     if why in ("changes", "short"):
+        step = longest.lasts / max(len(longest.rows) - 1, 1)
+        held, asked = f"for {longest.lasts:.3g} s", f"{found.shortest:.3g} s are asked for"
+        cure = "hold each level longer, state --shortest"
+        if len(longest.rows) < FEWEST or found.shortest > longest.lasts >= LEAST:  # it is the samples that are few
+            needed = max(FEWEST, round(found.shortest / step) if step > 0 else FEWEST)
+            held, asked = f"for {counted(len(longest.rows), 'sample')}", f"{needed} are needed"
+            cure = (
+                "log faster or hold each level longer (--shortest states the time, of at least "
+                f"{FEWEST} samples), remove time_s if each row is a settled run already"
+            )
         return (
-            f"{source}: no settled stretch: what is imposed holds for {longest.lasts:.3g} s at most ({rows}), and "
-            f"{found.shortest:.3g} s are asked for; hold each level longer, state --shortest, or give the log to "
-            "loop as it is (time histories)"
+            f"{source}: no settled stretch: what is imposed holds {held} at most ({rows}), and {asked}; {cure}, or "
+            "give the log to loop as it is (time histories)"
         )
     if why in ("settling", "accelerates"):
         return (

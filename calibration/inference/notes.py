@@ -83,6 +83,32 @@ class Unmeasured(Note):
     name: str
 
 
+class Repeats(Note):
+    """Rows under the same conditions whose readings differ beyond their noise.
+
+    Attributes:
+        source: of the table; rows: numbers of two of them; column: of the readings; values: theirs [its unit].
+        apart: by how much, in sds or as a share, as text.
+        unused: columns that differ between the two rows and are no conditions.
+        more: groups of such rows beside this one.
+    """
+
+    source: str
+    rows: tuple[int, int]
+    column: str
+    values: tuple[float, float]
+    apart: str
+    unused: tuple[str, ...] = ()
+    more: int = 0
+
+
+class StiffSupply(Note):
+    """A voltage that is read and is the same in every row."""
+
+    column: str
+    value: float
+
+
 class Constant(Note):
     """A condition that does not vary.
 

@@ -56,15 +56,13 @@ def glitches(found: Settled) -> list[str]:
     for channel in (s.channel for s in found.signals):
         mine = [s for s in found.kept if channel.name in s.glitches]
         if mine:
-            count, worst = (
-                sum(s.glitches[channel.name] for s in mine),
-                max(mine, key=lambda s: s.glitches[channel.name]),
-            )
-            share = 100 * worst.glitches[channel.name] / len(worst.rows)
+            counts = [s.glitches[channel.name] for s in mine]
+            worst = mine[counts.index(max(counts))]
             said.append(
-                f"{channel.column}: {counted(count, 'reading')} in {counted(len(mine), 'settled run')} left out of the "
-                f"mean, far from the readings next to them; most in rows {worst.rows[0] + 1} to {worst.rows[-1] + 1} "
-                f"({share:.2g} %); look at the instrument, or log a mean if they are pulses"
+                f"{channel.column}: {counted(sum(counts), 'reading')} in {counted(len(mine), 'settled run')} left "
+                f"out of the mean, far from the readings next to them; most in rows {worst.rows[0] + 1} to "
+                f"{worst.rows[-1] + 1} ({100 * max(counts) / len(worst.rows):.2g} %); look at the instrument, or log "
+                "a mean if they are pulses"
             )
     return said
 
