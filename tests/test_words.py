@@ -68,6 +68,11 @@ SAMPLES = [
         "remove it",
     ),
     (
+        of_fit.Turned("r.csv", "motor_current_A", "Iq", 8.04, 0.31),
+        "r.csv, Iq: off by 8 (rms) from what the file's numbers give, with the other sign by 0.31; if it is turned "
+        'round, state [columns] motor_current_A = {column = "Iq", factor = -1}',
+    ),
+    (
         of_fit.StiffSupply("motor_voltage_V", 24.0),
         "motor_voltage_V is 24 in every row: taken for a stiff supply; if it is no reading, remove the column",
     ),

@@ -146,6 +146,13 @@ class Settled:
         """Those that are settled runs."""
         return tuple(s for s in self.stretches if not s.why)
 
+    def settled_runs(self) -> Runs:
+        """The settled runs, as a table of runs that is read."""
+        columns = {**self.runs.columns, **self.table()}
+        count = len(self.kept)
+        columns = {name: x for name, x in columns.items() if len(x) == count and name not in ("time_s", "mode")}
+        return dataclasses.replace(self.runs, columns=columns, extras={}, log=None)
+
     def table(self) -> dict[str, np.ndarray]:
         """The settled runs, a column each as tables of runs have them."""
         kept = self.kept

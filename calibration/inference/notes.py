@@ -102,6 +102,21 @@ class Repeats(Note):
     more: int = 0
 
 
+class Turned(Note):
+    """A channel whose readings fit the robot with the other sign.
+
+    Attributes:
+        source: of the table; column: of the channel; theirs: its name in the file.
+        off, turned: rms difference from the robot of the file, as read and turned round [unit of the column].
+    """
+
+    source: str
+    column: str
+    theirs: str
+    off: float
+    turned: float
+
+
 class StiffSupply(Note):
     """A voltage that is read and is the same in every row."""
 

@@ -124,6 +124,8 @@ SAID: dict[type, str | Callable[[Any], str]] = {
     notes.Unmeasured: unmeasured,
     notes.Constant: constant,
     notes.Repeats: repeats,
+    notes.Turned: "{source}, {theirs}: off by {off:.2g} (rms) from what the file's numbers give, with the other sign "
+    'by {turned:.2g}; if it is turned round, state [columns] {column} = {{column = "{theirs}", factor = -1}}',
     notes.StiffSupply: "{column} is {value:g} in every row: taken for a stiff supply; if it is no reading, remove "
     "the column",
     notes.EndsEarly: ends_early,
