@@ -6,14 +6,34 @@ import difflib
 import re
 from collections.abc import Iterable
 
+#: Longest word of a message, of which `SHOWN` characters are kept if it is longer; longest path; longest message.
+WORD, SHOWN, PATH, LONGEST = 80, 40, 300, 900
+
+
+def shortened(message: str) -> str:
+    """Returns a message without the rest of very long words and the middle of very long text."""
+
+    def cut(word: re.Match[str]) -> str:
+        if len(word[0]) <= (PATH if "/" in word[0] else WORD):
+            return word[0]
+        end = word[0][len(word[0].rstrip(";,:.)")) :]
+        return f"{word[0][:SHOWN]}… ({len(word[0]) - len(end):,} characters){end}"
+
+    found = re.sub(r"\S+", cut, message)
+    return found if len(found) <= LONGEST else f"{found[: 2 * LONGEST // 3]} … {found[-LONGEST // 4 :]}"
+
 
 class UsageError(ValueError):
     """Wrong use of the public API; one sentence: where, what came, what is allowed."""
 
+    def __init__(self, message: str) -> None:
+        """Keeps the message `shortened`."""
+        super().__init__(shortened(message))
+
 
 def counted(count: int, noun: str) -> str:
     """`1 run`, `2,000 runs`: how many of what a noun in the singular names, whose plural has an s."""
-    return f"{count:,} {noun}{'s' * (count != 1)}"
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"  # a NumPy integer compares to no bool of Python
 
 
 def choices(word: str, allowed: Iterable[str], most: int = 1, shown: Iterable[str] | None = None) -> str:

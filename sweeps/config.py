@@ -13,7 +13,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from pydantic_core import PydanticCustomError
 
 from calibration.data.columns import CONDITIONS, ROWS, SIDES
-from calibration.data.errors import BadConfiguration, choices, toml_content, toml_text
+from calibration.data.errors import BadConfiguration, choices, parsed
+from calibration.data.input_files import toml_content, toml_text
 from mmrjax import channels, fidelities
 from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
 from sweeps.flags import flags
@@ -777,7 +778,7 @@ def settings(options: list[str] | None) -> dict[str, bool | float] | None:
         name, equals, value = option.partition("=")
         try:
             word = value.strip()
-            table[name.strip()] = word == "true" if word in ("true", "false") else float(word)
+            table[name.strip()] = word == "true" if word in ("true", "false") else parsed(word)
         except ValueError:
             raise BadConfiguration(
                 f"--set: got {option}; expected NAME=VALUE with a number, such as motor.resistance=0.9"
@@ -803,7 +804,7 @@ def axis(option: str, text: str | None) -> tuple[float, ...] | None:
     values: list[float] = []
     for part in text.split(","):
         try:
-            numbers = [float(n) for n in part.split(":")]
+            numbers = [parsed(n) for n in part.split(":")]
             if len(numbers) == 1:
                 values += numbers
                 continue

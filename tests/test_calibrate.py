@@ -24,7 +24,7 @@ from calibration.data.errors import BadConfiguration, BadData
 from calibration.inference import noise, observers, priors
 from calibration.inference import optimizers as fit
 from calibration.inference.calibrate import calibrate
-from calibration.inference.notes import Constant, SamePredictions, Unmeasured
+from calibration.inference.notes import Constant, Repeats, SamePredictions, Unmeasured
 from calibration.inference.observers import SettledRuns
 from calibration.inference.remarks import remarks
 from calibration.inference.result import HeldOut
@@ -229,19 +229,26 @@ def test_a_constant_condition_is_said(measured):
     assert Constant("slope_deg", 5.0, "guides") in notes
 
 
-def test_contradictory_replicates_are_refused(measured):
+def test_repeats_that_differ_are_said_and_no_error(measured):
     twice = measured.where(np.r_[0:20, 3])
     current = twice["total_current_A"].copy()
     current[20] = 5.2
     other = changed(twice, total_current_A=current)
-    with pytest.raises(
-        BadData, match=r"rows 4 and 21, total_current_A: the same conditions gave 3.45 and 5.2, 40% apart"
-    ):
-        quick(other)
-    with pytest.raises(
-        BadData, match=r"rows 4 and 21, .*, 14 sd apart; remove the wrong one or state a larger --noise"
-    ):
-        quick(other, noise="current=2%,motor_speed=1%,speed=1%")
+    for stated, apart in ((None, "40%"), ("current=2%,motor_speed=1%,speed=1%", "14 sd")):
+        known = noise.from_table(other, SettledRuns.sizes(other), stated)
+        assert SettledRuns.check(other, known) == [
+            Repeats(other.source, (4, 21), "total_current_A", (3.45, 5.2), apart)
+        ]
+
+
+def test_a_column_that_varies_where_no_condition_does_is_named(measured):
+    alike = measured.where(np.zeros(6, int))
+    speeds = {"motor_speed_rpm": np.linspace(4000.0, 5000.0, 6)}
+    extras = {"torque_mNm": np.arange(6.0), "who": np.array(list("abcdef"))}
+    dyno = dataclasses.replace(alike, columns=alike.columns | speeds, extras=extras)
+    known = noise.from_table(dyno, SettledRuns.sizes(dyno), "current=2%,motor_speed=1%,speed=1%")
+    with pytest.raises(BadData, match=r"; torque_mNm varies there and is not used as a condition: .*; no condition"):
+        SettledRuns.check(dyno, known)
 
 
 def test_thousands_of_rows_are_compared_at_once(measured):
@@ -252,8 +259,7 @@ def test_thousands_of_rows_are_compared_at_once(measured):
     began = time.monotonic()
     assert SettledRuns.check(long, known) == []
     long.columns["speed_mm_s"][-1] *= 2
-    with pytest.raises(BadData, match="rows 20 and 5000, speed_mm_s: the same conditions gave"):
-        SettledRuns.check(long, known)
+    assert [note.rows for note in SettledRuns.check(long, known)] == [(20, 5000)]
     assert time.monotonic() - began < 5.0  # of all pairs: minutes
 
 

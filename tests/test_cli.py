@@ -167,7 +167,7 @@ USAGE = {
         ["sweep", "--set", "6T2A.mass=-1"],
         r"--set, 6T2A\.mass: got -1; expected 0\.01 to 10000 kg",
     ),
-    "no config file": (["sweep", "--config", "none.toml"], r"none\.toml: not a readable TOML file"),
+    "no config file": (["sweep", "--config", "none.toml"], r"none\.toml: cannot be read \(No such file"),
     "chunk of zero": (["sweep", "--chunk", "0"], r"--chunk: got 0"),
     "slope of 95 for one run": (["simulate", "--slope", "95"], r"option, slope_deg: got 95; expected -45 to 45"),
     "mass below payload": (
@@ -355,7 +355,7 @@ BAD_RUNS = {
         f"{HEADER}\n6T2A,15,13.1,0,95,2.75,4800,400",
         "runs.csv row 1, slope_deg: got 95; is it in percent? then name the column slope_percent; expected -45 to 45",
     ),
-    "NaN": (f"{HEADER}\n6T2A,15,13.1,0,5,nan,4800,400", "row 1, total_current_A: got nan"),
+    "NaN": (f"{HEADER}\n6T2A,15,13.1,0,5,inf,4800,400", "row 1, total_current_A: got inf"),
     "configuration": (f"{HEADER}\n5T,15,13.1,0,5,1,4800,400", "row 1, configuration: got 5T"),
 }
 

@@ -87,7 +87,8 @@ def commanded(every=False) -> SimpleNamespace:
     room_for_it = tempfile.TemporaryDirectory()  # which is there as long as the answer
     folder, kept = Path(room_for_it.name), []
     case = tables.narrow(["churning"], 15.0, seed=3, grid=small)
-    written(folder / "runs.csv", {k: np.append(v, v[4]) for k, v in case.table.items()})
+    columns = {**case.table, "run_id": np.arange(24)}  # one of them twice
+    written(folder / "runs.csv", {k: np.append(v, v[4]) for k, v in columns.items()})
 
     def discover(*arguments, **options):
         kept.append(discovering(*arguments, **options))
@@ -283,7 +284,7 @@ BAD = {
     "missing column": (f"{HEADER.replace(',slope_deg', '')}\n6T2A,15,13.1,0,2.75,4800,400", "column slope_deg is missing"),
     "no channel": ("\n".join([",".join(HEADER.split(",")[:5]), *["6T2A,15,13.1,0,5"] * 8]), "runs.csv: no column of a channel"),
     "no such configuration": (f"{HEADER}\n{ROW.replace('6T2A', '8W8T')}", "configuration: got 8W8T; expected one of these; allowed: 6T2A, 4W2T"),
-    "not a number": (f"{HEADER}\n{ROW.replace('2.75', 'nan')}", "runs.csv row 1, total_current_A: got nan"),
+    "not a number": (f"{HEADER}\n{ROW.replace('2.75', 'inf')}", "runs.csv row 1, total_current_A: got inf"),
     "no noise": (f"{HEADER},speed_sd_mm_s\n{ROW},0", "runs.csv row 1, speed_sd_mm_s: got 0; expected more than 0"),
     "three rows": (
         "\n".join([HEADER, *(ROW.replace("15", str(u)) for u in (15, 24, 33))]),

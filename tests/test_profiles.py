@@ -242,7 +242,7 @@ def test_unknown_name_lists_what_is_packaged():
 
 
 def test_folder_is_no_profile(tmp_path):
-    with pytest.raises(BadData, match="is no file"):
+    with pytest.raises(BadData, match="is a folder; expected a file"):
         profiles.read(tmp_path)
 
 

@@ -9,6 +9,7 @@ from synthetic import table
 from test_loop_command import mmrjax
 from worlds import tables
 
+from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
@@ -49,6 +50,36 @@ def histories():
 
 def scaled(runs, column, factor):
     return Runs("runs.csv", {**runs.columns, column: runs[column] * factor})
+
+
+WINCH = """
+base = "none"
+imposed = "motor_speed"
+channels = ["motor_current"]
+[motor]
+torque_constant = 0.0551
+[gearbox]
+ratio = 1.0
+efficiency_load = 1.0
+[winch]
+load = "shaft"
+inertia = 1e-4
+torque_constant = 0.2
+loss_coulomb = 0.03
+"""
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_current_that_one_sign_explains_beside_a_weight_is_doubted(tmp_path, sign):
+    (tmp_path / "rig.toml").write_text(WINCH)
+    robot = robot_file.read(tmp_path / "rig.toml")
+    lifts = np.array([30.0, 120.0, 240.0, -30.0, -120.0, -240.0])
+    current = sign * np.where(lifts > 0, 4.7, 3.2)
+    rows = "".join(f"{n},{i}\n" for n, i in zip(lifts, current, strict=True))
+    (tmp_path / "t.csv").write_text(f"motor_speed_rpm,motor_current_A\n{rows}")
+    found = ranges.turned_signs(records.read(tmp_path / "t.csv", robot=robot), robot)
+    assert [note.column for note in found] == ["motor_current_A"] * (sign < 0)
+    assert all(note.turned < 1.0 < 7.0 < note.off for note in found)
 
 
 @pytest.mark.slow

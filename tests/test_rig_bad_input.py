@@ -113,7 +113,7 @@ def test_rig_check_does_not_call_runs_backward_unsettled(tmp_path, capsys):
 
 
 def test_rig_check_says_what_a_file_without_base_takes(tmp_path, capsys):
-    (tmp_path / "rig.toml").write_text("")
+    (tmp_path / "rig.toml").write_text("[motor]\nresistance = 0.6\n")
     assert rig_check.check(tmp_path / "rig.toml", None, (), False) == 0
     assert 'is its base\'s, a packaged robot (base = "none" starts from nothing)' in " ".join(
         capsys.readouterr().out.split()

@@ -121,14 +121,17 @@ REFUSED = {
         f"{HEADER}\n{ROW.replace('13.1', '-13.1')}",
         r"row 1, total_mass_kg: got -13\.1; expected 0\.1 to 500",
     ),
-    "zero voltage": (
-        f"{HEADER}\n{ROW.replace(',15,', ',0,')}",
-        r"row 1, supply_voltage_V: got 0; expected a voltage, in a table of readings",
+    "zero voltage everywhere": (
+        f"{HEADER}\n6T2A,0,13.1,0,5,0,0,0",
+        r"supply_voltage_V is 0 in every row, so nothing drives the motors; expected rows that are driven",
     ),
-    "NaN": (
-        f"{HEADER}\n{ROW.replace('2.75', 'nan')}",
-        r"row 1, total_current_A: got nan; leave the cell empty where there is no reading; expected -2000 to 2000",
+    "zero voltage of one that runs": (
+        f"{HEADER}\n{ROW}\n{ROW.replace(',15,', ',0,')}",
+        r"row 2, motor_speed_rpm: got 4800 where supply_voltage_V is 0; expected what drives it, or remove the row",
     ),
+    "NaN of a condition": (f"{HEADER}\n{ROW.replace(',5,', ',NaN,')}", r"row 1, slope_deg: got NaN; expected -45 to"),
+    "NA of what is imposed": (f"{HEADER}\n{ROW.replace('15', 'NA')}", r"supply_voltage_V: got NA; expected a number"),
+    "a number with an underscore": (f"{HEADER}\n{ROW.replace('4800', '48_00')}", r"got 48_00; .*expected a number"),
     "infinity": (f"{HEADER}\n{ROW.replace('4800', 'inf')}", r"motor_speed_rpm: got inf"),
     "no number": (
         f"{HEADER}\n{ROW.replace('4800', 'fast')}",
@@ -277,7 +280,7 @@ def test_commas_and_points_in_one_column_are_refused(tmp_path):
         ("slope_deg", "5 %", "write numbers alone, in deg, or name the column slope_percent"),
         ("slope_deg", "5 furlongs", "write the number alone, in deg; expected a number, -45 to 45"),
         ("slope_deg", "nan", "got nan; expected -45 to 45"),
-        ("motor_speed_rpm", "n/a", "leave the cell empty where there is no reading; expected a number"),
+        ("motor_speed_rpm", "--", "leave the cell empty where there is no reading; expected a number"),
         ("motor_speed_rpm", "1e9", r"got 1e9; expected -30000 to 30000"),
     ],
 )
@@ -288,12 +291,12 @@ def test_units_and_words_in_cells_get_a_hint(tmp_path, column, cell, says):
 
 
 def test_all_bad_cells_are_said_at_once_the_first_row_first(tmp_path):
-    rows = [ROW, ROW.replace("4800", "fast"), ROW, ROW.replace("15", "-500").replace("2.75", "nan")]
+    rows = [ROW, ROW.replace("4800", "fast"), ROW, ROW.replace("15", "-500").replace("2.75", "inf")]
     with pytest.raises(BadData) as error:
         records.read(written(tmp_path, "\n".join([HEADER, *rows])))
     said = str(error.value)
     assert said.startswith("runs.csv row 2, motor_speed_rpm: got fast; expected a number")
-    assert said.index("; also row 4, supply_voltage_V: got -500") < said.index("; row 4, total_current_A: got nan")
+    assert said.index("; also row 4, supply_voltage_V: got -500") < said.index("; row 4, total_current_A: got inf")
     with pytest.raises(BadData, match=r"expected .* 30000; also row 2, motor_speed_rpm: got fast; row 3"):
         records.read(written(tmp_path, "\n".join([HEADER, *[ROW.replace("4800", "fast")] * 3])))
     with pytest.raises(BadData, match=r"; and 12 more$"):

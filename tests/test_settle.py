@@ -392,6 +392,41 @@ def test_a_saturated_channel_leaves_its_stretch_out(tmp_path):
     assert "total_current shows one number for long: saturated or frozen" in words.left_out(found.stretches)[0]
 
 
+GLITCHES = {  # share of the speed's readings, what they are multiplied by, glitches in the middle level
+    "none": (0.0, 4.0, 0),
+    "edges missed": (0.12, 4.0, 24),
+    "dropouts": (0.2, 0.0, 40),
+    "most of them": (0.4, 4.0, None),
+}
+
+
+@pytest.mark.parametrize("case", GLITCHES)
+def test_glitches_leave_means_where_they_are_or_a_level_out(tmp_path, case):
+    share, times, count = GLITCHES[case]
+    columns, rng = stairs(), np.random.default_rng(8)
+    off = 200 + rng.permutation(200)[: round(200 * share)]
+    columns["motor_speed_rpm"][off] *= times
+    found = settled(tmp_path, bench(tmp_path, columns))
+    assert [s.why for s in found.stretches] == ["", "" if count is not None else "glitches", ""]
+    if count is None:
+        assert "motor_speed has many readings far from the others (4" in words.left_out(found.stretches)[0][0]
+        return
+    middle, clean = found.kept[1], stairs()["motor_speed_rpm"][200:400]
+    assert middle.glitches.get("motor_speed", 0) == np.isin(off, middle.rows).sum() >= 0.7 * count
+    kept = np.setdiff1d(middle.rows, off) - 200
+    assert middle.mean["motor_speed"] == pytest.approx(clean[kept].mean(), rel=1e-9)
+    assert middle.sd["motor_speed"] < 3 * 0.5 / np.sqrt(len(kept)) + 1.0  # the start's lag included
+    said = [x for x in words.remarks(found, 3) if "far from the readings next to them" in x]
+    assert len(said) == (count > 0)
+
+
+def test_a_current_in_pulses_keeps_its_mean(tmp_path):
+    columns = stairs()
+    columns["total_current_A"] = np.where(np.arange(600) % 10 == 0, 5.0, 0.0) + 1e-3 * np.arange(600) % 7e-3
+    found = settled(tmp_path, bench(tmp_path, columns))
+    assert found.kept and all(s.mean["total_current"] == pytest.approx(0.5, abs=0.03) for s in found.kept)
+
+
 def test_what_does_not_move_and_what_nothing_drives_is_left_out(tmp_path):
     columns = stairs(levels=(0.0, 1.0, 12.0))
     columns["motor_speed_rpm"] = np.where(columns["supply_voltage_V"] < 2, 0.0, columns["motor_speed_rpm"])

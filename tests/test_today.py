@@ -232,7 +232,6 @@ COLUMNS = "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,tot
     [
         ("6T2A,-15,13.1,0,0,-2.1,5292", "motor_speed_rpm: got 5292 at -15 V; expected readings with their signs"),
         ("6T2A,-15,13.1,0,-5,2.6,-5292", "total_current_A: got 2.6 at -15 V; expected readings with their signs"),
-        ("6T2A,0,13.1,0,0,0,0", "supply_voltage_V: got 0; expected a voltage, in a table of readings"),
     ],
 )
 def test_readings_without_a_sign_are_refused_backward(tmp_path, row, sentence):

@@ -57,6 +57,26 @@ SAMPLES = [
         "state total_mass_kg would",
     ),
     (
+        of_fit.Repeats("r.csv", (1, 2), "motor_speed_rpm", (4564.6, 4373.6), "6 sd", ("torque",), 2),
+        "r.csv rows 1 and 2, motor_speed_rpm: the same conditions gave 4564.6 and 4373.6, 6 sd apart (and so 2 more); "
+        "torque varies there and is not used as a condition: name it under [columns], or give each level of a load a "
+        "configuration",
+    ),
+    (
+        of_fit.Repeats("r.csv", (1, 2), "motor_speed_rpm", (4500.0, 4300.0), "5%"),
+        "r.csv rows 1 and 2, motor_speed_rpm: the same conditions gave 4500 and 4300, 5% apart; if one is wrong, "
+        "remove it",
+    ),
+    (
+        of_fit.Turned("r.csv", "motor_current_A", "Iq", 8.04, 0.31),
+        "r.csv, Iq: off by 8 (rms) from what the file's numbers give, with the other sign by 0.31; if it is turned "
+        'round, state [columns] motor_current_A = {column = "Iq", factor = -1}',
+    ),
+    (
+        of_fit.StiffSupply("motor_voltage_V", 24.0),
+        "motor_voltage_V is 24 in every row: taken for a stiff supply; if it is no reading, remove the column",
+    ),
+    (
         of_fit.Constant("slope_deg", 5.0, "guides"),
         "slope_deg is 5 in every row: rolling resistance, guide friction and Coulomb losses act alike without slopes, "
         "and only their priors tell them apart",

@@ -8,7 +8,7 @@ import math
 import re
 from collections.abc import Sequence
 
-from calibration.data.errors import BadData
+from calibration.data.errors import BadData, parsed
 
 #: What may separate cells beside a comma, and how it is called.
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
@@ -59,11 +59,18 @@ def cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], tuple[str, 
         name: of the file, for messages; lines: of the file, its header first.
 
     Raises:
-        BadData: a column that has decimal commas and points, or marks that may stand between thousands.
+        BadData: text that is no CSV, a column that has decimal commas and points, or marks that may stand between
+            thousands.
     """
     header = lines[0] if lines else ""
     mark = next((m for m in SEPARATORS if m in header and "," not in header), ",")
-    rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=mark)]
+    try:
+        rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=mark)]
+    except csv.Error as error:
+        raise BadData(
+            f"{name}: cannot be read as CSV ({error}); look for a quotation mark that is not closed, or a cell of "
+            f"more than {csv.field_size_limit():,} characters"
+        ) from error
     rows = [row for row in rows if any(row)]
     named = max((j + 1 for j, cell in enumerate(rows[0]) if cell), default=0) if rows else 0
     if not any(any(row[named:]) for row in rows):  # separators at the ends of lines
@@ -104,6 +111,6 @@ def _column(rows: list[list[str]], j: int) -> str:
 def number(cell: str) -> float:
     """A cell's number, NaN of what is none."""
     try:
-        return float(cell)
+        return parsed(cell)
     except ValueError:
         return math.nan

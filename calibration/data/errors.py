@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-import tomllib
-from pathlib import Path
 from typing import Any
 
 from mmrjax.errors import choices as choices
+from mmrjax.errors import shortened
 
 
 class InputError(Exception):
     """Something from outside is not as it should be; the message is one sentence for a person."""
+
+    def __init__(self, message: str) -> None:
+        """Keeps the message `shortened`."""
+        super().__init__(shortened(message))
 
     exit_code = 2
 
@@ -28,28 +31,15 @@ class BadData(InputError):
     exit_code = 4
 
 
-def toml_text(path: Path, where: str | Path) -> str:
-    """Text of a TOML file; `where` opens the message of an error.
+def parsed(text: str) -> float:
+    """Returns the number that a text states in digits, without the underscores that Python allows.
 
     Raises:
-        BadConfiguration: a file that cannot be read.
+        ValueError: it states none.
     """
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise BadConfiguration(f"{where}: not a readable TOML file ({error})") from error
-
-
-def toml_content(text: str, where: str | Path) -> dict[str, Any]:
-    """Keys and tables of such a text; `where` opens the message of an error.
-
-    Raises:
-        BadConfiguration: it is no TOML.
-    """
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise BadConfiguration(f"{where}: not a readable TOML file ({error})") from error
+    if "_" in text or not text.isascii():
+        raise ValueError(f"could not convert {text!r} to a number")
+    return float(text)
 
 
 def number(value: float) -> str:

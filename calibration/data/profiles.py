@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from calibration.data import delimited, units
+from calibration.data import delimited, input_files, units
 from calibration.data.errors import BadConfiguration, BadData, choices, is_number, number
 from calibration.data.units import Quantity
 from mmrjax import channels
@@ -223,13 +223,9 @@ def read(source: str | Path) -> ProfileTable:
         file = resources.files("calibration") / "data" / "profiles" / f"{source}.csv"
         return _parsed(file.read_bytes(), str(source))
     path = Path(source)
-    if not path.is_file():
-        raise BadData(
-            f"{source}: no such file and no packaged profile; {choices(str(source), PACKAGED)}"
-            if not path.exists()
-            else f"{source}: is no file; expected a CSV file or a packaged profile: {', '.join(PACKAGED)}"
-        )
-    return _parsed(path.read_bytes(), path.name)
+    if not path.exists():
+        raise BadData(f"{source}: no such file and no packaged profile; {choices(str(source), PACKAGED)}")
+    return _parsed(input_files.table(path, path.name or str(source)), path.name)
 
 
 def _parsed(content: bytes, name: str) -> ProfileTable:
@@ -274,7 +270,7 @@ def _settings(name: str, comments: list[str]) -> dict[str, Any]:
             continue
         try:
             found = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
+        except (ValueError, RecursionError) as error:
             raise BadData(f"{name}: got the line # {text}; expected TOML such as # cycles = 40 ({error})") from error
         for key, value in found.items():
             if key not in SETTINGS:

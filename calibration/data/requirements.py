@@ -9,7 +9,8 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from calibration.data.errors import BadConfiguration, choices, stated_number, toml_content, toml_text
+from calibration.data.errors import BadConfiguration, choices, stated_number
+from calibration.data.input_files import toml_content, toml_text
 from mmrjax.requirements import AXES, QUANTITIES, Quantity
 from mmrjax.tables import BENCH, CONDITION_LIMITS, SURFACES
 

@@ -210,6 +210,8 @@ def _channels(stated: Any, where: str) -> tuple[str, ...]:
     for name in stated:
         if name not in every:
             raise BadConfiguration(f"{where}: got {name}; {choices(name, every)}")
+        if stated.count(name) > 1:
+            raise BadConfiguration(f"{where}: {name} stands twice; expected each channel once")
     return tuple(name for name in every if name in stated)
 
 

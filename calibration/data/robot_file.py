@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from calibration.data import rig_file, stated
 from calibration.data.configuration_tables import loads, resolved_likes
 from calibration.data.effect_file import Library
-from calibration.data.errors import BadConfiguration, choices, is_number, number, toml_content, toml_text
+from calibration.data.errors import BadConfiguration, choices, is_number, number
+from calibration.data.input_files import toml_content, toml_text
 from calibration.data.writing import write_text
 from mmrjax import effects, params, power, robots
 from mmrjax.effects.scaled import scaled
@@ -149,6 +150,11 @@ def parse(path: Path, library: Library = effects.BY_NAME, notes: list[str] | Non
     """
     text = toml_text(path, path.name)
     content = toml_content(text, path.name)
+    if not content:
+        raise BadConfiguration(
+            f"{path.name}: states nothing; expected tables of parameters, as [motor], or for the packaged robot "
+            'base = "nominal"'
+        )
     schema = content.pop("schema", SCHEMA)
     if schema not in SCHEMAS:
         raise BadConfiguration(f"{path.name}, schema: got {schema}; expected {SCHEMA}")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.data import clock, contradictions, delimited, instruments, sides, surfaces, units
+from calibration.data import clock, contradictions, delimited, input_files, instruments, sides, surfaces, units
 from calibration.data.columns import (
     CONDITIONS,
     DEFAULTS,
@@ -32,7 +32,7 @@ from calibration.data.columns import (
     Layout,
     Meaning,
 )
-from calibration.data.errors import BadConfiguration, BadData, InputError, choices, number
+from calibration.data.errors import BadConfiguration, BadData, InputError, choices, number, parsed
 from calibration.data.table import Runs
 from mmrjax import channels
 from mmrjax.channels import MM, RPM, Channel
@@ -93,10 +93,7 @@ def read(
 def _read(
     path: Path, name: str, measured: bool, battery: bool, layout: Layout, *, inferred: bool, of_turns: bool
 ) -> Runs:
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise BadData(f"{name}: cannot be read ({error})") from error
+    content = input_files.table(path, name)
     text, encoded = delimited.text(name, content)
     lines = delimited.below_comments([line for line in text.splitlines() if line.strip()])
     rows, notes = delimited.cells(name, lines)
@@ -168,9 +165,14 @@ def _read(
     if battery and layout.imposed == "voltage":
         columns[SUPPLY] = np.full(len(rows) - 1, np.nan)
     elif measured and not set(TIME) <= set(columns):  # a history may stop, and go on forwards against its motors
+        driven, said = _driven(name, columns, layout)
+        if said:
+            columns = {column: values[driven] for column, values in columns.items()}
+            rows, notes = [rows[0], *(rows[k + 1] for k in np.flatnonzero(driven))], (*notes, said)
         if {*layout.sides, *HEADING} & set(columns):
             _check_level(name, columns)
-        (_check_turns if set(layout.sides) & set(columns) else _check_signs)(name, columns, layout)
+        if not set(layout.sides) & set(columns):
+            _check_signs(name, columns, layout)
     if not any(column in columns for column in WHEN):
         columns["order"] = np.arange(1.0, len(rows))
     unknown = tuple(c for c, meaning in zip(header, meanings, strict=True) if meaning is None)
@@ -253,7 +255,7 @@ def _lacks(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterato
         others = f", and so {len(copied) - 1} more" if len(copied) > 1 else ""
         yield (
             f"{name}: rows {' and '.join(map(str, copied[0][:2]))} have the same conditions and readings{others}; "
-            "remove copies, which make results look surer than they are"
+            "they count as repeats; remove copies, which make results look surer than they are"
         )
     if "run_id" in columns and not set(TIME) & set(columns):
         runs, times = np.unique(columns["run_id"], return_counts=True)
@@ -278,9 +280,9 @@ def _with_channels(name: str, header: list[str], layout: Layout, more: Sequence[
 
 
 def _extra(cells: list[str]) -> np.ndarray:
-    """A column without a role: numbers where every cell that is not empty is one, else words."""
+    """A column without a role: numbers where every cell that has a reading is one, else words."""
     try:
-        return np.array([float(cell) if cell else math.nan for cell in cells])
+        return np.array([math.nan if cell.lower() in MISSING else parsed(cell) for cell in cells])
     except ValueError:
         return np.array(cells)
 
@@ -327,14 +329,11 @@ def _refuse_stated(name: str, voltages: list[str]) -> None:
 
 
 def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> None:
-    """Refuse readings without a sign where what is imposed drives the robot backward, and rows without it."""
+    """Refuse readings without a sign where what is imposed drives the robot backward."""
     column = layout.imposed_column
-    imposed, what, unit = columns[column], column.split("_")[-2], column.split("_")[-1]
+    imposed, unit = columns[column], column.split("_")[-1]
     if layout.imposed == "voltage":
         imposed = imposed * columns.get("duty", 1.0)
-    if (imposed == 0).any():
-        row = int(np.flatnonzero(imposed == 0)[0]) + 1
-        raise BadData(f"{name} row {row}, {column}: got 0; expected a {what}, in a table of readings")
     for channel in layout.channels:
         if channel.column not in columns or not channel.directed:
             continue
@@ -537,25 +536,33 @@ def _cell(where: str, meaning: Meaning, cell: str, layout: Layout, kind: type[In
             raise refuse("the name of one of the robot's configurations")
         return cell
     deviations = layout.deviation_columns
-    if not cell and column != layout.imposed_column and column in (*layout.measured_columns, *deviations, *DUTY):
+    readings = (*layout.measured_columns, *deviations, *DUTY)
+    if cell.lower() in MISSING and column != layout.imposed_column and column in readings:
         return math.nan
     low, high = meaning.limits()
     positive = column in deviations
-    hint = _hint(meaning, cell, (*layout.measured_columns, *deviations))
+    hint = _hint(meaning, cell, readings)
     allowed = f"{'more than ' if positive else ''}{number(low)} to {number(high)}"
     try:
-        value = float(cell)
+        value = parsed(cell)
     except ValueError:
         raise refuse(f"a number, {allowed}", hint) from None
-    if not math.isfinite(value) or not low <= value <= high or (positive and value == low):
+    beyond = (ROUNDED_FACTOR if meaning.factor != 1.0 else ROUNDED) * max(abs(low), abs(high))
+    if not low - beyond <= value <= high + beyond or (positive and value <= low):
         raise refuse(allowed, hint)
+    value = min(max(value, low), high)
     return value if meaning.as_named else meaning.value(value)
 
 
 #: From how many times the largest value that is allowed another unit is supposed.
 FAR = 2.0
-#: What people write where there is no reading.
-NOTHING = ("nan", "na", "n/a", "n.a.", "none", "null", "-", "--", "?", "x", "inf", "-inf")
+#: How far a value may be beyond a limit because it is written with few digits, and because a factor from its unit is,
+#: as shares of the limit.
+ROUNDED, ROUNDED_FACTOR = 1e-6, 5e-4
+#: What programs write where there is no reading, as an empty cell.
+MISSING = ("", "nan", "na", "n/a", "#n/a", "<na>", "none", "null")
+#: What people write there.
+NOTHING = ("n.a.", "-", "--", "?", "x", "inf", "-inf")
 _WITH_UNIT = re.compile(r"([+-]?\d*\.?\d+(?:[eE][+-]?\d+)?)\s*([^\d\s.,].*)")
 
 
@@ -568,7 +575,7 @@ def _hint(meaning: Meaning, cell: str, readings: tuple[str, ...]) -> str:
         return ""
     named = {unit: column for column, unit in quantity.columns().items()}
     try:
-        value = float(cell)
+        value = parsed(cell)
     except ValueError:
         found = _WITH_UNIT.fullmatch(cell)
         return "" if found is None else _unit_hint(found[1], found[2], mine, named)
@@ -616,13 +623,42 @@ def _check_sides(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
         raise BadData(f"{name}: column {beside} beside {stated[0]}, which says how either side is driven; keep one")
 
 
-def _check_turns(name: str, columns: dict[str, np.ndarray], layout: Layout) -> None:
-    """Refuse rows in which nothing drives either side."""
-    supply = columns[SUPPLY] if layout.imposed == "voltage" else 1.0
-    idle = np.flatnonzero(np.max(np.abs([columns[c] for c in layout.sides]), 0) * supply == 0)
-    if idle.size:
-        got = ", ".join(f"{c} {number(columns[c][idle[0]])}" for c in (layout.imposed_column, *layout.sides))
-        raise BadData(f"{name} row {idle[0] + 1}: got {got}; nothing drives either side; remove the row")
+#: Share of the largest reading of a speed below which a motor that nothing drives stands.
+STILL = 0.02
+
+
+def _driven(name: str, columns: dict[str, np.ndarray], layout: Layout) -> tuple[np.ndarray, str]:
+    """True for rows of settled runs in which something drives the motors; a sentence on the other rows.
+
+    Raises:
+        BadData: no row is driven, or a speed is read where nothing drives the motors.
+    """
+    sides = [c for c in layout.sides if c in columns]
+    column = layout.imposed_column
+    size = np.max(np.abs([columns[c] for c in sides]), 0) if sides else np.abs(columns[column])
+    if layout.imposed == "voltage":
+        size = size * np.abs(columns[SUPPLY] if sides else columns.get("duty", 1.0))
+    idle = np.flatnonzero(size == 0)
+    if not idle.size:
+        return size != 0, ""
+    stated = (column, *sides, *(["duty"] if "duty" in columns else []))
+    zero = " and ".join(c for c in stated if not columns[c][idle].any())
+    for channel in (c for c in layout.channels if c.zero_at_rest and c.column in columns):
+        readings = np.nan_to_num(columns[channel.column])
+        moving = idle[np.abs(readings[idle]) > STILL * np.max(np.abs(readings))]
+        if moving.size and moving.size < len(readings):
+            raise BadData(
+                f"{name} row {moving[0] + 1}, {channel.column}: got {number(readings[moving[0]])} where "
+                f"{zero} is 0; expected what drives it, or remove the row"
+            )
+    if idle.size == len(size):
+        raise BadData(
+            f"{name}: {zero} is 0 in every row, so nothing drives the motors; expected rows that are driven"
+        )
+    which = f"row {idle[0] + 1} is" if idle.size == 1 else f"{idle.size} rows, the first row {idle[0] + 1}, are"
+    return size != 0, (
+        f"{name}: {which} left out, as nothing drives the motors ({zero or column} 0); rows are counted without them"
+    )
 
 
 def _check_level(name: str, columns: dict[str, np.ndarray]) -> None:

@@ -28,6 +28,8 @@ STILL = 0.02
 FINE = 0.005
 #: Largest change of a mean within a stretch, as a share of it, where none is stated.
 DRIFT = 0.02
+#: Shortest stretch where none is stated [s].
+LEAST = 0.3
 #: Fewest samples of a stretch, and of its parts between which means are compared.
 FEWEST, PART = 8, 3
 #: Sds within which means of parts agree.
@@ -41,11 +43,15 @@ COARSE = 0.2
 #: Equal readings one after the other that an instrument with noise does not show, and up to what share of all steps
 #: readings that are equal to the one before are noise's chance.
 STUCK, CHANCE = 20, 0.2
+#: Robust sds, and steps of the instrument, by which a glitch is off the readings next to it.
+FAR = 6.0
+#: Share of glitches in a stretch up to which the other readings have a mean; samples beside which a reading is held.
+MOST_GLITCHES, BESIDE = 0.25, (21, 101)
 #: Conditions whose every change ends a stretch.
 EXACT = ("configuration", "surface", "mode", "slope_deg", "payload_kg", "total_mass_kg")
 #: Why samples are left out.
 REASONS = (
-    "changes", "short", "settling", "accelerates", "idle", "rest", "stuck", "undriven",
+    "changes", "short", "settling", "accelerates", "idle", "rest", "stuck", "glitches", "undriven",
 )  # fmt: skip
 
 
@@ -54,9 +60,11 @@ class Signal:
     """What a channel shows of settled travel, sample by sample.
 
     Attributes:
-        channel: that the table of settled runs has; shown: its readings [unit of the column], NaN where missing.
+        channel: that the table of settled runs has; shown: its readings [unit of the column], NaN where missing and
+            at glitches.
         angle: the angle that it is the rate of [unit of its column], empty where it is read itself.
         step: of its instrument [unit], 0 without; largest: size of its readings but for the last two in a hundred.
+        glitches: True for readings far from those beside them, see `glitches`, shape (rows,).
     """
 
     channel: Channel
@@ -64,6 +72,7 @@ class Signal:
     angle: np.ndarray
     step: float
     largest: float
+    glitches: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,6 +101,7 @@ class Stretch:
             much, as a share.
         mean, sd: of each channel, by name [unit of the column]; of a settled run alone.
         drift: change of each channel over it, by name [unit]; imposed: mean of what drives the motors.
+        glitches: readings of each channel that its mean leaves out, by name; only channels that have some.
     """
 
     run: str
@@ -105,6 +115,7 @@ class Stretch:
     mean: Mapping[str, float] = dataclasses.field(default_factory=dict)
     sd: Mapping[str, float] = dataclasses.field(default_factory=dict)
     drift: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    glitches: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
     @property
     def lasts(self) -> float:
@@ -134,6 +145,13 @@ class Settled:
     def kept(self) -> tuple[Stretch, ...]:
         """Those that are settled runs."""
         return tuple(s for s in self.stretches if not s.why)
+
+    def settled_runs(self) -> Runs:
+        """The settled runs, as a table of runs that is read."""
+        columns = {**self.runs.columns, **self.table()}
+        count = len(self.kept)
+        columns = {name: x for name, x in columns.items() if len(x) == count and name not in ("time_s", "mode")}
+        return dataclasses.replace(self.runs, columns=columns, extras={}, log=None)
 
     def table(self) -> dict[str, np.ndarray]:
         """The settled runs, a column each as tables of runs have them."""
@@ -176,7 +194,7 @@ def settle(
     every channel's mean stays there. Their means are the settled run. Its sds are those of means of readings with
     their own autocorrelation (Geyer's initial positive sequence, 1992), with what steps of the instrument leave of
     their mean (Widrow and Kollár, Quantization noise, 2008, of normal noise: the first term), the drift that is left,
-    and what stretches alike differ by.
+    and what stretches alike differ by. Means leave out glitches; see `glitches`.
 
     Args:
         shortest: stretch [s]; None: 0.3 s, and at least 20 samples.
@@ -217,21 +235,21 @@ def _divided(runs: Runs, shortest: float | None, drift: float, inertia: Mapping[
         raise BadData(f"{runs.source}: column time_s is missing, and a row is a settled run already; give it to loop")
     each = _in_order(runs)
     step = float(np.median(np.concatenate([np.diff(runs["time_s"][rows]) for rows in each])))
-    shortest = max(0.3, 20 * step) if shortest is None else shortest
+    shortest = max(LEAST, 20 * step) if shortest is None else shortest
     half = max(1, round(shortest / 6 / step))
-    signals = _signals(runs, each, half)
-    for signal in signals:
-        _check_alive(runs, signal)
     drives = applied(runs)
-    stuck = {s.channel.name: _stuck(s, each) for s in signals}
     gaps: list[int] = []
-    found: list[Stretch] = []
+    levels: list[np.ndarray] = []
     for rows in each:
         far = np.flatnonzero(np.diff(runs["time_s"][rows]) > GAP * step)
         gaps += [int(rows[k]) for k in far]
         for part in np.split(rows, far + 1):
-            for level in _levels(runs, drives, part, shortest, drift, step):
-                found.append(_settled(runs, signals, drives, level, shortest, drift, step, stuck, inertia or {}))
+            levels += _levels(runs, drives, part, shortest, drift, step)
+    signals = _signals(runs, each, levels, half, drift)
+    for signal in signals:
+        _check_alive(runs, signal)
+    stuck = {s.channel.name: _stuck(s, each) for s in signals}
+    found = [_settled(runs, signals, drives, level, shortest, drift, step, stuck, inertia or {}) for level in levels]
     scatter = _scatter(runs, found, signals, float(np.max(np.abs(drives))))
     return Settled(runs, tuple(found), signals, shortest, drift, tuple(gaps), scatter)
 
@@ -271,36 +289,81 @@ def _in_order(runs: Runs) -> list[np.ndarray]:
     return each
 
 
-def _signals(runs: Runs, each: list[np.ndarray], half: int) -> tuple[Signal, ...]:
+def _signals(
+    runs: Runs, each: list[np.ndarray], levels: list[np.ndarray], half: int, drift: float
+) -> tuple[Signal, ...]:
     """What settled travel shows of each channel of a log; of an angle its rate, where no channel reads that."""
-    none = np.zeros(0)
-    found = [
-        Signal(c, runs[c.column], none, _step(runs, c), _size(runs[c.column]))
-        for c in runs.channels
-        if c.settled and runs.has(c.column) and np.isfinite(runs[c.column]).any()
-    ]
+    none, width = np.zeros(0), min(max(6 * half, BESIDE[0]), BESIDE[1])
+    found = []
+    for c in runs.channels:
+        if c.settled and runs.has(c.column) and np.isfinite(runs[c.column]).any():
+            off = glitches(runs[c.column], levels, width, _step(runs, c, runs[c.column]), drift)
+            shown = np.where(off, np.nan, runs[c.column])
+            found.append(Signal(c, shown, none, _step(runs, c, shown), _size(shown), off))
     have = {s.channel.name for s in found}
     for angle, rate, factor in RATES:
         if angle in runs.layout.measured_columns and runs.has(angle) and rate not in have:
             whole = np.full(len(runs), np.nan)
             shown = np.full(len(runs), np.nan)
+            read = next(c for c in runs.channels if c.column == angle)
+            off = glitches(runs[angle], levels, width, _step(runs, read, runs[angle]), None)
             for rows in each:
-                whole[rows] = runs[angle][rows] * factor
+                whole[rows] = np.where(off[rows], np.nan, runs[angle][rows] * factor)
                 shown[rows] = _rate(runs["time_s"][rows], whole[rows], half)
-            found.append(Signal(channels.find(rate), shown, whole, 0.0, _size(shown)))
+            found.append(Signal(channels.find(rate), shown, whole, 0.0, _size(shown), off))
     if not found:
         raise BadData(f"{runs.source}: no channel with readings that settled travel shows")
     return tuple(found)
+
+
+def glitches(shown: np.ndarray, levels: list[np.ndarray], width: int, step: float, drift: float | None) -> np.ndarray:
+    """True for readings that are far from the readings next to them, shape (rows,).
+
+    A reading is a glitch if it differs from the median of `width` readings around it by more than `FAR` robust sds
+    (1.4826 times the median of such differences), `FAR` steps and the allowed drift (Hampel, The influence curve and
+    its role in robust estimation, 1974). Normal noise has 2e-9 of them, so means of clean logs do not change. Where
+    most readings are near zero there are none: a current in pulses has its mean in the pulses. An angle that counts
+    on is compared with half of its usual travel over the window instead of the drift. The first `width` readings of
+    a level may be a start: `PART` in a row are none.
+
+    Args:
+        shown: readings, NaN where missing; levels: rows of each level, in the order of time.
+        width: readings that a median is of; step: of the instrument [unit of the readings].
+        drift: largest change of a mean within a stretch, as a share of it; None: the readings are an angle.
+    """
+    from scipy.ndimage import binary_opening, median_filter
+
+    found, largest = np.zeros(len(shown), bool), _size(shown)
+    for rows in levels:
+        rows = rows[np.isfinite(shown[rows])]
+        if len(rows) < FEWEST:
+            continue
+        size = min(width, len(rows)) | 1
+        x, pad = shown[rows], size // 2
+        # Beyond its ends a level goes on as there: a mirror would make glitches of a start.
+        ends = np.full(pad, np.median(x[:PART])), np.full(pad, np.median(x[-PART:]))
+        middle = median_filter(np.concatenate([ends[0], x, ends[1]]), size)[pad : pad + len(x)]
+        apart = np.abs(x - middle)
+        scatter = 1.4826 * median_filter(apart, min(5 * size, len(x)) | 1, mode="reflect")
+        grain = max(step, float(np.diff(np.unique(x)).min())) if np.ptp(x) > 0 else step  # coarse, whatever is stated
+        noise = FAR * np.maximum(scatter, grain)
+        if drift is None:
+            off = apart > np.maximum(noise, 0.5 * size * np.median(np.abs(np.diff(x))))
+        else:
+            allowed = np.maximum(noise, np.maximum(drift * np.abs(middle), FINE * largest))
+            off = (apart > allowed) & (np.abs(middle) > STILL * largest)
+        off[:size] &= ~binary_opening(off[:size], np.ones(PART))
+        found[rows] = off
+    return found
 
 
 #: Columns of angles, the channel of their rate, and its unit's value of one of the angle's a second.
 RATES = (("output_angle_deg", "output_speed", 1 / 6), ("position_mm", "speed", 1.0))
 
 
-def _step(runs: Runs, channel: Channel) -> float:
+def _step(runs: Runs, channel: Channel, shown: np.ndarray) -> float:
     """Step of a channel's instrument [unit of the column]: that which its readings show, else the file's, else of
     readings that mostly come again the smallest difference."""
-    shown = runs[channel.column]
     stated = (i.quantum or 0.0 for i in runs.layout.instruments if i.channel == channel.name)
     if found := step_of(shown) or next(stated, 0.0) / channel.factor:
         return found
@@ -425,8 +488,11 @@ def _settled(
         if left_over <= SLIGHT * drift:
             break
     means, sds, drifts = {}, {}, {}
+    off = {s.channel.name: int(s.glitches[taken].sum()) for s in signals}
     for signal in signals:
         name = signal.channel.name
+        if off[name] > MOST_GLITCHES * len(taken):
+            return out("glitches", name, off[name] / len(taken))
         mean, sd, change = seen[name]
         if not math.isfinite(mean):
             continue
@@ -456,7 +522,15 @@ def _settled(
         # What changes goes on after the end, of a lag's tail about as much again, and all channels with it.
         sds[name] = math.hypot(sds.get(name, math.nan), left_over * _scale(signal, means[name]))
         drifts.setdefault(name, math.nan)
-    return dataclasses.replace(left, rows=taken, begin=float(time[taken[0]]), mean=means, sd=sds, drift=drifts)
+    return dataclasses.replace(
+        left,
+        rows=taken,
+        begin=float(time[taken[0]]),
+        mean=means,
+        sd=sds,
+        drift=drifts,
+        glitches={name: count for name, count in off.items() if count},
+    )
 
 
 def _scale(signal: Signal, mean: float) -> float:
@@ -704,10 +778,19 @@ def _nothing(found: Settled) -> str:
     why = max(dict.fromkeys(whys), key=lambda w: sum(s.lasts for s in found.stretches if s.why == w))
     rows = f"rows {longest.rows[0] + 1} to {longest.rows[-1] + 1}"
     if why in ("changes", "short"):
+        step = longest.lasts / max(len(longest.rows) - 1, 1)
+        held, asked = f"for {longest.lasts:.3g} s", f"{found.shortest:.3g} s are asked for"
+        cure = "hold each level longer, state --shortest"
+        if len(longest.rows) < FEWEST or found.shortest > longest.lasts >= LEAST:  # it is the samples that are few
+            needed = max(FEWEST, round(found.shortest / step) if step > 0 else FEWEST)
+            held, asked = f"for {counted(len(longest.rows), 'sample')}", f"{needed} are needed"
+            cure = (
+                "log faster or hold each level longer (--shortest states the time, of at least "
+                f"{FEWEST} samples), remove time_s if each row is a settled run already"
+            )
         return (
-            f"{source}: no settled stretch: what is imposed holds for {longest.lasts:.3g} s at most ({rows}), and "
-            f"{found.shortest:.3g} s are asked for; hold each level longer, state --shortest, or give the log to "
-            "loop as it is (time histories)"
+            f"{source}: no settled stretch: what is imposed holds {held} at most ({rows}), and {asked}; {cure}, or "
+            "give the log to loop as it is (time histories)"
         )
     if why in ("settling", "accelerates"):
         return (

@@ -8,7 +8,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import delimited
+from calibration.data import delimited, input_files
 from calibration.data.errors import BadConfiguration, BadData
 from mmrjax import terrain
 from mmrjax.fidelities.climb import ON_GROUND, Sequence, clearance
@@ -44,11 +44,10 @@ def stairs(text: str) -> tuple[float, float, int]:
 
 def _read(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[dict[str, np.ndarray], Rows[str]]:
     """Columns of the first of some headers that a file has."""
-    try:
-        lines = path.read_text("utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise BadConfiguration(f"{option}: {path} cannot be read; expected a CSV file") from error
-    lines = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    if not path.exists():
+        raise BadConfiguration(f"{option}: got {path}, no such file")
+    text, _ = delimited.text(path.name, input_files.table(path, path.name or str(path)))
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     rows, _ = delimited.cells(path.name, lines)
     header = [cell.strip() for cell in rows[0]] if rows else []
     names = next((names for names in wanted if set(names) <= set(header)), None)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import own_mass
-from calibration.data.columns import ROWS
+from calibration.data.columns import ROWS, WHEN
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
@@ -596,16 +596,30 @@ def diagnosis_of_base(
     return Diagnosis(linear, scores, AdequacyTest(found, null, settings))
 
 
+def _once(columns: Sequence[np.ndarray]) -> int:
+    """Number of rows after which a table begins anew, row for row."""
+    rows = list(zip(*(column.astype(str).tolist() for column in columns), strict=True))
+    return next(n for n in range(1, len(rows) + 1) if len(rows) % n == 0 and rows[:-n] == rows[n:])
+
+
 def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Note]]:
-    """The runs without exact copies of one another, their row numbers, and what to say of that."""
-    columns = [runs[c] for c in observers.kind(runs).identity(runs)]
+    """The runs without exact copies of one another, their row numbers, and what to say of that.
+
+    Rows that a file tells apart by no name, order or time are repeats, even if a coarse display shows them the same.
+    They are copies where the whole table is: the same rows in the same sequence, several times.
+    """
+    columns = [*(runs[c] for c in observers.kind(runs).identity(runs)), *runs.extras.values()]
     seen: set[tuple[str, ...]] = set()
     keep: list[int] = []
     copies: list[int] = []
-    for k in range(len(runs)):
-        row = tuple(str(column[k]) for column in columns)
-        (copies if row in seen else keep).append(k)
-        seen.add(row)
+    if runs.sampled or {"run_id", *WHEN} & set(runs.headings):
+        for k in range(len(runs)):
+            row = tuple(str(column[k]) for column in columns)
+            (copies if row in seen else keep).append(k)
+            seen.add(row)
+    else:
+        once = _once(columns)
+        keep, copies = list(range(once)), list(range(once, len(runs)))
     if not copies:
         return runs, np.arange(1, len(runs) + 1), []
     return runs.where(np.asarray(keep)), np.asarray(keep) + 1, [Copies(tuple(k + 1 for k in copies))]

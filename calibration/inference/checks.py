@@ -13,7 +13,7 @@ from calibration.data.runs import Runs
 from calibration.inference import observers
 from calibration.inference.conduct import conduct
 from calibration.inference.noise import Noise
-from calibration.inference.notes import Constant, Note, Unmeasured
+from calibration.inference.notes import Constant, Note, StiffSupply, Unmeasured
 from calibration.inference.ranges import check_ranges
 from mmrjax.errors import counted
 from mmrjax.robot import Robot
@@ -30,8 +30,7 @@ def check(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[
     """
     _configurations(runs, robot, names)
     _enough(runs, names, noise)
-    _stuck(runs)
-    said = [*runs.missing(), *observers.kind(runs).check(runs, noise), *_constant_conditions(runs)]
+    said = [*runs.missing(), *_stuck(runs), *observers.kind(runs).check(runs, noise), *_constant_conditions(runs)]
     return [*said, *check_ranges(runs, robot), *conduct(runs, robot)]
 
 
@@ -63,21 +62,27 @@ def _enough(runs: Runs, names: Sequence[str], noise: Noise) -> None:
     raise BadData(f"{runs.source}: {have} {what}; at least {least} are needed{f', or {cure}' if names else ''}")
 
 
-def _stuck(runs: Runs) -> None:
+def _stuck(runs: Runs) -> list[StiffSupply]:
+    """Refuses a channel that shows one number under several conditions; notes a voltage that does."""
     labels = () if runs.layout.complete else ("configuration", "surface")
     columns = [c for c in (*observers.kind(runs).axes_of(runs), *labels) if runs.has(c)]
     varied = [np.unique(runs[c], return_inverse=True)[1] for c in columns]
+    stiff: list[StiffSupply] = []
     if len(np.unique(np.stack(varied, 1), axis=0)) < 2:
-        return
+        return stiff
     for channel in runs.channels:
         readings = (
             runs[channel.column][np.isfinite(runs[channel.column])] if runs.has(channel.column) else np.zeros(0)
         )
         if len(readings) > 2 and np.ptp(readings) == 0:
+            if channel.name == "motor_voltage":
+                stiff.append(StiffSupply(channel.column, float(readings[0])))
+                continue
             raise BadData(
                 f"{runs.source}, {channel.column}: {number(readings[0])} in every row although the conditions vary; "
                 "the instrument was stuck or the column is a copy"
             )
+    return stiff
 
 
 def _constant_conditions(runs: Runs) -> list[Constant]:

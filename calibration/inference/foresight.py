@@ -13,6 +13,7 @@ from calibration.data.runs import Runs
 from calibration.data.thinning import thinned
 from calibration.inference import identifiability, observers, priors
 from calibration.inference import optimizers as fit
+from calibration.inference.notes import Notes, OffBy, Repeats, SlopesIn, StiffSupply, Turned
 from calibration.inference.preparation import prepare
 from mmrjax import fidelities
 from mmrjax.robot import Robot
@@ -46,6 +47,7 @@ class Foresight:
         noise: of each channel: where its sd comes from.
         alike: pairs of parameters that these data hardly tell apart, with the correlation of their posterior.
         robot: with what the table shows of it, see `preparation.prepare`.
+        doubts: what should be looked at in the table before a fit.
     """
 
     parameters: tuple[Determined, ...]
@@ -53,6 +55,7 @@ class Foresight:
     noise: tuple[str, ...]
     alike: tuple[tuple[str, str, float], ...]
     robot: Robot
+    doubts: Notes = ()
 
 
 def foresee(runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS) -> Foresight:
@@ -92,4 +95,7 @@ def foresee(runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS
         for k, n in enumerate(names)
     )
     statuses = tuple(STATUSES[int(s)] for s in np.asarray(seen.status))
-    return Foresight(found, statuses, known.source, tuple(about.correlated()), robot)
+    doubts = tuple(
+        note for note in ready.checked if isinstance(note, OffBy | Repeats | SlopesIn | StiffSupply | Turned)
+    )
+    return Foresight(found, statuses, known.source, tuple(about.correlated()), robot, doubts)

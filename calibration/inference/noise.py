@@ -83,6 +83,8 @@ def parse(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float, bool]
         if name not in known:
             raise BadConfiguration(f"--noise {part.strip()}: no such channel; {choices(name, words)}")
         k = known[name]
+        if k in found:
+            raise BadConfiguration(f"--noise {part.strip()}: {name} stands twice; expected each channel once")
         channel = shown[k]
         match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*(%|[^\d\s.]+)\s*", value)
         sizes = {channel.unit: channel.factor, **dict(channel.other_units)}

@@ -83,6 +83,47 @@ class Unmeasured(Note):
     name: str
 
 
+class Repeats(Note):
+    """Rows under the same conditions whose readings differ beyond their noise.
+
+    Attributes:
+        source: of the table; rows: numbers of two of them; column: of the readings; values: theirs [its unit].
+        apart: by how much, in sds or as a share, as text.
+        unused: columns that differ between the two rows and are no conditions.
+        more: groups of such rows beside this one.
+    """
+
+    source: str
+    rows: tuple[int, int]
+    column: str
+    values: tuple[float, float]
+    apart: str
+    unused: tuple[str, ...] = ()
+    more: int = 0
+
+
+class Turned(Note):
+    """A channel whose readings fit the robot with the other sign.
+
+    Attributes:
+        source: of the table; column: of the channel; theirs: its name in the file.
+        off, turned: rms difference from the robot of the file, as read and turned round [unit of the column].
+    """
+
+    source: str
+    column: str
+    theirs: str
+    off: float
+    turned: float
+
+
+class StiffSupply(Note):
+    """A voltage that is read and is the same in every row."""
+
+    column: str
+    value: float
+
+
 class Constant(Note):
     """A condition that does not vary.
 

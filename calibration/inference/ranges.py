@@ -10,7 +10,7 @@ import numpy as np
 from calibration.data.errors import BadData, number
 from calibration.data.runs import Runs
 from calibration.inference import observers
-from calibration.inference.notes import Note, OffBy, SlopesIn
+from calibration.inference.notes import Note, OffBy, SlopesIn, Turned
 from calibration.inference.operating import operating_readings
 from calibration.words import tables
 from mmrjax import channels, params
@@ -27,6 +27,8 @@ UNDER_WAY = 0.25
 FRICTION = (0.1, 1.0, 4.0)
 #: Channels that show torque: what they show depends on friction, of which nothing is known of a rig from nothing.
 OF_TORQUE = ("total_current", "motor_current", "output_torque", "winding_temperature")
+#: Factor by which readings that are turned round come nearer to the robot, where their sign is doubted.
+NEARER = 2.0
 #: Readings smaller than this share of the channel's largest tell no factor.
 SMALL = 0.05
 #: What a robot could show is nothing, below this share of the readings: the yaw rate of one that goes straight.
@@ -85,7 +87,39 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
         if off > REFUSED:
             raise BadData(f"{runs.source}, {tables.off_by(found)}")
         said.append(found)
-    return [*said, *_slopes(runs, measured, possible[1], robot)]
+    return [*said, *_turned(runs, measured, possible), *_slopes(runs, measured, possible[1], robot)]
+
+
+def turned_signs(runs: Runs, robot: Robot) -> list[Turned]:
+    """Channels of settled runs that one sign brings `NEARER` to the robot as its file states it, beside a weight.
+
+    Without a weight signs are checked row by row as a table is read.
+    """
+    runs = runs.of(robot)
+    if not runs.layout.weight or any(float(c.torque_gravity) > 0 for c in robot.configurations.members):
+        return []
+    conditions = runs.conditions(robot)
+    return _turned(
+        runs, runs.measured(), np.stack([operating_readings(_rubbing(robot, f), conditions) for f in FRICTION])
+    )
+
+
+def _turned(runs: Runs, measured: np.ndarray, possible: np.ndarray) -> list[Turned]:
+    """As `turned_signs`, of readings [SI], shape (runs, channels), and those of several robots, (robots, ...)."""
+    found: list[Turned] = []
+    for k, channel in enumerate(runs.channels if runs.layout.weight else ()):
+        if not channel.directed or runs.layout.magnitude(channel.name):
+            continue
+        off, turned = (_rms(sign * measured[:, k] - possible[:, :, k]) for sign in (1.0, -1.0))
+        if turned * NEARER < off:
+            theirs = runs.headings.get(channel.column, channel.column)
+            found.append(Turned(runs.source, channel.column, theirs, off / channel.factor, turned / channel.factor))
+    return found if len(found) == 1 else []  # of several the file's numbers may be wrong as well
+
+
+def _rms(off: np.ndarray) -> float:
+    """The least root mean square along the rows of several robots, shape (robots, rows); infinite without numbers."""
+    return min((float(np.sqrt(np.nanmean(x**2))) for x in off if np.isfinite(x).any()), default=math.inf)
 
 
 def _rubbing(robot: Robot, factor: float) -> Robot:

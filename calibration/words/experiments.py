@@ -201,8 +201,8 @@ def _again(happens: bases.Window) -> str:
 def _usual(what: MoreRuns) -> dict[str, str]:
     """By variable, of a vehicle whose voltage is imposed."""
     low, high, within = what.low, what.high, what.within
-    load = [f"a payload up to {what.payload:g} kg"] * (what.payload > 0)
-    load += [f"a slope up to {what.slope:g} deg"] * (what.slope > 0)
+    load = [f"a payload up to {what.payload:g} kg"] * bool(what.payload > 0)
+    load += [f"a slope up to {what.slope:g} deg"] * bool(what.slope > 0)
     loaded = " and ".join(load) or "a brake or a drawbar pull"
     volts, angle, mass = what.steps
     return {

@@ -16,6 +16,7 @@ WHY = {
     "idle": ("nothing drives the motors", "nothing: settled runs are driven ones"),
     "rest": ("does not move", "nothing: friction holds it there; time histories use it"),
     "stuck": ("shows one number for long: saturated or frozen", "mend the instrument or its range"),
+    "glitches": ("has many readings far from the others", "mend the instrument, or log its mean if it shows pulses"),
     "undriven": ("the driver brakes or coasts", "nothing: time histories use it"),
 }
 
@@ -49,6 +50,23 @@ def statement(found: Settled) -> str:
     )
 
 
+def glitches(found: Settled) -> list[str]:
+    """Sentences on the readings that means leave out because they are far from the others, one for each channel."""
+    said = []
+    for channel in (s.channel for s in found.signals):
+        mine = [s for s in found.kept if channel.name in s.glitches]
+        if mine:
+            counts = [s.glitches[channel.name] for s in mine]
+            worst = mine[counts.index(max(counts))]
+            said.append(
+                f"{channel.column}: {counted(sum(counts), 'reading')} in {counted(len(mine), 'settled run')} left "
+                f"out of the mean, far from the readings next to them; most in rows {worst.rows[0] + 1} to "
+                f"{worst.rows[-1] + 1} ({100 * max(counts) / len(worst.rows):.2g} %); look at the instrument, or log "
+                "a mean if they are pulses"
+            )
+    return said
+
+
 def remarks(found: Settled, fewest: int) -> list[str]:
     """What should be looked at, a sentence each.
 
@@ -59,6 +77,7 @@ def remarks(found: Settled, fewest: int) -> list[str]:
     if found.gaps:
         rows = ", ".join(str(k + 1) for k in found.gaps[:5]) + (", ..." if len(found.gaps) > 5 else "")
         said.append(f"samples are missing after row{'s' * (len(found.gaps) > 1)} {rows}; no stretch goes across")
+    said += glitches(found)
     angles = {rate: angle for angle, rate, _ in RATES}
     for channel in (s.channel for s in found.signals):
         if channel not in found.runs.channels:

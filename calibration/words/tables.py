@@ -46,6 +46,23 @@ def unmeasured(note: notes.Unmeasured) -> str:
     )
 
 
+def repeats(note: notes.Repeats) -> str:
+    """Rows under the same conditions whose readings differ."""
+    (first, second), (one, other) = note.rows, map(number, note.values)
+    more = f" (and so {note.more} more)" if note.more else ""
+    said = (
+        f"{note.source} rows {first} and {second}, {note.column}: the same conditions gave {one} and {other}, "
+        f"{note.apart} apart{more}"
+    )
+    if note.unused:
+        many = len(note.unused) > 1
+        return (
+            f"{said}; {', '.join(note.unused)} {'vary' if many else 'varies'} there and {'are' if many else 'is'} "
+            "not used as a condition: name it under [columns], or give each level of a load a configuration"
+        )
+    return f"{said}; if one is wrong, remove it"
+
+
 def constant(note: notes.Constant) -> str:
     """A condition that does not vary."""
     here = f"{note.column} is {number(note.value)} in every row"
@@ -106,6 +123,11 @@ def off_by(note: notes.OffBy) -> str:
 SAID: dict[type, str | Callable[[Any], str]] = {
     notes.Unmeasured: unmeasured,
     notes.Constant: constant,
+    notes.Repeats: repeats,
+    notes.Turned: "{source}, {theirs}: off by {off:.2g} (rms) from what the file's numbers give, with the other sign "
+    'by {turned:.2g}; if it is turned round, state [columns] {column} = {{column = "{theirs}", factor = -1}}',
+    notes.StiffSupply: "{column} is {value:g} in every row: taken for a stiff supply; if it is no reading, remove "
+    "the column",
     notes.EndsEarly: ends_early,
     notes.NeverGrips: never_grips,
     notes.Thinned: "{source}: readings of {kept} of {rows} rows are used, evenly in time, and what drives the runs "

@@ -19,6 +19,7 @@ from calibration.data.runs import Runs
 from calibration.data.writing import finite
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.foresight import Foresight
+from calibration.words.notes import sentences
 from mmrjax import channels
 from mmrjax.channels import HEAT, Channel
 from mmrjax.errors import counted
@@ -285,7 +286,7 @@ def examined(file: Path, data: str | None, effects: tuple[str, ...] = ()) -> Rig
         return found
     runs = read_runs(data, robot, measured=True, series=True)
     seen = foresight.foresee(runs, robot)
-    doubts = (*filter(None, (settling.doubtful_sign(runs),)), *rig_facts.doubts(runs, robot))
+    doubts = (*filter(None, (settling.doubtful_sign(runs),)), *rig_facts.doubts(runs, robot), *sentences(seen.doubts))
     return dataclasses.replace(found, runs=runs, foresight=seen, doubts=doubts)
 
 

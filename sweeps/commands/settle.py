@@ -11,8 +11,10 @@ from rich.table import Table
 
 from calibration.data import robot_file, settling
 from calibration.data.settling import Inertia, Settled
+from calibration.inference import ranges
 from calibration.inference.observers import SettledRuns
 from calibration.words import settle as words
+from calibration.words.notes import sentences
 from mmrjax import balances
 from mmrjax.channels import Channel
 from mmrjax.conditions import Conditions
@@ -38,6 +40,8 @@ def settle(config: configuration.Settle, source: str, out: Path | None, force: b
         folder.write_table("stretches.csv", stretches(found))
         folder.write_json("result.json", to_json(found))
         print_settled(found)
+        for sentence in sentences(ranges.turned_signs(found.settled_runs(), robot)):
+            say(f"- {sentence}")
         shown = page("settle", found)
         return leave(folder, config, {"seed": None, "settled": len(found.kept)}, page=shown, runs=runs)
 
@@ -120,6 +124,9 @@ def to_json(found: Settled) -> dict[str, Any]:
         "drift": found.drift,
         "gaps": len(found.gaps),
         "scatter": dict(found.scatter),
+        "glitches": {
+            s.channel.name: sum(k.glitches.get(s.channel.name, 0) for k in found.kept) for s in found.signals
+        },
         "left_out": [dict(zip(("why", "stretches", "samples", "rows", "do"), row, strict=True)) for row in left],
         "notes": words.remarks(found, SettledRuns.fewest),
     }

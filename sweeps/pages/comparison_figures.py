@@ -52,7 +52,7 @@ def errors_over(
     in_units: bool = False,
     beside: Mapping[str, str] | None = None,
 ) -> Figure:
-    """Error (35) of each channel over each condition.
+    """Error (35) of each channel over each condition, over the rows where there is no condition.
 
     Args:
         beside: further columns than conditions, with their words, where errors are in units.
@@ -61,13 +61,15 @@ def errors_over(
     """
     every = {
         "slope_deg": "slope [°]", "supply_voltage_V": "supply voltage [V]", "motor_speed_rpm": "motor speed [rpm]",
-        "payload_kg": "payload [kg]",
+        "motor_current_A": "motor current [A]", "payload_kg": "payload [kg]",
     }  # fmt: skip
     conditions = {c: words for c, words in every.items() if c in table and f"simulated_{c}" not in table}
     if in_units:
         conditions |= beside or {}
         varied = {c: words for c, words in conditions.items() if np.unique(table[c]).size > 1}
         conditions = varied or dict(list(conditions.items())[:1])
+    if not conditions:
+        conditions, table = {"row": "row"}, {**table, "row": np.arange(1.0, len(table["configuration"]) + 1)}
     fig, grid = figure(len(channels), len(conditions), 2.3 * len(channels), sharex="col", sharey="row")
     look = looks(table["configuration"])
     for row, channel in zip(grid, channels, strict=True):

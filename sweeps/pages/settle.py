@@ -71,7 +71,10 @@ def over_log(found: Settled) -> Figure:
         begin = float(clock[mine[-1]])
     order = every[np.argsort(clock[every], kind="stable")]
     lines = [("{}\n[{}]".format(*IMPOSED[runs.layout.imposed]), applied(runs))]
-    lines += [(f"{s.channel.label}\n[{s.channel.unit}]", s.shown) for s in found.signals]
+    lines += [
+        (f"{s.channel.label}\n[{s.channel.unit}]", s.shown if len(s.angle) else runs[s.channel.column])
+        for s in found.signals
+    ]
     fig, grid = figure(len(lines), 1, 1.9 * len(lines), sharex=True)
     for axes, (label, values), signal in zip(grid[:, 0], lines, (None, *found.signals), strict=True):
         axes.plot(*_thinned(clock[order], values[order]), color=FAINT, lw=0.8)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from calibration.data.errors import BadConfiguration, BadData, number
+from calibration.data.errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
@@ -22,10 +22,11 @@ from calibration.inference.details import EquationDefects
 from calibration.inference.errors import root_mean_square
 from calibration.inference.linearization import Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
-from calibration.inference.notes import Note
+from calibration.inference.notes import Note, Repeats
 from calibration.inference.observers.base import Observer, SearchPolicy
 from calibration.inference.optimizers import Member, Numbers, Optimum, counted, penalties, searches_refilled
 from calibration.inference.problem import Data, Observation, Problem
+from calibration.words import tables
 from mmrjax import balances, channels, fidelities
 from mmrjax.compiling import SELDOM, compiled
 from mmrjax.conditions import Conditions
@@ -41,6 +42,8 @@ from mmrjax.signals import FAILED, SLIDES, TIPS, Result, Signals
 if TYPE_CHECKING:
     from calibration.discovery.adequacy import Diagnosis
 
+#: Column that a brake or a weight may set, so that a reading is a condition.
+LOAD = "output_torque_Nm"
 #: Replicates further apart than this many sds of their difference contradict each other.
 CONTRADICTION = 6.0
 #: The same for replicates whose sd is not known, as a share of their mean.
@@ -52,6 +55,18 @@ LOST = 0.1
 #: Balances to which the defect of a row is attributed, one for each equation that the channels close: what each is a
 #: part of, by its name among the signals.
 EQUATIONS = {"electrical": "voltage", "track": "torque_output", "slip": "speed_theoretical"}
+
+
+def _unused(runs: Runs, first: int, second: int, but: str) -> tuple[str, ...]:
+    """Columns that differ between two rows and are no condition: those without a role, and a load's torque.
+
+    Args:
+        but: a column that is left out.
+    """
+    without = [c for c, cells in runs.extras.items() if cells.dtype.kind == "f"]
+    torque = [c for c in (LOAD,) if c != but and runs.has(c)]
+    cells = {**runs.extras, **runs.columns}
+    return tuple(c for c in (*without, *torque) if cells[c][first] != cells[c][second])
 
 
 class SettledLinearization(Linearization):
@@ -133,9 +148,10 @@ class SettledRuns(Observer):
 
     @classmethod
     def check(cls, runs: Runs, noise: Noise) -> list[Note | str]:
+        """Refuses a table of one condition whose readings differ; notes the repeats that differ most."""
         columns = [c for c in ("configuration", *runs.axes, "surface") if runs.has(c)]
         measured, alike = runs.measured(), dict[tuple[str, ...], list[int]]()
-        least = cls.least(runs)
+        least, found = cls.least(runs), list[Repeats]()
         for row, key in enumerate(zip(*(runs[c].astype(str).tolist() for c in columns), strict=True)):
             alike.setdefault(key, []).append(row)
         for rows in map(np.array, alike.values()):
@@ -146,14 +162,14 @@ class SettledRuns(Observer):
             allowed = np.where(noise.estimated, CONTRADICTION_SHARE * mean, CONTRADICTION * sd)
             for at in np.argwhere(apart > allowed)[:1]:
                 (one, other, k), at = at.tolist(), tuple(at)
-                first, second, column = rows[one], rows[other], runs.channels[k].column
+                first, second, column = int(rows[one]), int(rows[other]), runs.channels[k].column
                 known = f"{apart[at] / sd[at]:.0f} sd" if not noise.estimated[k] else f"{apart[at] / mean[at]:.0%}"
-                raise BadData(
-                    f"{runs.source} rows {first + 1} and {second + 1}, {column}: the same conditions gave "
-                    f"{number(runs[column][first])} and {number(runs[column][second])}, {known} apart; "
-                    "remove the wrong one or state a larger --noise"
-                )
-        return []
+                values = float(runs[column][first]), float(runs[column][second])
+                others = _unused(runs, first, second, column)
+                found.append(Repeats(runs.source, (first + 1, second + 1), column, values, known, others))
+        if found and len(alike) == 1:
+            raise BadData(f"{tables.repeats(found[0])}; no condition varies, so nothing can be fitted")
+        return [dataclasses.replace(found[0], more=len(found) - 1)] if found else []
 
     @classmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Note | str]:
@@ -169,7 +185,8 @@ class SettledRuns(Observer):
 
     @classmethod
     def identity(cls, runs: Runs) -> tuple[str, ...]:
-        return tuple(c for c in runs.columns if c not in ("run_id", "order"))
+        own = () if "order" in runs.headings else ("order",)  # of the rows in the file
+        return tuple(c for c in runs.columns if c not in own)
 
     @classmethod
     def shows(cls, effect: type[Effect]) -> bool:

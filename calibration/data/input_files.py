@@ -1,0 +1,117 @@
+"""Opening of input files: every table, profile and TOML file comes in here."""
+
+from __future__ import annotations
+
+import re
+import stat
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from calibration.data.errors import BadConfiguration, BadData, InputError
+from mmrjax.errors import counted
+
+#: First bytes of formats that are no text, and what they are.
+BINARY = {
+    b"PAR1": "a Parquet file", b"\x89HDF\r\n\x1a\n": "an HDF5 file", b"PK\x03\x04": "an Excel workbook or a zip file",
+    b"\xd0\xcf\x11\xe0": "an Excel workbook", b"\x1f\x8b": "a gzip file", b"MATLAB 5.0": "a MATLAB file",
+    b"ARROW1": "an Arrow file", b"SQLite format 3\0": "an SQLite file", b"#ROSBAG": "a ROS bag",
+    b"\x89MCAP": "an MCAP file", b"ULog\x01": "a ULog file", b"\x93NUMPY": "a NumPy file", b"%PDF": "a PDF",
+}  # fmt: skip
+#: How JSON and web pages begin.
+TEXTS = {
+    re.compile(rb"\s*(\{|\[\s*[\[{\"\d-])"): "JSON",
+    re.compile(rb"\s*<(!doctype|html|\?xml)", re.I): "a web page or XML",
+}  # fmt: skip
+#: Largest table and largest TOML file [bytes], most keys of a TOML file and most tables within one another.
+LARGEST, LARGEST_TOML, KEYS, DEEPEST = 2**31, 2**22, 10_000, 16
+#: Whole numbers that a TOML file may hold (TOML 1.0: 64 bits).
+WHOLE = 2**63
+#: Kinds of files that are not read: what they are called.
+_KINDS = {stat.S_ISDIR: "a folder", stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket"}
+
+
+def content(path: Path, where: str | Path, kind: type[InputError] = BadData, largest: int = LARGEST) -> bytes:
+    """Returns the bytes of a regular file.
+
+    Args:
+        where: opens the message of an error; kind: of the error; largest: number of bytes.
+
+    Raises:
+        InputError: a folder, a pipe or a device, a file that is too large, or one that the system does not open.
+    """
+    try:
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):
+            what = next((word for is_kind, word in _KINDS.items() if is_kind(found.st_mode)), "a device")
+            raise kind(f"{where}: is {what}; expected a file")
+        if found.st_size > largest:
+            raise kind(f"{where}: has {found.st_size / 1e6:,.0f} MB; expected at most {largest / 1e6:,.0f} MB")
+        return path.read_bytes()
+    except (OSError, ValueError) as error:  # a name with a null byte
+        raise kind(f"{where}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+
+
+def table(path: Path, where: str | Path) -> bytes:
+    """Returns the bytes of a file that should be CSV.
+
+    Raises:
+        BadData: as `content`, or another format, which the message names.
+    """
+    found = content(path, where)
+    what = next((word for begin, word in BINARY.items() if found.startswith(begin)), None)
+    what = what or next((word for begin, word in TEXTS.items() if begin.match(found)), None)
+    if what is not None:
+        raise BadData(
+            f"{where}: is {what}; expected CSV: a header line with the columns' names, then one line for each row; "
+            "export it as CSV, from Python with pandas.DataFrame(...).to_csv(..., index=False)"
+        )
+    return found
+
+
+def toml_text(path: Path, where: str | Path) -> str:
+    """Returns the text of a TOML file.
+
+    Args:
+        where: opens the message of an error.
+
+    Raises:
+        BadConfiguration: as `content`, or text that is not UTF-8.
+    """
+    try:
+        return content(path, where, BadConfiguration, LARGEST_TOML).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise BadConfiguration(f"{where}: not a readable TOML file ({error}); save it in UTF-8") from error
+
+
+def toml_content(text: str, where: str | Path, kind: type[InputError] = BadConfiguration) -> dict[str, Any]:
+    """Returns the keys and tables of a TOML text.
+
+    Args:
+        where: opens the message of an error; kind: of the error.
+
+    Raises:
+        InputError: it is no TOML, has more than `KEYS` keys or `DEEPEST` tables within one another, or a whole number
+            of more than 64 bits.
+    """
+    try:
+        found = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, ValueError) as error:  # a number of more digits than Python reads
+        raise kind(f"{where}: not a readable TOML file ({error})") from error
+    except RecursionError as error:
+        raise kind(f"{where}: tables or lists are nested too deep; expected at most {DEEPEST} levels") from error
+    keys, left = 0, [(found, 1)]
+    while left:
+        value, depth = left.pop()
+        if depth > DEEPEST:
+            raise kind(f"{where}: tables or lists are nested too deep; expected at most {DEEPEST} levels")
+        inner = value.values() if isinstance(value, dict) else value
+        keys += len(value) if isinstance(value, dict) else 0
+        if keys > KEYS:
+            raise kind(f"{where}: has more than {counted(KEYS, 'key')}; is it the right file?")
+        for each in inner:
+            if isinstance(each, dict | list):
+                left.append((each, depth + 1))
+            elif isinstance(each, int) and not -WHOLE <= each < WHOLE:
+                raise kind(f"{where}: got a whole number beyond 64 bits; expected numbers of at most 18 digits")
+    return found

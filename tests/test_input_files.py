@@ -1,0 +1,183 @@
+"""Files that come in: what opens them, which are refused, and in which words."""
+
+import os
+import re
+
+import numpy as np
+import pytest
+
+from calibration.data import input_files, robot_file
+from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration, BadData, InputError
+from calibration.discovery.discover import without_copies
+from calibration.inference.checks import _stuck
+from calibration.inference.notes import StiffSupply
+from mmrjax.errors import counted
+from sweeps.pages import comparison_figures
+
+RIG = """
+base = "none"
+channels = ["motor_current", "output_speed"]
+{more}
+[motor]
+resistance = 1.0
+torque_constant = 0.05
+[gearbox]
+ratio = 1
+efficiency_load = 1.0
+[shaft]
+load = "shaft"
+inertia = 1e-4
+loss_coulomb = 0.01
+"""
+
+
+def bench(tmp_path, more=""):
+    (tmp_path / "rig.toml").write_text(RIG.format(more=more), encoding="utf-8")
+    return robot_file.read(tmp_path / "rig.toml")
+
+
+def table(tmp_path, text, robot):
+    (tmp_path / "t.csv").write_text(text, encoding="utf-8")
+    return records.read(tmp_path / "t.csv", robot=robot)
+
+
+DEEP = "a." * 4_999 + "a"
+TOML = {
+    "nested": ("x = " + "[" * 5000 + "]" * 5000, "nested too deep; expected at most 16 levels"),
+    "400 digits": ("[motor]\nresistance = 1" + "0" * 400, "a whole number beyond 64 bits"),
+    "5000 digits": ("[motor]\nresistance = 1" + "0" * 5000, "not a readable TOML file"),
+    "a long header": (f"[{DEEP}]\nx = 1", "nested too deep"),
+    "many keys": ("".join(f"k{k} = 1\n" for k in range(10_001)), "more than 10,000 keys; is it the right file"),
+    "a long value": ('base = "' + "x" * 100_000 + '"', "100,000 characters"),
+    "empty": ("# nothing\n", "states nothing; expected tables of parameters"),
+    "a channel twice": (
+        RIG.format(more="").replace('"motor_current"', '"output_speed"'),
+        "output_speed stands twice",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", TOML)
+def test_toml_that_cannot_be_is_refused_in_one_short_sentence(tmp_path, case):
+    text, says = TOML[case]
+    (tmp_path / "r.toml").write_text(text)
+    with pytest.raises(BadConfiguration, match=says) as refusal:
+        robot_file.read(tmp_path / "r.toml")
+    assert len(str(refusal.value)) < 400 and "\n" not in str(refusal.value)
+
+
+TABLES = {
+    "JSON": (b'{"time": [0, 1]}', "is JSON; expected CSV"),
+    "a list of JSON": (b'\n[[0, "a"]]', "is JSON; expected CSV"),
+    "Parquet": (b"PAR1\x15\x04", "is a Parquet file; expected CSV"),
+    "Excel": (b"PK\x03\x04\x14\x00", "is an Excel workbook or a zip file"),
+    "HDF5": (b"\x89HDF\r\n\x1a\n\0", "is an HDF5 file"),
+    "a web page": (b"<!DOCTYPE html>\n", "is a web page"),
+    "a long cell": (b'supply_voltage_V,output_speed_rpm\n1,"' + b"9" * 140_000 + b'"', "a cell of more than 131,072"),
+    "a long number": (b"supply_voltage_V,output_speed_rpm\n1," + b"9" * 100_000, "100,000 characters"),
+}
+
+
+@pytest.mark.parametrize("case", TABLES)
+def test_what_is_no_table_is_refused_in_one_short_sentence(tmp_path, case):
+    content, says = TABLES[case]
+    (tmp_path / "t.csv").write_bytes(content)
+    with pytest.raises(BadData, match=says) as refusal:
+        records.read(tmp_path / "t.csv", robot=bench(tmp_path))
+    assert len(str(refusal.value)) < 400 and "\n" not in str(refusal.value)
+
+
+def test_pipes_devices_and_folders_are_not_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path, what in ((tmp_path / "pipe", "a pipe"), (tmp_path, "a folder"), ("/dev/zero", "a device")):
+        with pytest.raises(BadData, match=f"is {what}; expected a file"):
+            records.read(path)
+        with pytest.raises(BadConfiguration, match=f"is {what}; expected a file"):
+            input_files.toml_text(records.Path(path), "x")
+
+
+@pytest.mark.parametrize("word", ["NaN", "nan", "NA", "N/A", "null", "None"])
+def test_words_for_no_reading_are_empty_cells(tmp_path, word):
+    robot = bench(tmp_path)
+    text = "supply_voltage_V,motor_current_A,output_speed_rpm,room_C\n4,0.3,700,20\n6,{},1100,{}\n8,0.5,1500,22\n"
+    named, empty = (table(tmp_path, text.format(x, x), robot) for x in (word, ""))
+    assert named.notes == empty.notes and "1 of 3 cells of motor_current_A are empty" in named.notes[0]
+    np.testing.assert_array_equal(named.measured(), empty.measured())
+    np.testing.assert_array_equal(named.extras["room_C"], empty.extras["room_C"])
+    with pytest.raises(BadData, match=f"row 1, supply_voltage_V: got {word}; expected "):
+        table(tmp_path, f"supply_voltage_V,output_speed_rpm\n{word},700\n", robot)
+
+
+def test_a_factor_of_few_digits_reaches_the_limit(tmp_path):
+    robot = bench(tmp_path, '[columns]\nduty = {column = "pwm", factor = 0.00392157}')
+    head = "supply_voltage_V,pwm,output_speed_rpm\n8,100,700\n8,"
+    found = table(tmp_path, f"{head}255,1800\n8,-255,-1800\n", robot)
+    assert found["duty"].tolist() == pytest.approx([0.392157, 1.0, -1.0], rel=1e-12)
+    with pytest.raises(BadData, match=r"row 2, pwm: got 256; expected -255 to 255"):
+        table(tmp_path, f"{head}256,1800\n", robot)
+
+
+@pytest.mark.parametrize(("imposed", "column"), [("voltage", "supply_voltage_V"), ("motor_speed", "motor_speed_rpm")])
+def test_a_row_that_nothing_drives_is_left_out_with_a_note(tmp_path, imposed, column):
+    robot = bench(tmp_path, f'imposed = "{imposed}"')
+    found = table(tmp_path, f"{column},motor_current_A,room_C\n0,0,20\n4,0.3,21\n8,0.4,22\n", robot)
+    assert found[column].tolist() == [4.0, 8.0] and found.extras["room_C"].tolist() == [21.0, 22.0]
+    assert [n for n in found.notes if f"row 1 is left out, as nothing drives the motors ({column} 0)" in n]
+
+
+ROWS = "4,0.3,700{}\n6,0.4,1100{}\n6,0.4,1100{}\n"
+
+
+@pytest.mark.parametrize(
+    ("head", "rows", "kept"),
+    [
+        ("", ROWS.format("", "", ""), 3),  # repeats on a coarse display
+        (",run_id", ROWS.format(",a", ",b", ",c"), 3),
+        (",run_id", ROWS.format(",a", ",b", ",b"), 2),
+        (",order", ROWS.format(",1", ",2", ",2"), 2),
+        ("", 2 * ROWS.format("", "", ""), 3),  # the whole table twice
+    ],
+)
+def test_rows_alike_are_repeats_and_the_same_run_twice_is_a_copy(tmp_path, head, rows, kept):
+    found = table(tmp_path, f"supply_voltage_V,motor_current_A,output_speed_rpm{head}\n{rows}", bench(tmp_path))
+    assert len(without_copies(found)[0]) == kept
+
+
+def test_a_stiff_supply_is_no_stuck_instrument(tmp_path):
+    (tmp_path / "rig.toml").write_text(
+        RIG.format(more='imposed = "motor_speed"').replace('"output_speed"', '"motor_voltage"')
+    )
+    robot = robot_file.read(tmp_path / "rig.toml")
+    rows = "".join(f"{speed},{0.01 * k},24\n" for k, speed in enumerate((4500, 4400, 4300, 4200)))
+    found = table(tmp_path, f"motor_speed_rpm,motor_current_A,motor_voltage_V\n{rows}", robot)
+    assert _stuck(found) == [StiffSupply("motor_voltage_V", 24.0)]
+
+
+@pytest.mark.parametrize("count", [1, np.int64(1), np.int32(2), np.uint8(0)])
+def test_counts_of_numpy_are_counts(count):
+    assert counted(count, "row") == f"{int(count)} row" + ("" if int(count) == 1 else "s")
+
+
+@pytest.mark.parametrize("column", ["motor_current_A", "motor_speed_rpm", None])
+def test_errors_are_drawn_over_what_is_imposed_or_the_rows(tmp_path, column):
+    robot = bench(tmp_path)
+    shown = robot.channels
+    rows = {"configuration": np.repeat("shaft", 3)} | ({} if column is None else {column: np.arange(3.0)})
+    for channel in shown:
+        rows |= {channel.column: np.ones(3), f"simulated_{channel.column}": np.full(3, 1.1)}
+        rows[f"error_{channel.name}_percent"] = np.full(3, 10.0)
+    rows.pop("simulated_motor_current_A" if column == "motor_current_A" else "", None)
+    shown = tuple(c for c in shown if f"simulated_{c.column}" in rows)
+    fig = comparison_figures.errors_over(rows, shown, in_units=True)
+    words = {"motor_current_A": "motor current [A]", "motor_speed_rpm": "motor speed [rpm]", None: "row"}
+    assert fig.axes[-1].get_xlabel() == words[column]
+
+
+def test_echoes_of_input_are_short():
+    said = str(InputError(f"t.csv row 1, x: got {'ab' * 50_000}; expected a number"))
+    assert re.fullmatch(r"t\.csv row 1, x: got (ab){20}… \(100,000 characters\); expected a number", said)
+    long = str(InputError("got " + "word " * 1000 + "; expected less"))
+    assert len(long) < 1000 and long.startswith("got word") and long.endswith("expected less")
+    path = f"/tmp/{'folder/' * 20}t.csv: is empty"
+    assert str(InputError(path)) == path
