@@ -12,8 +12,8 @@ from calibration.data import rig_facts, robot_file
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration, BadData
 from calibration.discovery import discover
+from calibration.inference import bases, checks, observers
 from calibration.inference import blocks as holdout
-from calibration.inference import checks, observers
 from calibration.inference.calibrate import calibrate
 from mmrjax import params
 from mmrjax.balances import absent
@@ -196,6 +196,12 @@ def test_levels_of_the_current_are_blocks_to_hold_out(robot, tmp_path):
     runs = settled_table(tmp_path, robot, DRY)
     kinds = holdout.distinct(runs, observers.kind(runs).blocks)
     assert list(kinds) == ["current"] and len(kinds["current"]) == 8
+
+
+def test_curves_are_over_a_current_that_is_imposed(robot, tmp_path):
+    runs = settled_table(tmp_path, robot, DRY)
+    found = observers.kind(runs).of(runs, robot).bases(runs.columns, np.ones(len(runs), bool), robot)
+    assert ("track", "current") in bases.names(found)
 
 
 @pytest.mark.slow
