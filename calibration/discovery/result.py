@@ -530,6 +530,15 @@ class DiscoveryResult:
         return before, after
 
     @property
+    def rms(self) -> dict[str, dict[str, float]]:
+        """rms errors by fit and channel with readings [unit of the channel], over the rows that errors in percent are
+        over."""
+        fits = dict(zip(("before", "after"), self.errors, strict=True))
+        main = next(iter(self.errors_held_out.values()), ())
+        fits |= dict(zip(("held_out_before", "held_out_after"), main, strict=False))
+        return {fit: {name: e["rms"] for name, e in by.items() if e["rows"]} for fit, by in fits.items()}
+
+    @property
     def held_by_prior(self) -> tuple[str, ...]:
         """Names of the parameters of the proposed robot that were fitted and are held by their priors."""
         base = [name for name, p in self.base_shift.items() if p.held_by_prior]

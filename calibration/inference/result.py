@@ -160,12 +160,14 @@ class ChannelErrors:
     Attributes:
         rows: how many they are.
         rms_percent, max_percent: of what `CalibrationResult.percent_of` says; rms_sigma: in sds of the noise.
+        rms: in the channel's unit.
     """
 
     rows: int
     rms_percent: float
     max_percent: float
     rms_sigma: float
+    rms: float
 
 
 #: Errors by the name of the channel.
@@ -345,6 +347,14 @@ class CalibrationResult:
     def main_blocks(self) -> HeldOut | None:
         """The most telling kind of blocks that was held out."""
         return next(iter(self.held_out.values()), None)
+
+    @property
+    def rms(self) -> dict[str, dict[str, float]]:
+        """rms errors before, after and held out, by fit and channel with readings [unit of the channel]."""
+        fits = {"before": self.errors_before, "after": self.errors_after}
+        if self.main_blocks is not None:
+            fits["held_out"] = self.main_blocks.errors
+        return {fit: {name: e.rms for name, e in by.items() if e.rows} for fit, by in fits.items()}
 
     def to_json(self) -> dict[str, Any]:
         """As in result.json, docs/schemas/calibrate.schema.json."""

@@ -9,7 +9,6 @@ from rich.table import Table
 from calibration.data.columns import Layout
 from calibration.inference import blocks, priors
 from calibration.inference.calibrate import calibrate as run
-from calibration.inference.errors import rms_by_fit
 from calibration.inference.result import CalibrationResult
 from mmrjax.errors import counted
 from sweeps import config as configuration
@@ -70,7 +69,7 @@ def print_calibration(found: CalibrationResult) -> None:
         errors.add_row(which, f"{max(e.rows for e in by.values())}/{len(found)}", *cells)
     say(errors)
     if Layout.of(found.robot).crosses_zero:
-        say(words.describe_rms(rms_by_fit(found.rows(), found.channels, ("before", "after", "held_out"))))
+        say(words.describe_rms(found.rms))
     say(found.starts.statement())
     for note in found.notes:
         say(f"- {note}")
