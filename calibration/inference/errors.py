@@ -36,6 +36,19 @@ def percent_error(simulated: np.ndarray, measured: np.ndarray, *, crosses_zero: 
         return (sized_error if crosses_zero else relative_error)(simulated, measured)
 
 
+def share_of_measured(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """rms of simulated less measured over the rms of what is measured [-], by channel over the rows that have both, NaN
+    without such a row; shape (channels,).
+
+    Args:
+        simulated, measured: shape (rows, channels).
+    """
+    both = np.isfinite(simulated) & np.isfinite(measured)
+    off, size = (np.sqrt(np.sum(np.square(x), 0, where=both)) for x in (simulated - measured, measured))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(off / size)
+
+
 def root_mean_square(errors: np.ndarray) -> float:
     """Of those that there are; NaN where there is none."""
     finite = errors[np.isfinite(errors)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from calibration.inference import blocks, notes
@@ -11,7 +11,7 @@ from mmrjax import channels
 from mmrjax.errors import counted
 
 if TYPE_CHECKING:
-    from calibration.inference.lack_of_fit import Adequacy
+    from calibration.inference.lack_of_fit import Adequacy, Miss
     from calibration.inference.residual_clusters import ResidualCluster
     from calibration.inference.result import CalibrationResult
 
@@ -170,8 +170,34 @@ def shown_by(test: notes.Shown) -> str:
     }[test.what]
 
 
+#: Why no test of residuals decides whether a fit is adequate.
+OBSTACLES = {
+    "undescribed": "This model does not describe these runs: {large}. Check units, signs, sides, and columns that "
+    "vary and are not used, before any parameter is read",
+    "not converged": "No verdict: the search did not converge, so its parameters are not the best ones ({every})",
+    "worse": "Not adequate: the fit is worse than the robot's file as stated ({every})",
+}
+
+
+def _misses(those: Sequence[Miss]) -> str:
+    """`total current 74 % of its measured rms (32 % with the file as stated)`."""
+    each = [
+        f"{channels.find(m.channel).label} {_percent(m.fitted)} of its measured rms ({_percent(m.as_stated)} with "
+        "the file as stated)"
+        for m in those
+    ]
+    return ", ".join(each)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.{0 if share > 0.1 else 1}f} %"
+
+
 def adequacy(found: Adequacy) -> str:
     """Whether a fit is adequate; opens a calibration's output."""
+    if found.obstacle:
+        large = "it misses " + _misses([m for m in found.misses if m.large])
+        return OBSTACLES[found.obstacle].format(large=large, every=_misses(found.misses))
     chi2 = f"χ² {found.chi2:.4g} on {found.degrees_of_freedom:.4g} degrees of freedom"
     if found.adequate is None or found.p_value is None:
         return (
