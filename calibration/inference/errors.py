@@ -37,8 +37,8 @@ def percent_error(simulated: np.ndarray, measured: np.ndarray, *, crosses_zero: 
 
 
 def share_of_measured(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """rms of simulated less measured over the rms of what is measured [-], by channel over the rows that have both, NaN
-    without such a row; shape (channels,).
+    """rms of simulated less measured over the rms of what is measured [-], by channel over the rows that have both;
+    NaN without such a row; shape (channels,).
 
     Args:
         simulated, measured: shape (rows, channels).

@@ -205,6 +205,11 @@ class SettledRuns(Observer):
         result, signals, left = jax.vmap(one)(self.conditions, unknowns, found)
         return self._observed(robot, result), signals, left
 
+    def operating(self, robot: Robot) -> Signals | None:
+        if self.long or self.conditions.turns:
+            return None
+        return jax.vmap(functools.partial(operating_signals, robot))(self.conditions)
+
     @property
     def long(self) -> bool:
         return fidelities.facts(self.fidelity).rollout
