@@ -28,6 +28,12 @@ ROOT = Path(__file__).resolve().parents[1]
 #: Notes, and what is said of them.
 SAMPLES = [
     (of_fit.HeldByPrior(("a",)), "not determined by these runs (posterior sd above 0.9 of the prior's): a"),
+    (
+        of_fit.OnlyTogether(
+            (of_fit.Pair("a", "b", 0.99, "ratio", -1.0), of_fit.Pair("a", "c", -1.0, "linear", 0.031))
+        ),
+        "determined only together: the ratio of a and b (correlation +0.990), a + 0.031 · c (correlation -1.000)",
+    ),
     (of_fit.HeldByPrior(("a", "b")), "not determined by these runs (posterior sd above 0.9 of the prior's): a, b"),
     (
         of_fit.FarFromPrior("m", 3.2, "loop"),

@@ -19,9 +19,10 @@ from calibration.discovery.notes import Asked, Instruction, NameSupport, RuledOu
 from calibration.discovery.prediction import Gain
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
-from calibration.inference.notes import HeldByPrior, Notes
+from calibration.inference.notes import HeldByPrior, Notes, Pair
+from calibration.inference.posterior import determined_together
 from calibration.inference.residual_clusters import ResidualCluster
-from calibration.words import experiments
+from calibration.words import experiments, fits
 from calibration.words import loop as words
 from calibration.words.notes import sentence, sentences
 from mmrjax.channels import Channel
@@ -545,6 +546,13 @@ class DiscoveryResult:
         each = [(f"effects.{e.name}.{name}", p) for e in self.effects for name, p in e.parameters.items()]
         return (*base, *(name for name, p in each if p.held_by_prior))
 
+    @property
+    def together(self) -> tuple[Pair, ...]:
+        """Pairs of base parameters and of effects' own of which these data determine a combination alone."""
+        own = {*self.base_shift, *(f"effects.{e.name}.{name}" for e in self.effects for name in e.parameters)}
+        pairs = determined_together(self.posterior, self.held_by_prior)
+        return tuple(pair for pair in pairs if own >= {pair.one, pair.other})
+
     def to_json(self) -> dict[str, Any]:
         """Everything as JSON-able data, as docs/schemas/loop.schema.json describes it."""
         held = {
@@ -600,6 +608,7 @@ class DiscoveryResult:
                 "of_readings": dict(zip(("before", "after"), self.chi2_of_readings, strict=True)),
             },
             "base_shift": {name: dataclasses.asdict(p) for name, p in self.base_shift.items()},
+            "together": [fits.pair(pair) for pair in self.together],
             "scores": [dataclasses.asdict(s) for s in self.scores],
             "bootstrap": {
                 "replicates": self.replicates,

@@ -13,6 +13,8 @@ from calibration.data.runs import Runs
 from calibration.data.thinning import thinned
 from calibration.inference import identifiability, observers, priors
 from calibration.inference import optimizers as fit
+from calibration.inference.notes import Pair
+from calibration.inference.posterior import determined_together, of_coordinates
 from calibration.inference.preparation import prepare
 from mmrjax import fidelities
 from mmrjax.robot import Robot
@@ -45,6 +47,7 @@ class Foresight:
         status: of each row with the numbers of the file.
         noise: of each channel: where its sd comes from.
         alike: pairs of parameters that these data hardly tell apart, with the correlation of their posterior.
+        together: pairs of which they determine a combination alone.
         robot: with what the table shows of it, see `preparation.prepare`.
     """
 
@@ -52,6 +55,7 @@ class Foresight:
     status: tuple[str, ...]
     noise: tuple[str, ...]
     alike: tuple[tuple[str, str, float], ...]
+    together: tuple[Pair, ...]
     robot: Robot
 
 
@@ -92,4 +96,6 @@ def foresee(runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS
         for k, n in enumerate(names)
     )
     statuses = tuple(STATUSES[int(s)] for s in np.asarray(seen.status))
-    return Foresight(found, statuses, known.source, tuple(about.correlated()), robot)
+    priors_hold = [p.name for p in found if p.held]
+    together = determined_together(of_coordinates(coordinates, np.asarray(z), about.covariance), priors_hold)
+    return Foresight(found, statuses, known.source, tuple(about.correlated()), together, robot)

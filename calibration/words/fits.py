@@ -61,6 +61,30 @@ def estimated_noise(note: notes.EstimatedNoise) -> str:
     )
 
 
+def combination(two: notes.Pair) -> str:
+    """Which combination of two parameters data determine: `the ratio of a and b`, `a + 0.03 · b`."""
+    if two.form != "linear":
+        return f"the {two.form} of {two.one} and {two.other}"
+    return f"{two.one} {'-' if two.weight < 0 else '+'} {abs(two.weight):.2g} · {two.other}"
+
+
+def pair(two: notes.Pair) -> dict[str, Any]:
+    """As in result.json."""
+    return {"a": two.one, "b": two.other, "correlation": two.correlation, "determined": combination(two)}
+
+
+def determined(name: str, held: bool, pairs: Sequence[notes.Pair]) -> str:
+    """Whether data determine a parameter: `yes`, `no`, `only with motor.resistance`."""
+    others = [p.other if p.one == name else p.one for p in pairs if name in (p.one, p.other)]
+    return "no" if held else f"only with {', '.join(others)}" if others else "yes"
+
+
+def only_together(note: notes.OnlyTogether) -> str:
+    """Parameters that are not determined separately, with what is."""
+    each = [f"{combination(p)} (correlation {p.correlation:+.3f})" for p in note.pairs]
+    return f"determined only together: {', '.join(each)}"
+
+
 def of_rows(note: notes.OfRows) -> str:
     """Of which rows something is so."""
     rows = f"rows {', '.join(map(str, note.rows))}"
@@ -251,6 +275,7 @@ def residual_cluster(c: ResidualCluster) -> str:
 #: Kind of note → a sentence with its fields, or a function that makes one.
 SAID: dict[type, str | Callable[[Any], str]] = {
     notes.HeldByPrior: f"not determined by these runs (posterior sd above {HELD:g} of the prior's): {{names}}",
+    notes.OnlyTogether: only_together,
     notes.FarFromPrior: lambda note: FAR[note.of].format(note.name, note.sds),
     notes.NoiseOff: noise_off,
     notes.Fact: lambda note: FACTS[note.what],

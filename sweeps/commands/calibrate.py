@@ -56,8 +56,7 @@ def print_calibration(found: CalibrationResult) -> None:
     for name, p in found.parameters.items():
         low, high = (f"{v:.3g}" for v in p.interval)
         marks = "> " * p.interval_open[1] + "< " * p.interval_open[0]  # the end lies further out
-        determined = "no" if p.held_by_prior else "yes"
-        shown.add_row(name, f"{p.value:.4g}", f"{marks}{low} .. {high}", f"{p.shift:+.1f}", determined)
+        shown.add_row(name, f"{p.value:.4g}", f"{marks}{low} .. {high}", f"{p.shift:+.1f}", found.determined(name))
     say(shown)
     errors = Table(title=f"rms of simulated - measured [% of {found.percent_of}]", title_justify="left")
     for heading in ("", "rows", *(c.label for c in found.channels)):

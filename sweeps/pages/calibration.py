@@ -51,6 +51,7 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
         sized=sized,
         has_ground=found.robot.has_ground,
         rms=found.rms,
+        determined={name: found.determined(name) for name in found.parameters},
         held=HELD,
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",
     )
