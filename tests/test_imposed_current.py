@@ -21,6 +21,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.fidelities import histories as integrator
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.steady import steady
+from sweeps.pages import comparison_figures
 
 K, RATIO, ETA = 0.05, 10.0, 0.9
 DRY, VISCOUS, INERTIA, ROTOR = 0.3, 0.02, 0.01, 2e-6
@@ -242,6 +243,16 @@ def test_commands_take_a_current_or_say_what_to_state(robot, tmp_path, mmrjax):
     ):  # fmt: skip
         code, _, err = mmrjax(*options, "--robot", "rig.toml", "--out", "none")
         assert code == 2 and said in " ".join(err.split()), err
+
+
+def test_errors_are_drawn_over_a_current_that_is_imposed(robot):
+    speed, current = np.linspace(100.0, 800.0, 5), np.linspace(0.1, 2.0, 5)
+    table = {
+        "configuration": np.full(5, "bench"), "motor_current_A": current, "motor_speed_rpm": speed,
+        "simulated_motor_speed_rpm": speed + 1.0, "error_motor_speed_percent": np.ones(5),
+    }  # fmt: skip
+    figure = comparison_figures.errors_over(table, robot.channels, in_units=True)
+    assert [axes.get_xlabel() for axes in figure.axes] == ["motor current [A]"]
 
 
 def test_a_table_without_its_current_is_refused(robot, tmp_path):

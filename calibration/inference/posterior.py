@@ -49,8 +49,8 @@ def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tup
     found = []
     for i, j in zip(*np.triu_indices(len(sd), 1), strict=True):
         one, other = posterior.coordinates[i], posterior.coordinates[j]
-        correlation = float(posterior.covariance[i, j] / (sd[i] * sd[j]))
-        if not abs(correlation) > TOGETHER or one in held and other in held:
+        correlation = float(posterior.covariance[i, j] / max(sd[i] * sd[j], 1e-300))
+        if not abs(correlation) > TOGETHER or (one in held and other in held):
             continue
         size = spread * np.where(log, value[: len(sd)], 1.0)
         weight = -np.sign(correlation) * abs(size[i] / size[j])

@@ -61,7 +61,7 @@ def errors_over(
     """
     every = {
         "slope_deg": "slope [°]", "supply_voltage_V": "supply voltage [V]", "motor_speed_rpm": "motor speed [rpm]",
-        "payload_kg": "payload [kg]",
+        "payload_kg": "payload [kg]", "motor_current_A": "motor current [A]",
     }  # fmt: skip
     conditions = {c: words for c, words in every.items() if c in table and f"simulated_{c}" not in table}
     if in_units:
