@@ -169,6 +169,13 @@ def test_a_table_without_order_or_levels_has_no_windows():
     assert windows({k: v for k, v in (table() | measured).items() if k != "order"}, COUNTS) == ()
 
 
+def test_an_order_that_the_only_condition_tells_has_no_curves():
+    order = np.arange(1.0, ROWS + 1)
+    columns = {"configuration": np.full(ROWS, "bench"), "motor_current_A": order, "order": order}
+    alone = bases.Scope(("electrical", "track"), ("motor_current_A",))
+    assert {v for _, v in names(families(columns, COUNTS, scope=alone))} == {bases.CONDITIONS}
+
+
 # --- sizes ----------------------------------------------------------------------------------------------
 
 

@@ -177,6 +177,7 @@ def test_reading_that_stands_alone_is_an_outlier(clean, looks):
     found = looks.analyst.discover(runs)
     assert found.outliers == (18,) and found.verdict == "none" and found.unusable == ()  # rows count from 1
     assert not found.included[17] and found.included.sum() == len(clean.runs) - 1
+    assert found.rms["before"]["speed"] < 2 * np.max(clean.runs["speed_sd_mm_s"]), found.rms
 
 
 @pytest.mark.nightly

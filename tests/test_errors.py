@@ -36,6 +36,8 @@ def test_channel_errors_leave_out_what_is_missing():
     assert found["total_current"]["rms_sigma"] == pytest.approx(np.sqrt(0.5))
     assert found["total_current"]["max_percent"] == pytest.approx(20.0)
     assert np.isnan(found["motor_speed"]["rms_percent"])
+    assert found["total_current"]["rms"] == pytest.approx(np.sqrt(0.5))
+    assert found["speed"]["rms"] == pytest.approx(0.1 / 1e-3)  # in mm/s, as the column
 
 
 def test_channel_errors_take_another_percentage():

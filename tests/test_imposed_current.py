@@ -12,8 +12,8 @@ from calibration.data import rig_facts, robot_file
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration, BadData
 from calibration.discovery import discover
+from calibration.inference import bases, checks, observers
 from calibration.inference import blocks as holdout
-from calibration.inference import checks, observers
 from calibration.inference.calibrate import calibrate
 from mmrjax import params
 from mmrjax.balances import absent
@@ -21,6 +21,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.fidelities import histories as integrator
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.steady import steady
+from sweeps.pages import comparison_figures
 
 K, RATIO, ETA = 0.05, 10.0, 0.9
 DRY, VISCOUS, INERTIA, ROTOR = 0.3, 0.02, 0.01, 2e-6
@@ -200,6 +201,12 @@ def test_levels_of_the_current_are_blocks_to_hold_out(robot, tmp_path):
     assert list(kinds) == ["current"] and len(kinds["current"]) == 8
 
 
+def test_curves_are_over_a_current_that_is_imposed(robot, tmp_path):
+    runs = settled_table(tmp_path, robot, DRY)
+    found = observers.kind(runs).of(runs, robot).bases(runs.columns, np.ones(len(runs), bool), robot)
+    assert ("track", "current") in bases.names(found)
+
+
 @pytest.mark.slow
 def test_a_calibration_of_settled_runs_gives_the_friction_back(robot, tmp_path):
     runs = settled_table(tmp_path, robot, 0.25)
@@ -238,6 +245,16 @@ def test_commands_take_a_current_or_say_what_to_state(robot, tmp_path, mmrjax):
     ):  # fmt: skip
         code, _, err = mmrjax(*options, "--robot", "rig.toml", "--out", "none")
         assert code == 2 and said in " ".join(err.split()), err
+
+
+def test_errors_are_drawn_over_a_current_that_is_imposed(robot):
+    speed, current = np.linspace(100.0, 800.0, 5), np.linspace(0.1, 2.0, 5)
+    table = {
+        "configuration": np.full(5, "bench"), "motor_current_A": current, "motor_speed_rpm": speed,
+        "simulated_motor_speed_rpm": speed + 1.0, "error_motor_speed_percent": np.ones(5),
+    }  # fmt: skip
+    figure = comparison_figures.errors_over(table, robot.channels, in_units=True)
+    assert [axes.get_xlabel() for axes in figure.axes] == ["motor current [A]"]
 
 
 def test_a_table_without_its_current_is_refused(robot, tmp_path):

@@ -15,6 +15,7 @@ from calibration.data.runs import Runs
 from calibration.discovery.discover import Sds, of_sds
 from calibration.inference import lack_of_fit
 from calibration.inference.calibrate import calibrate
+from calibration.inference.errors import root_mean_square
 from calibration.inference.lack_of_fit import Residuals, adequacy
 from calibration.inference.noise_factor import noise_factors, noise_remarks
 from calibration.inference.notes import Shown
@@ -112,6 +113,37 @@ def test_too_few_rows_cannot_be_tested_and_say_so():
     small = dataclasses.replace(whole, runs=whole.runs.where(few), jacobian=whole.jacobian[rows], **some)
     made = judged(small, estimated=True)
     assert made.adequate is None and made.p_value is None
+
+
+@pytest.mark.parametrize(
+    ("missed", "noise", "estimated", "converged", "stated_off", "obstacle", "adequate"),
+    [
+        (0.0, 1.0, True, True, 9.0, "", True),
+        (0.0, 1.0, True, False, 9.0, "not converged", None),
+        (0.0, 1.0, True, True, 0.0, "worse", False),
+        (0.6, 1.0, True, True, 9.0, "undescribed", False),
+        (0.6, 1.0, True, False, 9.0, "undescribed", False),
+        (0.6, 200.0, False, True, 900.0, "", True),  # an instrument that is stated to be so coarse
+        (0.6, 1.0, False, True, 900.0, "undescribed", False),
+    ],
+)
+def test_no_test_of_residuals_decides_before_the_fit_is_one(
+    missed, noise, estimated, converged, stated_off, obstacle, adequate
+):
+    """Against the case whose misfit had become its noise: 74 % of the current, worse than as stated, p = 1."""
+    made, rng = toy(np.random.default_rng(11)), np.random.default_rng(12)
+    sd = np.tile(SIGMA, (90, 1)) * [noise, 1.0, 1.0]
+    off = missed * root_mean_square(made.runs.measured()[:, 0]) * rng.standard_normal(90)
+    simulated = made.simulated + off[:, None] * [1.0, 0.0, 0.0]
+    whitened = (simulated - made.runs.measured()) / sd
+    made = dataclasses.replace(made, simulated=simulated, whitened=whitened)
+    unknown = np.full(3, estimated)
+    as_stated = made.runs.measured() + stated_off * SIGMA
+    found = lack_of_fit.judged(made, as_stated, sd, estimated=unknown, converged=converged)
+    assert (found.obstacle, found.adequate) == (obstacle, adequate) and len(found.misses) == 3
+    if obstacle:
+        assert "as stated" in found.statement and "Adequate" not in found.statement
+        assert ("total current 56 %" in found.statement) == (missed > 0)
 
 
 # --- sds that are not right ---------------------------------------------------------------------------

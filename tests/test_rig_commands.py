@@ -14,7 +14,7 @@ import pytest
 from calibration.data import robot_file
 from calibration.data.columns import Layout
 from calibration.data.runs import Runs
-from calibration.inference.errors import relative_error, rms_by_fit, sized_error
+from calibration.inference.errors import relative_error, sized_error
 from mmrjax import channels, fidelities, params
 from mmrjax.robots import nominal
 from sweeps import capabilities
@@ -478,10 +478,6 @@ def test_a_channel_without_readings_has_no_error_and_no_warning():
     """As an angle has none in settled runs of a rig whose logs have it."""
     nothing = np.full(2, np.nan)
     assert np.isnan(sized_error(np.stack([nothing, np.ones(2)], 1), np.ones((2, 2)))).tolist() == [[True, False]] * 2
-    shown = [channels.find("speed"), channels.find("position")]
-    table = {"before_speed_mm_s": np.ones(2), "speed_mm_s": np.zeros(2), "after_speed_mm_s": nothing}
-    table |= {f"{fit}position_mm": nothing for fit in ("", "before_", "after_")}
-    assert rms_by_fit(table, shown, ("before", "after")) == {"before": {"speed": 1.0}}
 
 
 def test_parameters_of_a_rig_say_where_they_come_from(tmp_path):

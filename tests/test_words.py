@@ -28,6 +28,12 @@ ROOT = Path(__file__).resolve().parents[1]
 #: Notes, and what is said of them.
 SAMPLES = [
     (of_fit.HeldByPrior(("a",)), "not determined by these runs (posterior sd above 0.9 of the prior's): a"),
+    (
+        of_fit.OnlyTogether(
+            (of_fit.Pair("a", "b", 0.99, "ratio", -1.0), of_fit.Pair("a", "c", -1.0, "linear", 0.031))
+        ),
+        "determined only together: the ratio of a and b (correlation +0.990), a + 0.031 · c (correlation -1.000)",
+    ),
     (of_fit.HeldByPrior(("a", "b")), "not determined by these runs (posterior sd above 0.9 of the prior's): a, b"),
     (
         of_fit.FarFromPrior("m", 3.2, "loop"),
@@ -527,7 +533,7 @@ def test_a_formula_without_terms_says_so():
 def test_why_an_effect_is_ruled_out():
     reasons = (RuledOut("a", "power"), RuledOut("b", "size", 2.94, ("x", "y")), RuledOut("c", "edge"))
     assert loop.why_ruled_out(reasons) == (
-        "a would put power in; b at 2.9 times its largest plausible size; check x and y; c is within an sd of the "
+        "a would make its balance supply power; b at 2.9 times its largest plausible size; check x and y; c is within an sd of the "
         "largest plausible size"
     )
 
@@ -540,7 +546,8 @@ def test_names_say_what_would_explain_more_than_they():
         return SimpleNamespace(effects=dict.fromkeys(names, 1.0), rise_chi2=rise, why="too large")
 
     near, better = candidate(-2.0, "a"), candidate(-30.4, "b", "c")
-    assert loop.ruled_out(of("named", near)) == "" == loop.ruled_out(of("unnamed"))
+    assert loop.ruled_out(of("named", candidate(6.5, "a"))) == "" == loop.ruled_out(of("unnamed"))
+    assert loop.ruled_out(of("named", near)).startswith("a would explain as much as what is proposed, but is")
     assert loop.ruled_out(of("class", near, better)) == (
         "b and c would explain 30 σ² more than what is proposed, but are ruled out by size or sign alone: too large."
     )

@@ -11,6 +11,7 @@ import numpy as np
 
 from calibration.data.errors import BadData
 from calibration.discovery.active_set import CandidateSpace
+from calibration.discovery.dissipation import supplying
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import Settings
 from calibration.inference.held_out import search_each
@@ -38,6 +39,7 @@ class Candidate:
         plausible: whether every amplitude is of a plausible size, off its bounds, and of a sign that physics allows.
         nearly: whether it is plausible, but for amplitudes up to `settings.stretched` times the largest.
         converged: whether the fit is an optimum.
+        supplying: effects whose balance would supply power with them.
     """
 
     active: tuple[str, ...]
@@ -49,6 +51,7 @@ class Candidate:
     plausible: bool
     nearly: bool
     converged: bool
+    supplying: tuple[str, ...] = ()
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -78,13 +81,13 @@ def candidate(space: CandidateSpace, active: tuple[str, ...], best: Optimum, set
     amplitude = np.where([bool(name) for name in active], amplitude, 0.0)
     size = np.array([_size(space, n, a, settings) if n else 0.0 for n, a in zip(active, amplitude, strict=True)])
     near = np.array([_size(space, n, s, settings) if n else 0.0 for n, s in zip(active, spread, strict=True)])
-    signs = [not (n and space.library[n].dissipative and a <= 0) for n, a in zip(active, amplitude, strict=True)]
-    # What lies within an sd of a bound is held by it, unless its sd is as large as all that is plausible.
-    ok = bool(np.all(size + np.where(near < 0.25, near, 0.0) < 1.0)) and all(signs)
-    nearly = bool(np.all(size < settings.stretched)) and all(signs)
     cost = float(best.cost) if np.isfinite(best.cost) else np.inf
     z, sd = np.asarray(best.z), np.asarray(best.sd)
-    return Candidate(active, z, sd, cost, amplitude, size, ok, nearly, bool(best.converged))
+    supplies = supplying(space, active, amplitude, z) if np.isfinite(cost) else ()
+    # What lies within an sd of a bound is held by it, unless its sd is as large as all that is plausible.
+    ok = bool(np.all(size + np.where(near < 0.25, near, 0.0) < 1.0)) and not supplies
+    nearly = bool(np.all(size < settings.stretched)) and not supplies
+    return Candidate(active, z, sd, cost, amplitude, size, ok, nearly, bool(best.converged), supplies)
 
 
 def _size(space: CandidateSpace, name: str, amplitude: float, settings: Settings) -> float:

@@ -73,7 +73,7 @@ from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
-from calibration.inference.notes import FarFromPrior, HeldByPrior, NoiseOff, Note, Notes, Step
+from calibration.inference.notes import FarFromPrior, HeldByPrior, NoiseOff, Note, Notes, OnlyTogether, Step
 from calibration.inference.residual_clusters import residual_clusters
 from calibration.words.notes import in_words
 from mmrjax import channels, effects
@@ -875,6 +875,7 @@ def remarks(found: DiscoveryResult) -> Notes:
     said += [FarFromPrior(name, x, "loop") for name, x in far.items()]
     held = tuple(name for name in found.held_by_prior if name not in far)
     said += [HeldByPrior(held)] * bool(held)
+    said += [OnlyTogether(found.together)] * bool(found.together)
     said += found.residual_clusters
     wave = found.unnamed
     if wave is not None and wave.score_free_in_each_run and wave.score < 0.5 * wave.score_free_in_each_run:

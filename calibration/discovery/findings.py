@@ -228,7 +228,7 @@ def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Set
             continue
         sds[name], sizes[name] = float(amplitude), float(size)
         sd = settings.width * float(c.sd[space.free + slot])
-        if space.library[name].dissipative and amplitude <= 0:
+        if name in c.supplying:
             why.append(RuledOut(name, "power"))
         elif size >= 1:
             check = space.library[name].rests_on or (amplitude_of(space.library[name]).spec.meaning,)
@@ -322,10 +322,10 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
 def _plausible_score(
     space: CandidateSpace, effect: Effect, scores: ScoreTable, settings: Settings
 ) -> tuple[float, float]:
-    """Amplitude [prior sds] and what it explains [σ²], no larger than plausible and of a sign that physics allows."""
+    """Amplitude [prior sds] and what it explains [σ²], no larger than plausible."""
     m = space.library.best_instance(effect.name, np.asarray(scores.single))
     wanted, left = float(scores.amplitude[m]), float(scores.left[m])
-    low = 0.0 if effect.dissipative else -settings.plausible
+    low = max(-settings.plausible, amplitude_of(effect).spec.bounds[0] / size_of(effect))
     amplitude = min(max(wanted, low), settings.plausible)
     return amplitude, float(scores.single[m] ** 2 - ((wanted - amplitude) * left) ** 2)
 

@@ -206,7 +206,7 @@ class RuledOut:
     """Why an effect is not plausible.
 
     Attributes:
-        name: its; why: its sign puts `power` in, its `size`, or an sd would take it to the `edge`.
+        name: its; why: its balance would supply `power`, its `size`, or an sd would take it to the `edge`.
         size: over the largest plausible one; check: what that rests on.
     """
 

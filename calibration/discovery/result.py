@@ -19,9 +19,10 @@ from calibration.discovery.notes import Asked, Instruction, NameSupport, RuledOu
 from calibration.discovery.prediction import Gain
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
-from calibration.inference.notes import HeldByPrior, Notes
+from calibration.inference.notes import HeldByPrior, Notes, Pair
+from calibration.inference.posterior import determined_together
 from calibration.inference.residual_clusters import ResidualCluster
-from calibration.words import experiments
+from calibration.words import experiments, fits
 from calibration.words import loop as words
 from calibration.words.notes import sentence, sentences
 from mmrjax.channels import Channel
@@ -530,11 +531,27 @@ class DiscoveryResult:
         return before, after
 
     @property
+    def rms(self) -> dict[str, dict[str, float]]:
+        """rms errors by fit and channel with readings [unit of the channel], over the rows that errors in percent are
+        over."""
+        fits = dict(zip(("before", "after"), self.errors, strict=True))
+        main = next(iter(self.errors_held_out.values()), ())
+        fits |= dict(zip(("held_out_before", "held_out_after"), main, strict=False))
+        return {fit: {name: e["rms"] for name, e in by.items() if e["rows"]} for fit, by in fits.items()}
+
+    @property
     def held_by_prior(self) -> tuple[str, ...]:
         """Names of the parameters of the proposed robot that were fitted and are held by their priors."""
         base = [name for name, p in self.base_shift.items() if p.held_by_prior]
         each = [(f"effects.{e.name}.{name}", p) for e in self.effects for name, p in e.parameters.items()]
         return (*base, *(name for name, p in each if p.held_by_prior))
+
+    @property
+    def together(self) -> tuple[Pair, ...]:
+        """Pairs of base parameters and of effects' own of which these data determine a combination alone."""
+        own = {*self.base_shift, *(f"effects.{e.name}.{name}" for e in self.effects for name in e.parameters)}
+        pairs = determined_together(self.posterior, self.held_by_prior)
+        return tuple(pair for pair in pairs if own >= {pair.one, pair.other})
 
     def to_json(self) -> dict[str, Any]:
         """Everything as JSON-able data, as docs/schemas/loop.schema.json describes it."""
@@ -591,6 +608,7 @@ class DiscoveryResult:
                 "of_readings": dict(zip(("before", "after"), self.chi2_of_readings, strict=True)),
             },
             "base_shift": {name: dataclasses.asdict(p) for name, p in self.base_shift.items()},
+            "together": [fits.pair(pair) for pair in self.together],
             "scores": [dataclasses.asdict(s) for s in self.scores],
             "bootstrap": {
                 "replicates": self.replicates,

@@ -215,8 +215,10 @@ def families(
     for variable, column in VARIABLES.items():
         if column not in columns or (column in EVERY_AXIS and column not in scope.axes):
             continue
-        # Another variable again in its place: tables of one size share what is compiled.
         drift = variable == "order" and collinearity(columns, weight, scope.axes) > COLLINEAR
+        if drift and not over:
+            continue
+        # Another variable again in its place: tables of one size share what is compiled.
         over[variable] = next(iter(over)) if drift else variable
 
     def curve(place: str, variable: str) -> np.ndarray:

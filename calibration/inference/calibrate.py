@@ -219,7 +219,9 @@ def calibrate(
         starts=found.starts,
         searched=searched,
         chi_square=estimates.chi_square(seen, measured, sd, about, known),
-        adequacy=lack_of_fit.adequacy(left, known=not known.estimated.any()),
+        adequacy=lack_of_fit.judged(
+            left, seen_before, sd, estimated=known.estimated, converged=bool(found.best.converged)
+        ),
         residual_clusters=residual_clusters(left, seed),
         identifiability=about,
         posterior=of_coordinates(posed.coordinates, z, about.covariance),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -34,6 +34,19 @@ def percent_error(simulated: np.ndarray, measured: np.ndarray, *, crosses_zero: 
     """Errors [%] of the channel's size where readings may cross zero, else of the reading; shape (rows, ...)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return (sized_error if crosses_zero else relative_error)(simulated, measured)
+
+
+def share_of_measured(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """rms of simulated less measured over the rms of what is measured [-], by channel over the rows that have both;
+    NaN without such a row; shape (channels,).
+
+    Args:
+        simulated, measured: shape (rows, channels).
+    """
+    both = np.isfinite(simulated) & np.isfinite(measured)
+    off, size = (np.sqrt(np.sum(np.square(x), 0, where=both)) for x in (simulated - measured, measured))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(off / size)
 
 
 def root_mean_square(errors: np.ndarray) -> float:
@@ -74,7 +87,8 @@ def channel_errors(
     sd: np.ndarray,
     percent: np.ndarray | None = None,
 ) -> dict[str, dict[str, float | int]]:
-    """Errors [%] and in sigmas of every channel over the rows that have a simulated and a measured value.
+    """Errors of every channel over the rows that have a simulated and a measured value: in percent, in sigmas and, as
+    `rms`, in the channel's unit.
 
     Args:
         shown: the channels.
@@ -84,23 +98,12 @@ def channel_errors(
     if percent is None:
         with np.errstate(divide="ignore", invalid="ignore"):
             percent = relative_error(simulated, measured)
-    sigma = (simulated - measured) / sd
+    off = simulated - measured
     answer = {}
     for k, channel in enumerate(shown):
-        answer[channel.name] = {**summary(percent[:, k]), "rms_sigma": root_mean_square(sigma[:, k])}
+        answer[channel.name] = {
+            **summary(percent[:, k]),
+            "rms_sigma": root_mean_square(off[:, k] / sd[:, k]),
+            "rms": root_mean_square(off[:, k]) / channel.factor,
+        }
     return answer
-
-
-def rms_by_fit(
-    table: Mapping[str, np.ndarray], shown: Sequence[Channel], fits: Iterable[str]
-) -> dict[str, dict[str, float]]:
-    """rms of simulated less measured in each channel's unit, by fit (of columns `FIT_COLUMN`) and channel that has
-    readings and a simulation."""
-    found: dict[str, dict[str, float]] = {}
-    for fit in fits:
-        for c in shown:
-            if f"{fit}_{c.column}" in table:
-                error = root_mean_square(table[f"{fit}_{c.column}"] - table[c.column])
-                if np.isfinite(error):
-                    found.setdefault(fit, {})[c.name] = error
-    return found

@@ -141,7 +141,9 @@ def _errors(
 ) -> Errors:
     found = channel_errors(shown, simulated, measured, sd, percent)
     return {
-        name: ChannelErrors(int(e["rows"]), float(e["rms_percent"]), float(e["max_percent"]), float(e["rms_sigma"]))
+        name: ChannelErrors(
+            int(e["rows"]), *(float(e[x]) for x in ("rms_percent", "max_percent", "rms_sigma", "rms"))
+        )
         for name, e in found.items()
     }
 

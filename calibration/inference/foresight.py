@@ -13,7 +13,8 @@ from calibration.data.runs import Runs
 from calibration.data.thinning import thinned
 from calibration.inference import identifiability, observers, priors
 from calibration.inference import optimizers as fit
-from calibration.inference.notes import Notes, OffBy, Repeats, SlopesIn, StiffSupply, Turned
+from calibration.inference.notes import Notes, OffBy, Pair, Repeats, SlopesIn, StiffSupply, Turned
+from calibration.inference.posterior import determined_together, of_coordinates
 from calibration.inference.preparation import prepare
 from mmrjax import fidelities
 from mmrjax.robot import Robot
@@ -46,6 +47,7 @@ class Foresight:
         status: of each row with the numbers of the file.
         noise: of each channel: where its sd comes from.
         alike: pairs of parameters that these data hardly tell apart, with the correlation of their posterior.
+        together: pairs of which they determine a combination alone.
         robot: with what the table shows of it, see `preparation.prepare`.
         doubts: what should be looked at in the table before a fit.
     """
@@ -54,6 +56,7 @@ class Foresight:
     status: tuple[str, ...]
     noise: tuple[str, ...]
     alike: tuple[tuple[str, str, float], ...]
+    together: tuple[Pair, ...]
     robot: Robot
     doubts: Notes = ()
 
@@ -98,4 +101,6 @@ def foresee(runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS
     doubts = tuple(
         note for note in ready.checked if isinstance(note, OffBy | Repeats | SlopesIn | StiffSupply | Turned)
     )
-    return Foresight(found, statuses, known.source, tuple(about.correlated()), robot, doubts)
+    priors_hold = [p.name for p in found if p.held]
+    together = determined_together(of_coordinates(coordinates, np.asarray(z), about.covariance), priors_hold)
+    return Foresight(found, statuses, known.source, tuple(about.correlated()), together, robot, doubts)

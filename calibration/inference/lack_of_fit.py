@@ -18,6 +18,7 @@ from scipy.special import chdtrc, fdtrc, ndtr
 
 from calibration.data.courses import courses
 from calibration.data.runs import DUTY, Runs
+from calibration.inference.errors import share_of_measured
 from calibration.inference.notes import Shown
 from calibration.inference.observers import Observer
 from calibration.words import fits
@@ -30,6 +31,25 @@ TERMS, OVER_TIME, LEAST = 3, 6, 10
 CLEAR = 1e-3
 #: Fewest degrees of freedom of replicates.
 REPLICATES = 4
+#: Share of a channel's measured rms that a model which describes the runs misses at most; residuals up to so many
+#: stated sds are noise, whatever their size.
+UNDESCRIBED, EXPLAINED = 0.25, 1.5
+#: Rise of χ² over that of the file as stated which rounding and the search for the noise leave [σ²].
+WORSE = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Miss:
+    """Error of a channel over its measured rms [-]: of the fit, and of the robot's file as stated.
+
+    Attributes:
+        large: whether it is larger than noise that is stated, and than `UNDESCRIBED`.
+    """
+
+    channel: str
+    fitted: float
+    as_stated: float
+    large: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,11 +57,14 @@ class Adequacy:
     """Whether a fit's residuals are what noise leaves.
 
     Attributes:
-        adequate: None where it cannot be tested.
+        adequate: None where it cannot be tested, or the search did not converge.
         chi2: misfit of the readings [σ²]; degrees_of_freedom: that the fit leaves them.
         p_value: family-wise, of all tests made; None where none could be.
         shown_by: the most telling test.
         noise_known: whether χ² was among the tests.
+        obstacle: why no test of residuals decides: the model is `undescribed`, the search `not converged`, or the fit
+            `worse` than the file as stated by the same sds; "" where a test does.
+        misses: of each channel.
     """
 
     adequate: bool | None
@@ -50,6 +73,8 @@ class Adequacy:
     p_value: float | None
     shown_by: Shown
     noise_known: bool
+    obstacle: str = ""
+    misses: tuple[Miss, ...] = ()
 
     @property
     def statement(self) -> str:
@@ -97,6 +122,24 @@ class Residuals:
         """Misfit of each channel [σ²], shape (channels,)."""
         return np.sum(self.whitened**2, 0)
 
+    def misses(self, as_stated: np.ndarray, stated: np.ndarray) -> tuple[Miss, ...]:
+        """Errors over the measured rms of each channel with readings.
+
+        Args:
+            as_stated: readings of the robot's file before any fit [SI], shape (rows, channels).
+            stated: whether the noise of a channel is, shape (channels,).
+        """
+        counts = self.counts & np.isfinite(as_stated)
+        measured = np.where(counts, self.runs.measured(), np.nan)
+        fitted, before = (share_of_measured(x, measured) for x in (self.simulated, as_stated))
+        sigma = np.sqrt(self.chi2 / np.maximum(self.counts.sum(0), 1))
+        large = (fitted > UNDESCRIBED) & ~(stated & (sigma <= EXPLAINED))
+        return tuple(
+            Miss(c.name, float(fitted[k]), float(before[k]), bool(large[k]))
+            for k, c in enumerate(self.runs.channels)
+            if np.isfinite(fitted[k])
+        )
+
     def rescaled(self) -> Residuals:
         """The same with each channel's sds as its own misfit says."""
         factor = np.sqrt(np.maximum(self.chi2, 1e-300) / np.maximum(self.freedom, 1e-9))
@@ -106,8 +149,36 @@ class Residuals:
         return dataclasses.replace(self, whitened=whitened, jacobian=jacobian)
 
 
+def judged(
+    fit: Residuals, as_stated: np.ndarray, sd: np.ndarray, *, estimated: np.ndarray, converged: bool
+) -> Adequacy:
+    """Tests of a fit: meaningful where the model describes the runs, the search converged, and the fit is
+    no worse than the file of the robot.
+
+    A fit minimises χ² and the distance to the priors, so with the same sds its χ² cannot be above that at the prior
+    means.
+
+    Args:
+        as_stated: readings of the file as stated [SI]; sd: of the readings [SI]; shape (rows, channels).
+        estimated: whether a channel's noise was, from the misfit, shape (channels,).
+        converged: whether the search was.
+    """
+    misses = fit.misses(as_stated, ~estimated)
+    found = adequacy(fit, known=not estimated.any())
+    both = fit.counts & np.isfinite(as_stated)
+    before = np.sum(((as_stated - fit.runs.measured()) / sd) ** 2, where=both)
+    obstacle = (
+        "undescribed" if any(m.large for m in misses)
+        else "not converged" if not converged
+        else "worse" if np.sum(fit.whitened**2, where=both) > before + WORSE
+        else ""
+    )  # fmt: skip
+    adequate = found.adequate if not obstacle else None if obstacle == "not converged" else False
+    return dataclasses.replace(found, adequate=adequate, obstacle=obstacle, misses=misses)
+
+
 def adequacy(fit: Residuals, *, known: bool) -> Adequacy:
-    """Test a fit.
+    """Tests of a fit's residuals.
 
     Args:
         known: whether the noise of every channel is, and was not estimated from the misfit.

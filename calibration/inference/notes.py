@@ -43,6 +43,28 @@ class HeldByPrior(Note):
     names: tuple[str, ...]
 
 
+class Pair(NamedTuple):
+    """Two parameters of which data determine a combination alone.
+
+    Attributes:
+        one, other: their names; correlation: of their posterior.
+        form: of the combination: their `ratio`, their `product`, or `linear`: `one` + `weight` · `other`.
+        weight: of that [unit of one / unit of other]; negative where the difference is determined.
+    """
+
+    one: str
+    other: str
+    correlation: float
+    form: str
+    weight: float
+
+
+class OnlyTogether(Note):
+    """Parameters that are not determined separately."""
+
+    pairs: tuple[Pair, ...]
+
+
 class FarFromPrior(Note):
     """A parameter far from its prior.
 

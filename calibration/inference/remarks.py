@@ -19,6 +19,7 @@ from calibration.inference.notes import (
     NoPrediction,
     Note,
     OfRows,
+    OnlyTogether,
     ProductAlone,
     SamePredictions,
 )
@@ -73,6 +74,8 @@ def _parameters(found: CalibrationResult) -> Iterator[Note]:
     far = {name for name, p in found.parameters.items() if abs(p.shift) > FAR}  # which is said of them instead
     if held := tuple(name for name in found.held_by_prior if name not in far):
         yield HeldByPrior(held)
+    if pairs := found.together:
+        yield OnlyTogether(pairs)
     for name, p in found.parameters.items():
         if name in far:
             yield FarFromPrior(name, abs(p.shift), "calibration")

@@ -14,8 +14,9 @@ from calibration.data.posterior import Posterior
 from calibration.inference.identifiability import Identifiability
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.multistart import Starts
-from calibration.inference.notes import HeldByPrior, Notes
+from calibration.inference.notes import HeldByPrior, Notes, Pair
 from calibration.inference.population import Searched
+from calibration.inference.posterior import determined_together
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.words import fits as words
 from calibration.words.notes import sentence, sentences
@@ -160,12 +161,14 @@ class ChannelErrors:
     Attributes:
         rows: how many they are.
         rms_percent, max_percent: of what `CalibrationResult.percent_of` says; rms_sigma: in sds of the noise.
+        rms: in the channel's unit.
     """
 
     rows: int
     rms_percent: float
     max_percent: float
     rms_sigma: float
+    rms: float
 
 
 #: Errors by the name of the channel.
@@ -321,6 +324,15 @@ class CalibrationResult:
         return tuple(name for name, p in self.parameters.items() if p.held_by_prior)
 
     @property
+    def together(self) -> tuple[Pair, ...]:
+        """Pairs of parameters of which these data determine a combination alone."""
+        return determined_together(self.posterior, self.held_by_prior)
+
+    def determined(self, name: str) -> str:
+        """`yes`, `no`, or with which parameters together these data determine one."""
+        return words.determined(name, self.parameters[name].held_by_prior, self.together)
+
+    @property
     def counts(self) -> dict[str, int]:
         """How many rows have each status with the calibrated robot."""
         return _counts(self.status)
@@ -345,6 +357,14 @@ class CalibrationResult:
     def main_blocks(self) -> HeldOut | None:
         """The most telling kind of blocks that was held out."""
         return next(iter(self.held_out.values()), None)
+
+    @property
+    def rms(self) -> dict[str, dict[str, float]]:
+        """rms errors before, after and held out, by fit and channel with readings [unit of the channel]."""
+        fits = {"before": self.errors_before, "after": self.errors_after}
+        if self.main_blocks is not None:
+            fits["held_out"] = self.main_blocks.errors
+        return {fit: {name: e.rms for name, e in by.items() if e.rows} for fit, by in fits.items()}
 
     def to_json(self) -> dict[str, Any]:
         """As in result.json, docs/schemas/calibrate.schema.json."""
@@ -389,6 +409,7 @@ class CalibrationResult:
                         {"singular_value": s, "components": main} for s, main in about.weak_directions()
                     ],
                     "correlated": [{"a": a, "b": b, "correlation": r} for a, b, r in about.correlated()],
+                    "together": [words.pair(pair) for pair in self.together],
                 },
                 "statuses_before": _counts(self.status_before),
                 "statuses": self.counts,

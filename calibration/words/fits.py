@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from calibration.inference import blocks, notes
@@ -11,7 +11,7 @@ from mmrjax import channels
 from mmrjax.errors import counted
 
 if TYPE_CHECKING:
-    from calibration.inference.lack_of_fit import Adequacy
+    from calibration.inference.lack_of_fit import Adequacy, Miss
     from calibration.inference.residual_clusters import ResidualCluster
     from calibration.inference.result import CalibrationResult
 
@@ -59,6 +59,30 @@ def estimated_noise(note: notes.EstimatedNoise) -> str:
         f"no noise was stated for {each}: estimated from the misfit, so it holds model error too and cannot test "
         "whether the model is adequate"
     )
+
+
+def combination(two: notes.Pair) -> str:
+    """Which combination of two parameters data determine: `the ratio of a and b`, `a + 0.03 · b`."""
+    if two.form != "linear":
+        return f"the {two.form} of {two.one} and {two.other}"
+    return f"{two.one} {'-' if two.weight < 0 else '+'} {abs(two.weight):.2g} · {two.other}"
+
+
+def pair(two: notes.Pair) -> dict[str, Any]:
+    """As in result.json."""
+    return {"a": two.one, "b": two.other, "correlation": two.correlation, "determined": combination(two)}
+
+
+def determined(name: str, held: bool, pairs: Sequence[notes.Pair]) -> str:
+    """Whether data determine a parameter: `yes`, `no`, `only with motor.resistance`."""
+    others = [p.other if p.one == name else p.one for p in pairs if name in (p.one, p.other)]
+    return "no" if held else f"only with {', '.join(others)}" if others else "yes"
+
+
+def only_together(note: notes.OnlyTogether) -> str:
+    """Parameters that are not determined separately, with what is."""
+    each = [f"{combination(p)} (correlation {p.correlation:+.3f})" for p in note.pairs]
+    return f"determined only together: {', '.join(each)}"
 
 
 def of_rows(note: notes.OfRows) -> str:
@@ -170,8 +194,34 @@ def shown_by(test: notes.Shown) -> str:
     }[test.what]
 
 
+#: Why no test of residuals decides whether a fit is adequate.
+OBSTACLES = {
+    "undescribed": "This model does not describe these runs: {large}. Check units, signs, sides, and columns that "
+    "vary and are not used, before any parameter is read",
+    "not converged": "No verdict: the search did not converge, so its parameters are not the best ones ({every})",
+    "worse": "Not adequate: the fit is worse than the robot's file as stated ({every})",
+}
+
+
+def _misses(those: Sequence[Miss]) -> str:
+    """`total current 74 % of its measured rms (32 % with the file as stated)`."""
+    each = [
+        f"{channels.find(m.channel).label} {_percent(m.fitted)} of its measured rms ({_percent(m.as_stated)} with "
+        "the file as stated)"
+        for m in those
+    ]
+    return ", ".join(each)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.{0 if share > 0.1 else 1}f} %"
+
+
 def adequacy(found: Adequacy) -> str:
     """Whether a fit is adequate; opens a calibration's output."""
+    if found.obstacle:
+        large = "it misses " + _misses([m for m in found.misses if m.large])
+        return OBSTACLES[found.obstacle].format(large=large, every=_misses(found.misses))
     chi2 = f"χ² {found.chi2:.4g} on {found.degrees_of_freedom:.4g} degrees of freedom"
     if found.adequate is None or found.p_value is None:
         return (
@@ -225,6 +275,7 @@ def residual_cluster(c: ResidualCluster) -> str:
 #: Kind of note → a sentence with its fields, or a function that makes one.
 SAID: dict[type, str | Callable[[Any], str]] = {
     notes.HeldByPrior: f"not determined by these runs (posterior sd above {HELD:g} of the prior's): {{names}}",
+    notes.OnlyTogether: only_together,
     notes.FarFromPrior: lambda note: FAR[note.of].format(note.name, note.sds),
     notes.NoiseOff: noise_off,
     notes.Fact: lambda note: FACTS[note.what],

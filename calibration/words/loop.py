@@ -344,7 +344,7 @@ def tentative(found: DiscoveryResult, effect: FoundEffect) -> str:
 
 #: Why an effect is not plausible.
 RULED_OUT = {
-    "power": "{0.name} would put power in",
+    "power": "{0.name} would make its balance supply power",
     "size": "{0.name} at {0.size:.2g} times its largest plausible size; check {check}",
     "edge": "{0.name} is within an sd of the largest plausible size",
 }
@@ -356,14 +356,12 @@ def why_ruled_out(reasons: Sequence[notes.RuledOut]) -> str:
 
 
 def ruled_out(found: DiscoveryResult) -> str:
-    """What would explain the data as well as what is proposed, or better, but for its size; empty for nothing.
-
-    Beside names it is said of what would explain more than they do alone.
-    """
-    candidates = found.implausible
+    """What would explain the data better than what is proposed, or as well, but for its size; empty for nothing."""
+    candidates, same = found.implausible, found.settings.same
     if found.verdict != "unnamed":
-        candidates = tuple(a for a in candidates if a.rise_chi2 < -found.settings.same)
-    if not candidates:
+        better = tuple(a for a in candidates if a.rise_chi2 < -same)
+        candidates = better or tuple(a for a in candidates if a.rise_chi2 <= same)
+    if not candidates or found.verdict == "none":
         return ""
     first = min(candidates, key=lambda a: (len(a.effects), a.rise_chi2))
     what = "the curve" if found.verdict == "unnamed" else "what is proposed"

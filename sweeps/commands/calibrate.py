@@ -9,7 +9,6 @@ from rich.table import Table
 from calibration.data.columns import Layout
 from calibration.inference import blocks, priors
 from calibration.inference.calibrate import calibrate as run
-from calibration.inference.errors import rms_by_fit
 from calibration.inference.result import CalibrationResult
 from mmrjax.errors import counted
 from sweeps import config as configuration
@@ -57,8 +56,7 @@ def print_calibration(found: CalibrationResult) -> None:
     for name, p in found.parameters.items():
         low, high = (f"{v:.3g}" for v in p.interval)
         marks = "> " * p.interval_open[1] + "< " * p.interval_open[0]  # the end lies further out
-        determined = "no" if p.held_by_prior else "yes"
-        shown.add_row(name, f"{p.value:.4g}", f"{marks}{low} .. {high}", f"{p.shift:+.1f}", determined)
+        shown.add_row(name, f"{p.value:.4g}", f"{marks}{low} .. {high}", f"{p.shift:+.1f}", found.determined(name))
     say(shown)
     errors = Table(title=f"rms of simulated - measured [% of {found.percent_of}]", title_justify="left")
     for heading in ("", "rows", *(c.label for c in found.channels)):
@@ -70,7 +68,7 @@ def print_calibration(found: CalibrationResult) -> None:
         errors.add_row(which, f"{max(e.rows for e in by.values())}/{len(found)}", *cells)
     say(errors)
     if Layout.of(found.robot).crosses_zero:
-        say(words.describe_rms(rms_by_fit(found.rows(), found.channels, ("before", "after", "held_out"))))
+        say(words.describe_rms(found.rms))
     say(found.starts.statement())
     for note in found.notes:
         say(f"- {note}")

@@ -22,7 +22,6 @@ from calibration.discovery.resolve import resolve
 from calibration.discovery.result import REFIT_FILE, DiscoveryResult
 from calibration.discovery.settings import fewest_replicates
 from calibration.inference import blocks, observers, priors
-from calibration.inference.errors import rms_by_fit
 from calibration.words import loop as said_of
 from sweeps import config as configuration
 from sweeps.console import pulse, say, tell
@@ -206,8 +205,8 @@ def print_discovery(found: DiscoveryResult) -> None:
         errors.add_row(text, f"{max(e['rows'] for e in by.values())}/{len(found.runs)}", *cells)
     say(errors)
     if Layout.of(found.robot).crosses_zero:
-        fits = ("before", "after", "held_out_before", "held_out_after")
-        say(words.describe_rms(rms_by_fit(found.rows_table(), found.channels, fits)))
+        shown_fits = {when: by for when, by in found.rms.items() if found.verdict != "none" or "before" in when}
+        say(words.describe_rms(shown_fits))
     if found.sensitivity:
         say(f"{said_of.at_other_noise(found.sensitivity)}")
     for note in found.notes:

@@ -19,6 +19,7 @@ from calibration.data.runs import Runs
 from calibration.data.writing import finite
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.foresight import Foresight
+from calibration.words import fits
 from calibration.words.notes import sentences
 from mmrjax import channels
 from mmrjax.channels import HEAT, Channel
@@ -181,7 +182,10 @@ class RigCheck:
         if self.foresight is None:
             return "Without data: give a table to see what it can determine."
         held = [p.name for p in self.foresight.parameters if p.held]
-        told = [p.name for p in self.foresight.parameters if not p.held]
+        pairs = self.foresight.together
+        traded = {name for pair in pairs for name in (pair.one, pair.other)}
+        told = [p.name for p in self.foresight.parameters if not p.held and p.name not in traded]
+        told += [fits.combination(p) for p in pairs]
         parts = [f"These data determine {', '.join(told)}" if told else "These data determine no parameter"]
         parts += [f"{', '.join(held)} would not be determined by these runs"] * bool(held)
         return "; ".join(parts) + "."
@@ -200,6 +204,7 @@ class RigCheck:
                 "status": {str(n): int(c) for n, c in zip(names, counts, strict=True)},
                 "parameters": [dataclasses.asdict(p) for p in self.foresight.parameters],
                 "alike": [list(pair) for pair in self.foresight.alike],
+                "together": [fits.pair(pair) for pair in self.foresight.together],
             }
         return {
             "schema": "mmrjax.rig_check/1",
@@ -350,7 +355,7 @@ def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
     title = "\nwhat these data can determine (posterior sd over prior sd, at the numbers of the file)"
     shown = _table(title, "parameter", "value>r", "prior ±>r", "unit", "posterior/prior>r", "")
     for p in sorted(seen.parameters, key=lambda p: p.share):
-        said = "not determined" if p.held else "determined"
+        said = fits.determined(p.name, p.held, seen.together)
         shown.add_row(p.name, f"{p.value:.4g}", f"{p.prior_sd:.2g}", p.unit, f"{p.share:.2f}", said)
     say(shown)
     say(f"not determined: above {identifiability.HELD:g}")

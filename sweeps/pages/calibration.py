@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from calibration.data.columns import Layout
-from calibration.inference.errors import rms_by_fit
 from calibration.inference.identifiability import HELD
 from calibration.inference.result import CalibrationResult
 from sweeps.pages import calibration_figures, cluster_figures, comparison_figures
@@ -51,7 +50,8 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
         columns=columns(found.channels),
         sized=sized,
         has_ground=found.robot.has_ground,
-        rms=rms_by_fit(table, found.channels, ("before", "after", "held_out")),
+        rms=found.rms,
+        determined={name: found.determined(name) for name in found.parameters},
         held=HELD,
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",
     )

@@ -14,8 +14,9 @@ from calibration.data.columns import Layout
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference import blocks
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
-from calibration.inference.errors import OF_SIZE, percent_error, rms_by_fit, root_mean_square
+from calibration.inference.errors import OF_SIZE, percent_error, root_mean_square
 from calibration.inference.notes import FarFromPrior
+from calibration.words import fits
 from calibration.words import loop as words
 from calibration.words.notes import sentence
 from mmrjax import params
@@ -245,6 +246,7 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         has_ground=found.robot.has_ground,
         sides=max(1, len(loop_figures.defects_of(table, "before", "track"))),
         closed=loop_figures.closed(table) if sized and isinstance(found.detail, EquationDefects) else [],
-        rms=rms_by_fit(table, found.channels, ("before", "after", "held_out_before", "held_out_after")),
+        rms=found.rms,
+        determined={n: fits.determined(n, p.held_by_prior, found.together) for n, p in found.base_shift.items()},
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",
     )

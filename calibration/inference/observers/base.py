@@ -190,6 +190,10 @@ class Observer(eqx.Module):
         (rows, unknowns)."""
         raise NotImplementedError
 
+    def operating(self, robot: Robot) -> Signals | None:
+        """Signals of a robot at every row's operating point; None where rows have none."""
+        return None
+
     @property
     @abc.abstractmethod
     def long(self) -> bool:

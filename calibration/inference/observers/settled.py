@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from calibration.data.columns import CURRENT
 from calibration.data.errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
@@ -221,6 +222,11 @@ class SettledRuns(Observer):
         result, signals, left = jax.vmap(one)(self.conditions, unknowns, found)
         return self._observed(robot, result), signals, left
 
+    def operating(self, robot: Robot) -> Signals | None:
+        if self.long or self.conditions.turns:
+            return None
+        return jax.vmap(functools.partial(operating_signals, robot))(self.conditions)
+
     @property
     def long(self) -> bool:
         return fidelities.facts(self.fidelity).rollout
@@ -334,6 +340,8 @@ class SettledRuns(Observer):
         weight = included.astype(float)
         if "duty" in columns:  # what the motors get
             columns = {**columns, "supply_voltage_V": columns["supply_voltage_V"] * columns["duty"]}
+        if CURRENT in columns and CURRENT in bases_room.axes_of(robot):  # imposed: no channel measures it
+            columns = {**columns, bases_room.VARIABLES["current"]: columns[CURRENT]}
         ways = dict.fromkeys(WAYS, np.asarray(_directions(self, robot)))
         told = columns, weight, robot, None, ways
         return (*bases_room.families(*told), *bases_room.windows(*told))
