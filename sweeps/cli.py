@@ -40,6 +40,9 @@ _NoCache = Annotated[
 _Config = Annotated[
     Path | None, typer.Option("--config", help="TOML file with the keys of a config.resolved.toml; options win.")
 ]
+_Trust = Annotated[
+    bool, typer.Option("--trust", help="Let --config name what is executed: effects, and a scheduler.")
+]
 _Effects = Annotated[
     list[str] | None, typer.Option("--effects", help="A Python file with effects of your own, repeatable.")
 ]
@@ -65,7 +68,7 @@ def _command(
     failure: str = "the solver failed at some runs (status failed). Runs that stall or slide are answers: 0",
     beside: type[config.Part] | None = None,
     arguments: tuple[str, ...] = (),
-    resolve: Callable[[Path | None, dict[str, Any]], config.Part] | None = None,
+    resolve: Callable[..., config.Part] | None = None,
 ) -> Callable[[Callable[..., int]], Callable[..., int]]:
     """A command whose options are the fields of a configuration: beside what its function states itself.
 
@@ -85,7 +88,7 @@ def _command(
         def run(**given: Any) -> int:
             from sweeps.console import working
 
-            no_cache, file = given.pop("no_cache"), given.pop("config_file")
+            no_cache, file, trust = given.pop("no_cache"), given.pop("config_file"), given.pop("trust")
             given.pop("help_all", None)
             plan = given.pop("plan", None)
             if plan is not None and file is not None:
@@ -94,8 +97,9 @@ def _command(
             stated = made.taken(kind, given)
             further = None
             if beside is not None:
-                further = config.resolve_beside(beside, file, made.taken(beside, given))
-            found = config.resolve(kind, file, stated, beside) if resolve is None else resolve(file, stated)
+                further = config.resolve_beside(beside, file, made.taken(beside, given), trust)
+            resolved = functools.partial(config.resolve, kind, beside=beside) if resolve is None else resolve
+            found = resolved(file, stated, trust=trust)
             with working(function.__name__.replace("_", " ")):
                 return function(Told(_prepared(found, no_cache), further, file), **given)
 
@@ -105,6 +109,7 @@ def _command(
         keyword = functools.partial(inspect.Parameter, kind=inspect.Parameter.KEYWORD_ONLY)
         last += [
             keyword("config_file", annotation=_Config, default=None),
+            keyword("trust", annotation=_Trust, default=False),
             keyword("no_cache", annotation=_NoCache, default=False),
             *made.help_all(kinds),
         ]
