@@ -156,11 +156,14 @@ def unfinished(partial: Path) -> dict[str, str] | None:
     """
     if partial.is_symlink() or not (partial / LOCK).is_file():
         return None
-    mark = _json(partial / LOCK)
-    if mark.get("schema") == UNFINISHED and isinstance(mark.get("command"), str):
-        return {"command": mark["command"], "identity": str(mark.get("identity", ""))}
-    alone = [p.name for p in partial.iterdir()] == [LOCK]
-    return {"command": "", "identity": ""} if alone and not (partial / LOCK).stat().st_size else None
+    for _ in range(2):  # another process may write it between the first look and the list of what is there
+        mark = _json(partial / LOCK)
+        if mark.get("schema") == UNFINISHED and isinstance(mark.get("command"), str):
+            return {"command": mark["command"], "identity": str(mark.get("identity", ""))}
+        with contextlib.suppress(FileNotFoundError):
+            if not (partial / LOCK).stat().st_size and [p.name for p in partial.iterdir()] == [LOCK]:
+                return {"command": "", "identity": ""}
+    return None
 
 
 def marked(command: str, identity: str = "") -> str:
@@ -172,6 +175,20 @@ def holds_work(partial: Path) -> bool:
     """True if a run that ended early has kept anything: chunks, stages, lines of a sweep's journal, or a result."""
     patterns = (f"{CHUNKS}/*.npz", f"{CHUNKS}/*.stage", "journal/*.jsonl", "manifest.json")
     return any(file.stat().st_size for pattern in patterns for file in partial.glob(pattern))
+
+
+def share_at_work(partial: Path, own: Path | None = None) -> str | None:
+    """A share of a sweep on which another process works; None if there is none.
+
+    Args:
+        own: journal of this process.
+    """
+    for file in sorted((partial / "journal").glob("*.jsonl")):
+        if file != own:
+            with file.open("a") as journal:
+                if not lockable(journal):
+                    return file.stem
+    return None
 
 
 def read_arrays(file: Path) -> dict[str, np.ndarray]:
@@ -240,7 +257,7 @@ class RunFolder(Folder):
         """Lock of the partial folder; None if another process has removed or moved the folder meanwhile."""
         self.partial.mkdir(parents=True, exist_ok=True)
         lock = (self.partial / LOCK).open("a+", encoding="utf-8")
-        if not lockable(lock):
+        if not lockable(lock) or share_at_work(self.partial) is not None:
             lock.close()
             raise BadConfiguration(
                 f"--out: another process is at work on {self.partial}; wait for it, or choose another path"
