@@ -162,3 +162,21 @@ def test_a_damaged_stage_or_chunk_is_made_again_with_a_note(tmp_path, capsys):
             assert chunk is None or np.array_equal(chunk["x"], np.arange(50.0) + k)
     said = capsys.readouterr().err
     assert said.count("computed again") >= 40 and "Traceback" not in said
+
+
+def test_effects_are_those_of_the_file_that_is_read_and_not_of_bytes_beside_it(tmp_path):
+    import importlib.util
+    import py_compile
+
+    file = tmp_path / "own.py"
+    file.write_text("import pathlib\npathlib.Path('harmed').touch()\n" + OWN)
+    py_compile.compile(str(file), invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH)
+    assert os.path.exists(importlib.util.cache_from_source(str(file)))
+    file.write_text(OWN)
+    before = os.getcwd()
+    os.chdir(tmp_path)
+    try:
+        (mine,) = effect_file.read(file)
+    finally:
+        os.chdir(before)
+    assert mine.name == "mine" and not (tmp_path / "harmed").exists()

@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import importlib.machinery
 import importlib.util
 import inspect
 import math
 import os
 import sys
+import types
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -80,6 +82,13 @@ def library(paths: Sequence[Path | str] = ()) -> Library:
     return known
 
 
+class _FromSource(importlib.machinery.SourceFileLoader):
+    """Runs the file itself: compiled code beside it may be of another text, and none is left there."""
+
+    def get_code(self, fullname: str) -> types.CodeType:
+        return self.source_to_code(self.get_data(self.path), self.path)
+
+
 def read(path: Path) -> tuple[type[Effect], ...]:
     """The effect classes that a Python file defines, in its order. The file's code is run.
 
@@ -91,8 +100,8 @@ def read(path: Path) -> tuple[type[Effect], ...]:
         raise BadConfiguration(f"--effects: got {path}, no such file; expected a Python file with Effect classes")
     # A name of its own: two files may be called alike, and none may hide a module of the package.
     name = OWN_MODULE + hashlib.sha256(os.fsencode(path.resolve())).hexdigest()[:16]
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
+    spec = importlib.util.spec_from_file_location(name, path, loader=_FromSource(name, str(path)))
+    if path.suffix != ".py" or spec is None or spec.loader is None:
         raise BadConfiguration(f"--effects: got {path.name}; expected a file whose name ends in .py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
