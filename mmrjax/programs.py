@@ -3,7 +3,8 @@
 JAX's own cache is asked for a program once it has been traced and lowered, which is most of the time of a process
 that compiles nothing. Here a program is found by a name, a hash of all that its tracing reads: the source of our
 packages, the versions of the libraries, JAX's settings, and the arguments with shapes in the place of their arrays.
-What has no such name (a class of a user's own file, an array of keys) goes the usual way.
+What has no such name (a class of a user's own file, an array of keys) goes the usual way. A program is native code:
+it is read from a folder that nobody but the user can change, and from no other (`mmrjax.private`).
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ import jax
 import jax.monitoring
 import jax.numpy as jnp
 from jax.experimental import serialize_executable
+
+from mmrjax.private import exposure
 
 #: Names the folder in which programs are kept; where it is not set, or empty, none are.
 VARIABLE = "MMRJAX_PROGRAMS"
@@ -94,7 +97,7 @@ class Programs:
     def of(self, arguments: tuple[tuple, dict[str, Any]]) -> Program | None:
         """The program for positional and named arguments; None where none may be kept."""
         folder = os.environ.get(VARIABLE, "")
-        if not folder or not _keeps():
+        if not folder or not _keeps() or not _private(folder):
             return None
         leaves, tree = jax.tree.flatten(arguments)
         if has_tracer(leaves):
@@ -172,6 +175,12 @@ def has_tracer(tree: Any) -> bool:
 
 def _arrays(leaves: list[Any]) -> list[Any]:
     return [x for x in leaves if eqx.is_array(x)]
+
+
+@functools.cache
+def _private(folder: str) -> bool:
+    """True if nobody but the user can change a folder, and its files, as it is first used."""
+    return not exposure(Path(folder))
 
 
 def _keeps() -> bool:

@@ -40,6 +40,9 @@ _NoCache = Annotated[
 _Config = Annotated[
     Path | None, typer.Option("--config", help="TOML file with the keys of a config.resolved.toml; options win.")
 ]
+_Trust = Annotated[
+    bool, typer.Option("--trust", help="Let --config name what is executed: effects, and a scheduler.")
+]
 _Effects = Annotated[
     list[str] | None, typer.Option("--effects", help="A Python file with effects of your own, repeatable.")
 ]
@@ -65,7 +68,7 @@ def _command(
     failure: str = "the solver failed at some runs (status failed). Runs that stall or slide are answers: 0",
     beside: type[config.Part] | None = None,
     arguments: tuple[str, ...] = (),
-    resolve: Callable[[Path | None, dict[str, Any]], config.Part] | None = None,
+    resolve: Callable[..., config.Part] | None = None,
 ) -> Callable[[Callable[..., int]], Callable[..., int]]:
     """A command whose options are the fields of a configuration: beside what its function states itself.
 
@@ -85,7 +88,7 @@ def _command(
         def run(**given: Any) -> int:
             from sweeps.console import working
 
-            no_cache, file = given.pop("no_cache"), given.pop("config_file")
+            no_cache, file, trust = given.pop("no_cache"), given.pop("config_file"), given.pop("trust")
             given.pop("help_all", None)
             plan = given.pop("plan", None)
             if plan is not None and file is not None:
@@ -94,8 +97,9 @@ def _command(
             stated = made.taken(kind, given)
             further = None
             if beside is not None:
-                further = config.resolve_beside(beside, file, made.taken(beside, given))
-            found = config.resolve(kind, file, stated, beside) if resolve is None else resolve(file, stated)
+                further = config.resolve_beside(beside, file, made.taken(beside, given), trust)
+            resolved = functools.partial(config.resolve, kind, beside=beside) if resolve is None else resolve
+            found = resolved(file, stated, trust=trust)
             with working(function.__name__.replace("_", " ")):
                 return function(Told(_prepared(found, no_cache), further, file), **given)
 
@@ -105,6 +109,7 @@ def _command(
         keyword = functools.partial(inspect.Parameter, kind=inspect.Parameter.KEYWORD_ONLY)
         last += [
             keyword("config_file", annotation=_Config, default=None),
+            keyword("trust", annotation=_Trust, default=False),
             keyword("no_cache", annotation=_NoCache, default=False),
             *made.help_all(kinds),
         ]
@@ -530,6 +535,7 @@ WHOLE = 1_000_000
 def _start_jax(no_cache: bool, flags: tuple[str, ...] = (), options: tuple[str, ...] = ()) -> None:
     """Import jax with double precision, by flags of XLA and options beside that of `SOUND_AT_LEVEL_0`, and with the
     compilation cache unless it is not wanted."""
+    _refuse_little_memory()
     if "jax" not in sys.modules:  # which takes it when it starts
         flags = ",".join((SOUND_AT_LEVEL_0, *options)), *flags
     if flags:
@@ -545,6 +551,23 @@ def _start_jax(no_cache: bool, flags: tuple[str, ...] = (), options: tuple[str, 
     jax.config.update("jax_enable_x64", True)
 
 
+#: Smallest limit of address space with which one run can be simulated [bytes]: below, libraries abort the process.
+LEAST_MEMORY = 2_000_000_000
+
+
+def _refuse_little_memory() -> None:
+    try:
+        import resource
+    except ImportError:  # a system without such limits
+        return
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY and limit < LEAST_MEMORY:
+        raise InputError(
+            f"memory: got a limit of {limit / 1e9:.2g} GB of address space (ulimit -v); expected at least "
+            f"{LEAST_MEMORY / 1e9:g} GB"
+        )
+
+
 def main() -> None:
     """Run the command line; every failure is one sentence on stderr and a documented exit code."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ended or interrupted: both can be taken up again
@@ -552,26 +575,8 @@ def main() -> None:
         code = app(standalone_mode=False)
         if code == INTERRUPTED:  # the option parser has caught the interrupt
             raise KeyboardInterrupt
-    except InputError as error:
-        code = _fail(str(error), error.exit_code)
-    except (typer.Abort, KeyboardInterrupt):
-        advice = "no run folder was left"
-        if "sweep" in sys.argv[1:2]:
-            advice = "a sweep goes on where it stopped, after its last whole chunk, with the same --out"
-        if "loop" in sys.argv[1:2]:
-            advice = "the loop goes on after its last whole stage, with the same --out"
-        code = _fail(f"interrupted; {advice}", INTERRUPTED)
-    except OSError as error:
-        place = error.filename or "a file"
-        code = _fail(f"{place}: {error.strerror}; no run folder was left, only its .partial beside it", 2)
-    except Exception as error:
-        if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of the option parser
-            code = _fail(_no_number(error) or error.format_message(), error.exit_code)
-        else:
-            import traceback
-
-            traceback.print_exc()
-            code = _fail(f"internal error: {error}", 1)
+    except BaseException as error:
+        code = _answered(error)
     kept = sys.modules.get("calibration.discovery.kept")  # whose threads nobody waits for
     beside = kept is not None and any(t.name.startswith(kept.BESIDE) for t in threading.enumerate())
     spent = code == 3 and "loop" in sys.argv[1:2]  # perhaps out of time, which interrupts a step too
@@ -583,6 +588,44 @@ def main() -> None:
     sys.exit(code if isinstance(code, int) else 0)
 
 
+def _answered(error: BaseException) -> int:
+    """Say why a command failed; returns its exit code."""
+    if isinstance(error, typer.Abort) and isinstance(error.__context__, EOFError):
+        error = error.__context__  # of a file, which the option parser takes for the end of its own input
+    if isinstance(error, InputError):
+        return _fail(str(error), error.exit_code)
+    if isinstance(error, typer.Abort | KeyboardInterrupt):
+        advice = "no run folder was left"
+        if "sweep" in sys.argv[1:2]:
+            advice = "a sweep goes on where it stopped, after its last whole chunk, with the same --out"
+        if "loop" in sys.argv[1:2]:
+            advice = "the loop goes on after its last whole stage, with the same --out"
+        return _fail(f"interrupted; {advice}", INTERRUPTED)
+    if _memory_exhausted(error):
+        return _fail("memory exhausted; take fewer points at once (--chunk), fewer rows, or more memory", 2)
+    if isinstance(error, OSError):
+        place = error.filename or "a file"
+        return _fail(f"{place}: {error.strerror}; no run folder was left; what was kept is in its .partial", 2)
+    if isinstance(error, SystemExit):
+        return _fail("--effects: code of a file of effects has ended the program; remove the call that does", 2)
+    if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of the option parser
+        return _fail(_no_number(error) or error.format_message(), error.exit_code)
+    import traceback
+
+    traceback.print_exception(error)
+    return _fail(f"internal error: {error}", 1)
+
+
+def _memory_exhausted(error: BaseException | None) -> bool:
+    """True if a failure, or what it came of, is that memory ran out: Python's, XLA's or the loader's of libraries."""
+    while error is not None:
+        out = isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)
+        if out or (isinstance(error, ImportError) and "failed to map segment" in str(error)):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
 def _no_number(error: Any) -> str:
     """What to say of a text where an option takes a number, which most often has its unit."""
     option = getattr(error, "param", None)
@@ -592,6 +635,12 @@ def _no_number(error: Any) -> str:
     return f"{option.opts[0]}: got no number; expected one without its unit. {told}"
 
 
+#: Longest message, beyond which its middle is left out: an input is quoted in it, and may be of any length.
+LONGEST = 390
+
+
 def _fail(message: str, code: int) -> int:
+    if len(message) > LONGEST:
+        message = f"{message[: LONGEST - 130]} [...] {message[-120:]}"
     print(f"mmrjax: {message}", file=sys.stderr)
     return code

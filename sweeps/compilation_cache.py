@@ -2,7 +2,8 @@
 
 It lies in `$MMRJAX_CACHE`, else `$XDG_CACHE_HOME/mmrjax`, else `~/.cache/mmrjax`; `MMRJAX_CACHE=off` switches it off.
 JAX keys an entry by program, compiler version, flags and device; a folder of its own for each version of jaxlib and
-each kind of processor keeps native code of one machine from another with the same home. Importable without jax.
+each kind of processor keeps native code of one machine from another with the same home. Programs are native code: a
+folder that others could change is not used (`mmrjax.private`). Importable without jax.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ import re
 import stat
 import warnings
 from pathlib import Path
+
+from mmrjax.private import exposure
 
 VARIABLE = "MMRJAX_CACHE"
 #: The same of `mmrjax.programs`, which finds programs that were kept whole there; empty to keep none so.
@@ -62,11 +65,14 @@ def keep_programs() -> Path | None:
 
     To be called before anything compiles. A cache that JAX has been given by its own settings
     (`JAX_COMPILATION_CACHE_DIR`) stays. An entry that cannot be read is compiled again. `MMRJAX_CACHE` is the folder
-    to hold caches, or `off`; without it `~/.cache/mmrjax`.
+    to hold caches, or `off`; without it `~/.cache/mmrjax`. A folder that other users could change is not used, which
+    a line on stderr reports.
 
     Returns:
-        The folder; None where the cache is switched off or its place cannot be written to, which is no error.
+        The folder; None if the cache is switched off, its place cannot be written to or others could change it.
     """
+    if _refused(os.environ.get(PROGRAMS, "")):
+        os.environ[PROGRAMS] = ""
     folder = location()
     if folder is None:
         return None
@@ -80,14 +86,17 @@ def keep_programs() -> Path | None:
 
     own = jax.config.values["jax_compilation_cache_dir"]
     if own is not None:
+        if "://" not in own and _refused(own):
+            jax.config.update("jax_enable_compilation_cache", False)
+            return None
         return Path(own)
     try:
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)  # who may write here may run code
-        _prune(folder.parent)
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError:
         return None
-    if not os.access(folder, os.W_OK | os.X_OK):
+    if not os.access(folder, os.W_OK | os.X_OK) or _refused(str(folder)):
         return None
+    _prune(folder.parent)
     warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache entry")
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -95,6 +104,16 @@ def keep_programs() -> Path | None:
     jax.config.update("jax_raise_persistent_cache_errors", False)
     os.environ.setdefault(PROGRAMS, str(folder))
     return folder
+
+
+def _refused(folder: str) -> bool:
+    """True if others could change a folder of programs, which is reported: their code would be run."""
+    reason = exposure(Path(folder)) if folder else ""
+    if reason:
+        from sweeps.console import tell
+
+        tell(f"compiled programs are not kept: {reason}; name a folder of your own in {VARIABLE}, or chmod go-w it")
+    return bool(reason)
 
 
 def _entries(folder: Path) -> list[tuple[float, int, Path]]:
@@ -130,15 +149,19 @@ class Contents:
     Attributes:
         path: its folder; None where it is switched off.
         entries: compiled programs in it; size: of them all [bytes].
+        exposed: why it is not used, if others could change it.
     """
 
     path: Path | None
     entries: int
     size: int
+    exposed: str = ""
 
     def __str__(self) -> str:
         if self.path is None:
             return f"off ({VARIABLE}=off)" if os.environ.get(VARIABLE) else "off"
+        if self.exposed:
+            return f"{self.path}: not used, since {self.exposed}"
         return f"{self.path}: {self.entries} programs, {self.size / 1e6:.1f} MB"
 
 
@@ -146,4 +169,5 @@ def describe(path: Path | None = None) -> Contents:
     """Where the cache lies and what it holds."""
     folder = location(path)
     entries = [] if folder is None else _entries(folder)
-    return Contents(folder, len(entries), sum(entry[1] for entry in entries))
+    exposed = "" if folder is None else exposure(folder)
+    return Contents(folder, len(entries), sum(entry[1] for entry in entries), exposed)

@@ -42,7 +42,8 @@ def about(default: Any, description: str, **extra: Any) -> Any:
         extra: `usual`, what a default of None comes to, in words; `flag`, its option, where that is not its name;
             `solver`, how its command solves, which few need: hidden in `--help`, and a key of `[solver]`;
             `verbatim`, a list each of whose texts may have commas; `metavar` of an argument; `format`, such as path;
-            `minimum`, where the command asks for more than the field.
+            `minimum`, where the command asks for more than the field; `executes`, whose value is code that is run,
+            or leads to such: a file may state it with `--trust` only.
     """
     return Field(default=default, description=description, json_schema_extra=extra or None)
 
@@ -60,7 +61,9 @@ class RobotPart(Part):
     set: dict[str, bool | float] = about(
         {}, "Change a parameter, SI units, repeatable: 6T2A.ground.friction.static=0.6"
     )
-    effects: tuple[str, ...] = about((), "A Python file with effects of your own, repeatable", verbatim=True)
+    effects: tuple[str, ...] = about(
+        (), "A Python file with effects of your own, repeatable; its code is run", verbatim=True, executes=True
+    )
 
 
 class ModelPart(Part):
@@ -677,8 +680,13 @@ def read_toml(file: Path) -> dict[str, Any]:
 
 def solver_keys(kind: type[Part]) -> list[str]:
     """The fields of a configuration that say how its command solves, keys of `[solver]` of a file."""
+    return fields_with(kind, "solver")
+
+
+def fields_with(kind: type[Part], fact: str) -> list[str]:
+    """The fields of a configuration of which a fact is stated (`about`)."""
     extra = {name: f.json_schema_extra for name, f in kind.model_fields.items()}
-    return [name for name, said in extra.items() if isinstance(said, dict) and said.get("solver")]
+    return [name for name, said in extra.items() if isinstance(said, dict) and said.get(fact)]
 
 
 def _keys(kind: type[Part], file: Path, beside: type[Part] | None) -> dict[str, Any]:
@@ -697,31 +705,48 @@ def _keys(kind: type[Part], file: Path, beside: type[Part] | None) -> dict[str, 
     return {**values, **{key: value for key, value in table.items() if key in own}}
 
 
-def resolve_beside(kind: type[C], file: Path | None, options: dict[str, Any]) -> C:
+def resolve_beside(kind: type[C], file: Path | None, options: dict[str, Any], trust: bool = False) -> C:
     """What a command is told beside its configuration, of which a file has the keys of `[solver]` alone.
+
+    Args:
+        trust: as of `resolve`.
 
     Raises:
         BadConfiguration: as `resolve`.
     """
     table = {} if file is None else read_toml(file).get("solver", {})
     stated = {key: table[key] for key in solver_keys(kind) if key in table}
-    return _checked(kind, file, stated, options)
+    return _checked(kind, file, stated, options, trust)
 
 
-def resolve(kind: type[C], file: Path | None, options: dict[str, Any], beside: type[Part] | None = None) -> C:
+def resolve(
+    kind: type[C],
+    file: Path | None,
+    options: dict[str, Any],
+    beside: type[Part] | None = None,
+    trust: bool = False,
+) -> C:
     """The configuration of a command: defaults, then the file's keys, then the options given (not None).
 
     Args:
         beside: what else the command is told, whose keys the file's table `[solver]` may have too.
+        trust: whether the file may state what is executed, else options alone may.
 
     Raises:
-        BadConfiguration: unreadable file, unknown key, or a value out of range; one sentence.
+        BadConfiguration: unreadable file, unknown key, a value out of range, or what a file may not state.
     """
-    return _checked(kind, file, {} if file is None else _keys(kind, file, beside), options)
+    return _checked(kind, file, {} if file is None else _keys(kind, file, beside), options, trust)
 
 
-def _checked(kind: type[C], file: Path | None, values: dict[str, Any], options: dict[str, Any]) -> C:
+def _checked(kind: type[C], file: Path | None, values: dict[str, Any], options: dict[str, Any], trust: bool) -> C:
     given = {k: v for k, v in options.items() if v is not None}
+    for name in fields_with(kind, "executes"):
+        if file is not None and values.get(name) and name not in given and not trust:
+            option = flags(kind)[name]
+            raise BadConfiguration(
+                f"{file.name}, {name}: would run code, which a file cannot ask for; state {option} on the command "
+                "line, or --trust if you trust who wrote the file"
+            )
     if "set" in given:
         stated = values.get("set", {})
         # A file whose table is none is refused below, whatever the options say.

@@ -82,7 +82,7 @@ class SharePart(Part):
         None, "Simulate the i-th of n shares, as 3/8: a process of a job array each", solver=True
     )
     scheduler: str | None = about(
-        None, "Address of a dask scheduler whose workers simulate, as tcp://host:8786", solver=True
+        None, "Address of a dask scheduler whose workers simulate, as tcp://host:8786", solver=True, executes=True
     )
 
 
@@ -141,7 +141,7 @@ def is_campaign(file: Path | None) -> bool:
     return file is not None and not set(KEYS).isdisjoint(read_toml(file))
 
 
-def resolve_campaign(file: Path | None, options: dict[str, Any]) -> Campaign | Sweep:
+def resolve_campaign(file: Path | None, options: dict[str, Any], trust: bool = False) -> Campaign | Sweep:
     """The configuration of a sweep into a store: of its file, or the grid of the options (or of such a file).
 
     A grid is one of a store's once the robot is known (`of_grid`).
@@ -157,8 +157,8 @@ def resolve_campaign(file: Path | None, options: dict[str, Any]) -> Campaign | S
                     f"{flags(Sweep)[name]}: acts with a grid of options only; expected it in {file.name}, among its "
                     "axes or conditions"
                 )
-        return resolve(Campaign, file, {k: v for k, v in options.items() if k not in GRID}, SharePart)
-    return resolve(Sweep, file, options, SharePart)
+        return resolve(Campaign, file, {k: v for k, v in options.items() if k not in GRID}, SharePart, trust)
+    return resolve(Sweep, file, options, SharePart, trust)
 
 
 def of_grid(grid: Sweep) -> Campaign:

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import errno
+import fcntl
 import hashlib
 import importlib.metadata
 import json
 import os
-import pickle
 import platform
 import re
 import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from calibration.data import writing
 from calibration.data.errors import BadConfiguration, InputError
 from calibration.data.runs import Runs
 from mmrjax import __version__, params
+from sweeps.console import tell
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
@@ -32,12 +34,20 @@ T = TypeVar("T")
 #: Exit codes of a command that is done: every solver gave an answer, or one failed. A run that stalls or slides, a
 #: requirement that is missed and any verdict are answers.
 DONE, SOLVER_FAILED = 0, 3
+#: Schemas of a finished run folder, and of the file that marks an unfinished one and is locked while it is worked on.
+MANIFEST, UNFINISHED = "mmrjax.manifest/1", "mmrjax.unfinished/1"
+LOCK, CHUNKS = "lock", "chunks"
+#: Largest manifest or mark that is read [bytes].
+LARGEST = 2**20
 #: Packages whose versions are part of a result.
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "equinox", "optimistix", "lineax", "diffrax", "numpy")
 
 
 class Folder:
-    """What a command leaves, in `path` + `.partial` until it is whole and moved into place."""
+    """Files that a command leaves, in `path` + `.partial` until the folder is whole and moved into place."""
+
+    #: Names beside those of the manifest that a finished folder may hold: what a kill while it was moved leaves.
+    further: tuple[str, ...] = (LOCK,)
 
     def __init__(self, path: Path) -> None:
         """The folder that is to appear at `path`.
@@ -54,15 +64,45 @@ class Folder:
         """Refuse a path that holds something already.
 
         Args:
-            force: whether a run folder is to be replaced.
+            force: replace a run folder that holds nothing but what its command left.
 
         Raises:
             BadConfiguration: it does.
         """
-        taken = self.path.is_file() or (self.path.is_dir() and any(self.path.iterdir()))
-        if taken and not (force and (self.path / "manifest.json").is_file()):
-            hint = "--force replaces a run folder" if self.path.is_dir() else "it is a file"
-            raise BadConfiguration(f"--out: {self.path} exists already; choose another path ({hint})")
+        if not os.path.lexists(self.path) or (self.path.is_dir() and not any(self.path.iterdir())):
+            return
+        if not self.path.is_dir():
+            hint = "it is a file"
+        elif not force:
+            hint = "--force replaces a run folder"
+        elif (left := contents(self.path)) is None:
+            hint = "it is no run folder that --force could replace"
+        else:
+            foreign = sorted({p.name for p in self.path.iterdir()} - {*left, *self.further})
+            if not foreign:
+                return
+            hint = f"--force would delete {foreign[0]}, which its command did not write"
+        raise BadConfiguration(f"--out: {self.path} exists already; choose another path ({hint})")
+
+    def refuse_foreign(self, command: str, force: bool) -> None:
+        """Refuse a `.partial` that is not ours, or holds interrupted work of another command.
+
+        Args:
+            command: that is to go on there; force: begin anew in place of another command.
+
+        Raises:
+            BadConfiguration: it does.
+        """
+        if not os.path.lexists(self.partial) or (self.partial.is_dir() and not any(self.partial.iterdir())):
+            return
+        mark = unfinished(self.partial)
+        if mark is None:
+            raise BadConfiguration(f"--out: {self.partial} is in the way and is no run of ours; choose another path")
+        if mark["command"] not in ("", command) and not force and holds_work(self.partial):
+            raise BadConfiguration(
+                f"--out: {self.partial} holds an interrupted {mark['command']}, which the same command takes up "
+                "again; choose another path, or --force to begin anew"
+            )
 
     def write_text(self, name: str, text: str) -> None:
         """Write a text file."""
@@ -79,7 +119,8 @@ class Folder:
     def finish(self, manifest: dict[str, Any], runs: Runs | None = None) -> Path:
         """Write the manifest and move the folder into place; returns its path.
 
-        Hashes of the folder's `robot.toml` and of the file that `runs` came from, if any, are added.
+        Hashes of the folder's `robot.toml` and of the file that `runs` came from, if any, are added, and the names of
+        all that the folder holds: `--force` deletes nothing else.
         """
         hashes = {"robot": digest((self.partial / "robot.toml").read_bytes()), **manifest.get("hashes", {})}
         if runs is not None and runs.digest:
@@ -89,7 +130,9 @@ class Folder:
             "started": self.started.isoformat(timespec="seconds"),
             "seconds": round((now - self.started).total_seconds(), 3),
         }
-        self.write_json("manifest.json", {**provenance(), **times, **manifest, "hashes": hashes})
+        names = {"manifest.json", *(p.name for p in self.partial.iterdir())} - {LOCK, CHUNKS}
+        whole = {**provenance(), **times, **manifest, "hashes": hashes, "contents": sorted(names)}
+        self.write_json("manifest.json", whole)
         return self.move_into_place()
 
     def move_into_place(self) -> Path:
@@ -97,11 +140,89 @@ class Folder:
         raise NotImplementedError
 
 
+def contents(folder: Path) -> list[str] | None:
+    """Names that the manifest of a run folder lists; None if it is no run folder of ours."""
+    found = _json(folder / "manifest.json")
+    names = found.get("contents")
+    if found.get("schema") != MANIFEST or not isinstance(names, list):
+        return None
+    return [name for name in names if isinstance(name, str)]
+
+
+def unfinished(partial: Path) -> dict[str, str] | None:
+    """Command and identity of an interrupted run; None if a folder is not one of ours.
+
+    Of a run that was killed before it could write them both are empty.
+    """
+    if partial.is_symlink() or not (partial / LOCK).is_file():
+        return None
+    for _ in range(2):  # another process may write it between the first look and the list of what is there
+        mark = _json(partial / LOCK)
+        if mark.get("schema") == UNFINISHED and isinstance(mark.get("command"), str):
+            return {"command": mark["command"], "identity": str(mark.get("identity", ""))}
+        with contextlib.suppress(FileNotFoundError):
+            if not (partial / LOCK).stat().st_size and [p.name for p in partial.iterdir()] == [LOCK]:
+                return {"command": "", "identity": ""}
+    return None
+
+
+def marked(command: str, identity: str = "") -> str:
+    """Text of a lock's file, by which a folder is known as ours."""
+    return json.dumps({"schema": UNFINISHED, "command": command, "identity": identity})
+
+
+def holds_work(partial: Path) -> bool:
+    """True if a run that ended early has kept anything: chunks, stages, lines of a sweep's journal, or a result."""
+    patterns = (f"{CHUNKS}/*.npz", f"{CHUNKS}/*.stage", "journal/*.jsonl", "manifest.json")
+    return any(file.stat().st_size for pattern in patterns for file in partial.glob(pattern))
+
+
+def share_at_work(partial: Path, own: Path | None = None) -> str | None:
+    """A share of a sweep on which another process works; None if there is none.
+
+    Args:
+        own: journal of this process.
+    """
+    for file in sorted((partial / "journal").glob("*.jsonl")):
+        if file != own:
+            with file.open("a") as journal:
+                if not lockable(journal):
+                    return file.stem
+    return None
+
+
+def read_arrays(file: Path) -> dict[str, np.ndarray]:
+    """Arrays of a file of `np.savez`, none of which is of objects; raises whatever a damaged file comes to."""
+    with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
+        return {key: arrays[key] for key in arrays.files}
+
+
+def lockable(file: TextIO) -> bool:
+    """Lock an open file until it is closed; False if another process has locked it."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return True
+    return True
+
+
+def _json(file: Path) -> dict[str, Any]:
+    """Object of a small JSON file; empty if it cannot be read."""
+    try:
+        with file.open("rb") as stream:
+            found = json.loads(stream.read(LARGEST))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
 class RunFolder(Folder):
     """A folder that appears at `path` only when `finish` is called.
 
     If the command is stopped, the same command with the same configuration finds its finished chunks in `partial`
-    and goes on; with another configuration the partial folder is begun anew.
+    and goes on; with another configuration the partial folder is begun anew. One process at a time works on it.
     """
 
     def __init__(self, path: Path, identity: dict[str, Any], *, force: bool = False) -> None:
@@ -109,93 +230,152 @@ class RunFolder(Folder):
 
         Args:
             path: where the folder is to appear.
-            identity: what makes this run what it is; two runs with the same identity share their chunks.
-            force: replace an existing run folder.
+            identity: what makes this run what it is, its `command` among it; two runs with the same identity share
+                their chunks.
+            force: replace an existing run folder, and an interrupted one of another command.
 
         Raises:
-            BadConfiguration: `path` holds something already, or cannot be written.
+            BadConfiguration: `path` holds something already or cannot be written, another process is at work on it,
+                or another command was interrupted there.
         """
         super().__init__(path)
-        self._force = force
-        self.refuse_taken(force)
+        self._force, self._command = force, str(identity.get("command", ""))
         self._digest = digest(json.dumps(identity, sort_keys=True, default=str).encode())
-        mark = self.partial / "identity"
-        foreign = self.partial.exists() and not mark.is_file()
-        if foreign and not (self.partial.is_dir() and not any(self.partial.iterdir())):
-            raise BadConfiguration(f"--out: {self.partial} is in the way and is no run of ours; choose another path")
+        self._lock: TextIO | None = None
+        self.refuse_taken(force)
         try:
-            if mark.is_file() and mark.read_text() != self._digest:
-                shutil.rmtree(self.partial)
-            (self.partial / "chunks").mkdir(parents=True, exist_ok=True)
-            mark.write_text(self._digest)
+            while self._lock is None:
+                self.refuse_foreign(self._command, force)
+                self._lock = self._entered()
+            self._begin_or_take_up()
         except OSError as error:
             raise BadConfiguration(
                 f"--out: {path} cannot be written ({error.strerror}); choose another path"
             ) from error
 
+    def _entered(self) -> TextIO | None:
+        """Lock of the partial folder; None if another process has removed or moved the folder meanwhile."""
+        self.partial.mkdir(parents=True, exist_ok=True)
+        lock = (self.partial / LOCK).open("a+", encoding="utf-8")
+        if not lockable(lock) or share_at_work(self.partial) is not None:
+            lock.close()
+            raise BadConfiguration(
+                f"--out: another process is at work on {self.partial}; wait for it, or choose another path"
+            )
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(lock.fileno()), (self.partial / LOCK).stat()):
+                return lock
+        lock.close()
+        return None
+
+    def _begin_or_take_up(self) -> None:
+        assert self._lock is not None
+        try:
+            self.refuse_taken(self._force)  # by a process that has finished meanwhile
+        except BadConfiguration:
+            self._remove()
+            raise
+        mark = unfinished(self.partial)
+        if mark is None or mark["identity"] != self._digest:
+            if mark is not None and holds_work(self.partial):
+                tell(f"{self.partial}: of another configuration; begun anew")
+            for entry in self.partial.iterdir():
+                if entry.name != LOCK:
+                    shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
+            self._lock.truncate(0)
+            self._lock.write(marked(self._command, self._digest))
+            self._lock.flush()
+        (self.partial / CHUNKS).mkdir(exist_ok=True)
+
     def __enter__(self) -> RunFolder:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, *_: Any) -> None:
-        """Leave nothing behind where the command was refused, or interrupted before a chunk was done.
+        """Leave nothing behind if the command was refused, or ended before a chunk was done.
 
-        What else an interrupt leaves is taken up again.
+        Chunks and stages of any other end are taken up again.
         """
-        if kind is None:
-            return
         if isinstance(error, OSError) and error.filename is None:
             error.filename = str(self.partial)
-        chunks = self.partial / "chunks"
-        vain = issubclass(kind, KeyboardInterrupt) and not any((*chunks.glob("*.npz"), *chunks.glob("*.stage")))
-        if vain or issubclass(kind, InputError):
-            shutil.rmtree(self.partial, ignore_errors=True)
+        if kind is not None and (issubclass(kind, InputError) or not holds_work(self.partial)):
+            self._remove()
+        self.close()
+
+    def _remove(self) -> None:
+        """Remove the partial folder of this process."""
+        shutil.rmtree(self.partial, ignore_errors=True)
+        self.close()
+
+    def close(self) -> None:
+        """Let other processes work on what is left."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
 
     def chunk(self, name: str) -> dict[str, np.ndarray] | None:
-        """A chunk that an interrupted run finished, or None."""
-        file = self.partial / "chunks" / f"{name}.npz"
+        """A chunk that an interrupted run finished; None if there is none that can be read."""
+        file = self.partial / CHUNKS / f"{name}.npz"
         if not file.is_file():
             return None
-        with np.load(file, allow_pickle=False) as arrays:
-            return {key: arrays[key] for key in arrays.files}
+        try:
+            return read_arrays(file)
+        except Exception:  # whatever a damaged file makes the reader raise
+            tell(f"{file}: damaged; computed again")
+            return None
 
     def keep_chunk(self, name: str, columns: dict[str, np.ndarray]) -> None:
         """Keep a finished chunk for a run that is taken up again."""
-        file = self.partial / "chunks" / f"{name}.npz"
+        file = self.partial / CHUNKS / f"{name}.npz"
         aside = file.with_suffix(".writing")
         with writing.naming(file), aside.open("wb") as stream:
             np.savez(stream, allow_pickle=False, **columns)
         aside.replace(file)
 
     def stage(self, name: str, make: Callable[[], T]) -> T:
-        """The result of a stage: that which an interrupted run of the same identity kept, or made now and kept. What
-        cannot be written is not kept."""
+        """Result of a stage: read if an interrupted run of the same identity kept it, else made and kept.
+
+        A damaged file is reported, and the stage made again. A result that cannot be written is not kept.
+        """
+        from sweeps import stages
+
         file = self._of_stage(name)
         if file.is_file():
-            return pickle.loads(file.read_bytes())
+            try:
+                kept: T = stages.read(file)
+                return kept
+            except stages.Unreadable:
+                tell(f"{file}: damaged; computed again")
         made = make()
         aside = file.with_suffix(".writing")
-        with contextlib.suppress(OSError, pickle.PicklingError, AttributeError, TypeError):
-            aside.write_bytes(pickle.dumps(made))
+        with contextlib.suppress(OSError, stages.Unwritable):
+            stages.write(aside, made)
             aside.replace(file)
         return made
 
     def keeps(self, name: str) -> bool:
-        """Whether the result of a stage is kept."""
+        """True if the result of a stage is kept."""
         return self._of_stage(name).is_file()
 
     def _of_stage(self, name: str) -> Path:
-        return self.partial / "chunks" / f"{re.sub(r'[^a-z0-9.]', '-', name)}.stage"
+        return self.partial / CHUNKS / f"{re.sub(r'[^a-z0-9.]', '-', name)}.stage"
 
     def move_into_place(self) -> Path:
-        """Drop the chunks, and move the folder to where it is to appear."""
-        shutil.rmtree(self.partial / "chunks")
-        (self.partial / "identity").unlink()
+        """Drop the chunks, and move the folder to where it is to appear; the lock's file goes last.
+
+        Raises:
+            OSError: something has appeared there meanwhile; the partial folder is left.
+        """
+        try:
+            self.refuse_taken(self._force)
+        except BadConfiguration:
+            raise OSError(errno.EEXIST, os.strerror(errno.EEXIST), str(self.path)) from None
+        shutil.rmtree(self.partial / CHUNKS)
         if self.path.is_dir():
-            if self._force and any(self.path.iterdir()):
-                shutil.rmtree(self.path)
-            else:
-                self.path.rmdir()
+            os.replace(self.path, self.partial / CHUNKS)
+            shutil.rmtree(self.partial / CHUNKS)
         os.replace(self.partial, self.path)
+        (self.path / LOCK).unlink()
+        self.close()
         return self.path
 
 
@@ -220,6 +400,7 @@ def open_folder(
         "config": config.model_dump(exclude={"report"}),
         "robot": {p.name: float(p.value) for p in params.walk(robot)},
         "runs": None if runs is None else {key: value.tolist() for key, value in runs.columns.items()},
+        "effects": [digest(Path(file).read_bytes()) for file in config.effects],
     }
     return RunFolder(out or default_path(command), identity, force=force)
 
@@ -230,7 +411,7 @@ def provenance() -> dict[str, Any]:
     import jax.numpy as jnp
 
     return {
-        "schema": "mmrjax.manifest/1",
+        "schema": MANIFEST,
         "program": f"mmrjax {__version__}",
         "arguments": sys.argv[1:],
         "python": platform.python_version(),

@@ -718,3 +718,59 @@ def test_a_fourth_channel_is_one_row(tmp_path):
     assert errors["rows"] == 1 and errors["missing"] == 1
     assert errors["rms_percent"] == pytest.approx(100 * 0.5 / 15)
     assert "terminal_voltage_V: 1 of 2 readings are missing" in compared.stdout
+
+
+# --- what ends a command from outside -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ended", [MemoryError(), RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes."),
+                                   ImportError("libx.so: failed to map segment from shared object")])  # fmt: skip
+@pytest.mark.parametrize("command", [("simulate",), ("sweep", "--zarr", "--voltages", "24", "--slopes", "0")])
+def test_memory_exhausted_is_one_sentence_and_leaves_nothing(mmrjax, tmp_path, monkeypatch, command, ended):
+    def short(*_, **__):
+        raise ended
+
+    monkeypatch.setattr(scale.Compiled, "__call__", short)
+    code, _, err = mmrjax(*command, "--no-report", "--out", "x")
+    assert code == 2 and err.endswith(
+        "mmrjax: memory exhausted; take fewer points at once (--chunk), fewer rows, or more memory\n"
+    )
+    assert "Traceback" not in err and not any(tmp_path.iterdir())
+
+
+def test_too_little_memory_is_refused_at_once(mmrjax, tmp_path, monkeypatch):
+    import resource
+
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (500_000_000, 500_000_000))
+    code, _, err = mmrjax("simulate", "--out", "x")
+    assert code == 2 and "memory: got a limit of 0.5 GB of address space (ulimit -v); expected at least 2 GB" in err
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("code", ["0", "1", "'all is well'"])
+def test_an_effects_file_cannot_end_the_command_as_if_it_were_done(mmrjax, tmp_path, monkeypatch, code):
+    (tmp_path / "own.py").write_text(f"import sys\nsys.exit({code})\n")
+    ended, _, err = mmrjax("simulate", "--effects", "own.py", "--out", "x")
+    assert ended == 2 and "own.py: its code fails (SystemExit:" in err and not (tmp_path / "x").exists()
+
+    def later(*_, **__):
+        raise SystemExit(0)
+
+    monkeypatch.setattr(scale.Compiled, "__call__", later)
+    ended, _, err = mmrjax("simulate", "--no-report", "--out", "x")
+    assert ended == 2 and "code of a file of effects has ended the program" in err
+    assert [p.name for p in tmp_path.iterdir()] == ["own.py"]
+
+
+def test_a_file_that_ends_too_early_is_no_interrupt(mmrjax, monkeypatch):
+    def short(*_, **__):
+        raise EOFError("No data left in file")
+
+    monkeypatch.setattr(scale.Compiled, "__call__", short)
+    code, _, err = mmrjax("simulate", "--no-report", "--out", "x")
+    assert code == 1 and "internal error: No data left in file" in err and "interrupted" not in err
+
+
+def test_a_message_is_short_whatever_it_quotes(mmrjax):
+    code, _, err = mmrjax("simulate", "--set", "m" * 100_000 + "=x", "--out", "x")
+    assert code == 2 and len(err) < 410 and "expected NAME=VALUE with a number" in err

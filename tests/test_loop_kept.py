@@ -22,6 +22,7 @@ from calibration.discovery.kept import OutOfTime
 from calibration.discovery.notes import Outstanding
 from mmrjax import programs, robots
 from sweeps import config
+from sweeps import stages as kept_stages
 from sweeps.commands import loop as command
 from sweeps.store import RunFolder, open_folder
 
@@ -44,7 +45,7 @@ def test_a_stage_is_made_once_and_read_after_an_interrupt(tmp_path):
 
 def test_a_stage_of_another_version_is_made_again(tmp_path, monkeypatch):
     """What is named by a hash of the source: the release's number does not change with a mended line."""
-    told = SimpleNamespace(model_dump=lambda **_: {})
+    told = SimpleNamespace(model_dump=lambda **_: {}, effects=())
 
     def stage(make):
         with (
@@ -90,7 +91,7 @@ def rig(tmp_path):
 @pytest.mark.parametrize(("end", "ends"), [(KeyboardInterrupt, 130), (OutOfTime, 3)])
 def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypatch, tmp_path, end, ends):
     def first(*_, keep, **__):
-        keep("verdict", lambda: SimpleNamespace(verdict="class", members=(("iron_loss", "windage"),), families=()))
+        keep("verdict", lambda: room.LoopStages("class", None, None, None))
         raise end
 
     at_once = []  # what XLA is at then crashes an ordinary end
@@ -101,6 +102,7 @@ def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypat
 
     monkeypatch.setattr(os, "_exit", leave)
     monkeypatch.setattr(command, "discover", first)
+    monkeypatch.setattr(command.said_of, "verdict", lambda found: f"verdict: {found.verdict}, iron_loss or windage")
     code, _, err = mmrjax(*rig, "--within", "5min")
     assert at_once == [ends]
     assert ("no verdict within 300 s\n" in err) == (end is OutOfTime)
@@ -120,7 +122,7 @@ def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypat
 
 def test_what_cannot_be_kept_is_not_said_to_be(rig, mmrjax, monkeypatch, tmp_path):
     def first(*_, keep, **__):
-        keep("verdict", lambda: SimpleNamespace(verdict="none", own=lambda: None))  # which pickle refuses
+        keep("verdict", lambda: SimpleNamespace(verdict="none", own=lambda: None))  # which no file takes
         raise KeyboardInterrupt
 
     monkeypatch.setattr(command, "discover", first)
@@ -183,16 +185,18 @@ def test_a_loop_of_kept_stages_finds_what_it_found(tmp_path):
     (tmp_path / "table.csv").write_text("\n".join(rows) + "\n")
     robot = robot_file.read(tmp_path / "rig.toml")
     runs = records.read(tmp_path / "table.csv", robot=robot)
-    stages: dict[str, object] = {}
+    written: dict[str, object] = {}
 
     def keep(name, make):
-        stages[name] = make()
-        return stages[name]
+        made = make()
+        kept_stages.write(tmp_path / name, made)
+        written[name] = kept_stages.read(tmp_path / name)
+        return made
 
     found = room.discover(runs, robot, replicates=250, keep=keep)
-    factors = tuple(float(name.split()[1]) for name in stages if name.startswith("noise"))
-    assert {"base", "bootstrap 0", "verdict", "result"} <= set(stages) and len(factors) == 2
-    again = room.discover(runs, robot, replicates=250, keep=lambda name, make: stages[name])
+    factors = tuple(float(name.split()[1]) for name in written if name.startswith("noise"))
+    assert {"base", "bootstrap 0", "verdict", "result"} <= set(written) and len(factors) == 2
+    again = room.discover(runs, robot, replicates=250, keep=lambda name, make: written[name])
     assert again.verdict == found.verdict and again.chi2 == found.chi2
     assert [e.name for e in again.effects] == [e.name for e in found.effects]
     assert again.sensitivity == found.sensitivity
@@ -200,7 +204,7 @@ def test_a_loop_of_kept_stages_finds_what_it_found(tmp_path):
     def slow(name, make):  # other noises take longer than there is time
         if name.startswith("noise"):
             raise concurrent.futures.TimeoutError
-        return stages[name]
+        return written[name]
 
     ended = room.discover(runs, robot, replicates=250, keep=slow, left=lambda: 0.0)
     assert ended.verdict == found.verdict and not ended.sensitivity

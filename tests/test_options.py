@@ -166,3 +166,34 @@ def test_no_message_of_what_was_stated_by_options_names_a_field(tmp_path):
         config.resolve(config.Simulate, tmp_path / "a.toml", {})
     with pytest.raises(BadConfiguration, match=r"^--left: got 500\.0; "):
         config.resolve(config.Simulate, None, {"left_V": 500.0, "right_V": 1.0})
+
+
+HARM = "import pathlib\npathlib.Path('harmed').touch()\n"
+ASKED = [
+    (("simulate",), 'effects = ["own.py"]', "--effects"),
+    (("loop", "measured"), 'effects = ["own.py"]', "--effects"),
+    (("sweep", "--dry-run"), 'effects = ["own.py"]\n[axes]\nvoltage = [24]', "--effects"),
+    (("sweep", "--dry-run"), "[solver]\nscheduler = 'tcp://127.0.0.1:1'\n[axes]\nvoltage = [24]", "--scheduler"),
+    (("sweep",), "[solver]\nscheduler = 'tcp://127.0.0.1:1'", "--scheduler"),
+]
+
+
+@pytest.mark.parametrize(("command", "text", "option"), ASKED)
+def test_a_file_runs_no_code_unless_it_is_trusted(mmrjax, tmp_path, command, text, option):
+    (tmp_path / "own.py").write_text(HARM)
+    (tmp_path / "plan.toml").write_text(text)
+    asks = (*command, "--config", "plan.toml", "--out", "x")
+    code, out, err = mmrjax(*asks)
+    assert code == 2 and f"would run code, which a file cannot ask for; state {option} on the command" in err
+    assert not out and sorted(p.name for p in tmp_path.iterdir()) == ["own.py", "plan.toml"]
+    if option == "--effects":
+        for how in (("--trust",), ("--effects", "own.py")):
+            code, _, err = mmrjax(*asks, *how)
+            assert code == 2 and "own.py: holds no effect" in err
+            (tmp_path / "harmed").unlink()
+
+
+def test_an_empty_list_of_effects_asks_for_nothing(tmp_path):
+    (tmp_path / "a.toml").write_text(config.as_toml(config.Simulate()))
+    assert "effects = []" in (tmp_path / "a.toml").read_text()
+    assert config.resolve(config.Simulate, tmp_path / "a.toml", {}) == config.Simulate()

@@ -11,7 +11,7 @@ import pytest
 
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration
-from calibration.inference import identifiability, noise, observers, population, priors
+from calibration.inference import identifiability, multistart, noise, observers, population, priors
 from calibration.inference.calibrate import calibrate
 from calibration.inference.notes import (
     Edge,
@@ -184,8 +184,25 @@ def test_members_of_another_calibration_are_refused(posed, known, tmp_path):
 def test_file_that_holds_no_members_is_refused(posed, tmp_path, content):
     file = tmp_path / "members.npz"
     file.write_bytes(content)
-    with pytest.raises(BadConfiguration, match="no file of members"):
+    with pytest.raises(BadConfiguration, match="not a file of members that can be read"):
         Members(posed, file)
+
+
+def never(*_, **__):
+    raise AssertionError("searched")
+
+
+def test_damaged_members_are_refused_before_the_first_search(tmp_path, monkeypatch, mmrjax):
+    (tmp_path / "kept.npz").write_bytes(b"cut")
+    monkeypatch.setattr(multistart, "search", never)
+    with pytest.raises(BadConfiguration, match="not a file of members that can be read"):
+        calibrate(
+            records.read("measured"), robots.nominal(), model="track", population=8, members=tmp_path / "kept.npz"
+        )
+    monkeypatch.setattr("sweeps.commands.loop.discover", never)
+    code, _, err = mmrjax("loop", "measured", "--resolve", "--members", "kept.npz", "--out", "x")
+    assert code == 2 and "--members kept.npz: not a file of members that can be read" in err
+    assert [p.name for p in tmp_path.iterdir()] == ["kept.npz"]
 
 
 def test_full_disk_is_said_and_leaves_what_was_there(posed, known, tmp_path, monkeypatch):

@@ -1,5 +1,6 @@
 """Sweeps into a store: what xarray reads, resumption bit by bit, shares, devices, and what is refused."""
 
+import contextlib
 import csv
 import dataclasses
 import errno
@@ -9,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import time
+import zlib
 from pathlib import Path
 
 import jax
@@ -17,7 +19,7 @@ import pytest
 import xarray as xr
 from test_cli import MMRJAX
 
-from calibration.data.errors import BadConfiguration
+from calibration.data.errors import BadConfiguration, BadData
 from mmrjax import params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady
@@ -27,6 +29,7 @@ from sweeps.commands import sweep as command
 from sweeps.config_campaign import Campaign
 from sweeps.points import axes, identity, scale, zarr_store
 from sweeps.points.job import laid_out, prepare
+from sweeps.store import LOCK, MANIFEST, RunFolder
 
 CONFIG = """report = false
 chunk = 40
@@ -666,7 +669,8 @@ def test_replacement_killed_between_any_two_steps_is_taken_up(opened, monkeypatc
     def finish(store):
         with store.last() as last:
             assert last
-            (store.partial / "manifest.json").write_text("{}")
+            names = ["identity.json", "journal", "manifest.json", zarr_store.STORE]
+            store.write_json("manifest.json", {"schema": MANIFEST, "contents": names})
             store.move_into_place()
 
     def simulated(speed, **options):
@@ -702,6 +706,124 @@ def test_replacement_killed_between_any_two_steps_is_taken_up(opened, monkeypatc
     assert [p.name for p in tmp_path.iterdir()] == ["s"]
     assert not {"lock", "writing"} & {p.name for p in (tmp_path / "s").iterdir()}
     assert xr.open_zarr(tmp_path / "s" / zarr_store.STORE).speed.values.tolist() == [2.0] * 3
+
+
+# --- damage ---------------------------------------------------------------------------------------------------------
+
+
+def cut(file):
+    file.write_bytes(file.read_bytes()[:-3])
+
+
+def flip(file):
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 4
+    file.write_bytes(content)
+
+
+HARMS = {"cut": cut, "flip": flip, "empty": lambda file: file.write_bytes(b""), "remove": Path.unlink}
+DAMAGED = (
+    "identity.json",
+    "journal/1-of-1.jsonl",
+    "zarr.json",
+    "speed/zarr.json",
+    "speed/c/1",
+    "status/c/1",
+    "voltage/c/0",
+)
+WHOLE = [1.0, 2.0, 3.0]
+
+
+def victim(folder, name):
+    return folder / name if name.startswith(("identity", "journal")) else folder / zarr_store.STORE / name
+
+
+def finished(store):
+    with store.last() as last:
+        assert last
+        names = ["identity.json", "journal", "manifest.json", zarr_store.STORE]
+        store.write_json("manifest.json", {"schema": MANIFEST, "contents": names})
+        store.move_into_place()
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+@pytest.mark.parametrize("harm", HARMS)
+def test_what_is_damaged_of_an_interrupted_sweep_is_computed_again(opened, tmp_path, capsys, name, harm):
+    store = opened()
+    store.begin()
+    for k, speed in enumerate(WHOLE):
+        written(store, k, speed=speed)
+    store.close()
+    HARMS[harm](victim(store.partial, name))
+    if name == "identity.json" and harm != "remove":  # without one the store had not begun
+        with pytest.raises(
+            BadData, match=r"identity\.json is damaged; choose another path, or --force to begin anew"
+        ):
+            opened()
+        again = opened(force=True)
+    else:
+        again = opened()
+    again.begin()
+    for k in set(range(3)) - set(again.done()):
+        written(again, k, speed=WHOLE[k])
+    finished(again)
+    assert xr.open_zarr(tmp_path / "s" / zarr_store.STORE).speed.values.tolist() == WHOLE
+    assert ("damaged; " in capsys.readouterr().err) == ("identity" not in name and "journal" not in name)
+    last = opened()  # which reads the chunk's second line
+    assert last.finished and len(last.done()) == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "harm"), [*((n, h) for n in DAMAGED for h in ("flip", "remove")), ("manifest.json", "cut")]
+)
+def test_what_is_damaged_of_a_finished_sweep_is_said(opened, tmp_path, name, harm):
+    store = opened()
+    store.begin()
+    written(store, 0, 1, 2)
+    finished(store)
+    store.close()
+    file = tmp_path / "s" / name if name == "manifest.json" else victim(tmp_path / "s", name)
+    HARMS[harm](file)
+    with pytest.raises((BadData, BadConfiguration), match=r"is damaged; choose another path|s exists already"):
+        opened()
+    if name not in ("manifest.json", "identity.json") or harm == "flip":
+        return
+    before = sorted(tmp_path.rglob("*"))
+    with contextlib.suppress(BadConfiguration):
+        opened(force=True).close()
+    assert (sorted(tmp_path.rglob("*")) == before) == (name == "manifest.json")
+
+
+@pytest.mark.parametrize(
+    "line", ["[0]", '[0,[1],{},{"speed":1}]', "[0,1,2,3]", '["a",[],{},{}]', "[7,[1],{},{}]", "[" * 9000]
+)
+def test_a_forged_line_of_a_journal_counts_for_nothing(opened, line):
+    store = opened()
+    store.begin()
+    check = f"{zlib.crc32(line.encode()):08x}"
+    (store.partial / "journal" / "0-of-1.jsonl").write_text(f"{check} {line}\n")
+    assert not store.done()
+    written(store, 0, 1, 2)
+    assert len(store.done()) == 3
+
+
+def test_a_store_and_a_table_of_one_path_leave_each_other_alone(opened, tmp_path):
+    store = opened()
+    store.begin()
+    written(store, 0)
+    for force, why in ((False, "holds an interrupted sweep into a store"), (True, "another process is at work")):
+        with pytest.raises(BadConfiguration, match=why):
+            RunFolder(tmp_path / "s", {"command": "sweep"}, force=force)
+    assert len(store.done()) == 1
+    store.close()
+    with RunFolder(tmp_path / "s", {"command": "sweep"}, force=True) as folder:
+        with pytest.raises(BadConfiguration, match="another process is at work"):
+            opened(force=True)
+        folder.stage("base", lambda: 1)
+    with pytest.raises(BadConfiguration, match="holds an interrupted sweep, which"):
+        opened()
+    store = opened(force=True)
+    assert json.loads((store.partial / LOCK).read_text())["command"] == zarr_store.COMMAND and not store.done()
 
 
 # --- devices --------------------------------------------------------------------------------------------------------
@@ -804,7 +926,7 @@ def test_somebody_elses_folder_is_left_alone(sweep, tmp_path):
     (tmp_path / "s.partial").mkdir()
     (tmp_path / "s.partial" / "thesis.txt").write_text("years of work")
     code, _, err = sweep("s")
-    assert code == 2 and "is in the way and is no sweep of ours" in err
+    assert code == 2 and "is in the way and is no run of ours" in err
     (tmp_path / "t").mkdir()
     (tmp_path / "t" / "thesis.txt").write_text("years of work")
     for force in ([], ["--force"]):

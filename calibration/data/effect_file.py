@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import hashlib
+import importlib.machinery
 import importlib.util
 import inspect
 import math
+import os
 import sys
+import types
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,6 +31,9 @@ from mmrjax.signals import Signals, State
 
 #: Effects by name, as robot files and the command line know them.
 Library = Mapping[str, type[Effect]]
+
+#: First part of the name of a module of the user's own effects; the rest is a hash of its path.
+OWN_MODULE = "mmrjax_user_effects_"
 
 #: Kind of every class attribute that an effect states or inherits.
 _STATED = {
@@ -75,6 +82,13 @@ def library(paths: Sequence[Path | str] = ()) -> Library:
     return known
 
 
+class _FromSource(importlib.machinery.SourceFileLoader):
+    """Runs the file itself: compiled code beside it may be of another text, and none is left there."""
+
+    def get_code(self, fullname: str) -> types.CodeType:
+        return self.source_to_code(self.get_data(self.path), self.path)
+
+
 def read(path: Path) -> tuple[type[Effect], ...]:
     """The effect classes that a Python file defines, in its order. The file's code is run.
 
@@ -85,15 +99,15 @@ def read(path: Path) -> tuple[type[Effect], ...]:
     if not path.is_file():
         raise BadConfiguration(f"--effects: got {path}, no such file; expected a Python file with Effect classes")
     # A name of its own: two files may be called alike, and none may hide a module of the package.
-    name = f"mmrjax_user_effects_{abs(hash(path.resolve())):x}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
+    name = OWN_MODULE + hashlib.sha256(os.fsencode(path.resolve())).hexdigest()[:16]
+    spec = importlib.util.spec_from_file_location(name, path, loader=_FromSource(name, str(path)))
+    if path.suffix != ".py" or spec is None or spec.loader is None:
         raise BadConfiguration(f"--effects: got {path.name}; expected a file whose name ends in .py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise BadConfiguration(f"{path.name}: its code fails ({type(error).__name__}: {error})") from error
     concrete = effects.defined_in(module)
     if not concrete:
@@ -140,7 +154,7 @@ def _check(path: Path, effect: type[Effect]) -> None:
         raise refuse(": its docstring states no equation with its «Source:»")
     try:
         default = effect()
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise refuse(f": cannot be made without arguments ({error}); give every field a default") from error
     acting, stated = default.configurations, effect.configurations
     if acting != stated or not isinstance(acting, tuple) or not all(isinstance(c, str) for c in acting):
@@ -200,7 +214,7 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
             kept = []
             if effect.memory_size is not None:
                 kept = [effect().rate(robot, every), effect().settled(robot, known)]
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise refuse(f": its term cannot be computed ({type(error).__name__}: {error})") from error
         if once.shape != ():
             raise refuse(f": its term has shape {once.shape}; expected a scalar for scalar signals")

@@ -257,30 +257,34 @@ def diagnosis_beside(space: CandidateSpace, found: Discrepancy, bases: Bases, le
     return Diagnosis(linear, scores, AdequacyTest(strongest, left.test.null, left.test.settings))
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
 class CurveBeside:
     """Where the base leaves something, the smooth curve there and what it leaves, each found when it is first asked
     for: both the verdict and its result may ask.
 
     Attributes:
-        where: the place, as `locate` has it.
+        space, base, left, bases: as of `fit_discrepancy` and `diagnosis_beside`.
     """
 
-    def __init__(self, space: CandidateSpace, base: Candidate, left: Diagnosis, bases: Bases) -> None:
-        """Arguments as of `fit_discrepancy` and `diagnosis_beside`."""
-        self.where = locate(left, bases, space.included)
-        self._given = space, base, left, bases
+    space: CandidateSpace
+    base: Candidate
+    left: Diagnosis
+    bases: Bases
+
+    @functools.cached_property
+    def where(self) -> DiscrepancyLocation:
+        """The place, as `locate` has it."""
+        return locate(self.left, self.bases, self.space.included)
 
     @functools.cached_property
     def curve(self) -> Discrepancy:
         """The curve, fitted with the base."""
-        space, base, left, _ = self._given
-        return fit_discrepancy(space, base, left.linear, self.where.place, self.where.variable)
+        return fit_discrepancy(self.space, self.base, self.left.linear, self.where.place, self.where.variable)
 
     @functools.cached_property
     def diagnosis(self) -> Diagnosis:
         """What the fit with the curve leaves."""
-        space, _, left, bases = self._given
-        return diagnosis_beside(space, self.curve, bases, left)
+        return diagnosis_beside(self.space, self.curve, self.bases, self.left)
 
 
 def _with_curve(space: CandidateSpace, base: Candidate, curve: Smooth) -> Problem:

@@ -14,12 +14,14 @@ import numpy as np
 from scipy.special import chdtrc
 
 from calibration.data.errors import BadConfiguration
+from calibration.data.runs import Runs
 from calibration.discovery.notes import Asked
 from calibration.discovery.result import PLAUSIBLE, DiscoveryResult, Estimate, Resolved
 from calibration.inference import noise as noise_room
 from calibration.inference import observers
 from calibration.inference.calibrate import calibrate
 from calibration.inference.notes import Step
+from calibration.inference.population import saved_members
 from calibration.inference.result import CalibrationResult
 from calibration.words.notes import in_words
 from mmrjax import channels
@@ -56,6 +58,18 @@ def found_in(name: str, found: DiscoveryResult) -> bool:
     return any(s.name == name and s.balance in BALANCES for s in found.scores)
 
 
+def check_resolvable(runs: Runs, members: Path | None = None) -> None:
+    """Refuse what `resolve` cannot be asked about, before the loop that it follows.
+
+    Raises:
+        BadConfiguration: the data are histories, or the file of members cannot be read.
+    """
+    if not observers.kind(runs).rows_tell:
+        raise BadConfiguration("--resolve: the track model is asked about settled rows; these are histories")
+    if members is not None and members.exists():
+        saved_members(members)
+
+
 def resolve(
     found: DiscoveryResult,
     *,
@@ -78,8 +92,7 @@ def resolve(
     Raises:
         BadConfiguration: the data are histories.
     """
-    if not observers.kind(found.runs).rows_tell:
-        raise BadConfiguration("--resolve: the track model is asked about settled rows; these are histories")
+    check_resolvable(found.runs)
     reason, robot = asked(found), found.robot
     tracked = [name for name, chassis in robot.configurations.items() if float(chassis.on_tracks) > 0.5]
     rows = found.runs.where(found.included & np.isin(found.runs["configuration"], tracked))

@@ -261,6 +261,8 @@ def _searched(
     if not posed.observe.eased:
         return multistart.search_one_by_one(posed, known, points, multistart.first_shares(known), tell), None
     tell(Step("steady"))
+    if evolved.size:
+        population.Members(posed, evolved.file)  # refuses a file of others before the search of steady
     draws = rng.standard_normal((fidelities.facts("steady").effort.starts, size))
     draws[0] = 0.0
     easy = multistart.search(observers.pose(runs, base, posed.coordinates, known.sd), known, draws)

@@ -12,7 +12,6 @@ import dataclasses
 import hashlib
 import os
 import time
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -131,6 +130,25 @@ def identity(posed: Problem) -> str:
     return digest.hexdigest()[:16]
 
 
+def saved_members(file: Path) -> tuple[str, list[np.ndarray]]:
+    """Identity of the problem of a file of members, and its arrays in the order of `KEPT`.
+
+    Raises:
+        BadConfiguration: it is not a file of members, or is damaged.
+    """
+    try:
+        with file.open("rb") as bytes_, np.load(bytes_, allow_pickle=False) as saved:
+            own, arrays = str(saved["identity"]), [saved[k] for k in KEPT]
+        if len({len(array) for array in arrays}) != 1:
+            raise ValueError("its arrays have different lengths")
+    except Exception as error:  # whatever a damaged file makes the reader raise
+        raise BadConfiguration(
+            f"--members {file}: not a file of members that can be read ({type(error).__name__}); remove it, or name "
+            "another file"
+        ) from error
+    return own, arrays
+
+
 class Members:
     """Runs members, and keeps what they gave, in a file where one is named, from which a search goes on.
 
@@ -151,11 +169,7 @@ class Members:
             self._load(file)
 
     def _load(self, file: Path) -> None:
-        try:
-            with file.open("rb") as bytes_, np.load(bytes_) as saved:
-                own, arrays = str(saved["identity"]), [saved[k] for k in KEPT]
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise BadConfiguration(f"--members {file}: no file of members; {error}") from None
+        own, arrays = saved_members(file)
         if own != self._own:
             raise BadConfiguration(
                 f"--members {file}: its members are of another calibration (data, robot, parameters or model); "

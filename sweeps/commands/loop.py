@@ -18,7 +18,7 @@ from calibration.data.columns import Layout
 from calibration.discovery import findings
 from calibration.discovery.discover import discover
 from calibration.discovery.kept import OutOfTime
-from calibration.discovery.resolve import resolve
+from calibration.discovery.resolve import check_resolvable, resolve
 from calibration.discovery.result import REFIT_FILE, DiscoveryResult
 from calibration.discovery.settings import fewest_replicates
 from calibration.inference import blocks, observers, priors
@@ -62,6 +62,8 @@ def _loop(
     robot = load_robot(config).robot
     runs = read_runs(source, robot, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
+    if config.resolve:
+        check_resolvable(runs, members)
     replicates = max(config.replicates, fewest_replicates(observers.kind(runs)))
 
     stages: dict[str, Any] = {}

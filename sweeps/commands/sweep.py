@@ -112,7 +112,7 @@ def _into_store(config: Campaign, file: RobotFile, where: str, out: Path | None,
             if not store.finished:
                 simulate(store, job, options, pool)
             return finish(store, config, file, job, same, options)
-        except (InputError, KeyboardInterrupt):
+        except BaseException:
             if options.shard is None:
                 store.abandon()
             raise

@@ -1,7 +1,8 @@
 """The store of a sweep: a Zarr group whose chunks are whole or absent, and the record of those that are done.
 
 Arrays are laid out in the Zarr format 3; each chunk is a file, written aside and moved into place, so that none is
-ever half there. A chunk of the sweep counts as done when its line in a journal is whole, and that is written last.
+ever half there. A chunk of the sweep counts as done when its line in a journal is whole, and that is written last;
+the line has a checksum of each of its files, so that a file that was damaged later is seen.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import json
 import math
 import os
 import shutil
+import tempfile
 import warnings
 import zlib
 from collections.abc import Iterator, Mapping
@@ -21,14 +23,17 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from calibration.data.errors import BadConfiguration
+from calibration.data.errors import BadConfiguration, BadData
 from mmrjax.signals import STATUSES
 from mmrjax.variation import STATUS
+from sweeps.console import tell
 from sweeps.points.design import SAMPLE, Blocks, Design
 from sweeps.points.identity import Identity, differences
-from sweeps.store import Folder
+from sweeps.store import LOCK, Folder, contents, lockable, marked, share_at_work, unfinished
 
 STORE = "results.zarr"
+#: The command that a store's folder is marked with: a sweep into a table leaves other files.
+COMMAND = "sweep into a store"
 #: Folder in which files are written before they are moved into place.
 ASIDE = "writing"
 #: Status of a point that has not been simulated.
@@ -82,15 +87,19 @@ class Done:
     Attributes:
         chunk: its number; statuses: how many points ended in each; ranges: least and greatest finite value of each
             output, none where there is none.
+        checks: checksum of the chunk's file of each array, CRC-32.
     """
 
     chunk: int
     statuses: tuple[int, ...]
     ranges: Mapping[str, tuple[float, float]]
+    checks: Mapping[str, int]
 
 
 class SweepStore(Folder):
     """The folder of a sweep, `path` + `.partial` until it is whole, shared by the processes of a job array."""
+
+    further = (LOCK, ASIDE, "runs.csv", "runs.parquet")
 
     def __init__(self, path: Path, identity: Identity, layout: Layout, *, force: bool = False) -> None:
         """Begin a store, or take up one with the same identity.
@@ -98,6 +107,7 @@ class SweepStore(Folder):
         Raises:
             BadConfiguration: `path` holds something else, or a sweep of another identity (the message says where they
                 differ), or another process is at work on what `force` would replace.
+            BadData: the sweep is finished, and a file of its store is damaged.
         """
         super().__init__(path)
         self.layout = layout
@@ -107,16 +117,14 @@ class SweepStore(Folder):
         self._lock: TextIO | None = None
         self._identity = identity
         self._aside = self.partial / ASIDE / "identity"
-        cut_short = (path / "lock").is_file()  # killed while the folder was moved into place
-        if (path / "identity.json").is_file() and (not force or (cut_short and not self._differs(path))):
+        self._sound: dict[int, Done] = {}
+        self._damaged = set[int]()
+        cut_short = (path / LOCK).is_file()  # killed while the folder was moved into place
+        if self._is_finished() and (not force or (cut_short and not self._differs(path))):
             self._take_finished()
             return
         self.refuse_taken(force)
-        ours = (self.partial / "lock").is_file()
-        if self.partial.exists() and not ours and any(self.partial.iterdir()):
-            raise BadConfiguration(
-                f"--out: {self.partial} is in the way and is no sweep of ours; choose another path"
-            )
+        self.refuse_foreign(COMMAND, force)
         try:
             while not self._enter(force):
                 self.close()
@@ -128,27 +136,35 @@ class SweepStore(Folder):
         """Begin the store or take it up; False where another process has removed it while this one waited for it."""
         try:
             self.partial.mkdir(parents=True, exist_ok=True)
-            self._lock = (self.partial / "lock").open("a")
+            self._lock = (self.partial / LOCK).open("a")
         except OSError as error:
             raise BadConfiguration(
                 f"--out: {self.path} cannot be written ({error.strerror}); choose another path"
             ) from error
+        mark = unfinished(self.partial)
+        if mark is not None and mark["command"] not in ("", COMMAND) and not lockable(self._lock):
+            raise BadConfiguration(
+                f"--out: another process is at work on {self.partial}; wait for it, or choose another path"
+            )
         with self._locked():
             if not self._present():
                 return self._finished_by_another(force)
             self._begin_or_take_up(force)
         return True
 
+    def _is_finished(self) -> bool:
+        return contents(self.path) is not None and (self.path / "identity.json").is_file()
+
     def _present(self) -> bool:
         """Whether the folder is the one that this process has opened, and not removed or moved meanwhile."""
         assert self._lock is not None
         try:
-            return os.path.samestat(os.fstat(self._lock.fileno()), (self.partial / "lock").stat())
+            return os.path.samestat(os.fstat(self._lock.fileno()), (self.partial / LOCK).stat())
         except FileNotFoundError:
             return False
 
     def _finished_by_another(self, force: bool = False) -> bool:
-        if not (self.path / "identity.json").is_file() or (force and self._differs(self.path)):
+        if not self._is_finished() or (force and self._differs(self.path)):
             return False
         self._take_finished()
         return True
@@ -157,11 +173,13 @@ class SweepStore(Folder):
         self._same(self.path)
         self._tidy()
         self.finished = True
+        self._refuse_damaged()
 
     def _begin_or_take_up(self, force: bool) -> None:
         if (self.partial / "identity.json").is_file() and not (force and self._differs(self.partial)):
             self._same(self.partial)
-        elif not force and (self.path / "identity.json").is_file():  # finished between our looking and our coming
+            self._mend_layout()
+        elif not force and self._is_finished():  # finished between our looking and our coming
             self._take_finished()
             shutil.rmtree(self.partial)
         else:
@@ -170,11 +188,18 @@ class SweepStore(Folder):
     # --- identity ---------------------------------------------------------------------------------
 
     def _differs(self, folder: Path) -> str:
-        stored = json.loads((folder / "identity.json").read_text(encoding="utf-8"))
-        return differences(stored, self._identity)
+        try:
+            stored = json.loads((folder / "identity.json").read_text(encoding="utf-8"))
+            return differences(stored, self._identity)
+        except (ValueError, AttributeError, TypeError, RecursionError):
+            return "identity.json"
 
     def _same(self, folder: Path) -> None:
         differ = self._differs(folder)
+        if differ == "identity.json":
+            raise BadData(
+                f"--out: {folder / 'identity.json'} is damaged; choose another path, or --force to begin anew"
+            )
         if differ:
             raise BadConfiguration(
                 f"--out: {folder} holds another sweep, which differs in {differ}; choose another path, or --force to "
@@ -194,8 +219,8 @@ class SweepStore(Folder):
 
     def _clear(self) -> None:
         for entry in self.partial.iterdir():
-            if entry.name != "lock":
-                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+            if entry.name != LOCK:
+                shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
 
     def _create(self) -> None:
         """Metadata and axes, and the identity last: what has one is whole.
@@ -207,10 +232,40 @@ class SweepStore(Folder):
         if share is not None:
             raise self._busy(share)
         self._clear()
+        (self.partial / LOCK).write_text(marked(COMMAND), encoding="utf-8")
         (self.partial / "journal").mkdir()
         (self.partial / ASIDE).mkdir()
         create(self.partial / STORE, self.layout)
         write_file(self.partial / "identity.json", json.dumps(self._identity, indent=1).encode(), self._aside)
+
+    def _altered(self, folder: Path) -> dict[Path, bytes]:
+        """Files of metadata and axes that are not as `create` writes them, with what they should hold."""
+        with tempfile.TemporaryDirectory() as place:
+            create(Path(place) / STORE, self.layout)
+            whole = {p.relative_to(place): p.read_bytes() for p in Path(place).rglob("*") if p.is_file()}
+        found = {folder / name: content for name, content in whole.items()}
+        return {p: content for p, content in found.items() if not p.is_file() or p.read_bytes() != content}
+
+    def _mend_layout(self) -> None:
+        """Write what is damaged of metadata and axes anew, with a note."""
+        for file, content in self._altered(self.partial).items():
+            tell(f"{file}: damaged; written again")
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_file(file, content, self._aside)
+
+    def _refuse_damaged(self) -> None:
+        """Refuse a finished sweep of which anything is damaged.
+
+        Raises:
+            BadData: names the first file.
+        """
+        damaged = next(iter(self._altered(self.path)), None)
+        if damaged is None and len(self.done()) < len(self.layout.blocks):
+            lost = min(set(range(len(self.layout.blocks))) - set(self._sound))
+            records = self._records().get(lost, [])
+            damaged = self._wrong_file(records[-1]) if records else self.path / "journal"
+        if damaged is not None:
+            raise BadData(f"--out: {damaged} is damaged; choose another path, or --force to make the sweep anew")
 
     # --- chunks -----------------------------------------------------------------------------------
 
@@ -231,7 +286,7 @@ class SweepStore(Folder):
                 )
             self._same(self.partial)
             journal = file.open("a+", encoding="utf-8")
-            if not _lockable(journal):
+            if not lockable(journal):
                 journal.close()
                 raise self._busy(name)
             self._journal, self._share = journal, file
@@ -241,12 +296,7 @@ class SweepStore(Folder):
 
     def _at_work(self) -> str | None:
         """A share that another process works on, of those that have one; to be called within `_locked`."""
-        for file in sorted((self.partial / "journal").glob("*.jsonl")):
-            if file != self._share:
-                with file.open("a") as journal:
-                    if not _lockable(journal):
-                        return file.stem
-        return None
+        return share_at_work(self.partial, self._share)
 
     def _busy(self, name: str) -> BadConfiguration:
         return BadConfiguration(
@@ -255,14 +305,46 @@ class SweepStore(Folder):
         )
 
     def done(self) -> dict[int, Done]:
-        """Finished chunks by number."""
-        found: dict[int, Done] = {}
+        """Finished chunks by number, whose files are as they were written; a damaged one is reported once."""
+        for chunk, records in self._records().items():
+            if chunk in self._sound:
+                continue
+            sound = next((record for record in records if self._wrong_file(record) is None), None)
+            if sound is not None:
+                self._sound[chunk] = sound
+            elif chunk not in self._damaged and not self.finished:
+                self._damaged.add(chunk)
+                tell(f"{self._wrong_file(records[-1])}: damaged; computed again")
+        return dict(sorted(self._sound.items()))
+
+    def _records(self) -> dict[int, list[Done]]:
+        """Lines of all journals that are whole, by chunk."""
+        found: dict[int, list[Done]] = {}
         folder = self.path if self.finished else self.partial
         for file in sorted((folder / "journal").glob("*.jsonl")):
-            for line in file.read_text(encoding="utf-8").splitlines():
+            for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
                 record = _record(line)
-                if record is not None:
-                    found[record.chunk] = record
+                if record is not None and 0 <= record.chunk < len(self.layout.blocks):
+                    found.setdefault(record.chunk, []).append(record)
+        return found
+
+    def _wrong_file(self, record: Done) -> Path | None:
+        """File of a chunk that is not as it was written; None if all are."""
+        store = (self.path if self.finished else self.partial) / STORE
+        for name, file in self._files(record.chunk).items():
+            try:
+                if zlib.crc32((store / file).read_bytes()) != record.checks.get(name):
+                    return store / file
+            except OSError:
+                return store / file
+        return None
+
+    def _files(self, chunk: int) -> dict[str, Path]:
+        """Files of a chunk within the store, by array: those of the samples at the beginning of all other axes."""
+        place, samples = self.layout.blocks.place(chunk), self.layout.design.samples
+        found = {v.name: Path(v.name, "c", *map(str, place)) for v in self.layout.variables}
+        if samples is not None and not any(place[:-1]):
+            found |= {name: Path(name, "c", *map(str, place[-1:])) for name in samples.names}
         return found
 
     def write(self, chunk: int, arrays: Mapping[str, np.ndarray], drawn: np.ndarray | None) -> Done:
@@ -272,37 +354,38 @@ class SweepStore(Folder):
             arrays: by variable, a value a point of its box; drawn: values of the samples there, a row a name, written
                 by the chunks at the beginning of all axes.
         """
-        layout, place = self.layout, self.layout.blocks.place(chunk)
+        layout, files = self.layout, self._files(chunk)
         box = layout.blocks.box(chunk)
         shape = tuple(b.stop - b.start for b in box)
-        store = self.partial / STORE
+        checks = {}
         for variable in layout.variables:
             values = np.asarray(arrays[variable.name], variable.dtype).reshape(shape)
-            self._chunk(store / variable.name, place, values, layout.blocks.size, fill(variable))
+            checks[variable.name] = self._chunk(files[variable.name], values, layout.blocks.size, fill(variable))
         samples = layout.design.samples
-        if samples is not None and drawn is not None and not any(place[:-1]):
+        if samples is not None and drawn is not None:
             for name, values in zip(samples.names, drawn, strict=True):
-                self._chunk(store / name, place[-1:], values, layout.blocks.size[-1:], math.nan)
-        record = Done(
-            chunk, _counts(arrays[STATUS]), {v.name: r for v in layout.variables if (r := _range(arrays, v))}
-        )
+                checks[name] = self._chunk(files[name], values, layout.blocks.size[-1:], math.nan)
+        ranges = {v.name: r for v in layout.variables if (r := _range(arrays, v))}
+        record = Done(chunk, _counts(arrays[STATUS]), ranges, checks)
         assert self._journal is not None
         self._journal.write(_line(record))
         self._journal.flush()
         os.fsync(self._journal.fileno())
+        self._sound[chunk] = record
         return record
 
-    def _chunk(
-        self, array: Path, place: tuple[int, ...], values: np.ndarray, size: tuple[int, ...], empty: Any
-    ) -> None:
+    def _chunk(self, file: Path, values: np.ndarray, size: tuple[int, ...], empty: Any) -> int:
+        """Write the chunk of an array; returns its checksum."""
         if values.shape != size:  # chunks at the end of an axis are filled up, as the format wants
             full = np.full(size, empty, values.dtype)
             full[tuple(slice(n) for n in values.shape)] = values
             values = full
-        file = array.joinpath("c", *map(str, place))
-        file.parent.mkdir(parents=True, exist_ok=True)
-        content = np.ascontiguousarray(values).data
-        write_file(file, content if self.layout.compression == "none" else _compressed(content), self._aside)
+        path = self.partial / STORE / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        values = np.ascontiguousarray(values)
+        content = values.tobytes() if self.layout.compression == "none" else _compressed(values.data)
+        write_file(path, content, self._aside)
+        return zlib.crc32(content)
 
     # --- the end ----------------------------------------------------------------------------------
 
@@ -331,9 +414,9 @@ class SweepStore(Folder):
 
     def _tidy(self) -> None:
         """Delete what a finished folder does not need, the lock last: while there is one, something may be left."""
-        if (self.path / "lock").is_file():
+        if (self.path / LOCK).is_file():
             shutil.rmtree(self.path / ASIDE, ignore_errors=True)
-            (self.path / "lock").unlink(missing_ok=True)
+            (self.path / LOCK).unlink(missing_ok=True)
 
     def close(self) -> None:
         """Let other processes work on what is left."""
@@ -351,15 +434,6 @@ class SweepStore(Folder):
             if self._present() and not self.done() and self._at_work() is None:
                 self._clear()  # the lock last: a folder without one would be somebody else's
                 shutil.rmtree(self.partial)
-
-
-def _lockable(journal: TextIO) -> bool:
-    """Lock a journal until it is closed; False where another process has."""
-    try:
-        fcntl.flock(journal, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
 
 
 def write_file(path: Path, content: Any, aside: Path) -> None:
@@ -442,7 +516,7 @@ def _range(arrays: Mapping[str, np.ndarray], variable: Variable) -> tuple[float,
 
 
 def _line(record: Done) -> str:
-    body = json.dumps([record.chunk, record.statuses, record.ranges], separators=(",", ":"))
+    body = json.dumps(dataclasses.astuple(record), separators=(",", ":"))
     return f"{zlib.crc32(body.encode()):08x} {body}\n"
 
 
@@ -451,5 +525,8 @@ def _record(line: str) -> Done | None:
     check, _, body = line.partition(" ")
     if not body or f"{zlib.crc32(body.encode()):08x}" != check:
         return None
-    chunk, statuses, ranges = json.loads(body)
-    return Done(chunk, tuple(statuses), {name: tuple(r) for name, r in ranges.items()})
+    try:
+        chunk, statuses, ranges, checks = json.loads(body)
+        return Done(int(chunk), tuple(statuses), {name: tuple(r) for name, r in ranges.items()}, dict(checks))
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        return None
