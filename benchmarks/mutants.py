@@ -1,7 +1,8 @@
-"""Whether the quick tests notice plausible mistakes: each mutant of tests/mutants.toml has to die by its tests.
+"""Tries the plausible mistakes of tests/mutants.toml: each has to make one of the tests that it names fail.
 
 Each mutant replaces one piece of text in a copy of the tree and runs the tests that it names, in a process of its
-own. Before that the same tests have to pass without any mutant, and to be among those of `make test`.
+own. Before that the same tests have to pass without any mutant. Tests of `make test` kill at least 97 % of the list;
+a mutant with `slow = true` dies by a slow test, one of `make test-all`.
 
     python benchmarks/mutants.py                          # all of them, one at a time
     python benchmarks/mutants.py --jobs 2
@@ -34,7 +35,7 @@ LIST = ROOT / "tests" / "mutants.toml"
 #: What takes most of a test's start is imported once, before processes are forked; nothing of ours.
 PRELOADED = ("numpy", "scipy.stats", "jax", "jax.numpy", "equinox", "optimistix", "optax", "mujoco")
 #: A module that is imported before pytest sees it, which it warns of, has no asserts to rewrite here.
-OPTIONS = ("-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAssertRewriteWarning")
+OPTIONS = ("-x", "-q", "-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAssertRewriteWarning")
 #: How long the tests of a mutant may run [s]: a mutant may loop for ever.
 PATIENCE = 900.0
 LEFT_OUT = shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", ".*_cache", "*.egg-info", ".hypothesis")
@@ -47,7 +48,8 @@ class Mutant:
     Attributes:
         kind: what it is in; file: from the root of the tree.
         text: replaced, once in the file; by: its replacement.
-        killed_by: node ids of quick tests, of which at least one has to fail.
+        killed_by: node ids of tests, of which at least one has to fail.
+        slow: these tests are marked slow.
     """
 
     name: str
@@ -56,6 +58,12 @@ class Mutant:
     text: str
     by: str
     killed_by: tuple[str, ...]
+    slow: bool = False
+
+    @property
+    def marks(self) -> str:
+        """Selection of the tests that may kill it, as pytest's option -m takes it."""
+        return "not nightly" if self.slow else "not slow"
 
     def applied(self, source: str) -> str:
         """The file's text with the mistake in it.
@@ -87,8 +95,8 @@ class _Passed:
             self.names.append(report.nodeid)
 
 
-def _run(tree: str, tests: list[str], log: str, answer: str) -> None:
-    """Run quick tests of a tree in this process; leaves exit code of pytest and tests that passed in a file."""
+def _run(tree: str, tests: list[str], marks: str, log: str, answer: str) -> None:
+    """Run tests of a tree in this process; leaves exit code of pytest and tests that passed in a file."""
     os.chdir(tree)
     os.environ["PYTHONPATH"] = tree  # for processes that tests start
     sys.path.insert(0, tree)
@@ -98,7 +106,7 @@ def _run(tree: str, tests: list[str], log: str, answer: str) -> None:
     import pytest
 
     passed = _Passed()
-    code = int(pytest.main([*OPTIONS, *tests], plugins=[passed]))
+    code = int(pytest.main([*OPTIONS, "-m", marks, *tests], plugins=[passed]))
     for name in ("mmrjax", "calibration", "sweeps"):
         module = sys.modules.get(name)
         if module is not None and not str(module.__file__).startswith(tree):
@@ -106,12 +114,12 @@ def _run(tree: str, tests: list[str], log: str, answer: str) -> None:
     Path(answer).write_text(json.dumps([code, passed.names]), encoding="utf-8")
 
 
-def run(tree: Path, tests: list[str], log: Path) -> tuple[int | None, list[str]]:
-    """Exit code of pytest over quick tests in a process of its own, None where it hangs or dies, and what passed."""
+def run(tree: Path, tests: list[str], marks: str, log: Path) -> tuple[int | None, list[str]]:
+    """Exit code of pytest over tests in a process of its own, None where it hangs or dies, and what passed."""
     context = multiprocessing.get_context("forkserver")
     answer = tree / "mutant.json"
     answer.unlink(missing_ok=True)
-    process = context.Process(target=_run, args=(str(tree), tests, str(log), str(answer)))
+    process = context.Process(target=_run, args=(str(tree), tests, marks, str(log), str(answer)))
     process.start()
     process.join(PATIENCE)
     if process.is_alive():
@@ -131,7 +139,7 @@ def tested(mutant: Mutant, tree: Path, stamp: int) -> tuple[str, float, str]:
     try:
         path.write_text(mutant.applied(original), encoding="utf-8")
         os.utime(path, (stamp, stamp))  # so that no compiled module is taken for that of another text
-        code, _ = run(tree, list(mutant.killed_by), log)
+        code, _ = run(tree, list(mutant.killed_by), mutant.marks, log)
     except ValueError as error:
         return "error", 0.0, str(error)
     finally:
@@ -144,20 +152,23 @@ def tested(mutant: Mutant, tree: Path, stamp: int) -> tuple[str, float, str]:
 
 
 def unmutated(chosen: list[Mutant], trees: list[Path]) -> str | None:
-    """Why the killing tests can't serve, None where all pass and are quick; files side by side, one tree each."""
-    tests = list(dict.fromkeys(test for mutant in chosen for test in mutant.killed_by))
-    files = list(dict.fromkeys(test.split("::")[0] for test in tests))
-    shares = [[t for t in tests if files.index(t.split("::")[0]) % len(trees) == k] for k in range(len(trees))]
-    parts = [(tree, share) for tree, share in zip(trees, shares, strict=True) if share]
-    with ThreadPoolExecutor(len(parts)) as pool:
-        ends = list(pool.map(lambda part: run(*part, part[0] / "mutant.log"), parts))
-    for (tree, _), (code, _) in zip(parts, ends, strict=True):
-        if code != 0:
-            said = (tree / "mutant.log").read_text(errors="replace")
-            return f"the tests don't pass without a mutant:\n{said[-3000:]}"
-    passed = [name for _, names in ends for name in names]
-    none = [t for t in tests if not any(p == t or p.startswith((f"{t}[", f"{t}::")) for p in passed)]
-    return f"no test of `make test`: {', '.join(none)}" if none else None
+    """Reason why the killing tests cannot serve; None if all pass without a mutant and run under the marks stated."""
+    for marks in dict.fromkeys(mutant.marks for mutant in chosen):
+        tests = list(dict.fromkeys(test for mutant in chosen if mutant.marks == marks for test in mutant.killed_by))
+        files = list(dict.fromkeys(test.split("::")[0] for test in tests))
+        shares = [[t for t in tests if files.index(t.split("::")[0]) % len(trees) == k] for k in range(len(trees))]
+        parts = [(tree, share) for tree, share in zip(trees, shares, strict=True) if share]
+        with ThreadPoolExecutor(len(parts)) as pool:
+            ends = list(pool.map(lambda part: run(part[0], part[1], marks, part[0] / "mutant.log"), parts))  # noqa: B023
+        for (tree, _), (code, _) in zip(parts, ends, strict=True):
+            if code != 0:
+                said = (tree / "mutant.log").read_text(errors="replace")
+                return f"the tests don't pass without a mutant:\n{said[-3000:]}"
+        passed = [name for _, names in ends for name in names]
+        none = [t for t in tests if not any(p == t or p.startswith((f"{t}[", f"{t}::")) for p in passed)]
+        if none:
+            return f"not run with -m '{marks}': {', '.join(none)}"
+    return None
 
 
 def main() -> int:
@@ -185,7 +196,7 @@ def main() -> int:
         trees: queue.SimpleQueue[Path] = queue.SimpleQueue()
         for copy in copies:
             trees.put(copy)
-        print(f"{len(chosen)} mutants; their tests pass without them and belong to `make test`", flush=True)
+        print(f"{len(chosen)} mutants; their tests pass without them", flush=True)
 
         def one(k: int) -> tuple[str, float]:
             tree = trees.get()
@@ -205,6 +216,8 @@ def main() -> int:
     for kind in dict.fromkeys(m.kind for m in chosen):
         print(f"{kind:14}{by_kind[kind, 'killed']:8}{by_kind[kind, 'survived']:10}{by_kind[kind, 'error']:7}")
     left = [m.name for m, (outcome, _) in zip(chosen, outcomes, strict=True) if outcome != "killed"]
+    quick = sum(outcome == "killed" and not m.slow for m, (outcome, _) in zip(chosen, outcomes, strict=True))
+    print(f"{quick} of {len(chosen)} die by `make test` alone ({100 * quick / len(chosen):.1f} %)")
     print(f"{len(chosen) - len(left)} of {len(chosen)} killed" + (f"; not: {', '.join(left)}" if left else ""))
     return 1 if left else 0
 
