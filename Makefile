@@ -43,7 +43,7 @@ lint: $(TOOLS)
 	$(BIN)/ruff format --check .
 	$(BIN)/python -m mypy
 
-# Whether `make test` notices plausible mistakes; some four minutes on two cores.
+# Tries plausible mistakes; prints how many die by `make test` alone and by all tests.
 mutants: $(TOOLS)
 	$(QUICK) $(BIN)/python benchmarks/mutants.py --jobs 2
 
