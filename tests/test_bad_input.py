@@ -78,6 +78,7 @@ def test_runs_of_ten_milliseconds_are_said(short):
     assert isinstance(said, EndsEarly) and said.runs == RUNS and np.isnan(said.share)
 
 
+@pytest.mark.slow
 def test_loop_and_calibrate_say_both(sliding, short):
     """Both ask `checks.check` before they fit, and keep what it says."""
     for runs, kind in ((sliding, NeverGrips), (short, EndsEarly)):

@@ -390,6 +390,7 @@ def test_a_table_with_missing_readings_calibrates_and_says_so(found_with_gaps):
     jsonschema.validate(json.loads(json.dumps(made.to_json())), SCHEMA)
 
 
+@pytest.mark.slow
 def test_a_prediction_is_made_where_a_reading_is_missing(found_with_gaps):
     table = found_with_gaps.rows()
     assert np.isfinite(table["after_motor_speed_rpm"]).all() and np.isnan(table["motor_speed_rpm"]).all()

@@ -436,6 +436,7 @@ def test_longer_levers_would_get_over_the_step(robot):
     assert sheet.check(changed, alone, changes=False)[0].met
 
 
+@pytest.mark.slow
 def test_stairs_need_friction_reach_and_a_tread(robot):
     """A flat belt holds up to its friction; on asphalt its length decides."""
     text = 'stairs_rise_mm = {{ least = 170, tread_mm = 290, surface = "{}" }}'

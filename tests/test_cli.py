@@ -47,6 +47,7 @@ def test_sweep_is_table_8_in_both_configurations(mmrjax, tmp_path):
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_sweep_repeats_from_what_it_left(mmrjax, tmp_path):
     assert mmrjax("sweep", "--slopes", "0:10:5", "--voltages", "24", "--payloads", "0", "--no-report", "--out", "a",
                   "--set", "motor.resistance=0.9")[0] == 0  # fmt: skip
@@ -569,6 +570,7 @@ def test_help_shows_what_an_option_is_when_it_is_not_given(monkeypatch, capsys):
         assert default in text
 
 
+@pytest.mark.slow
 def test_doctor_finds_this_installation_healthy(mmrjax):
     code, out, _ = mmrjax("doctor")
     assert code == 0 and "fails" not in out and "24 V / C_E" in out

@@ -281,6 +281,7 @@ def beside_mujoco(slope, ground, angles, volts, clear):
     return run, ours, theirs
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("slope", [0.0, 10.0])
 def test_ten_thousand_steps_are_those_of_mujoco_under_the_same_forces(slope):
     """Of a second of driving off and swinging the levers."""

@@ -84,6 +84,7 @@ def test_steepest_slope_that_the_motors_end_is_where_the_robot_comes_to_stand(ro
     assert status == [CONVERGED, STALLED] and 0 < found < 45
 
 
+@pytest.mark.slow
 def test_steepest_slope_ends_at_the_limit_and_is_missing_where_the_flat_is_not_held(robot):
     sticky = changed(robot, **{"6T2A__ground__friction__static": 2.5})
     at = steepest_slope.compute(sticky, asked(0, 33.0))

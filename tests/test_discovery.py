@@ -217,6 +217,7 @@ def test_rows_beyond_the_model_are_kept_out(clean, looks):
 # --- invariances -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_order_of_rows_does_not_matter(churning, looks):
     runs, before = churning.runs, churning.traced
     found = looks.analyst.trace(runs.where(np.random.default_rng(0).permutation(len(runs))))
@@ -237,6 +238,7 @@ def test_same_seed_gives_the_same_numbers(clean, looks):
 # --- statistics --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_held_out_readings_are_those_of_a_refit_without_the_block(clean, looks):
     runs, sd = clean.runs, known(clean.runs).sd
     block = (runs["slope_deg"] == runs["slope_deg"].max()) & (runs["supply_voltage_V"] == 15)
@@ -251,6 +253,7 @@ def test_held_out_readings_are_those_of_a_refit_without_the_block(clean, looks):
     assert (np.abs(fitted.reading[: len(runs)] - expected)[block] > sd[block]).any()
 
 
+@pytest.mark.slow
 def test_signatures_are_derivatives_of_the_readings(clean, looks):
     """Of the whole library, against differentiation of the steady model in every amplitude, at two points a shape."""
     problem = clean.space.bare

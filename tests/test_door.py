@@ -56,6 +56,7 @@ def test_what_instruments_show_is_that_of_the_whole(robot, whole):
         _ = shown_first.velocity
 
 
+@pytest.mark.slow
 def test_results_are_a_pytree_whole_or_not_yet(robot, whole):
     pending = mm.simulate(robot, mm.Conditions(**MIXED))
     half = jax.tree.map(lambda x: x[:3], pending)

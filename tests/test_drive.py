@@ -129,6 +129,7 @@ def test_drive_energy_in_is_losses_work_and_stored(robot, grid, drive_table8):
         assert np.asarray(powers[loss]).min() >= -1e-12, loss
 
 
+@pytest.mark.slow
 def test_drive_energy_balance_can_fail(robot, grid, drive_table8):
     heavier = dataclasses.replace(drive_table8.signals, mass=drive_table8.signals.mass * 1.05)
     _, energy = energies(robot, grid, dataclasses.replace(drive_table8, signals=heavier))

@@ -480,6 +480,7 @@ def test_an_instruments_errors_are_added_to_what_it_shows(signed, expected):
         assert read - ideal == pytest.approx(float(balances.added(robot, signals, "sensor", "motor_current")))
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("signed", [True, False])
 def test_a_run_backward_is_read_as_one_forward_of_the_robot_turned_about(signed):
     """A zero error keeps its sign in space; one of an instrument that shows magnitudes is the same both ways."""
@@ -706,11 +707,13 @@ MUTANTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.__name__[4:])
 def test_control_of_the_mutants_obeys(law):
     law(Good)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "mutant"),
     [
@@ -943,6 +946,7 @@ def test_series_resistance_is_winding_resistance():
     _same(_steady_with(series_resistance=0.4), _steady_with({"motor.resistance": 0.611 + 0.4}))
 
 
+@pytest.mark.slow
 def test_mass_offset_is_mass_of_the_wheeled_robot():
     _same(_steady_with(mass_offset=1.6), _steady_with({"4W2T.mass": 11.5 + 1.6}))
 

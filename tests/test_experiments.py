@@ -71,7 +71,7 @@ def shown():
     return of
 
 
-@pytest.mark.quick(8)
+@pytest.mark.quick(3)
 @pytest.mark.parametrize("name", [None, *laws.LIBRARY])
 def test_menu_agrees_with_the_generators_own_physics(name, shown):
     p, term = settled.perturbed(np.random.default_rng(5), scale=0.5), None
@@ -358,6 +358,7 @@ def test_configurations_without_rows_are_not_on_the_menu():
     assert next(e for e in made if e.name == "weigh").at == ((1.0, 0.0), (1.0, 8.0))
 
 
+@pytest.mark.slow
 def test_level_table_without_payload_asks_for_neither_slope_nor_payload(rover):
     made = menu.menu(reach(rover, grid([12.0], [0.0], [0.0]), channels.USUAL))
     runs = runs_of(made)

@@ -111,6 +111,7 @@ def test_the_model_follows_such_a_log_with_the_numbers_that_it_was_made_of(tmp_p
     assert error < 0.01 * np.ptp(runs[column]) and error > 0.1 * least
 
 
+@pytest.mark.slow
 def test_curves_are_over_the_voltage_at_motors_whose_speed_no_channel_reads(tmp_path, monkeypatch):
     """Of a servo on PWM the duty's share of the supply; while the circuit is open, the back-EMF of the run itself."""
     log = {name: column[::2] for name, column in servo(np.random.default_rng(4), levels=(0.9,), hold=0.5).items()}

@@ -134,6 +134,7 @@ def test_energy_in_is_where_it_went_and_what_is_stored(robot, configuration, bat
     assert min(losses) >= 0.0
 
 
+@pytest.mark.slow
 def test_regeneration_charges_the_battery_and_is_flagged_above_its_charge_voltage(robot):
     idle = params.replace(robot, {"battery.current_other": 0.0})
     p = rows([0, 60], slope_deg=-20.0, payload=8.0, current_other=0.0)

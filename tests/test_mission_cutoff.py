@@ -241,6 +241,7 @@ def run_folder(folder, capsys, monkeypatch):
     return folder / "a"
 
 
+@pytest.mark.slow
 def test_words_and_files_say_cut_off_and_the_charge_that_is_left(run_folder):
     out, err = ((run_folder.parent / f"{name}.txt").read_text() for name in ("out", "err"))
     result = json.loads((run_folder / "result.json").read_text())
@@ -254,6 +255,7 @@ def test_words_and_files_say_cut_off_and_the_charge_that_is_left(run_folder):
     assert history[-1]["event"] == "cut_off" and "below_cut_off" in [row["event"] for row in history]
 
 
+@pytest.mark.slow
 def test_a_name_is_one_quantity_in_every_file_of_a_mission(run_folder):
     """Current of one motor; of all motors as peak; distance either way; forward less backward."""
     result = json.loads((run_folder / "result.json").read_text())

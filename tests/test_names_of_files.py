@@ -392,6 +392,7 @@ def test_a_store_and_its_export_hold_the_numbers_of_a_table(made, swept):
             np.testing.assert_allclose(np.sort(np.ravel(array[:])), np.sort(other[rows[name].column]), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_an_export_has_conditions_in_the_units_of_their_columns(folder):
     """A discharge of 1800 C is 500 mAh; it was a column discharge_C, whose end is that of a temperature."""
     (folder / "charge.toml").write_text(

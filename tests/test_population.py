@@ -170,6 +170,7 @@ def test_kept_members_are_not_run_again_and_an_ended_search_goes_on(posed, known
     assert [p.name for p in tmp_path.iterdir()] == ["members.npz"]
 
 
+@pytest.mark.slow
 def test_members_of_another_calibration_are_refused(posed, known, tmp_path):
     file = tmp_path / "members.npz"
     evolve(posed, known, 1, file)

@@ -136,6 +136,7 @@ def test_on_wheels_a_robot_rests_on_them(robot):
     assert float(found.gap) == 0
 
 
+@pytest.mark.slow
 def test_derivatives_of_posture_and_step_are_those_of_differences(robot):
     names = ("running_gear.lever_length", "running_gear.levers.roller", "running_gear.lever_mass", "6T2A.radius")
     known = {p.name: p.value for p in params.walk(robot)}
@@ -156,6 +157,7 @@ def test_derivatives_of_posture_and_step_are_those_of_differences(robot):
     assert (np.abs(exact).max(0) > 1e-4).all()
 
 
+@pytest.mark.quick("angles0")
 @pytest.mark.parametrize("angles", [(-120.0, -40.0), (180.0, 50.0)])
 def test_derivative_where_two_parts_decide_the_step(robot, angles):
     """Front levers that reach the step beside the belt over its edge; and a smooth highest point."""
@@ -170,6 +172,7 @@ def test_derivative_where_two_parts_decide_the_step(robot, angles):
         assert float(exact[k]) == pytest.approx(apart, rel=2e-3), k
 
 
+@pytest.mark.quick("-180.0")
 @pytest.mark.parametrize("least", [-180.0, -30.0])
 def test_no_posture_stands_on_a_higher_step_than_the_best(robot, least):
     """Of all within the range, near the best and far from it; and near it some stand about as high."""

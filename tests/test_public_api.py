@@ -271,6 +271,7 @@ def in_fours(monkeypatch):
     return sizes
 
 
+@pytest.mark.slow
 def test_large_batches_run_in_chunks(robot, monkeypatch):
     """Ten runs by four: the last call repeats two of the one before, which are left out."""
     runs = mm.Conditions(voltage=np.linspace(10.0, 30.0, 10))
@@ -349,6 +350,7 @@ def test_a_delay_is_known_under_jit_where_the_robot_is_no_argument(robot):
     assert jax.eval_shape(lambda x: x if robot.rig.prompt else (x, x), 1.0).shape == ()
 
 
+@pytest.mark.slow
 def test_derivative_by_conditions_and_through_bad_values_passes_the_door(robot):
     slope = jax.grad(lambda angle: mm.simulate(robot, mm.Conditions(slope_deg=angle)).total_current)(5.0)
     assert np.isfinite(slope) and slope > 0

@@ -48,6 +48,7 @@ def test_page_is_offline_and_shows_counts_names_and_ranges_of_the_store(page, tm
     }
 
 
+@pytest.mark.slow
 def test_page_of_a_sweep_in_which_nothing_settles_has_no_figures(page, tmp_path):
     tables = page("[conditions]\nslope_deg = 40\n[axes]\nvoltage = [15, 24, 33]\n")
     assert "3 slides" in " ".join(tables.text.split()) and tables.tables["ranges"][1][2] == "–"

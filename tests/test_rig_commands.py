@@ -118,6 +118,7 @@ SIMULATED = {
 }
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("case", [
     k if k in ("bench, speed", "wheeled") else pytest.param(k, marks=pytest.mark.slow) for k in SIMULATED
 ])  # fmt: skip
@@ -133,6 +134,7 @@ def test_simulate_takes_what_a_rig_imposes_and_shows_its_channels(mmrjax, tmp_pa
     assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind", ["bench", *(pytest.param(k, marks=pytest.mark.slow) for k in ("pendulum", "wheeled"))]
 )
@@ -238,6 +240,7 @@ def test_what_a_rig_does_not_have_is_refused_in_one_sentence(mmrjax, tmp_path, c
 # --- what is imposed where nothing is stated -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_single_run_takes_the_limit_of_the_file(mmrjax, tmp_path):
     rig = of_kind(tmp_path, "bench")
     code, _, err = mmrjax(
@@ -272,6 +275,7 @@ def test_a_sweep_of_a_bench_has_one_axis(mmrjax, tmp_path):
     assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
 
 
+@pytest.mark.slow
 def test_a_sweep_of_a_vehicle_with_imposed_speed_varies_its_slopes(mmrjax, tmp_path):
     rig = of_kind(tmp_path, "wheeled", speed=True)
     code, out, err = mmrjax(
@@ -283,6 +287,7 @@ def test_a_sweep_of_a_vehicle_with_imposed_speed_varies_its_slopes(mmrjax, tmp_p
     assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
 
 
+@pytest.mark.slow
 def test_a_sweep_into_a_store_knows_what_is_imposed(mmrjax, tmp_path):
     rig = of_kind(tmp_path, "bench", speed=True)
     code, out, err = mmrjax(

@@ -446,6 +446,7 @@ def test_what_is_said_of_constant_conditions_is_of_the_rig(tmp_path):
     assert [note for note in said if isinstance(note, Constant)] == [Constant("motor_speed_rpm", 900.0, "speed")]
 
 
+@pytest.mark.slow
 def test_a_gear_ratio_upside_down_is_said(tmp_path):
     robot = bench("voltage", ("output_speed",))
     runs = measured(tmp_path, robot, Conditions(np.zeros(4, int), voltage=np.array([6.0, 9, 12, 24])),
@@ -466,6 +467,7 @@ def test_readings_in_another_unit_are_refused_with_the_unit(tmp_path):
         check_ranges(off, robot)
 
 
+@pytest.mark.slow
 def test_a_slow_speed_where_the_stated_friction_holds_the_robot_is_no_matter_of_units(tmp_path):
     # Between a robot that stands and one of a tenth of its friction any speed is possible, also a sixtieth of that
     # one's, which was refused: "are they in turns/s?".

@@ -324,6 +324,7 @@ def test_what_a_table_lacks_is_said_before_it_is_used(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_a_command_says_it_on_stderr_before_it_fits(mmrjax, tmp_path, monkeypatch):
     text = f"{HEADER}\n{ROW}\n{ROW.replace('2.75', '')}\n"
     (tmp_path / "runs.csv").write_text(text.replace(",", ";"))

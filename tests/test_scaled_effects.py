@@ -82,6 +82,7 @@ def test_every_effect_of_a_rigs_size_is_read_again_as_it_was_written(tmp_path, k
     assert off_library  # else there would be nothing to state
 
 
+@pytest.mark.slow
 def test_effects_of_turns_of_a_rigs_size_are_read_again_as_they_were_written(tmp_path):
     """The loop writes them into the robot of a table of turns, which every command takes."""
     robot, *_ = rig("wheeled", "voltage", tmp_path)

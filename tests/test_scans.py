@@ -79,6 +79,7 @@ def test_a_scan_sees_the_misfit_of_runs_at_each_delay(coarse):
     np.testing.assert_array_equal(np.asarray(others)[:, 0], at)
 
 
+@pytest.mark.slow
 def test_a_scan_is_as_fine_as_the_rise_of_a_current(coarse):
     robot, runs = coarse
     problem = posed(robot, runs)

@@ -248,6 +248,7 @@ def test_command_leaves_indices_tables_and_a_page(mmrjax, tmp_path, outputs):
     assert config["method"] == "sobol" and config["evaluations"] == 3000
 
 
+@pytest.mark.slow
 def test_local_command_says_derivatives_and_elasticities_of_every_point(mmrjax, tmp_path):
     code, _, _ = mmrjax(*SMALL, "--method", "local", "--no-report", "--out", "l")
     document = json.loads((tmp_path / "l" / "result.json").read_text())
@@ -259,6 +260,7 @@ def test_local_command_says_derivatives_and_elasticities_of_every_point(mmrjax, 
     assert index["elasticity"][0] == pytest.approx(index["derivative"][0] * 0.3 / value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "keys"), [
     ("morris", {"mean_absolute_effect", "mean_effect", "sd_effect"}), ("derivative", {"lower", "upper"}),
 ])  # fmt: skip

@@ -79,6 +79,7 @@ def test_a_run_settles_where_steady_says():
     assert (np.asarray(run.status) == np.asarray(steady.status)).all()
 
 
+@pytest.mark.slow
 def test_friction_holds_a_shaft_that_its_motors_cannot_turn():
     robot, conditions = bench(loss_coulomb=5.0), Conditions(voltage=np.array([1.0, -1.0, 0.5, -0.5]))
     run = drive_batch(robot, conditions, jnp.asarray([0.0, 0.5, 1.0])).result  # in the shapes of the test above

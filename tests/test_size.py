@@ -218,6 +218,7 @@ def test_report_shows_designs_and_what_binds_where(folder):
     assert "nan" not in tables.text.lower()
 
 
+@pytest.mark.slow
 def test_chart_has_the_limits_of_the_robot(robot, asked):
     """On the bench's surface adhesion ends at 14.6°; the required speed counts within its envelope alone."""
     of = chart.chart(robot, requirements.read("speed_m_s = 0.1", "r.toml"), (8.0, 30.0))

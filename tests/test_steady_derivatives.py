@@ -58,6 +58,7 @@ def test_steady_derivatives_are_central_differences(point, theta, derivatives):
     assert (np.abs(reverse - central) <= allowed).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "conditions",
     [dict(slope_deg=20.0), dict(voltage=np.nan), dict(battery=1.0, discharge=9e3), dict(voltage=0.0)],

@@ -89,6 +89,7 @@ def test_draws_have_the_intervals_of_robots_simulated_one_by_one(robot, runs, po
     assert found.columns[uncertainty.SHARE].tolist() == [1, 1, 1, 0] and np.isnan(found.sd("speed_mm_s")[3])
 
 
+@pytest.mark.slow
 def test_chunks_of_draws_change_no_interval(robot, runs, posterior):
     """Of a run all draws in one chunk, some runs in each; and a run's draws in three."""
     whole = uncertainty.intervals(robot, posterior, runs, chunked(2 * DRAWS), DRAWS)

@@ -71,6 +71,7 @@ def test_statuses_of_steady_and_drive_agree_where_both_settle(anywhere):
     assert held.any() and (np.asarray(drive.speed)[held] == 0).all() and (np.asarray(steady.speed)[held] == 0).all()
 
 
+@pytest.mark.slow
 def test_a_status_is_mirrored_with_voltage_and_slope():
     rng, count = np.random.default_rng(3), 400  # whose program is that of `anywhere`
     voltage, slope = rng.uniform(-20, 20, count), rng.uniform(-20, 20, count)
@@ -366,6 +367,7 @@ def test_bad_limits_and_switches_are_refused(values, sentence):
         robot_file.change(robots.nominal(), values, where="mine.toml")
 
 
+@pytest.mark.slow
 def test_a_switch_can_be_set_on_the_command_line(mmrjax, tmp_path):
     code, _, _ = mmrjax("simulate", "--set", "gearbox.mesh_theory=true", "--no-report", "--out", "a")
     assert code == 0 and "mesh_theory = true" in (tmp_path / "a" / "robot.toml").read_text()

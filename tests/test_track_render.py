@@ -63,6 +63,7 @@ def test_picture_shows_robot_and_forces(scenes, tmp_path, k):
         assert (np.abs(pixels - colour).sum(axis=1) < 90).sum() > 50
 
 
+@pytest.mark.slow
 def test_gif_moves(scenes, tmp_path):
     file = render(scenes(0), tmp_path / "robot.gif", begin=0.02, end=0.034, slow=10, rate=20)
     with Image.open(file) as film:

@@ -46,7 +46,7 @@ def amplitudes(**some):
     return {name: jnp.asarray(some.get(name, 0.0)) for name in effects.OF_TURNS}
 
 
-@pytest.mark.quick(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", effects.OF_TURNS)
 def test_effect_moves_the_turn_and_mirrors(name):
     y = flat(MOTION)

@@ -269,7 +269,7 @@ def test_spot_turn_under_coulomb_friction_has_the_width_of_its_closed_form():
     assert width_on_the_spot(False, coulomb, 1.0, 1.0) == pytest.approx(1 + u / b, rel=3e-5)
 
 
-@pytest.mark.quick(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("wheeled", "share"), [(False, 1 / 4), (True, 1 / 2)], ids=["tracks", "wheels"])
 def test_lateral_sliding_has_the_moment_of_its_closed_form(wheeled, share):
     coulomb = Friction(static=0.32, dynamic=0.32, speed_static=1e-9, speed_dynamic=1e-8)

@@ -83,6 +83,7 @@ def test_readings_are_those_of_the_simulator(worlds, kind):
             np.testing.assert_allclose(found / size, s.shown / size, atol=1e-6, err_msg=str(w.rig))
 
 
+@pytest.mark.slow
 def test_comparison_with_the_simulator_can_fail(worlds):
     w = next(w for w in worlds if w.rig.kind == "winch" and w._driven())
     with jax.enable_x64(True):
