@@ -16,9 +16,12 @@ from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import Settings
 from calibration.inference.held_out import search_each
 from calibration.inference.linearization import amplitude_of
-from calibration.inference.optimizers import Optimum
+from calibration.inference.optimizers import Optimum, observation
 from calibration.inference.problem import Observation
+from mmrjax.signals import SLIDES
 
+#: Prior sds above its mean up to which an adhesion is plausible.
+ADHESION = 2.5
 #: Fewest rows that a base can be fitted to.
 FEWEST = 4
 #: Difference of the objective of searches that end in one place [½σ²].
@@ -124,7 +127,9 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str) -> BaseFit:
     Raises:
         BadData: too few rows are left.
     """
-    unusable: tuple[int, ...] = ()
+    lost = _beyond_adhesion(space)
+    unusable = tuple(map(int, np.flatnonzero(lost)))
+    space = space.without(lost) if unusable else space
     while True:
         found, seen = _base_searches(space, settings)
         # The first of those that end in one place: which of them is the lowest is rounding's choice.
@@ -144,6 +149,19 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str) -> BaseFit:
         if space.included.sum() < FEWEST:
             rows = ", ".join(str(r + 1) for r in unusable[:12])
             raise BadData(f"{where}: the model reaches too few rows to trace anything (not rows {rows})")
+
+
+def _beyond_adhesion(space: CandidateSpace) -> np.ndarray:
+    """True for rows in which the robot slides at any plausible adhesion, shape (rows,).
+
+    A search would stretch the adhesion, and the whole base with it, until the robot grips in them.
+    """
+    problem = space.bare
+    if problem.observe.long:
+        return np.zeros(len(space.included), bool)
+    ground = [name.endswith("ground.friction.static") for name in problem.coordinates.names]
+    seen = observation(problem, jnp.where(jnp.asarray(ground), ADHESION, 0.0))
+    return (np.asarray(seen.status) == SLIDES) & space.included
 
 
 def _base_searches(space: CandidateSpace, settings: Settings) -> tuple[Optimum, Observation]:
