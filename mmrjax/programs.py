@@ -21,7 +21,7 @@ import sys
 import threading
 import types
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -99,17 +99,14 @@ class Programs:
         folder = os.environ.get(VARIABLE, "")
         if not folder or not _keeps() or not _private(folder):
             return None
-        leaves, tree = jax.tree.flatten(arguments)
-        if has_tracer(leaves):
+        structure = structure_of(arguments)
+        if structure is None:
             return None
-        try:
-            structure = tree, tuple(_shape(x) for x in leaves)
-            with self._lock:
-                first = structure not in self._found
-                found = self._found.setdefault(structure, Future())
-        except (TypeError, Unnamed):  # what cannot be hashed
-            return None
+        with self._lock:
+            first = structure not in self._found
+            found = self._found.setdefault(structure, Future())
         if first:
+            leaves, tree = jax.tree.flatten(arguments)
             try:
                 found.set_result(self._obtained(Path(folder), leaves, tree))
             except BaseException as error:
@@ -166,6 +163,19 @@ class Programs:
         # The text names what is on disk: without the arguments that nothing reads, programs of others would be alike.
         lowered = jax.jit(flat, keep_unused=True).lower(*_arrays(leaves))
         return returned[0], lowered
+
+
+def structure_of(arguments: Any) -> Hashable | None:
+    """Returns what a program knows of its arguments; None where that cannot be hashed, or where some are traced."""
+    leaves, tree = jax.tree.flatten(arguments)
+    if has_tracer(leaves):
+        return None
+    try:
+        structure = tree, tuple(_shape(x) for x in leaves)
+        hash(structure)
+    except (TypeError, Unnamed):
+        return None
+    return structure
 
 
 def has_tracer(tree: Any) -> bool:

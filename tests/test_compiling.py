@@ -1,6 +1,8 @@
 """Programs are shared by what equations cannot tell apart, and by nothing else."""
 
 import dataclasses
+import time
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import jax
@@ -119,3 +121,23 @@ def test_a_fit_that_ends_above_the_one_it_builds_on_starts_again_there(monkeypat
         assert [c.cost for c in found] == [kept, 30.0]
         assert asked.pop() == [("b", 1, 0), ("a", 0, 7)] and asked.pop() == [("a", 1, 9), ("b", 1, 9)]
     assert candidates.fit_beside(space, [], None) == []
+
+
+def test_two_threads_never_trace_at_once():
+    """Not one function, for arguments that are alike or not, and not one that another traces."""
+    now, most = [], []
+
+    def body(x):
+        now.append(x.shape)
+        most.append(len(now))
+        time.sleep(0.1)
+        now.remove(x.shape)
+        return 2 * x
+
+    inner = compiled(body)
+    calls = inner, compiled(lambda x: inner(x)), jax.jit(lambda x: inner(x))
+    given = [jnp.ones(n) for n in (2, 3)]
+    with ThreadPoolExecutor(6) as pool:
+        tasks = [pool.submit(call, x) for call in calls for x in given]
+        assert [float(t.result()[0]) for t in tasks] == [2.0] * 6
+    assert max(most) == 1 and len(most) >= 2

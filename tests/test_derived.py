@@ -169,9 +169,12 @@ def test_start_of_a_run_that_does_not_settle_has_no_numbers(robot):
 
 
 def test_peak_is_the_top_of_a_parabola():
-    x = np.linspace(0, 1, 12)
-    assert float(start.peak(jnp.asarray(3 - (x - 0.47) ** 2))) == pytest.approx(3.0, abs=1e-12)
-    assert float(start.peak(jnp.asarray(x))) == 1.0  # no top between: the largest sample
+    x = jnp.asarray([0.0, 0.1, 0.3, 0.5, 0.9, 1.0])  # at unequal distances
+    top = np.testing.assert_allclose
+    top(start.peak(x, 3 - (x - 0.47) ** 2), 3.0, atol=1e-12)
+    top(start.peak(x, jnp.where(x < 0.8, 3 - (x - 0.37) ** 2, jnp.nan)), 3.0, atol=1e-12)  # of a run that has ended
+    for rises in (x, -x, jnp.where(x < 0.8, x, jnp.nan)):  # no top between: the largest sample
+        assert float(start.peak(x, rises)) == float(jnp.nanmax(rises))
 
 
 def test_crossing_is_exact_for_a_cubic():

@@ -25,6 +25,7 @@ from calibration.inference.held_out import held_out
 from calibration.inference.linearization import PROBED
 from calibration.inference.observers.settled import SettledLinearization
 from mmrjax import channels, params
+from mmrjax.effects.curve import PLACES
 from mmrjax.fidelities.steady import steady_batch
 
 #: An effect that no library holds → balance and variable that it acts through.
@@ -198,8 +199,8 @@ def test_formula_reads_as_text():
     assert str(product) == "(I/2 A)^2 (U/24 V)" and product.variables == ("current", "voltage")
 
 
-def test_every_balance_of_a_curve_has_a_symbol():
-    assert set(formula.SYMBOL) == {*bases.BALANCES, *bases.OF_TURNS, *channels.USUAL}
+def test_every_place_of_a_curve_has_a_symbol():
+    assert set(formula.SYMBOL) == set(PLACES) >= {*bases.BALANCES, *bases.OF_TURNS, *(c.name for c in channels.EVERY)}
 
 
 def test_no_formula_is_proposed_where_nothing_shows(found):

@@ -265,9 +265,9 @@ def test_a_history_has_the_peak_of_the_inrush(climb, mmrjax, tmp_path):
     code, out, _ = mmrjax("simulate", "--model", "drive", "--slope", 10, "--no-report", "--out", "a")
     assert code == 0 and re.search(rf"peak current, all motors \[A\] +│ {peak:.1f}", out)
     (row,) = table(tmp_path / "a" / "runs.csv")
-    assert float(row[PEAK]) == pytest.approx(peak, rel=2e-3)
+    assert float(row[PEAK]) == pytest.approx(peak, rel=1e-4)
     kept = [float(r["total_current_A"]) for r in table(tmp_path / "a" / "history.csv")]
-    assert max(kept) == pytest.approx(float(row[PEAK]))
+    assert 0.999 * float(row[PEAK]) < max(kept) < float(row[PEAK])
     assert json.loads((tmp_path / "a" / "result.json").read_text())[PEAK] == pytest.approx(float(row[PEAK]))
 
 

@@ -12,11 +12,11 @@ from calibration.discovery.smooth import Smooth
 from calibration.inference.bases import ORDERS, signature
 from calibration.inference.linearization import Linearization
 from mmrjax import channels
-from mmrjax.effects.curve import PLACES
+from mmrjax.effects.curve import PLACES, READINGS
 
 #: What a formula is called, in the symbols of the paper.
 SYMBOL = {"electrical": "ΔU", "track": "ΔM_t", "ground": "ΔF_f", "slip": "ΔV", "yaw": "ΔM_ψ"} | {
-    c.name: f"Δ({c.label})" for c in channels.usual()
+    c.name: f"Δ({c.label})" for c in channels.EVERY if c.name in READINGS
 }
 #: Variables over which things fade: symbol, and unit of its constant.
 FADING = {"time": ("t", " s"), "order": ("k", "")}

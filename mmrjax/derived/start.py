@@ -27,18 +27,21 @@ def instants() -> np.ndarray:
     return np.concatenate([[0.0], early, np.linspace(LATEST, TIME_SETTLED, REST)])
 
 
-def peak(x: Float[Array, " times"]) -> Float[Array, ""]:
-    """The largest value of a sampled curve: the top of the parabola through its largest sample and the two beside.
+def peak(times: Float[Array, " times"], x: Float[Array, " times"]) -> Float[Array, ""]:
+    """Largest value of a sampled curve: the top of the parabola through its largest sample and the two next to it.
 
-    Samples may lie at unequal distances: with the place of the sample as abscissa the curve is another one, with the
-    same top.
+    Args:
+        times: not decreasing [s]; x: NaN where the curve has no value.
     """
-    k = jnp.clip(jnp.argmax(x), 1, x.shape[0] - 2)
-    before, top, after = x[k - 1], x[k], x[k + 1]
-    bend = before - 2 * top + after
-    bent = bend < 0
-    raised = top - jnp.where(bent, (after - before) ** 2 / (8 * jnp.where(bent, bend, -1.0)), 0.0)
-    return jnp.where(bent, raised, jnp.maximum(before, jnp.maximum(top, after)))
+    known = jnp.where(jnp.isfinite(x), x, -jnp.inf)
+    k = jnp.clip(jnp.argmax(known), 1, x.shape[0] - 2)
+    before, after = times[k] - times[k - 1], times[k + 1] - times[k]
+    inside = (before > 0) & (after > 0) & (x[k] > x[k - 1]) & (x[k] > x[k + 1])
+    before, after = jnp.where(inside, before, 1.0), jnp.where(inside, after, 1.0)
+    rise, fall = (x[k] - x[k - 1]) / before, (x[k + 1] - x[k]) / after
+    bend = (fall - rise) / (before + after)
+    slope = rise + bend * before
+    return jnp.where(inside, x[k] - slope**2 / (4 * jnp.where(inside, bend, -1.0)), known[jnp.argmax(known)])
 
 
 def crossing(
@@ -84,7 +87,7 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     whole = jnp.concatenate([jnp.zeros(1), jnp.cumsum(width * (power[1:] + power[:-1]) / 2)])
     here = power[k] + share * (power[k + 1] - power[k])
     found = {
-        "peak_current": peak(jnp.asarray(robot.sides * signals.current)),
+        "peak_current": peak(times, jnp.asarray(robot.sides * signals.current)),
         "time_to_speed": times[k] + share * width[k],
         "energy_start": whole[k] + share * width[k] * (power[k] + here) / 2,
     }

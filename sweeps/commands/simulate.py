@@ -19,6 +19,7 @@ from calibration.data.errors import BadConfiguration
 from mmrjax import channels, fidelities, ground, outputs, stages
 from mmrjax.channels import Channel
 from mmrjax.compiling import SELDOM, compiled
+from mmrjax.derived.start import peak
 from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.result import result
 from mmrjax.motor import Motor
@@ -139,7 +140,7 @@ def over_time(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
     last = np.where(finite.any(-1), finite.shape[-1] - 1 - np.argmax(finite[..., ::-1], -1), 0)
     rows = np.arange(len(last))
     motors = float(robot.sides) * np.asarray(history.signals.current)
-    columns[PEAK] = np.abs(np.where(finite, motors, 0.0)).max(-1)
+    columns[PEAK] = np.maximum(_peaks(time, np.abs(motors)), 0.0)
     columns["displacement_m"], columns["time_end_s"] = np.array(history.distance)[rows, last], time[rows, last]
     empty = (status == BATTERY_EMPTY) & ~finite[rows, -1]
     if empty.any():
@@ -164,6 +165,11 @@ def permissible(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
     filled[: len(current)] = np.where(known, current, 0.0)
     time = _permissible(robot.motor, jnp.asarray(filled))
     return np.where(known, np.asarray(time)[: len(current)], np.nan)
+
+
+@functools.partial(compiled, options=SELDOM)
+def _peaks(time: Float[Array, "runs samples"], values: Float[Array, "runs samples"]) -> Float[Array, " runs"]:
+    return jax.vmap(peak)(time, values)
 
 
 @functools.partial(compiled, options=SELDOM)

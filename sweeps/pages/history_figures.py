@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from mmrjax import channels
 from mmrjax.channels import MM, Channel
+from mmrjax.derived.start import peak
 from mmrjax.stages import Stages, ending, numbers, of_histories
 from sweeps.pages import words
 from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, axis_label, figure, looks, note
@@ -21,6 +22,13 @@ if TYPE_CHECKING:
 
 INRUSH = 0.04  # s, shown enlarged
 _STAGES = (("I", "#fdebd0", "starting"), ("II", "#e3eef7", "slipping"), ("III", "#eaf5ea", "uniform"))
+
+
+def _largest(time: np.ndarray, values: np.ndarray) -> float:
+    """Value of the largest size of a sampled curve, between its samples too; NaN of none."""
+    if len(values) < 3:
+        return float(values[np.argmax(np.abs(values))]) if values.size else np.nan
+    return float(np.sign(values[np.argmax(np.abs(values))]) * peak(time, np.abs(values)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +78,7 @@ class Start:
     @property
     def peak(self) -> float:
         """Largest current [A], with the sign that it is drawn with."""
-        return float(self.current[int(np.argmax(np.abs(self.current)))])
+        return _largest(self.time, self.current)
 
     @property
     def ended(self) -> tuple[float, float]:
@@ -292,8 +300,7 @@ class Course:
 
     def largest(self, channel: str) -> float:
         """Reading that is largest in size."""
-        values = self.readings[channel]
-        return float(values[int(np.argmax(np.abs(values)))]) if values.size else np.nan
+        return _largest(self.time, self.readings[channel])
 
     def last(self, channel: str) -> float:
         """Reading at the end."""
