@@ -9,13 +9,13 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from calibration.data.errors import InputError
+from calibration.data.errors import BadConfiguration, InputError
 from mmrjax import SOUND_AT_LEVEL_0, __version__, fidelities
 from sweeps import config, config_campaign
 from sweeps import options as made
@@ -545,10 +545,23 @@ def _start_jax(no_cache: bool, flags: tuple[str, ...] = (), options: tuple[str, 
     jax.config.update("jax_enable_x64", True)
 
 
+def _check_arguments(arguments: Sequence[str]) -> None:
+    """Refuse names that are not UTF-8: neither pages nor JSON could show them.
+
+    Raises:
+        BadConfiguration: an argument with other bytes.
+    """
+    for argument in arguments:
+        if not argument.isprintable() and any("\ud800" <= c <= "\udfff" for c in argument):
+            shown = argument.encode("utf-8", "replace").decode()
+            raise BadConfiguration(f"{shown}: is not in UTF-8; rename the file or folder")
+
+
 def main() -> None:
     """Run the command line; every failure is one sentence on stderr and a documented exit code."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ended or interrupted: both can be taken up again
     try:
+        _check_arguments(sys.argv[1:])
         code = app(standalone_mode=False)
         if code == INTERRUPTED:  # the option parser has caught the interrupt
             raise KeyboardInterrupt
@@ -562,8 +575,11 @@ def main() -> None:
             advice = "the loop goes on after its last whole stage, with the same --out"
         code = _fail(f"interrupted; {advice}", INTERRUPTED)
     except OSError as error:
-        place = error.filename or "a file"
-        code = _fail(f"{place}: {error.strerror}; no run folder was left, only its .partial beside it", 2)
+        from sweeps.console import OUTPUT
+
+        place = str(error.filename or "a file")
+        left = "" if place == OUTPUT else "; no run folder was left, only its .partial beside it"
+        code = _fail(f"{place}: {error.strerror}{left}", 2)
     except Exception as error:
         if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of the option parser
             code = _fail(_no_number(error) or error.format_message(), error.exit_code)

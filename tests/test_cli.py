@@ -717,3 +717,26 @@ def test_a_fourth_channel_is_one_row(tmp_path):
     assert errors["rows"] == 1 and errors["missing"] == 1
     assert errors["rms_percent"] == pytest.approx(100 * 0.5 / 15)
     assert "terminal_voltage_V: 1 of 2 readings are missing" in compared.stdout
+
+
+def test_output_that_is_full_is_named(mmrjax, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("sweeps.console._out.print", full)
+    code, _, err = mmrjax("rig", "new", "r.toml", "--kind", "bench")
+    assert code == 2 and err == "mmrjax: standard output: No space left on device\n"
+
+
+def test_a_name_that_is_not_utf8_is_refused_before_anything_runs(mmrjax, tmp_path):
+    code, _, err = mmrjax("compare", "runs\udcff.csv", "--out", "r")
+    assert code == 2 and err == "mmrjax: runs?.csv: is not in UTF-8; rename the file or folder\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_rig_on_a_read_only_disk_is_named_without_a_partial(mmrjax, monkeypatch):
+    monkeypatch.setattr(
+        Path, "write_text", lambda *_, **__: (_ for _ in ()).throw(OSError(30, "Read-only file system"))
+    )
+    code, _, err = mmrjax("rig", "new", "r.toml", "--kind", "bench")
+    assert code == 2 and err == "mmrjax: r.toml: cannot be written (Read-only file system); state a file elsewhere\n"

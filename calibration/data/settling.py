@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calibration.data.columns import TIME
 from calibration.data.contradictions import GAP
 from calibration.data.courses import applied, differs
 from calibration.data.errors import BadData, number
@@ -150,7 +151,7 @@ class Settled:
         """The settled runs, as a table of runs that is read."""
         columns = {**self.runs.columns, **self.table()}
         count = len(self.kept)
-        columns = {name: x for name, x in columns.items() if len(x) == count and name not in ("time_s", "mode")}
+        columns = {name: x for name, x in columns.items() if len(x) == count and name not in (*TIME, "mode")}
         return dataclasses.replace(self.runs, columns=columns, extras={}, log=None)
 
     def table(self) -> dict[str, np.ndarray]:
