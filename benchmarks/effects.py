@@ -6,6 +6,7 @@ python benchmarks/effects.py --check   say whether the page is what the library 
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import sys
 from pathlib import Path
@@ -236,8 +237,11 @@ def page() -> str:
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="compare with the page, and write nothing")
+    check = parser.parse_args().check
     text = page()
-    if "--check" in sys.argv:
+    if check:
         same = PAGE.read_text(encoding="utf-8") == text
         print("docs/effects.md is " + ("right" if same else "out of date: run python benchmarks/effects.py"))
         sys.exit(not same)

@@ -11,6 +11,7 @@ goals (0.5 % at the wheel, 1 % in Wh/km, at either step of FASTSim).
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import importlib.metadata
 import json
@@ -281,6 +282,7 @@ CASES = ((ROBOT, trace(0.5, 1.0, 5.0, 4.0)), (CAR, trace(6.0, 12.0, 3.0, 2.0)))
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     try:
         version = importlib.metadata.version("fastsim")
     except importlib.metadata.PackageNotFoundError:

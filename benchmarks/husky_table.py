@@ -10,8 +10,8 @@ instrument, and one of them rolls at more than 50 mm/s. Of each run those that s
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -92,9 +92,15 @@ def result(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1] == "--regressions":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("table", type=Path, nargs="?", help="file that the table is written to")
+    what.add_argument("--regressions", action="store_true", help="regressions of the table")
+    what.add_argument("--result", type=Path, metavar="FOLDER", help="figures of a run folder")
+    given = parser.parse_args()
+    if given.regressions:
         regressions()
-    elif sys.argv[1] == "--result":
-        result(Path(sys.argv[2]))
+    elif given.result:
+        result(given.result)
     else:
-        write(Path(sys.argv[1]))
+        write(given.table)

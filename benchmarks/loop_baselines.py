@@ -14,7 +14,6 @@ import warnings
 
 import loop
 import numpy as np
-import pysindy
 from campaign import Task, begun, campaign
 from loop_scores import MIMIC, interval
 from worlds import tables
@@ -126,6 +125,8 @@ def sparse(theta: np.ndarray, target: np.ndarray, known: bool) -> np.ndarray:
         known: whether the target's noise has an sd of 1; else BIC takes that of the residual.
     """
     n = len(target)
+
+    import pysindy  # of the extra `bench`
 
     def value(support: np.ndarray) -> float:
         left = target

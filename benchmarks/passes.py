@@ -9,6 +9,7 @@ is of: all of them, and those that hand it on to another. Prints a line of JSON.
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 import threading
@@ -64,4 +65,8 @@ def watched(kind: type, arguments: list[str]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(watched(KINDS[sys.argv[1]], sys.argv[2:])))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("kind", choices=KINDS, help="what is followed")
+    parser.add_argument("command", nargs=argparse.REMAINDER, help="of mmrjax, with its options")
+    given = parser.parse_args()
+    print(json.dumps(watched(KINDS[given.kind], given.command)))

@@ -226,13 +226,14 @@ def main() -> None:
     options.add_argument(
         "--native", action="store_true", help="C MuJoCo with the same forces in place of the findings"
     )
+    options.add_argument("--parts", type=int, nargs="+", default=[1, 2], help="of the step")
     arguments = options.parse_args()
     print(json.dumps({"benchmark": "shaking", "machine": machine()}), flush=True)
     if arguments.native:
         for point in POINTS:
             print(json.dumps(native(*point)), flush=True)
         return
-    for parts in (1, 2):
+    for parts in arguments.parts:
         for row in findings(STEP / parts):
             print(json.dumps({"step": STEP / parts} | row), flush=True)
 

@@ -54,7 +54,9 @@ def main() -> None:
         count = arguments.baseline_points
         answer = steady_batch(robot, batch(count))
         assert bool(jnp.all(answer.status == CONVERGED))
-        ours = np.stack([answer.reading.total_current / 2, answer.reading.motor_speed, answer.reading.speed], -1)
+        ours = np.stack(
+            [answer.reading["total_current"] / 2, answer.reading["motor_speed"], answer.reading["speed"]], -1
+        )
         rows = [(v, s, p, bool(round(w))) for w, s, p, v in conditions(count)]
         best, loop = float("inf"), []
         for _ in range(2):

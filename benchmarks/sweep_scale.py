@@ -128,7 +128,7 @@ def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None 
     finally:
         shutil.rmtree(folder)
     return {
-        "model": job.model,
+        "model": job.task.model,
         "points": job.plan.design.points,
         "devices": len(devices),
         "chunk": job.blocks.points,

@@ -119,7 +119,7 @@ class Resolved(SettledRuns):
     Wheels have no grousers: the track model puts out the same numbers for them (docs/track-model.md).
     """
 
-    wheeled: Conditions
+    wheeled: Conditions = eqx.field(kw_only=True)
     parts: int = eqx.field(static=True, default=1)
 
     def __call__(self, robot: Robot) -> Observation:
@@ -276,7 +276,7 @@ def pose(what: str) -> tuple[Posed, Robot, Runs]:
     simulated = np.full(len(measured), np.nan)
     simulated[tracked] = 100 * (1 - speed * float(robot.gearbox.ratio) / (motor * float(robot.radius_pulley)))
     data = data_of(measured[row], SettledRuns.sizes(table)[row], len(names))
-    problem = Problem(params.strong(robot), coordinates, Resolved(chosen, "track", rest), data)
+    problem = Problem(params.strong(robot), coordinates, Resolved(chosen, "track", wheeled=rest), data)
     return Posed(problem, row, measured, slope, voltage, tracked, what, simulated), robot, table
 
 
@@ -439,7 +439,7 @@ def timed(arguments: argparse.Namespace) -> dict[str, Any]:
     conditions = table.conditions(robot)
     data = data_of(table.measured(), SettledRuns.sizes(table), len(coordinates))
     none = jax.tree.map(lambda x: x[:0], conditions)
-    problem = Problem(params.strong(robot), coordinates, Resolved(conditions, "track", none), data)
+    problem = Problem(params.strong(robot), coordinates, Resolved(conditions, "track", wheeled=none), data)
     values = np.where(np.array(coordinates.scale), np.log(np.maximum(np.abs(SET_S), 1e-12)), np.array(SET_S))
     centre = (values - np.asarray(coordinates.location)) / np.asarray(coordinates.spread)
     size = (arguments.population, len(coordinates))

@@ -56,11 +56,10 @@ def surfaces() -> None:
         )
 
 
-def speed() -> None:
+def speed(points: int) -> None:
     """Print settled turns a second, and the time of runs that turn over that of straight ones."""
     robot = mm.nominal()
     rng = np.random.default_rng(0)
-    points = 16_384
     duties = rng.uniform(-1, 1, (2, points))
     runs = mm.Conditions(["6T2A"] * points, voltage=33.0, duty_left=duties[0], duty_right=duties[1]).resolved(robot)
     for name in ("compiled and run", "run"):
@@ -115,7 +114,11 @@ def tracks() -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--speed", action="store_true")
-    parser.add_argument("--track", action="store_true")
+    parser.add_argument("--speed", action="store_true", help="turns a second")
+    parser.add_argument("--track", action="store_true", help="beside the track model")
+    parser.add_argument("--points", type=int, default=16_384, help="turns of --speed")
     chosen = parser.parse_args()
-    (speed if chosen.speed else tracks if chosen.track else surfaces)()
+    if chosen.speed:
+        speed(chosen.points)
+    else:
+        (tracks if chosen.track else surfaces)()

@@ -9,13 +9,13 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from calibration.data.errors import InputError
+from calibration.data.errors import BadConfiguration, InputError
 from mmrjax import SOUND_AT_LEVEL_0, __version__, fidelities
 from sweeps import config, config_campaign
 from sweeps import options as made
@@ -568,10 +568,23 @@ def _refuse_little_memory() -> None:
         )
 
 
+def _check_arguments(arguments: Sequence[str]) -> None:
+    """Refuse names that are not UTF-8: neither pages nor JSON could show them.
+
+    Raises:
+        BadConfiguration: an argument with other bytes.
+    """
+    for argument in arguments:
+        if not argument.isprintable() and any("\ud800" <= c <= "\udfff" for c in argument):
+            shown = argument.encode("utf-8", "replace").decode()
+            raise BadConfiguration(f"{shown}: is not in UTF-8; rename the file or folder")
+
+
 def main() -> None:
     """Run the command line; every failure is one sentence on stderr and a documented exit code."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ended or interrupted: both can be taken up again
     try:
+        _check_arguments(sys.argv[1:])
         code = app(standalone_mode=False)
         if code == INTERRUPTED:  # the option parser has caught the interrupt
             raise KeyboardInterrupt
@@ -604,8 +617,11 @@ def _answered(error: BaseException) -> int:
     if _memory_exhausted(error):
         return _fail("memory exhausted; take fewer points at once (--chunk), fewer rows, or more memory", 2)
     if isinstance(error, OSError):
-        place = error.filename or "a file"
-        return _fail(f"{place}: {error.strerror}; no run folder was left; what was kept is in its .partial", 2)
+        from sweeps.console import OUTPUT
+
+        place = str(error.filename or "a file")
+        left = "" if place == OUTPUT else "; no run folder was left; what was kept is in its .partial"
+        return _fail(f"{place}: {error.strerror}{left}", 2)
     if isinstance(error, SystemExit):
         return _fail("--effects: code of a file of effects has ended the program; remove the call that does", 2)
     if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of the option parser

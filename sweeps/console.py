@@ -23,10 +23,14 @@ from rich.progress import (
 )
 from rich.text import Text
 
+from calibration.data.writing import naming
+
 #: Widest line of text on a terminal.
 COLUMNS = 80
 #: Longest silence of a long computation, and of a command that begins [s].
 SILENCE, FIRST = 10.0, 1.0
+#: What results are printed to, as an error calls it.
+OUTPUT = "standard output"
 _WIDTH = None if sys.stdout.isatty() else 120  # a file has no width of its own
 _out = Console(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
 _err = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
@@ -34,7 +38,8 @@ _err = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
 
 def say(what: Any) -> None:
     """Print text or a table to stdout."""
-    _out.print(wrapped(what) if isinstance(what, str) and sys.stdout.isatty() else what)
+    with naming(OUTPUT):
+        _out.print(wrapped(what) if isinstance(what, str) and sys.stdout.isatty() else what)
 
 
 def tell(text: str) -> None:

@@ -776,3 +776,26 @@ def test_a_file_that_ends_too_early_is_no_interrupt(mmrjax, monkeypatch):
 def test_a_message_is_short_whatever_it_quotes(mmrjax):
     code, _, err = mmrjax("simulate", "--set", "m" * 100_000 + "=x", "--out", "x")
     assert code == 2 and len(err) < 410 and "expected NAME=VALUE with a number" in err
+
+
+def test_output_that_is_full_is_named(mmrjax, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("sweeps.console._out.print", full)
+    code, _, err = mmrjax("rig", "new", "r.toml", "--kind", "bench")
+    assert code == 2 and err == "mmrjax: standard output: No space left on device\n"
+
+
+def test_a_name_that_is_not_utf8_is_refused_before_anything_runs(mmrjax, tmp_path):
+    code, _, err = mmrjax("compare", "runs\udcff.csv", "--out", "r")
+    assert code == 2 and err == "mmrjax: runs?.csv: is not in UTF-8; rename the file or folder\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_rig_on_a_read_only_disk_is_named_without_a_partial(mmrjax, monkeypatch):
+    monkeypatch.setattr(
+        Path, "write_text", lambda *_, **__: (_ for _ in ()).throw(OSError(30, "Read-only file system"))
+    )
+    code, _, err = mmrjax("rig", "new", "r.toml", "--kind", "bench")
+    assert code == 2 and err == "mmrjax: r.toml: cannot be written (Read-only file system); state a file elsewhere\n"

@@ -40,7 +40,7 @@ REFUSED = {
     "angles beside a sequence of them": (["--step", "50", "--sequence", "s.csv", "--levers-front", "30"],
                                          r"s\.csv states all angles"),
     "a search of another kind": (["--find", "gap", "--step", "50"], r"--find gap acts without --step"),
-    "no such terrain": (["--terrain", "none.csv"], r"--terrain: none\.csv cannot be read"),
+    "no such terrain": (["--terrain", "none.csv"], r"--terrain: got none\.csv, no such file"),
     "a derivative by nothing": (["--step", "50", "--derivatives", "payload,motor.resistence"],
                                 r"got motor\.resistence; expected adhesion, payload, voltage, .*did you mean motor\.resistance"),
     "a size that the terrain has not": (["--terrain", "t.csv", "--derivatives", "obstacle_mm"], r"got obstacle_mm; expected"),
@@ -60,6 +60,13 @@ def test_what_cannot_be_climbed_is_refused_in_one_sentence(mmrjax, tmp_path, cas
     assert code == 2 and err.count("\n") == 1, err
     assert re.search(message, err), err
     assert not (tmp_path / "c").exists()
+
+
+@pytest.mark.parametrize("header", ["x_mm,time_s,front_deg,rear_deg", "x_mm,front_deg,rear_deg,front_V,rear_V"])
+def test_a_sequence_over_both_clocks_or_of_both_units_is_refused(tmp_path, header):
+    (tmp_path / "s.csv").write_text(f"{header}\n{','.join('0' * (header.count(',') + 1))}\n")
+    with pytest.raises(BadData, match=r"s\.csv: got columns \w+(, rear_V)? and \w+(, rear_deg)?; expected one kind"):
+        terrains.read_sequence(tmp_path / "s.csv", nominal(), (0.0, 0.0))
 
 
 def test_files_of_terrain_and_sequence_are_read_with_their_units(tmp_path):

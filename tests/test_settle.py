@@ -420,6 +420,14 @@ def test_glitches_leave_means_where_they_are_or_a_level_out(tmp_path, case):
     assert len(said) == (count > 0)
 
 
+def test_the_readings_of_a_start_are_no_glitches():
+    """A delayed start of a current: the old level, then a peak that decays; a single reading later is a glitch."""
+    rng, k = np.random.default_rng(0), np.arange(200)
+    shown = np.where(k < 4, 2.0, 1.0 + 8.0 * np.exp(-(k - 4) / 4)) + 0.01 * rng.standard_normal(200)
+    shown[150] = 5.0
+    assert np.flatnonzero(settling.glitches(shown, [k], 31, 0.0, 0.02)).tolist() == [150]
+
+
 def test_a_current_in_pulses_keeps_its_mean(tmp_path):
     columns = stairs()
     columns["total_current_A"] = np.where(np.arange(600) % 10 == 0, 5.0, 0.0) + 1e-3 * np.arange(600) % 7e-3

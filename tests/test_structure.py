@@ -799,7 +799,7 @@ def test_toml_is_read_in_one_place():
         for path in (ROOT / layer).rglob("*.py")
         if "tomllib" in (text := path.read_text(encoding="utf-8")) and "tomllib" in dict(imports(ast.parse(text), ""))
     }
-    assert found == {"calibration/data/errors.py", "calibration/data/profiles.py"}
+    assert found == {"calibration/data/input_files.py", "calibration/data/profiles.py"}
 
 
 def test_how_many_of_something_is_said_in_the_singular_where_it_is_one():

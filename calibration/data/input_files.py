@@ -38,7 +38,7 @@ def content(path: Path, where: str | Path, kind: type[InputError] = BadData, lar
         where: opens the message of an error; kind: of the error; largest: number of bytes.
 
     Raises:
-        InputError: a folder, a pipe or a device, a file that is too large, or one that the system does not open.
+        InputError: a folder, a pipe, a device, a file larger than `largest`, or a file that the system does not open.
     """
     try:
         found = path.stat()
@@ -100,7 +100,8 @@ def toml_content(text: str, where: str | Path, kind: type[InputError] = BadConfi
         raise kind(f"{where}: not a readable TOML file ({error})") from error
     except RecursionError as error:
         raise kind(f"{where}: tables or lists are nested too deep; expected at most {DEEPEST} levels") from error
-    keys, left = 0, [(found, 1)]
+    keys = 0
+    left: list[tuple[dict[str, Any] | list[Any], int]] = [(found, 1)]
     while left:
         value, depth = left.pop()
         if depth > DEEPEST:

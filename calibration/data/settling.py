@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calibration.data.columns import TIME
 from calibration.data.contradictions import GAP
 from calibration.data.courses import applied, differs
 from calibration.data.errors import BadData, number
@@ -64,7 +65,7 @@ class Signal:
             at glitches.
         angle: the angle that it is the rate of [unit of its column], empty where it is read itself.
         step: of its instrument [unit], 0 without; largest: size of its readings but for the last two in a hundred.
-        glitches: True for readings far from those beside them, see `glitches`, shape (rows,).
+        glitches: True for readings far from the readings next to them, see `glitches`, shape (rows,).
     """
 
     channel: Channel
@@ -150,7 +151,7 @@ class Settled:
         """The settled runs, as a table of runs that is read."""
         columns = {**self.runs.columns, **self.table()}
         count = len(self.kept)
-        columns = {name: x for name, x in columns.items() if len(x) == count and name not in ("time_s", "mode")}
+        columns = {name: x for name, x in columns.items() if len(x) == count and name not in (*TIME, "mode")}
         return dataclasses.replace(self.runs, columns=columns, extras={}, log=None)
 
     def table(self) -> dict[str, np.ndarray]:
@@ -319,12 +320,12 @@ def _signals(
 def glitches(shown: np.ndarray, levels: list[np.ndarray], width: int, step: float, drift: float | None) -> np.ndarray:
     """True for readings that are far from the readings next to them, shape (rows,).
 
-    A reading is a glitch if it differs from the median of `width` readings around it by more than `FAR` robust sds
-    (1.4826 times the median of such differences), `FAR` steps and the allowed drift (Hampel, The influence curve and
-    its role in robust estimation, 1974). Normal noise has 2e-9 of them, so means of clean logs do not change. Where
-    most readings are near zero there are none: a current in pulses has its mean in the pulses. An angle that counts
-    on is compared with half of its usual travel over the window instead of the drift. The first `width` readings of
-    a level may be a start: `PART` in a row are none.
+    A glitch differs from the median of the `width` readings around it by more than `FAR` robust sds, `FAR` steps and
+    the allowed drift. The robust sd is 1.4826 times the median difference (Hampel, The influence curve and its role in
+    robust estimation, 1974). Normal noise has 2e-9 of them, so means of clean logs do not change. A level has no
+    glitches if most of its readings are near zero: a current in pulses has its mean in the pulses. An angle that
+    counts on is compared with half of its usual travel over the window instead of the drift. The first `width`
+    readings of a level may be a start, so `PART` in a row are no glitches there.
 
     Args:
         shown: readings, NaN where missing; levels: rows of each level, in the order of time.

@@ -54,6 +54,12 @@ def _read(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[dict[str, n
     if names is None:
         either = ", or ".join(" and ".join(names) for names in wanted)
         raise BadData(f"{path.name}: got columns {', '.join(header) or 'none'}; expected {either}")
+    for others in wanted:
+        if both := [name for name in others if name in header and name not in names]:
+            ours = ", ".join(name for name in names if name not in others)
+            raise BadData(
+                f"{path.name}: got columns {', '.join(both)} and {ours}; expected one kind, remove the other"
+            )
     found: dict[str, list[float]] = {name: [] for name in names}
     for k, row in enumerate(rows[1:], 2):
         for name in names:

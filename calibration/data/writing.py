@@ -14,7 +14,7 @@ import numpy as np
 
 
 @contextlib.contextmanager
-def naming(path: Path) -> Iterator[None]:
+def naming(path: Path | str) -> Iterator[None]:
     """What the system refuses while a file is written names it: a full disk does not."""
     try:
         yield

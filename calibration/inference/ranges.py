@@ -91,9 +91,9 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
 
 
 def turned_signs(runs: Runs, robot: Robot) -> list[Turned]:
-    """Channels of settled runs that one sign brings `NEARER` to the robot as its file states it, beside a weight.
+    """Returns the channels of settled runs whose readings with the other sign are `NEARER` to the robot of the file.
 
-    Without a weight signs are checked row by row as a table is read.
+    It needs a robot with a weight. Without a weight signs are checked row by row as a table is read.
     """
     runs = runs.of(robot)
     if not runs.layout.weight or any(float(c.torque_gravity) > 0 for c in robot.configurations.members):

@@ -39,6 +39,9 @@ def new(file: Path, kind: str, force: bool) -> int:
         raise BadConfiguration(f"{file}: {what}")
     if not file.parent.is_dir():
         raise BadConfiguration(f"{file}: no such folder as {file.parent}; make it first")
-    file.write_text(template(kind), encoding="utf-8")
+    try:
+        file.write_text(template(kind), encoding="utf-8")
+    except OSError as error:
+        raise BadConfiguration(f"{file}: cannot be written ({error.strerror}); state a file elsewhere") from error
     say(f"{file}: {KINDS[kind]}. Fill in what is marked example: yours, then: mmrjax rig check {file} [DATA.csv]")
     return 0

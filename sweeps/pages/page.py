@@ -13,6 +13,7 @@ import jinja2
 import numpy as np
 from markupsafe import Markup, escape
 
+from calibration.data.writing import write_text
 from mmrjax import __version__, channels, effects, params
 from mmrjax.channels import Channel
 from sweeps import capabilities
@@ -41,7 +42,7 @@ class Album:
             drawn = draw()
             figure, *numbers = drawn if isinstance(drawn, tuple) else (drawn,)
             text = svg(figure)
-        (self.folder / f"{name}.svg").write_text(text, encoding="utf-8")
+        write_text(self.folder / f"{name}.svg", text)
         self.pictures[name] = Markup(_inline(text, name))
         return numbers[0] if numbers else None
 
@@ -235,7 +236,7 @@ def render(
     warnings = {"curve-warning": words.of_curves(curves), "robot-warning": escape(". ".join(remarks))}
     page = _with_contents(page, warnings)
     path = Path(folder) / "report.html"
-    path.write_text(page, encoding="utf-8")
+    write_text(path, page)
     return path
 
 
