@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import os
+import threading
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
@@ -16,7 +17,7 @@ import equinox as eqx
 import jax
 
 from mmrjax import SOUND_AT_LEVEL_0
-from mmrjax.programs import Programs
+from mmrjax.programs import Programs, structure
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -44,17 +45,28 @@ SELDOM = {**SMALL, "xla_backend_optimization_level": 0 if SOUND_AT_LEVEL_0 in os
 def compiled(function: Callable[P, T], *, options: dict[str, Any] | None = None) -> Callable[P, T]:
     """`eqx.filter_jit` of a function; one that returns a robot returns it as `for_equations` leaves it.
 
-    Where a folder for them is stated its programs are kept there (`mmrjax.programs`).
+    Where a folder for them is stated its programs are kept there (`mmrjax.programs`). One thread at a time traces it:
+    what JAX keeps of a trace is not safe from another one of the same function.
 
     Args:
         options: of XLA, by which programs that are kept are compiled: `SMALL`, `SELDOM` or None for its own.
     """
     inner, kept = eqx.filter_jit(function), Programs(function, options)
+    traced, lock = set[Any](), threading.RLock()
 
     @functools.wraps(function)
     def call(*args: P.args, **named: P.kwargs) -> T:
         args, named = for_equations((args, named))
         program = kept.of((args, named))
-        return inner(*args, **named) if program is None else program((args, named))
+        if program is not None:
+            return program((args, named))
+        known = structure((args, named))
+        if known in traced:
+            return inner(*args, **named)
+        with lock:
+            found = inner(*args, **named)
+        if known is not None:
+            traced.add(known)
+        return found
 
     return call

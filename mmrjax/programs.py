@@ -99,23 +99,19 @@ class Programs:
         folder = os.environ.get(VARIABLE, "")
         if not folder or not _keeps() or not _private(folder):
             return None
-        leaves, tree = jax.tree.flatten(arguments)
-        if has_tracer(leaves):
+        known = structure(arguments)
+        if known is None:
             return None
-        try:
-            structure = tree, tuple(_shape(x) for x in leaves)
-            with self._lock:
-                first = structure not in self._found
-                found = self._found.setdefault(structure, Future())
-        except (TypeError, Unnamed):  # what cannot be hashed
-            return None
+        with self._lock:
+            first = known not in self._found
+            found = self._found.setdefault(known, Future())
         if first:
             try:
-                found.set_result(self._obtained(Path(folder), leaves, tree))
+                found.set_result(self._obtained(Path(folder), *jax.tree.flatten(arguments)))
             except BaseException as error:
                 found.set_exception(error)
                 with self._lock:
-                    del self._found[structure]
+                    del self._found[known]
         return found.result()
 
     def _obtained(self, folder: Path, leaves: list[Any], tree: Any) -> Program | None:
@@ -166,6 +162,19 @@ class Programs:
         # The text names what is on disk: without the arguments that nothing reads, programs of others would be alike.
         lowered = jax.jit(flat, keep_unused=True).lower(*_arrays(leaves))
         return returned[0], lowered
+
+
+def structure(arguments: Any) -> Any:
+    """Structure of arguments, by which a program is known in this process; None with tracers or without a hash."""
+    leaves, tree = jax.tree.flatten(arguments)
+    if has_tracer(leaves):
+        return None
+    try:
+        found = tree, tuple(_shape(x) for x in leaves)
+        hash(found)
+    except (TypeError, Unnamed):
+        return None
+    return found
 
 
 def has_tracer(tree: Any) -> bool:

@@ -167,7 +167,7 @@ def unfinished(partial: Path) -> dict[str, str] | None:
 
 
 def marked(command: str, identity: str = "") -> str:
-    """Text of a lock's file, by which a folder is known as ours."""
+    """Text of the file `lock`, which marks a folder as ours."""
     return json.dumps({"schema": UNFINISHED, "command": command, "identity": identity})
 
 

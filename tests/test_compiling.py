@@ -1,6 +1,8 @@
 """Programs are shared by what equations cannot tell apart, and by nothing else."""
 
+import concurrent.futures
 import dataclasses
+import time
 from types import SimpleNamespace
 
 import jax
@@ -117,3 +119,27 @@ def test_a_fit_that_ends_above_the_one_it_builds_on_starts_again_there(monkeypat
         assert [c.cost for c in found] == [kept, 30.0]
         assert asked.pop() == [("b", 1, 0), ("a", 0, 7)] and asked.pop() == [("a", 1, 9), ("b", 1, 9)]
     assert candidates.fit_beside(space, [], None) == []
+
+
+def test_one_thread_at_a_time_traces_a_function():
+    """Two calibrations in two threads have failed in JAX: «Store occupied»."""
+    within, most = [], []
+
+    @compiled
+    def doubled(x):
+        within.append(x)
+        most.append(len(within))
+        time.sleep(0.05)
+        within.pop()
+        return 2 * x
+
+    @compiled
+    def outer(x):
+        return doubled(x) + 1
+
+    with concurrent.futures.ThreadPoolExecutor(6) as pool:
+        calls = [pool.submit((doubled, outer)[n % 2], jnp.arange(float(n))) for n in range(1, 7)]
+        found = [call.result() for call in calls]
+    assert [len(x) for x in found] == [1, 2, 3, 4, 5, 6] and len(most) == 6 and max(most) == 1
+    traces = len(most)
+    assert doubled(jnp.ones(3)).tolist() == [2.0] * 3 and len(most) == traces
