@@ -10,7 +10,7 @@ from collections.abc import Iterable
 WORD, SHOWN, PATH, LONGEST = 80, 40, 300, 900
 
 
-def shortened(message: str) -> str:
+def shortened(message: str, longest: int = LONGEST) -> str:
     """Returns a message without the rest of very long words and the middle of very long text."""
 
     def cut(word: re.Match[str]) -> str:
@@ -20,7 +20,7 @@ def shortened(message: str) -> str:
         return f"{word[0][:SHOWN]}… ({len(word[0]) - len(end):,} characters){end}"
 
     found = re.sub(r"\S+", cut, message)
-    return found if len(found) <= LONGEST else f"{found[: 2 * LONGEST // 3]} … {found[-LONGEST // 4 :]}"
+    return found if len(found) <= longest else f"{found[: 2 * longest // 3]} … {found[-longest // 4 :]}"
 
 
 class UsageError(ValueError):

@@ -46,7 +46,7 @@ def _reason(part: Path, itself: bool) -> str:
 
 
 def _own_group(group: int) -> bool:
-    """True if a group is the one that many systems make for each user, with the user's name."""
+    """True if a group has the user's name: many systems make one for each user alone."""
     import grp
     import pwd
 

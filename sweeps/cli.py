@@ -17,6 +17,7 @@ import typer
 
 from calibration.data.errors import BadConfiguration, InputError
 from mmrjax import SOUND_AT_LEVEL_0, __version__, fidelities
+from mmrjax.errors import shortened
 from sweeps import config, config_campaign
 from sweeps import options as made
 from sweeps.flags import flags as flags_of
@@ -655,7 +656,12 @@ def _no_number(error: Any) -> str:
 LONGEST = 390
 
 
+#: Longest message [characters].
+LONGEST = 390
+
+
 def _fail(message: str, code: int) -> int:
+    message = " ".join(message.splitlines())
     if len(message) > LONGEST:
         message = f"{message[: LONGEST - 130]} [...] {message[-120:]}"
     print(f"mmrjax: {message}", file=sys.stderr)

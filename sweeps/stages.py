@@ -16,7 +16,7 @@ import math
 import sys
 import types
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -24,7 +24,6 @@ from calibration.data.effect_file import OWN_MODULE
 from mmrjax import channels
 from mmrjax.channels import Channel
 from mmrjax.effects.scaled import scaled
-from sweeps.store import read_arrays
 
 #: Packages whose dataclasses a file may name, and modules whose functions it may.
 PACKAGES = ("mmrjax", "calibration")
@@ -51,8 +50,8 @@ def write(file: Path, value: Any) -> None:
     writer = _Writer()
     try:
         tree = json.dumps(writer.encoded(value), separators=(",", ":"), allow_nan=False).encode()
-    except RecursionError as error:
-        raise Unwritable("nested too deeply") from error
+    except (RecursionError, TypeError, ValueError) as error:  # nested too deeply, without attributes, a huge number
+        raise Unwritable(f"{type(error).__name__}: {error}") from error
     with file.open("wb") as stream:
         data = np.frombuffer(b"".join(writer.data), np.uint8)
         np.savez(stream, allow_pickle=False, tree=np.frombuffer(tree, np.uint8), data=data)
@@ -69,6 +68,12 @@ def read(file: Path) -> Any:
         return _Reader(found["data"].tobytes()).decoded(json.loads(found["tree"].tobytes()))
     except Exception as error:  # whatever a damaged or a made-up file comes to
         raise Unreadable(f"{type(error).__name__}: {error}") from error
+
+
+def read_arrays(file: Path) -> dict[str, np.ndarray]:
+    """Arrays of a file of `np.savez`, none of which is of objects; raises whatever a damaged file comes to."""
+    with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
+        return {key: arrays[key] for key in arrays.files}
 
 
 class _Writer:
@@ -110,8 +115,8 @@ class _Writer:
         if isinstance(x, types.FunctionType) and x.__module__ in FUNCTIONS:
             return ["function", x.__module__, x.__qualname__]
         if dataclasses.is_dataclass(x):
-            kept = [name for name in _attributes(type(x)) if name in vars(x)]
-            return ["instance", *_named_class(type(x)), {name: self.encoded(vars(x)[name]) for name in kept}]
+            held = {name: self.encoded(value) for name, value in vars(x).items() if _holds(type(x), name)}
+            return ["instance", *_named_class(type(x)), held]
         if isinstance(x, tuple) and hasattr(x, "_fields"):
             return ["named", *_named_class(type(x)), [self.encoded(item) for item in x]]
         raise Unwritable(f"{type(x).__module__}.{type(x).__qualname__}")
@@ -121,7 +126,9 @@ class _Writer:
             return ["O", list(x.shape), [self.encoded(item) for item in x.ravel()]]
         if x.dtype.kind not in KINDS:
             raise Unwritable(f"array of {x.dtype}")
-        order = "F" if x.flags.f_contiguous and not x.flags.c_contiguous else "C"  # which sums depend on
+        order: Literal["F", "C"] = (
+            "F" if x.flags.f_contiguous and not x.flags.c_contiguous else "C"
+        )  # which sums depend on
         content = x.tobytes(order)
         at, self._size = self._size, self._size + len(content)
         self.data.append(content)
@@ -186,7 +193,7 @@ class _Reader:
 
     def _instance(self, module: str, name: str, factors: list[float] | None, fields: dict[str, Any]) -> Any:
         kind = _class(module, name, factors)
-        if not dataclasses.is_dataclass(kind) or not set(fields) <= set(_attributes(kind)):
+        if not dataclasses.is_dataclass(kind) or not all(_holds(kind, name) for name in fields):
             raise Unreadable(f"{module}.{name} has other fields")
         made: Any = object.__new__(kind)
         for field, value in fields.items():
@@ -194,11 +201,10 @@ class _Reader:
         return made
 
 
-@functools.cache
-def _attributes(kind: type) -> list[str]:
-    """Names of what an instance of a dataclass holds: its fields, and values that it has found and keeps."""
-    found = [f.name for f in dataclasses.fields(kind)]
-    return found + [n for n, v in inspect.getmembers_static(kind) if isinstance(v, functools.cached_property)]
+def _holds(kind: type, name: str) -> bool:
+    """True if instances of a dataclass hold a value by that name: a field, or what they compute once and keep."""
+    kept = inspect.getattr_static(kind, name, None)
+    return name in kind.__dataclass_fields__ or isinstance(kept, functools.cached_property)
 
 
 def _on_device(x: np.ndarray, weak: bool) -> Any:
@@ -236,7 +242,7 @@ def _class(module: str, name: str, factors: list[float] | None) -> type:
         found = getattr(found, part)
     if not isinstance(found, type) or found.__module__ != module:
         raise Unreadable(f"{module}.{name} is no class there")
-    return found if factors is None else scaled(found, tuple(factors))  # type: ignore[arg-type]
+    return found if factors is None else scaled(found, tuple(factors))
 
 
 def _function(module: str, name: str) -> types.FunctionType:

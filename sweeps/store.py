@@ -167,7 +167,7 @@ def unfinished(partial: Path) -> dict[str, str] | None:
 
 
 def marked(command: str, identity: str = "") -> str:
-    """Text of a lock's file, by which a folder is known as ours."""
+    """Text of the file `lock`, which marks a folder as ours."""
     return json.dumps({"schema": UNFINISHED, "command": command, "identity": identity})
 
 
@@ -189,12 +189,6 @@ def share_at_work(partial: Path, own: Path | None = None) -> str | None:
                 if not lockable(journal):
                     return file.stem
     return None
-
-
-def read_arrays(file: Path) -> dict[str, np.ndarray]:
-    """Arrays of a file of `np.savez`, none of which is of objects; raises whatever a damaged file comes to."""
-    with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
-        return {key: arrays[key] for key in arrays.files}
 
 
 def lockable(file: TextIO) -> bool:
@@ -314,11 +308,13 @@ class RunFolder(Folder):
 
     def chunk(self, name: str) -> dict[str, np.ndarray] | None:
         """A chunk that an interrupted run finished; None if there is none that can be read."""
+        from sweeps import stages
+
         file = self.partial / CHUNKS / f"{name}.npz"
         if not file.is_file():
             return None
         try:
-            return read_arrays(file)
+            return stages.read_arrays(file)
         except Exception:  # whatever a damaged file makes the reader raise
             tell(f"{file}: damaged; computed again")
             return None

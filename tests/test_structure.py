@@ -312,6 +312,7 @@ KEPT = {
     ("sweeps/points/cluster.py", "jax.config"): "a switch of jax, once a process",
     ("mmrjax/programs.py", "sources"): "a hash of the files of this program",
     ("mmrjax/programs.py", "_linear_algebra"): "lets jax find LAPACK, once a process",
+    ("mmrjax/programs.py", "_private"): "that a folder is private, as it is first used",
     ("sweeps/compilation_cache.py", "os.environ"): "set for jax, before it is imported",
     ("sweeps/compilation_cache.py", "jax.config"): "where jax keeps programs",
     ("sweeps/points/design.py", "_directions"): "pure, of hashable arguments",

@@ -83,7 +83,7 @@ def library(paths: Sequence[Path | str] = ()) -> Library:
 
 
 class _FromSource(importlib.machinery.SourceFileLoader):
-    """Runs the file itself: compiled code beside it may be of another text, and none is left there."""
+    """Runs the file itself. Compiled bytes next to it may differ from its text; they are not read and not written."""
 
     def get_code(self, fullname: str) -> types.CodeType:
         return self.source_to_code(self.get_data(self.path), self.path)

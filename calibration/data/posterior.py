@@ -193,7 +193,8 @@ def read(path: Path | str) -> Posterior:
             data.load()
         found = _of(data)
     except Exception as error:  # whatever a damaged file makes the reader raise
-        raise BadData(f"{path}: not a posterior that can be read ({type(error).__name__}: {error})") from error
+        why = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise BadData(f"{path}: not a posterior that can be read ({why})") from error
     size = len(found)
     sound = (
         found.covariance.shape == (size, size)
