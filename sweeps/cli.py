@@ -661,8 +661,5 @@ LONGEST = 390
 
 
 def _fail(message: str, code: int) -> int:
-    message = " ".join(message.splitlines())
-    if len(message) > LONGEST:
-        message = f"{message[: LONGEST - 130]} [...] {message[-120:]}"
-    print(f"mmrjax: {message}", file=sys.stderr)
+    print(f"mmrjax: {shortened(' '.join(message.splitlines()), LONGEST)}", file=sys.stderr)
     return code
