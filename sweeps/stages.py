@@ -76,6 +76,10 @@ def read_arrays(file: Path) -> dict[str, np.ndarray]:
         return {key: arrays[key] for key in arrays.files}
 
 
+#: Weakly typed arrays of more values are read as arrays of the other kind.
+FEW = 256
+
+
 class _Writer:
     """Encodes values: JSON has lists and plain values as they are, everything else as [KIND, ...]."""
 
@@ -210,10 +214,11 @@ def _holds(kind: type, name: str) -> bool:
 def _on_device(x: np.ndarray, weak: bool) -> Any:
     import jax.numpy as jnp
 
-    made = jnp.asarray(x)
-    if weak:  # a program is compiled anew for an array of the other kind
-        made.aval = made.aval.update(weak_type=True)  # type: ignore[attr-defined, misc]
-    return made
+    if not weak or not 0 < x.size <= FEW:
+        return jnp.asarray(x)
+    # Scalars of Python are of the weak kind, for which another program would be compiled, and so is what they make.
+    scalars = [jnp.asarray(value) for value in x.ravel().tolist()]
+    return scalars[0] if x.shape == () else jnp.stack(scalars).reshape(x.shape)
 
 
 def _named_class(kind: type) -> tuple[str, str, list[float] | None]:

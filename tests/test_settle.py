@@ -14,6 +14,7 @@ from worlds import rigs
 from calibration.data import contradictions, rig_facts, robot_file, settling
 from calibration.data import runs as records
 from calibration.data.errors import BadData
+from calibration.inference.foresight import Foresight
 from calibration.words import settle as words
 from sweeps.commands import rig_check
 from sweeps.commands.settle import rolling
@@ -282,6 +283,8 @@ def test_signs_and_units_that_cannot_be_are_said_with_rows_and_remedy(tmp_path, 
         settled(tmp_path, robot, rolling=rolling(robot))
 
 
+#: What a fit would say of a table, where none is made.
+NOTHING_FORESEEN = Foresight((), (), (), (), (), None)
 SIGNS = [case for case in WRONG if "sign" in case or "round" in case]
 
 
@@ -289,7 +292,7 @@ SIGNS = [case for case in WRONG if "sign" in case or "round" in case]
 def test_rig_check_says_of_a_log_that_signs_are_wrong(tmp_path, monkeypatch, case):
     changes, said = WRONG.get(case, ({}, ""))
     bench(tmp_path, both_ways(**changes), '"total_current", "motor_speed", "output_angle"')
-    monkeypatch.setattr(rig_check.foresight, "foresee", lambda runs, robot: None)
+    monkeypatch.setattr(rig_check.foresight, "foresee", lambda runs, robot: NOTHING_FORESEEN)
     found = rig_check.examined(tmp_path / "rig.toml", str(tmp_path / "log.csv"))
     if not said:
         assert found.doubts == ()
@@ -302,7 +305,7 @@ def test_rig_check_says_of_a_log_that_signs_are_wrong(tmp_path, monkeypatch, cas
 def test_rig_check_says_which_current_a_total_one_is_beside_a_duty(tmp_path, monkeypatch, duty):
     columns = both_ways() | ({"duty": np.full(800, 0.5)} if duty else {})
     bench(tmp_path, columns)
-    monkeypatch.setattr(rig_check.foresight, "foresee", lambda runs, robot: None)
+    monkeypatch.setattr(rig_check.foresight, "foresee", lambda runs, robot: NOTHING_FORESEEN)
     said = rig_check.examined(tmp_path / "rig.toml", str(tmp_path / "log.csv")).remarks()
     assert any("what a sensor in a motor's leads shows is motor_current" in s for s in said) == duty
 

@@ -151,7 +151,7 @@ def test_rig_check_says_how_many_rows_are_used(tmp_path, monkeypatch, capsys):
 
     def foresee(runs, robot):
         runs = thinned(runs)
-        return foresight.Foresight((), ("converged",) * len(runs), ("columns",) * len(runs.channels), (), robot)
+        return foresight.Foresight((), ("converged",) * len(runs), ("columns",) * len(runs.channels), (), (), robot)
 
     monkeypatch.setattr(rig_check.foresight, "foresee", foresee)
     found = rig_check.examined(tmp_path / "rig.toml", str(tmp_path / "log.csv"))

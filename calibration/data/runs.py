@@ -547,8 +547,8 @@ def _cell(where: str, meaning: Meaning, cell: str, layout: Layout, kind: type[In
         value = parsed(cell)
     except ValueError:
         raise refuse(f"a number, {allowed}", hint) from None
-    beyond = (ROUNDED_FACTOR if meaning.factor != 1.0 else ROUNDED) * max(abs(low), abs(high))
-    if not low - beyond <= value <= high + beyond or (positive and value <= low):
+    beyond = ROUNDED_FACTOR if meaning.factor != 1.0 else ROUNDED
+    if not low - beyond * abs(low) <= value <= high + beyond * abs(high) or (positive and value <= low):
         raise refuse(allowed, hint)
     value = min(max(value, low), high)
     return value if meaning.as_named else meaning.value(value)
