@@ -321,8 +321,8 @@ def glitches(shown: np.ndarray, levels: list[np.ndarray], width: int, step: floa
     """True for readings that are far from the readings next to them, shape (rows,).
 
     A glitch differs from the median of the `width` readings around it by more than `FAR` robust sds, `FAR` steps and
-    the allowed drift. The robust sd is 1.4826 times the median difference (Hampel, The influence curve and its role in
-    robust estimation, 1974). Normal noise has 2e-9 of them, so means of clean logs do not change. A level has no
+    the allowed drift. The robust sd is 1.4826 times the median difference (Hampel, The influence curve and its role
+    in robust estimation, 1974). Normal noise has 2e-9 of them, so means of clean logs do not change. A level has no
     glitches if most of its readings are near zero: a current in pulses has its mean in the pulses. An angle that
     counts on is compared with half of its usual travel over the window instead of the drift. The first `width`
     readings of a level may be a start, so `PART` in a row are no glitches there.
