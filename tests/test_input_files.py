@@ -48,7 +48,7 @@ TOML = {
     "400 digits": ("[motor]\nresistance = 1" + "0" * 400, "a whole number beyond 64 bits"),
     "5000 digits": ("[motor]\nresistance = 1" + "0" * 5000, "not a readable TOML file"),
     "a long header": (f"[{DEEP}]\nx = 1", "nested too deep"),
-    "many keys": ("".join(f"k{k} = 1\n" for k in range(10_001)), "more than 10,000 keys; is it the right file"),
+    "many keys": ("".join(f"k{k} = 1\n" for k in range(2_001)), "more than 2,000 keys; is it the right file"),
     "a long value": ('base = "' + "x" * 100_000 + '"', "100,000 characters"),
     "empty": ("# nothing\n", "states nothing; expected tables of parameters"),
     "a channel twice": (

@@ -24,7 +24,7 @@ TEXTS = {
     re.compile(rb"\s*<(!doctype|html|\?xml)", re.I): "a web page or XML",
 }  # fmt: skip
 #: Largest table and largest TOML file [bytes], most keys of a TOML file and most tables within one another.
-LARGEST, LARGEST_TOML, KEYS, DEEPEST = 2**31, 2**22, 10_000, 16
+LARGEST, LARGEST_TOML, KEYS, DEEPEST = 2**31, 2**22, 2_000, 16
 #: Whole numbers that a TOML file may hold (TOML 1.0: 64 bits).
 WHOLE = 2**63
 #: Kinds of files that are not read: what they are called.
