@@ -313,7 +313,7 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
     """
     stated = current_values(values, robot, where, notes)
     counts = {name: _count(where, name, stated.pop(name)) for name in COUNTS if name in stated}
-    ratings = {name: _rating(where, name, stated.pop(name)) for name in RATINGS if name in stated}
+    ratings: dict[str, Any] = {name: _rating(where, name, stated.pop(name)) for name in RATINGS if name in stated}
     if CURVE & stated.keys() and "battery.capacity" in stated:  # all of one cell, unless it is said otherwise
         ratings.setdefault("battery.capacity_curve", stated["battery.capacity"])
     ratings |= {name: _switch(where, name, stated.pop(name)) for name in SWITCHES if name in stated}

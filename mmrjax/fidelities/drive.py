@@ -197,7 +197,7 @@ def drive(
     signals = jax.vmap(lambda y: balances.moving(robot, conditions, state_of(robot, y)))(ys)
     if not imposed:
         static = jax.vmap(lambda y: standing(robot, conditions, state_of(robot, y)))(ys)
-        signals = jax.tree.map(lambda here, there: jnp.where(parked, here, there), static, signals)
+        signals = jax.tree.map(lambda at_rest, moves: jnp.where(parked, at_rest, moves), static, signals)
     end = jax.tree.map(lambda x: x[-1], signals)
     status = _status(robot, conditions, end, parked, went)
     return _kept(

@@ -220,7 +220,7 @@ def _operating_at(
     if conditions.motor_speed is None:
         stands_still = (status == STALLED) & (jnp.abs(signals.speed_theoretical) < 1e-9)
         static = standing(robot, conditions, _state(unknowns, conditions.discharge))
-        signals = jax.tree.map(lambda here, there: jnp.where(stands_still, here, there), static, signals)
+        signals = jax.tree.map(lambda at_rest, moves: jnp.where(stands_still, at_rest, moves), static, signals)
     status = jnp.where(solved, status, FAILED)
     empty = (conditions.battery > 0.5) & robot.battery.empty(conditions.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)

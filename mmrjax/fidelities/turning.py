@@ -232,8 +232,8 @@ def _settled(robot: Robot, conditions: Conditions) -> tuple[PlaneMotion, Float[A
     """The motion of a settled turn on level ground, its loads, see `turning.grip`, and whether it was found.
 
     Broyden's method, which looks along each unknown first, finds most. Where it does not end, or at a turn that is
-    not stable, implicit Euler's steps, longer and longer, follow a run to where it settles, and of these only the
-    shortest may let the rates grow. The last step is Newton's and carries the derivatives, the implicit ones.
+    not stable, implicit Euler's steps, longer and longer, follow a run to where it settles. Only the shortest of them
+    may let the rates grow. The last step is Newton's and carries the derivatives, the implicit ones.
     """
     size = SETTLING + len(SIDES)
     moves = np.arange(size) >= (0 if conditions.of_sides().motor_speed is None else 4)
