@@ -50,8 +50,8 @@ ABSORBED = 1e-9
 STARTS = np.concatenate([[0.0], np.geomspace(1e-4, 0.05, 40), np.linspace(0.06, 2.0, 98)])  # [s]
 
 EVERY = (*ALL, *OF_TURNS.values(), *OF_CHANNELS.values())
-SETTLED = tuple(e for e in ALL if not e.transient and not e.needs_battery)
-PASSING = tuple(e for e in ALL if e not in SETTLED)
+SETTLED = tuple(e for e in ALL if not e.transient and not e.needs_battery and not e.needs_duty)
+PASSING = tuple(e for e in ALL if e not in SETTLED and not e.needs_duty)
 
 
 def robot(effects: tuple[type[Effect], ...]) -> Robot:
@@ -185,7 +185,8 @@ def page() -> str:
         "An effect declares what others have to know of it: that a positive amplitude only takes power out",
         "(`dissipative`), that settled travel shows nothing of it (`transient`) or cannot tell it from another",
         "(`settles_to`), that it acts on the on-board battery alone (`needs_battery`) or on tracks or wheels alone",
-        "(`movers`), that only runs both ways tell it from a parameter of the robot (`needs_reverse`), that it keeps",
+        "(`movers`), that only runs both ways tell it from a parameter of the robot (`needs_reverse`), that only a",
+        "duty below 1 shows it (`needs_duty`), that it keeps",
         "its sign in space when the robot goes backward (`odd_in_travel`). A robot file may name the configurations",
         'that one acts on: `[effects.churning] configurations = ["4W2T"]`.',
         "",
@@ -208,7 +209,8 @@ def page() -> str:
         "and the effects that 180 runs of Table 8 (μ_s = 0.6) cannot tell from it: |cos| > 0.95 of the",
         "signatures, in units of 0.02 A, 5 rpm, 3 mm/s, once the eleven friction parameters that a fit frees are",
         "projected out. `left` is the share of the signature that this projection leaves: nothing of a parameter by",
-        "another name; what acts where a load drives the motor is not seen in these runs, which climb.",
+        "another name; what acts where a load drives the motor is not seen in these runs, which climb; nor is what",
+        "acts at a duty below 1, as `coast_decay`, which is left out here.",
         "",
         "| effect | 15 V, 0°: A | rpm | mm/s | 33 V, 20°: A | rpm | mm/s | left | look-alikes |",
         "|---|---|---|---|---|---|---|---|---|",

@@ -108,7 +108,9 @@ def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar 
         angle=state.distance / chassis.radius,
         temperature=state.temperature,
         duty=duty,
-        total_current=robot.sides * state.current * duty,
+        pause=jnp.where(jnp.abs(jnp.asarray(conditions.open)) > 0.5, 0.0, 1 - jnp.abs(duty)),
+        share_drawn=robot.driver.share_drawn(duty),
+        total_current=robot.sides * state.current * robot.driver.share_drawn(duty),
     )
     if isinstance(chassis, Shaft):  # no ground carries it
         return _fill(signals, mass=jnp.zeros_like(state.speed), normal=jnp.zeros_like(state.speed))
@@ -125,10 +127,16 @@ def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
     source = power.voltage_source(
         robot.battery, conditions.voltage, conditions.battery, signals.total_current, signals.discharge
     )
-    voltage = signals.duty * (source - added(robot, signals, "supply"))
-    blocked = robot.driver.blocks(signals.duty, signals.current, conditions.open)
     back = robot.motor.voltage_back(signals.speed_motor)
+    voltage = robot.driver.voltage(source - added(robot, signals, "supply"), signals.duty, signals.pause, back)
+    blocked = robot.driver.blocks(signals.duty, signals.current, conditions.open)
     return _fill(signals, voltage_source=source, voltage=jnp.where(blocked, back, voltage))
+
+
+def power_drawn(robot: Robot, signals: Signals) -> Scalar:
+    """Power that all motors take [W], the heat of their current's pulses with it."""
+    pulses = (robot.driver.ripple(signals.duty) - 1) * signals.voltage_drop
+    return robot.sides * (signals.voltage + pulses) * signals.current
 
 
 def charge_drawn(robot: Robot, conditions: Conditions, total_current: Scalar) -> Scalar:
@@ -225,7 +233,9 @@ def gearbox(robot: Robot, chassis: Load, signals: Signals, mover: Scalar | None 
     drive = signals.torque_motor - idle
     inertia_added = added(robot, signals, "inertia")
     # Of shafts without inertia, the side from which power flows and what they transmit are those of next to none.
-    inertia_wheel = LEAST_INERTIA + at_least(chassis.inertia + inertia_added, 0.0)
+    inertia_wheel = chassis.inertia + inertia_added
+    next_to_none = LEAST_INERTIA + at_least(inertia_wheel, 0.0)  # with a derivative by what is added to none
+    inertia_wheel = jnp.where(inertia_wheel < LEAST_INERTIA, next_to_none, inertia_wheel)
     through = gear.ratio * inertia_motor
     side = (drive * inertia_wheel + through * load) / (inertia_wheel + through)
     efficiency = gear.efficiency_flow(side, signals.direction)
@@ -291,7 +301,7 @@ def _speed_imposed(robot: Robot, conditions: Conditions, chassis: Chassis, signa
 
     def at(given: tuple[Robot, Conditions, Chassis, Signals], current: Scalar) -> Signals:
         robot, conditions, chassis, signals = given
-        total = robot.sides * current * signals.duty
+        total = robot.sides * current * signals.share_drawn
         moved = electrical(robot, conditions, _fill(signals, current=current, total_current=total))
         return gearbox(robot, chassis, motor(robot, moved))
 

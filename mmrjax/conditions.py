@@ -40,7 +40,8 @@ class Conditions(eqx.Module):
         total_mass: mass of robot and payload as weighed [kg]; None takes the robot's own mass and the payload.
         order: place in the sequence of runs; what drifts from run to run depends on it [-].
         duty: share of the supply's voltage that the driver gives the motors, negative backward [-]; None: 1.
-        open: 1 where the motors' circuit is open, so that they coast.
+        open: 1 where the motors' circuit is open, so that they coast; -1 where the driver shorts it, so that they
+            brake whatever it does between pulses.
         motor_speed: imposed on the motors' shafts [rad/s], whatever voltage that takes; None: the voltage is imposed.
         motor_acceleration: of an imposed speed [rad/s²]; None: none.
         motor_current: imposed on each motor [A], whatever voltage that takes; None: it follows.

@@ -7,7 +7,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from mmrjax.balances import Travel, added
+from mmrjax.balances import Travel, added, power_drawn
 from mmrjax.conditions import Conditions
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
@@ -50,8 +50,8 @@ def sinks(robot: Robot, conditions: Conditions, signals: Signals) -> dict[str, S
     return {
         "battery": jnp.where(on_battery, battery.cells * battery.resistance * load**2, 0.0),
         "other": jnp.where(on_battery, battery.current_other * signals.voltage_source, 0.0),
-        "driver": signals.voltage_source * signals.total_current - sides * signals.voltage * signals.current,
-        "winding": sides * signals.voltage_drop * signals.current,
+        "driver": signals.voltage_source * signals.total_current - power_drawn(robot, signals),
+        "winding": sides * signals.voltage_drop * signals.current * robot.driver.ripple(signals.duty),
         "motor": sides * signals.torque_motor_loss * signals.speed_motor,
         "gearbox": sides * (into + own * signals.speed_wheel - ground),
         "track": sides * signals.torque_track_loss * signals.speed_wheel,

@@ -112,8 +112,8 @@ class Profile(eqx.Module):
         for name in ("duty", "duty_left", "duty_right"):
             duty = stated.get(name, getattr(otherwise, name))
             stated[name] = None if duty is None else jnp.where(held, 0.0, duty)
-        coasts = jnp.where(self.mode == COAST, 1.0, otherwise.open)
-        return dataclasses.replace(otherwise, **stated, open=coasts)
+        opened = jnp.where(self.mode == COAST, 1.0, jnp.where(self.mode == BRAKE, -1.0, otherwise.open))
+        return dataclasses.replace(otherwise, **stated, open=opened)
 
 
 Index = Int[Array, ""] | int

@@ -130,6 +130,8 @@ class Signals(eqx.Module):
     normal: Scalar = UNSET  # normal load of one side [N]
     # supply and electrical
     duty: Scalar = UNSET  # D of the driver, its limit seen to [-]
+    pause: Scalar = UNSET  # share of a period without a pulse, 1 - |D|; 0 where the motors are open or shorted [-]
+    share_drawn: Scalar = UNSET  # of the motors' current, from the supply [-]
     total_current: Scalar = UNSET  # D I of all motors, from the supply I_s, eq. (10) [A]
     voltage_source: Scalar = UNSET  # of battery or external supply, eq. (8) [V]
     voltage: Scalar = UNSET  # U_e at the motors [V]

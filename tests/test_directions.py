@@ -10,8 +10,10 @@ from synthetic import Analyst
 
 from calibration.data.runs import Runs, read
 from calibration.discovery import discover
+from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
 from calibration.discovery.settings import settings_for
 from calibration.inference.observers import Histories, SettledRuns
+from calibration.words import loop as words
 from mmrjax import channels, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
@@ -73,6 +75,27 @@ def test_what_needs_runs_both_ways_is_looked_for_in_such_alone(kind):
     # A constant torque is directional friction in settled travel.
     only = {"directional_friction", "directional_viscous", *(["torque_offset"] if kind is Histories else [])}
     assert names[0] - names[1] == only and names[1] < names[0]
+
+
+@pytest.mark.parametrize(
+    ("supply", "duty", "below_one", "alone"),
+    [
+        ([8.0, 8.0, 8.0], [1.0, 0.5, -0.5], True, True),
+        ([8.0, 8.0, 8.0], [-1.0, 1.0, 1.0], False, False),
+        ([8.0, 6.0, 8.0], [1.0, 0.5, 0.5], True, False),
+        ([8.0, 8.0, 8.0], None, False, False),
+    ],
+)
+def test_what_a_duty_drives_is_known_and_its_effect_looked_for_in_such_alone(supply, duty, below_one, alone):
+    columns = {"configuration": np.full(3, "6T2A"), "supply_voltage_V": np.array(supply)}
+    columns |= {} if duty is None else {"duty": np.array(duty)}
+    runs = Runs("synthetic", columns)
+    assert discover.pulsed(runs) is below_one and varied_by_duty(runs) is alone
+    names = {e.name for e in discover.visible(BY_NAME, robots.nominal(), SettledRuns, True, discover.pulsed(runs))}
+    assert ("coast_decay" in names) is below_one
+    where = DiscrepancyLocation("electrical", "voltage", ("electrical",), (), 9.0, 9.0, by_duty=alone)
+    assert where.family.endswith("duty" if alone else "voltage")
+    assert words.shown_over("voltage", alone) == f"best shown over {'duty' if alone else 'voltage'}"
 
 
 @pytest.mark.nightly

@@ -2,12 +2,16 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 
-from mmrjax import balances, params
+from mmrjax import balances, energy, params, robots
 from mmrjax.conditions import Conditions
-from mmrjax.driver import STEEPNESS, Driver
+from mmrjax.driver import FAST, SLOW, STEEPNESS, Driver
 from mmrjax.effects import BY_NAME
+from mmrjax.fidelities.steady import steady_batch
+from mmrjax.robot import Configurations
+from mmrjax.shaft import Shaft
 from mmrjax.signals import State
 
 LIMITED = Driver(current_limit=5.0)
@@ -50,3 +54,69 @@ def test_supply_gives_the_duty_of_its_voltage_and_of_the_current(robot):
     signals = balances.begin(robot, run, State(3.0, 500.0, 0.4, 0.0))
     assert float(signals.total_current) == pytest.approx(2 * 3.0 * 0.25)
     assert float(balances.supply(robot, run, signals).voltage) == pytest.approx(0.25 * (24.0 - 0.5 * 1.5))
+
+
+def bench(decay, **load):
+    """k = 0.1 N·m/A, R = 5 ohm, without losses but the shaft's 0.02 N·m."""
+    shaft = Shaft(**{"inertia": 1e-3, "loss_coulomb": 0.02, **load})
+    robot = robots.blank(Configurations({"bench": shaft}), sides=1.0)
+    motor = {
+        "motor.resistance": 5.0,
+        "motor.torque_constant": 0.1,
+        "gearbox.ratio": 1.0,
+        "gearbox.efficiency_load": 1.0,
+    }
+    return dataclasses.replace(params.replace(robot, motor), driver=Driver(decay=decay))
+
+
+DUTIES = np.array([0.25, 0.5, 0.9, 1.0, -0.3, -1.0])
+
+
+def test_between_the_pulses_of_fast_decay_the_motors_coast():
+    """Mean torque |d| k (U - k ω)/R: the speed without load does not depend on the duty, and what the supply gives is
+    all of the current."""
+    runs = Conditions(voltage=8.0, duty=DUTIES)
+    found = steady_batch(bench(FAST), runs)
+    speed = np.sign(DUTIES) * (8.0 / 0.1 - 0.02 * 5.0 / (0.1**2 * np.abs(DUTIES)))
+    np.testing.assert_allclose(found.motor_speed, speed, rtol=1e-9)
+    np.testing.assert_allclose(found.motor_current, 0.2 * np.sign(DUTIES), rtol=1e-9)
+    np.testing.assert_allclose(found.total_current, 0.2, rtol=1e-9)
+    np.testing.assert_allclose(found.power_supply, 8.0 * 0.2, rtol=1e-9)
+    np.testing.assert_allclose(found.efficiency_motor, 0.1 * np.abs(speed) / 8.0, rtol=1e-9)
+    short = steady_batch(bench(SLOW), runs)
+    np.testing.assert_allclose(short.motor_speed, 80.0 * DUTIES - 10.0 * np.sign(DUTIES), rtol=1e-9)
+    whole = np.abs(DUTIES) == 1
+    for name in ("motor_speed", "power_supply", "total_current"):
+        np.testing.assert_allclose(getattr(found, name)[whole], getattr(short, name)[whole], rtol=1e-12)
+
+
+def test_a_driver_in_fast_decay_is_the_effect_of_its_name():
+    effect = dataclasses.replace(bench(SLOW), effects=(BY_NAME["coast_decay"](amplitude=1.0),))
+    runs = Conditions(voltage=8.0, duty=DUTIES)
+    speeds = [steady_batch(robot, runs).motor_speed for robot in (effect, bench(FAST))]
+    np.testing.assert_allclose(*speeds, rtol=1e-9)
+
+
+@pytest.mark.parametrize("decay", [SLOW, FAST])
+@pytest.mark.parametrize("duty", [0.3, -0.6, 0.0])
+def test_power_of_the_supply_is_what_goes_into_heat_and_motion(decay, duty):
+    """Also while a load drives the motors faster than the pulses would, and with no pulses at all."""
+    robot = bench(decay, torque_constant=-0.5)
+    for state in (State(0.4, 30.0, 30.0, 0.0), State(-0.7, 120.0, 120.0, 0.0)):
+        current = 0.0 if decay == FAST and duty == 0 else state.current
+        state = dataclasses.replace(state, current=current)
+        run = Conditions(voltage=8.0, duty=duty)
+        signals = balances.moving(robot, run, state)
+        goes = sum(float(x) for x in energy.sinks(robot, run, signals).values())
+        stored = float(signals.voltage_left * signals.current)  # in the inductance
+        inertia = robot.motor.inertia + 1e-3
+        stored += float(inertia * signals.acceleration_wheel * signals.speed_wheel)
+        assert float(energy.source(robot, run, signals)) == pytest.approx(goes + stored, abs=1e-9)
+
+
+@pytest.mark.parametrize(("opened", "current"), [(1.0, 0.0), (-1.0, -0.1 * 40.0 / 5.0), (0.0, 0.0)])
+def test_fast_decay_coasts_without_pulses_and_brakes_where_it_is_told_to(opened, current):
+    run = Conditions(voltage=8.0, duty=0.0, open=opened)
+    robot = bench(FAST)
+    signals = balances.driven(robot, run, State(current, 40.0, 40.0, 0.0), None)
+    assert float(signals.voltage_left) == pytest.approx(0.0, abs=1e-12)

@@ -70,7 +70,7 @@ SIGNAL_UNITS = {
     "H": "inductance",
     "kg·m^2": "inertia_added",
     "rad": "angle heading",
-    "-": "side duty on_tracks battery slope adhesion order direction direction_travel direction_turn efficiency_load",
+    "-": "side duty pause share_drawn on_tracks battery slope adhesion order direction direction_travel direction_turn efficiency_load",
 }
 UNIT_OF = {name: unit for unit, fields in SIGNAL_UNITS.items() for name in fields.split()}
 SENSOR_UNITS = {c.name: c.unit_si or c.unit for c in channels.EVERY}
@@ -121,6 +121,7 @@ CONDITIONS = Conditions(
     configuration=["6T2A", "4W2T", "6T2A", "4W2T", "4W2T"],
     battery=[0.0, 0.0, 1.0, 0.0, 1.0],
     discharge=[0.0, 0.0, 3000.0, 0.0, 100.0],
+    duty=[1.0, 0.8, 1.0, 1.0, 1.0],
 ).resolved(NOMINAL)
 
 
@@ -142,7 +143,12 @@ def random_states(n=400):
     turn = rng.uniform(-4, 4, n)
     lateral = -np.sign(turn) * rng.uniform(0, 5, n)  # against the turn
     return dataclasses.replace(
-        straight, side=rng.choice((-1.0, 1.0), n), yaw_rate=turn, direction_turn=np.sign(turn), moment_lateral=lateral
+        straight,
+        pause=rng.uniform(0, 1, n),
+        side=rng.choice((-1.0, 1.0), n),
+        yaw_rate=turn,
+        direction_turn=np.sign(turn),
+        moment_lateral=lateral,
     )
 
 
@@ -252,6 +258,7 @@ DRIVERS = {
     "demand": ("demand", "traction", "resistance"),
     "weight": ("normal", "mass"),
     "slope": ("slope",),
+    "duty": ("pause",),
     "configuration": ("configuration", "on_tracks"),
     "direction": ("direction",),
     "the side": ("side",),
@@ -390,7 +397,7 @@ def law_readable(effect: type[Effect]) -> None:
 #: Signals that are the same in a run in mirror image (the robot turned about on the same slope).
 EVEN = (
     *("configuration", "on_tracks", "payload", "adhesion", "battery", "discharge", "memory", "mass", "normal"),
-    *("inductance", "inertia_added", "adhesion_limit", "efficiency_load", "temperature", "duty"),
+    *("inductance", "inertia_added", "adhesion_limit", "efficiency_load", "temperature", "duty", "pause"),
 )
 
 
@@ -736,7 +743,7 @@ def test_law_rejects_mutant(law, mutant):
 #: Positions in tables of scores and in the random numbers of a bootstrap.
 ORDER = """
 mass_error mass_offset rotating_inertia supply_sag battery_sag series_resistance brush_drop winding_heating
-thermal_drift armature_inductance windage stribeck_motor iron_loss torque_constant_saturation cogging gear_load_loss
+thermal_drift coast_decay armature_inductance windage stribeck_motor iron_loss torque_constant_saturation cogging gear_load_loss
 gear_quadratic_loss stribeck_gear backdriving_loss churning stribeck_track tension_friction centrifugal_tension
 bending_loss stick_slip directional_friction stribeck_exponent directional_viscous torque_offset presliding
 angle_friction position_friction speed_rolling adhesive_drag weight_transfer sinkage slope_bias grouser_polygon rolling_radius belt_creep nonlinear_slip speed_slip load_slip pulley_eccentricity
@@ -954,7 +961,7 @@ def test_mass_offset_is_mass_of_the_wheeled_robot():
 def test_winding_heating_is_resistance_at_the_settled_temperature():
     with_it = _steady_with(winding_heating=1.0)
     for k in range(CONDITIONS.voltage.size):
-        current = float(with_it.total_current[k]) / 2
+        current = float(with_it.motor_current[k])
         rise = 7.7 * 0.611 * current**2
         hot = _steady_with({"motor.resistance": 0.611 * (1 + 0.00393 * rise)})
         np.testing.assert_allclose(with_it.motor_speed[k], hot.motor_speed[k], rtol=1e-9)
@@ -1169,6 +1176,7 @@ def test_library_declares_what_the_loop_asks_for():
     assert {e.name: e.settles_to for e in ALL if e.settles_to} == {
         "thermal_drift": "winding_heating", "torque_offset": "directional_friction",
     }  # fmt: skip
+    assert [e.name for e in ALL if e.needs_duty] == ["coast_decay"]
     assert [e.name for e in ALL if e.odd_in_travel] == [*both_ways, "slope_bias"]
     assert {e.name: e.movers for e in ALL if e.movers} == {
         "mass_offset": "wheels", "grouser_polygon": "tracks", "vibration_slip": "tracks",

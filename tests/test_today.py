@@ -328,7 +328,7 @@ def test_remarks_name_the_run_they_are_of():
 
 
 RATED = (
-    "[gearbox]\ntorque_limit = 4.5\nmesh_theory = true\n[driver]\nreturns_current = false\n[battery]\n"
+    "[gearbox]\ntorque_limit = 4.5\nmesh_theory = true\n[driver]\nreturns_current = false\ndecay = 'fast'\n[battery]\n"
     "voltage_charge = 4.25\nvoltage_cutoff = 3.2\ndelay_cutoff = 2.0\ncurrent_limit = 30\ncurrent_charge = 2\n"
 )
 
@@ -339,6 +339,7 @@ def test_rated_limits_and_switches_are_read_and_written(tmp_path):
     (tmp_path / "mine.toml").write_text(RATED)
     robot = robot_file.read(tmp_path / "mine.toml")
     assert (robot.gearbox.torque_limit, robot.gearbox.mesh_theory, robot.driver.returns_current) == (4.5, True, False)
+    assert robot.driver.decay == "fast"
     battery = robot.battery
     assert (battery.voltage_charge, battery.voltage_cutoff, battery.delay_cutoff) == (4.25, 3.2, 2.0)
     assert (battery.current_limit, battery.current_charge) == (30.0, 2.0)
@@ -354,6 +355,8 @@ def test_rated_limits_and_switches_are_read_and_written(tmp_path):
     [
         ({"gearbox.mesh_theory": 1}, r"mine.toml, gearbox.mesh_theory: got 1; expected true or false \(load driving"),
         ({"driver.returns_current": "no"}, "driver.returns_current: got 'no'; expected true or false"),
+        ({"driver.decay": "coast"}, r"mine.toml, driver.decay: got 'coast'; expected slow or fast \(between pulses"),
+        ({"driver.decay": ["fast"]}, r"driver.decay: got \['fast'\]; expected slow or fast"),
         ({"gearbox.torque_limit": -1}, "gearbox.torque_limit: got -1; expected a number, 0.001 to"),
         (
             {"battery.voltage_cutoff": 4.5},

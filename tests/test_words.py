@@ -481,7 +481,9 @@ def test_verdict_tells_what_is_tentative():
     )
     # where no name stands and it was not tested by itself, what speaks against all of them
     curve = NameSupport(False, "curve alone", curves=(OVER,))
-    place = SimpleNamespace(place="slip", variable="slope", alike=("slip",), variables_alike=(), family="slip")
+    place = SimpleNamespace(
+        place="slip", variable="slope", alike=("slip",), variables_alike=(), family="slip", by_duty=False
+    )
     only = Missing(("b",), (), ("slip",), False)
     said = loop.statement(Summary("unnamed", 0.001, place, (only,), support=curve))
     assert "no effect of the library is established" in said

@@ -195,6 +195,24 @@ def test_more_runs_are_said_within_reach(reach, variable, said):
     )
 
 
+@pytest.mark.parametrize(
+    ("reach", "variable", "said"),
+    [
+        (BENCH, "voltage", "Repeat with the duty in 15 even steps up to 0.9 at 12 V"),
+        (BENCH, "speed", "Repeat with the duty in 15 even steps from crawl to 0.9 at 12 V"),
+        (ONE, "voltage", "Repeat at one slope and payload with the duty in 15 even steps up to 0.9 at 12 V"),
+        (
+            ONE,
+            "speed_motor",
+            "Repeat on the level, unladen, with the duty in 15 even steps from crawl to 0.9 at 12 V",
+        ),
+    ],
+)
+def test_runs_that_a_duty_drives_are_repeated_over_the_duty(reach, variable, said):
+    reach = dataclasses.replace(reach, duties=(0.3, 0.9))
+    assert words.instruction(more_runs("slip", variable, reach, by_duty=True)).startswith(f"{said}; ")
+
+
 def test_every_kind_of_runs_has_words():
     reaches = (REACH, ONE, BENCH, DRIVEN)
     assert {e.doing for r in reaches for e in menu.menu(r) if isinstance(e, menu.Run)} == set(words.DOING)

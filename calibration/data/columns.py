@@ -35,6 +35,8 @@ ROWS = 4000
 #: backward; and how they are driven: by that share, or not, their terminals shorted or their circuit open.
 DUTY: dict[str, tuple[float, float]] = {"duty": (-1.0, 1.0)}
 DRIVEN = ("voltage", "brake", "coast")
+#: The motors' circuit in each of these modes, see `Conditions.open`.
+CIRCUITS = dict(zip(DRIVEN, (0.0, -1.0, 1.0), strict=True))
 DRIVING = ("duty", "mode")
 #: What a table may state of a robot whose sides are driven apart: the shares of the supply's voltage that the motors
 #: of either side get; and where it heads at the start, from uphill, positive to the left.

@@ -45,6 +45,7 @@ _STATED = {
     "settles_to": str,
     "needs_battery": bool,
     "needs_reverse": bool,
+    "needs_duty": bool,
     "odd_in_travel": bool,
     "movers": str,
     "memory_unit": str,

@@ -19,6 +19,7 @@ from calibration.data.errors import BadConfiguration, choices, is_number, number
 from calibration.data.input_files import toml_content, toml_text
 from calibration.data.writing import write_text
 from mmrjax import effects, params, power, robots
+from mmrjax.driver import DECAYS
 from mmrjax.effects.scaled import scaled
 from mmrjax.robot import Configurations, Robot
 from mmrjax.shaft import Shaft
@@ -61,6 +62,8 @@ SWITCHES = {
     "gearbox.mesh_theory": "load driving the motor loses 2 - 1/η of the mesh's theory, else η",
     "driver.returns_current": "supply and driver take back what the motors return, else a diode blocks it",
 }
+#: What a robot is, in words, which no fit can free: those that there are, meaning.
+CHOICES = {"driver.decay": (DECAYS, "between pulses the driver shorts the motors (slow) or lets them coast (fast)")}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,7 +140,7 @@ def parse(path: Path, library: Library = effects.BY_NAME, notes: list[str] | Non
             tables. One that the base does not have states `like`, the base's configuration that it starts from, or
             `movers` (`tracks` or `wheels`) or `load` (see `rig_file.LOADS`) and every parameter that has no default.
         parameters: in tables by dotted name in SI units, e.g. `[motor] resistance = 0.9`, or with the sd of their
-            prior as `"0.9 ± 5 %"`; RATINGS; and SWITCHES, true or false.
+            prior as `"0.9 ± 5 %"`; RATINGS; SWITCHES, true or false; and CHOICES.
         effects: one is present when its table `[effects.NAME]` is, which may name the `configurations` that it acts
             on, and by `scaled` how its priors and limits compare to the library's (see `effects.scaled`).
 
@@ -306,7 +309,7 @@ def current_values(values: Mapping[str, T], robot: Robot, where: str, notes: lis
 
 
 def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str] | None = None) -> Robot:
-    """The robot with parameters replaced, each checked; `sides`, `battery.cells`, RATINGS and SWITCHES too.
+    """The robot with parameters replaced, each checked; `sides`, `battery.cells`, RATINGS, SWITCHES and CHOICES too.
 
     Args:
         values: by dotted name [SI]; where: opens the message of an error; notes: as for `find`.
@@ -316,10 +319,11 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
     """
     stated = current_values(values, robot, where, notes)
     counts = {name: _count(where, name, stated.pop(name)) for name in COUNTS if name in stated}
-    ratings = {name: _rating(where, name, stated.pop(name)) for name in RATINGS if name in stated}
+    ratings: dict[str, Any] = {name: _rating(where, name, stated.pop(name)) for name in RATINGS if name in stated}
     if CURVE & stated.keys() and "battery.capacity" in stated:  # all of one cell, unless it is said otherwise
         ratings.setdefault("battery.capacity_curve", stated["battery.capacity"])
     ratings |= {name: _switch(where, name, stated.pop(name)) for name in SWITCHES if name in stated}
+    ratings |= {name: _choice(where, name, stated.pop(name)) for name in CHOICES if name in stated}
     known = {p.name: p for p in params.walk(robot)}
     refused = [f"{name}: {why}" for name, value in stated.items() if (why := _refused(name, value, known))]
     if refused:
@@ -378,6 +382,13 @@ def _with_backlash(robot: Robot, where: str) -> Robot:
 def _switch(where: str, name: str, value: Any) -> bool:
     if not isinstance(value, bool):
         raise BadConfiguration(f"{where}, {name}: got {value!r}; expected true or false ({SWITCHES[name]})")
+    return value
+
+
+def _choice(where: str, name: str, value: Any) -> str:
+    allowed, what = CHOICES[name]
+    if value not in allowed:
+        raise BadConfiguration(f"{where}, {name}: got {value!r}; expected {' or '.join(allowed)} ({what})")
     return value
 
 
@@ -491,6 +502,10 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
         switch = getattr(getattr(robot, part), key)
         if whole or switch != getattr(getattr(nothing, part), key):
             tables.setdefault(part, []).append(f"{key} = {str(switch).lower()}  # {what}")
+    for name, (_, what) in CHOICES.items():
+        part, _, key = name.partition(".")
+        if (choice := getattr(getattr(robot, part), key)) != getattr(getattr(nothing, part), key):
+            tables.setdefault(part, []).append(f"{key} = {json.dumps(choice)}  # {what}")
     lines = [f"# {line}" for line in note.splitlines()]
     lines += [f'schema = "{SCHEMA}"', f'base = "{"nominal" if whole else rig_file.NONE}"']
     lines += [f"sides = {int(robot.sides)}  # motors driven alike", *head]

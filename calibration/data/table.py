@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.data import sides, surfaces
-from calibration.data.columns import DRIVEN, DUTY, HEADING, IMPOSED, LEVERS, SUPPLY, TIME, Layout
+from calibration.data.columns import CIRCUITS, DRIVEN, DUTY, HEADING, IMPOSED, LEVERS, SUPPLY, TIME, Layout
 from calibration.data.errors import BadData, choices
 from mmrjax import channels
 from mmrjax.channels import Channel
@@ -246,7 +246,7 @@ class Runs:
             total_mass=self["total_mass_kg"] if self.has("total_mass_kg") else None,
             order=self["order"] if self.has("order") else 0.0,
             duty=np.where(held, 0.0, self["duty"] if self.has("duty") else 1.0),
-            open=self["mode"] == "coast" if self.has("mode") else 0.0,
+            open=[CIRCUITS[mode] for mode in self["mode"]] if self.has("mode") else 0.0,
             motor_speed=self[column] * factor if robot.rig.imposed == "motor_speed" else None,
             motor_current=self[column] * factor if robot.rig.imposed == "motor_current" else None,
         )

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import own_mass
-from calibration.data.columns import ROWS, WHEN
+from calibration.data.columns import ROWS, SIDES, WHEN
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
@@ -29,7 +29,7 @@ from calibration.discovery.discrepancy import CurveBeside, locate
 from calibration.discovery.experiments import Proposal, denser, no_menu, separating
 from calibration.discovery.hidden import hidden
 from calibration.discovery.kept import Keep
-from calibration.discovery.location import DiscrepancyLocation
+from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
 from calibration.discovery.notes import (
     AssumedNoise,
     Copies,
@@ -424,10 +424,11 @@ def trace(
 
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
     beside, predicted = CurveBeside(space, base, left, bases), Predicted()
+    where = dataclasses.replace(beside.where, by_duty=varied_by_duty(runs))
     model, searched, stood = choose(runs, screened, left, searched, settings, progress, beside, predicted)
     stages = functools.partial(LoopStages, beside=beside, predicted=predicted)
     if model is None:
-        return stages("unnamed", screened, left, sds, searched, where=beside.where, standing=stood)
+        return stages("unnamed", screened, left, sds, searched, where=where, standing=stood)
 
     searched = dataclasses.replace(searched, best=model[0], diagnosis=model[1])
     best, after = model
@@ -435,7 +436,7 @@ def trace(
     progress(Step("alike", (best.effects,)))
     alike = classes(space, base, best, searched.ladder, left, settings)
     if not any(named):
-        return stages("unnamed", screened, left, sds, searched, alike, beside.where, standing=stood)
+        return stages("unnamed", screened, left, sds, searched, alike, where, standing=stood)
     compared: tuple[HeldOutAlternative, ...] = ()
     if settings.prefer == HELD_OUT:
         progress(Step("held out"))
@@ -527,18 +528,22 @@ def pose(
     names = priors.free_names(robot, runs.configurations_named(robot), *kind.free())
     coordinates = priors.coordinates(robot, names, dict(stated or {}), any_surface=True)
     bare = observers.pose(runs.where(index), robot, coordinates, sd[index])
-    shown = visible(library, robot, kind, both_ways(runs))
+    shown = visible(library, robot, kind, both_ways(runs), pulsed(runs))
     space = candidate_space(bare, shown, library, settings.slots, settings.width)
     return space.without(~real)
 
 
 def visible(
-    library: Library, robot: Robot, kind: type[observers.Observer], either_way: bool = True
+    library: Library,
+    robot: Robot,
+    kind: type[observers.Observer],
+    either_way: bool = True,
+    at_duties: bool = False,
 ) -> tuple[Effect, ...]:
     """The effects of a library that such data can show and the robot does not have yet.
 
     Args:
-        either_way: whether the runs go both ways, see `both_ways`.
+        either_way: whether the runs go both ways, see `both_ways`; at_duties: see `pulsed`.
     """
     have = {e.name for e in robot.effects}
     return tuple(
@@ -548,7 +553,14 @@ def visible(
         and kind.shows(effect)
         and scales.present(effect, robot)
         and (either_way or not effect.needs_reverse)
+        and (at_duties or not effect.needs_duty)
     )
+
+
+def pulsed(runs: Runs) -> bool:
+    """True if some runs have a duty below 1."""
+    duties = [runs[name] for name in ("duty", *SIDES) if runs.has(name)]
+    return any((np.abs(x) < 1).any() for x in duties)
 
 
 def both_ways(runs: Runs) -> bool:

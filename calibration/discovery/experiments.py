@@ -322,14 +322,15 @@ def choose(seen: PredictedReadings) -> Proposal:
 SERIES, REPEATS = 15, 3
 
 
-def more_runs(place: str, variable: str, within: Reach) -> MoreRuns:
+def more_runs(place: str, variable: str, within: Reach, by_duty: bool = False) -> MoreRuns:
     """How the variable of a curve is covered more densely, within reach of the table."""
     volts = within.voltages
     low, high = (volts[0], volts[-1]) if volts[-1] > volts[0] else (menu.round_significant(0.5 * volts[0]), volts[0])
     slope = max(u.steepest for u in within.used)
     payload = max(u.payloads[-1] for u in within.used)
     step, angle, mass = (menu.round_significant(x / (SERIES - 1), 1) for x in (high - low, slope, payload))
-    return MoreRuns(place, variable, SERIES, low, high, volts[-1], slope, payload, (step, angle, mass), within)
+    steps = step, angle, mass
+    return MoreRuns(place, variable, SERIES, low, high, volts[-1], slope, payload, steps, within, by_duty)
 
 
 def denser(space: CandidateSpace, where: DiscrepancyLocation, settings: Settings) -> Proposal:
@@ -346,7 +347,7 @@ def denser(space: CandidateSpace, where: DiscrepancyLocation, settings: Settings
     name = f"steady speeds for {variable}" if variable in bases.ORDERS else f"finer steps in {variable}"
     name = name if bases.window(variable) is None else "the same runs again"
     curve = f"curve of the {bases.in_words(where.place)} over {variable}"
-    return Proposal((name,), more_runs(where.place, variable, within), (curve,), sigma, False, ())
+    return Proposal((name,), more_runs(where.place, variable, within, where.by_duty), (curve,), sigma, False, ())
 
 
 def no_menu(space: CandidateSpace) -> Proposal:

@@ -5,8 +5,19 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import numpy as np
+
+from calibration.data.columns import SUPPLY
+from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
 from mmrjax.effects.base import EQUATION, THE_SIDE
+
+
+def varied_by_duty(runs: Runs) -> bool:
+    """True if the motors' voltage varies in a table with the duty alone, at one supply voltage."""
+    if not (runs.has("duty") and runs.has(SUPPLY)):
+        return False
+    return len(np.unique(np.abs(runs["duty"]))) > 1 and len(np.unique(np.abs(runs[SUPPLY]))) == 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,6 +32,7 @@ class DiscrepancyLocation:
             what happens for a while one along each axis.
         explained: what the curves of that balance and variable explain [σ²]; strongest: what the most improbable
             family does.
+        by_duty: whether the motors' voltage varied with the duty alone.
     """
 
     place: str
@@ -29,6 +41,7 @@ class DiscrepancyLocation:
     variables_alike: tuple[str, ...]
     explained: float
     strongest: float
+    by_duty: bool = dataclasses.field(default=False, kw_only=True)
 
     @property
     def balance(self) -> str:
@@ -53,6 +66,7 @@ class DiscrepancyLocation:
         what = bases_room.in_words(self.place) if self.channel else EQUATION[self.balance]
         drivers = {"speed_motor": "speed", "current": "current" if self.balance == "electrical" else "load"}
         drivers |= {"payload": "load", "slope": "demand" if self.balance == "slip" else "slope"}
+        drivers |= {"voltage": "duty"} if self.by_duty else {}
         drivers |= {"yaw_rate": "speed", "side": THE_SIDE}
         return f"{what} that changes with {drivers.get(variable, variable)}"
 

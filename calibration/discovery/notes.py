@@ -397,7 +397,7 @@ class MoreRuns:
         runs: of the series.
         low, high: voltages that it goes between, top: the highest that the table used [V].
         slope [deg], payload [kg]: up to which it may go; steps: of voltage, slope and payload.
-        within: reach of the table.
+        within: reach of the table; by_duty: whether it varied the duty at one supply voltage.
     """
 
     place: str
@@ -410,6 +410,7 @@ class MoreRuns:
     payload: float
     steps: tuple[float, float, float]
     within: Reach
+    by_duty: bool = False
 
 
 @dataclasses.dataclass(frozen=True)

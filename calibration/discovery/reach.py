@@ -67,6 +67,7 @@ class Reach:
         imposed: on the motors, see `Rig`; levels: of speed [rad/s] or current [A] that the table
             used, where these are imposed.
         has_ground: whether a ground carries it.
+        duties: sizes of the driver's duty that the table used [-].
     """
 
     used: tuple[Used, ...]
@@ -86,6 +87,7 @@ class Reach:
     imposed: str = "voltage"
     levels: tuple[float, ...] = ()
     has_ground: bool = True
+    duties: tuple[float, ...] = ()
 
     @property
     def voltages(self) -> tuple[float, ...]:
@@ -133,7 +135,7 @@ def reach(robot: Robot, conditions: Conditions, measured: tuple[str, ...]) -> Re
         used, measured, voltage, min(voltage, constant * geared), min(voltage, constant * alone), current,
         motor_speed, speed, geared, alone, motors, resistance, constant, motor.temperature_limit, robot.rig.imposed,
         _levels(np.asarray(getattr(conditions, robot.rig.imposed))) if conditions.voltage_follows else (),
-        robot.has_ground,
+        robot.has_ground, _levels(np.abs(np.asarray(conditions.duty))),
     )  # fmt: skip
 
 

@@ -22,6 +22,7 @@ COMPARE = "Read a second instrument beside that of the {}, at several values"
 VARY = {
     "speed": "the speed (the supply voltage)", "current": "the current (slope or payload at one voltage)",
     "load": "the load (slope or payload at one voltage)", "slope": "the slope", "weight": "the payload",
+    "duty": "the duty at one supply voltage",
     "configuration": "the configuration", "direction": "the direction of travel",
     "demand": "the demand on adhesion (slope or payload)", "angle": "nothing: sample fast enough to see a turn",
     THE_SIDE: "nothing: compare the sides in straight travel and in turns both ways",
@@ -47,6 +48,7 @@ def declared(effect: type[Effect]) -> Iterator[str]:
         f"settles to `{effect.settles_to}`" * bool(effect.settles_to),
         "on the battery alone" * effect.needs_battery,
         "in runs both ways alone" * effect.needs_reverse,
+        "at a duty below 1 alone" * effect.needs_duty,
         "odd in travel" * effect.odd_in_travel,
         f"on {effect.movers} alone" * bool(effect.movers),
         f"rests on `{', '.join(effect.rests_on)}`" * bool(effect.rests_on),

@@ -198,6 +198,15 @@ def _again(happens: bases.Window) -> str:
     )
 
 
+def _steps(what: MoreRuns, first: str = "") -> str:
+    """`the supply voltage in 15 even steps up to 8 V`: what drives the motors, as the table varied it."""
+    begun = f" from {first}" if first else ""
+    if what.by_duty:
+        most = max(what.within.duties)
+        return f"the duty in {what.runs} even steps{begun} {'to' if first else 'up to'} {most:g} at {what.top:g} V"
+    return f"the supply voltage in {what.runs} even steps{begun} {'to' if first else 'up to'} {what.top:g} V"
+
+
 def _usual(what: MoreRuns) -> dict[str, str]:
     """By variable, of a vehicle whose voltage is imposed."""
     low, high, within = what.low, what.high, what.within
@@ -205,13 +214,16 @@ def _usual(what: MoreRuns) -> dict[str, str]:
     load += [f"a slope up to {what.slope:g} deg"] * bool(what.slope > 0)
     loaded = " and ".join(load) or "a brake or a drawbar pull"
     volts, angle, mass = what.steps
+    by_duty = what.by_duty
+    driven = f"the supply voltage from {low:g} to {high:g} V in steps of {volts:g} V"
+    crawl = (
+        _steps(what, "crawl") if by_duty else f"the supply voltage in steps of {volts:g} V from crawl to {high:g} V"
+    )
     return {
-        "voltage": f"Repeat at one slope and payload with the supply voltage from {low:g} to {high:g} V in steps of "
-        f"{volts:g} V",
+        "voltage": f"Repeat at one slope and payload with {_steps(what) if by_duty else driven}",
         "current": f"Repeat at {high:g} V with {loaded}, raised in small steps, so that the current rises evenly "
         f"from no load to its largest, some {within.current * within.motors:.2g} A",
-        "speed_motor": f"Repeat on the level, unladen, with the supply voltage in steps of {volts:g} V from crawl to "
-        f"{high:g} V",
+        "speed_motor": f"Repeat on the level, unladen, with {crawl}",
         "slope": f"Repeat at one voltage and payload with the slope from 0 to {what.slope:g} deg in steps of "
         f"{angle:g} deg, and downhill",
         "payload": f"Repeat at one voltage and slope with the payload from 0 to {what.payload:g} kg in steps of "
@@ -247,9 +259,9 @@ def _of_level(what: MoreRuns) -> dict[str, str]:
 
 def _of_shaft(what: MoreRuns) -> dict[str, str]:
     """By variable, where the load is a shaft."""
-    crawl = f"Repeat with the supply voltage in {what.runs} even steps from crawl to {what.top:g} V"
+    crawl = f"Repeat with {_steps(what, 'crawl')}"
     return {
-        "voltage": f"Repeat with the supply voltage in {what.runs} even steps up to {what.top:g} V",
+        "voltage": f"Repeat with {_steps(what)}",
         "speed_motor": crawl,
         "speed": crawl,
         "current": f"Repeat at {what.top:g} V with a brake that is raised in {what.runs} even steps",

@@ -118,16 +118,17 @@ def _without_name(where: DiscrepancyLocation, p: float, no_effect: str) -> str:
     others = [bases.in_words(p).removesuffix(" balance") for p in where.alike if p != where.place]
     also = f" (or {', '.join(others)}, which act alike in these data)" if others else ""
     what = f": {where.family}" if where.variable in bases.VARIABLES else ""
-    well = [shown_over(v).removeprefix("best shown ") for v in where.variables_alike]
-    over = shown_over(where.variable) + (f" (as well {', '.join(well)})" if well else "")
+    well = [shown_over(v, where.by_duty).removeprefix("best shown ") for v in where.variables_alike]
+    over = shown_over(where.variable, where.by_duty) + (f" (as well {', '.join(well)})" if well else "")
     return (
         f"Something is missing in the {bases.in_words(where.place)}{also}, {over}{what}; no effect of the library "
         f"{no_effect} (family-wise p {p_value(p)})."
     )
 
 
-def shown_over(variable: str) -> str:
-    """Where a discrepancy shows."""
+def shown_over(variable: str, by_duty: bool = False) -> str:
+    """Where a discrepancy shows; `by_duty`: the motors' voltage varied with the duty alone."""
+    variable = "duty" if by_duty and variable == "voltage" else variable
     happens = bases.window(variable)
     if variable == "side":
         return "unlike on the two sides"

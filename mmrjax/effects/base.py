@@ -68,6 +68,7 @@ class Effect(eqx.Module):
             shows it.
         needs_reverse: whether runs one way alone cannot tell it from a parameter of the robot, so that no such table
             shows it.
+        needs_duty: whether it acts at a duty below 1 alone.
         odd_in_travel: whether it keeps its sign in space and not in the frame of travel, as a wrong slope does:
             a robot that travels backward, looked at so that its travel is forward again, meets minus its amplitude.
         resolved: whether the track model has by itself what it stands for.
@@ -94,6 +95,7 @@ class Effect(eqx.Module):
     settles_to: ClassVar[str] = ""
     needs_battery: ClassVar[bool] = False
     needs_reverse: ClassVar[bool] = False
+    needs_duty: ClassVar[bool] = False
     odd_in_travel: ClassVar[bool] = False
     resolved: ClassVar[bool] = False
     movers: ClassVar[str] = ""

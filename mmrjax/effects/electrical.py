@@ -157,3 +157,29 @@ class ThermalDrift(ElectricalEffect):
             return jnp.zeros_like(signals.current)
         drop = robot.motor.voltage_winding(signals.current)
         return self.amplitude * robot.motor.temperature_coefficient * self.recall(robot, signals) * drop
+
+
+class CoastDecay(ElectricalEffect):
+    """ΔU = -a (1 - |D|) E: between the pulses of a duty D the motors are left to coast, for a share a of the pauses.
+
+    A driver in fast decay, whose current ends within each period: the mean torque is in proportion to the duty, and
+    the speed without load does not depend on it.
+
+    Source: Mohan, Undeland and Robbins, Power Electronics (2003), chapter 7: discontinuous conduction, with pulses
+    and pauses long against L/R (see `driver.Driver`, whose `decay = "fast"` is a = 1, and where the supply's current
+    and the heat of the pulses follow too). At full duty it is absent, as where the motors are open or shorted.
+    """
+
+    driver = "duty"
+    needs_duty = True
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="share of the pauses between pulses in which the motors coast",
+        bounds=(-0.2, 1.2),
+        sd=0.5,
+        source="0 slow decay, 1 fast decay with the current ending at once",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return -self.amplitude * signals.pause * robot.motor.voltage_back(signals.speed_motor)

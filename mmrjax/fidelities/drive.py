@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from mmrjax import balances
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
+from mmrjax.driver import FAST
 from mmrjax.fidelities import turning
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
 from mmrjax.fidelities.rest import holds, standing, status_moving, voltage_at_rest
@@ -149,7 +150,8 @@ def _initial(robot: Robot, conditions: Conditions) -> Array:
     rolling = radius * turning / robot.gearbox.ratio
     left = voltage_at_rest(robot, conditions)
     if conditions.motor_current is None:  # whose amplifier makes up for it
-        left = left - robot.motor.voltage_back(turning)
+        share = jnp.abs(conditions.duty) if robot.driver.decay == FAST else 1.0
+        left = left - share * robot.motor.voltage_back(turning)
     open_circuit = (conditions.open > 0.5) | (conditions.motor_speed is not None)
     current = jnp.where(open_circuit, 0.0, left / robot.motor.resistance)
     return jnp.stack([jnp.asarray(x, float) for x in (current, turning, rolling, radius * begin.angle)])

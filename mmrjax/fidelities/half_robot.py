@@ -188,7 +188,7 @@ def current_after(robot: Robot, conditions: Conditions, step: Scalar, signals: S
     """
 
     def left(current: Scalar) -> Scalar:
-        total = signals.total_current + robot.sides * signals.duty * (current - signals.current)
+        total = signals.total_current + robot.sides * signals.share_drawn * (current - signals.current)
         shifted = dataclasses.replace(signals, current=current, total_current=total)
         return balances.electrical(robot, conditions, balances.supply(robot, conditions, shifted)).voltage_left
 

@@ -118,6 +118,7 @@ def instant(
     signals = balances.moving(asked.robot, asked.conditions, state)
     winding, housing = (y[k] * UNITS[k] for k in (WINDING, HOUSING))
     copper = robot.motor.voltage_winding(signals.current, winding) * signals.current
+    copper = copper * robot.driver.ripple(signals.duty)
     heating = robot.heating(copper, winding, housing)
     still = jnp.where(stands, 0.0, 1.0)
     rates = [
@@ -154,7 +155,8 @@ def slowness(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
 
 def drawn(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     robot, state = asked.robot, state_of(asked.robot, y, stands)
-    motors = robot.sides * state.current * robot.driver.duty_limited(asked.conditions.duty, state.current)
+    duty = robot.driver.duty_limited(asked.conditions.duty, state.current)
+    motors = robot.sides * state.current * robot.driver.share_drawn(duty)
     return motors, state.discharge
 
 

@@ -108,6 +108,7 @@ def instant(
     signals = travel.signals
     winding, housing = (y[k] * _EACH[2] for k in (WINDING, HOUSING))
     copper = robot.motor.voltage_winding(signals.current, winding) * signals.current
+    copper = copper * robot.driver.ripple(signals.duty)
     still = jnp.where(stands, 0.0, 1.0)
     rates = [
         signals.voltage_left / signals.inductance,
@@ -160,7 +161,7 @@ def slowness(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
 def drawn(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     robot, motion = asked.robot, state_of(asked.robot, y, stands)
     duty = robot.driver.duty_limited(asked.conditions.of_sides().duty, motion.current)
-    return robot.sides * total(jnp.asarray(motion.current * duty)) / 2, motion.discharge
+    return robot.sides * total(jnp.asarray(motion.current * robot.driver.share_drawn(duty))) / 2, motion.discharge
 
 
 def stored(robot: Robot, found: Found) -> Scalar:

@@ -24,11 +24,11 @@ CURRENT_SMALL = 1e-3
 def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
     """Readings, power chain of Fig. 4 and exceeded limits of one instant; what is not known of a rig is NaN."""
     sides = robot.sides
-    power_supply = sides * signals.voltage * signals.current
+    power_supply = balances.power_drawn(robot, signals)
     power_motor = sides * signals.torque_motor * signals.speed_motor
     power_gear = sides * signals.torque_gear * signals.speed_wheel
     power_ground = sides * signals.traction * signals.speed
-    temperature = robot.motor.temperature_settled(signals.current)
+    temperature = robot.motor.temperature_settled(signals.current * robot.driver.ripple(signals.duty) ** 0.5)
     limit = robot.motor.temperature_limit
     hot = (temperature > limit) & (limit < UNLIMITED) & robot.knows(channels.HEAT)  # settled or not
     flags = mask({**exceeded(robot, signals), "winding_hot": hot})

@@ -53,8 +53,10 @@ SETTLING = 7
 #: it has ended [units]; looks after which it is given up; and how far the last step may be from where it ended.
 ALONG, NEAR, SOON, CLOSE = 1e-6, 1e-7, 60, 1e-6
 #: Of the second: implicit Euler's first step, its shortest and longest [s]; by what the next is longer, and shorter
-#: where the rates grew by more than `WORSE`, or an unknown changed by more than `FAR` units.
-FIRST, SHORTEST, LONGEST, LONGER, SHORTER, WORSE, FAR = 0.05, 1e-6, 1e9, 3.0, 0.25, 1.05, 0.1
+#: where the rates grew by more than `WORSE`, or an unknown changed by more than `FAR` units. The shortest is taken
+#: whatever the rates do: it follows the run, along which they may grow, as where friction or the gearbox's flow of
+#: power turns round.
+FIRST, SHORTEST, LONGEST, LONGER, SHORTER, WORSE, FAR = 0.05, 1e-4, 1e9, 3.0, 0.25, 1.05, 0.1
 #: So many are followed at once, as few members of a batch need it.
 FEW = 32
 #: It has ended at a change so small where the rates are small too [1/s] or the step is long [s]; and failed after so
@@ -230,8 +232,8 @@ def _settled(robot: Robot, conditions: Conditions) -> tuple[PlaneMotion, Float[A
     """The motion of a settled turn on level ground, its loads, see `turning.grip`, and whether it was found.
 
     Broyden's method, which looks along each unknown first, finds most. Where it does not end, or at a turn that is
-    not stable, implicit Euler's steps, longer and longer, follow a run to where it settles, and none is taken that
-    lets the rates grow. The last step is Newton's and carries the derivatives, which are the implicit ones.
+    not stable, implicit Euler's steps, longer and longer, follow a run to where it settles. Only the shortest of them
+    may let the rates grow. The last step is Newton's and carries the derivatives, the implicit ones.
     """
     size = SETTLING + len(SIDES)
     moves = np.arange(size) >= (0 if conditions.of_sides().motor_speed is None else 4)
@@ -290,6 +292,7 @@ def _settled(robot: Robot, conditions: Conditions) -> tuple[PlaneMotion, Float[A
         slope, found = around(*held[:2], next_y)
         before, after = jnp.linalg.norm(search.rates), jnp.linalg.norm(found)
         worse = (~(after <= WORSE * before + SMALL) | (largest > FAR)) & (search.turns > 0)
+        worse &= search.step > SHORTEST
         ended = ~worse & (largest < SMALL) & ((search.step > LONG) | (after < SMALL_RATE))
         y, found, slope = (
             jnp.where(worse, old, new)

@@ -23,6 +23,7 @@ from calibration.words import fits
 from calibration.words.notes import sentences
 from mmrjax import channels
 from mmrjax.channels import HEAT, Channel
+from mmrjax.driver import FAST
 from mmrjax.errors import counted
 from mmrjax.motor import UNLIMITED
 from mmrjax.robot import Robot
@@ -73,10 +74,12 @@ class RigCheck:
             "free": "start as a fit finds",
         }
         delay = float(rig.delay)
+        late = f", {delay:g} s late" if delay else ""
         lines = ", on straight lines between the rows of histories" * (rig.between_rows == "linear")
+        coasts = "; between the pulses of a duty the motors coast" * (self.robot.driver.decay == FAST)
         return [
             f"{motors}, through {gear}, {loads}.",
-            f"Imposed is {imposed}{f', {delay:g} s late' if delay else ''}{lines}; histories {starts[rig.start]}.",
+            f"Imposed is {imposed}{late}{lines}{coasts}; histories {starts[rig.start]}.",
         ]
 
     def remarks(self) -> list[str]:
