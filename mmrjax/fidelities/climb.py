@@ -49,6 +49,8 @@ GAIN, PATIENCE = 5e-3, 2.0
 ON_GROUND = 4e-4
 #: A belt slower than this [m/s] stands; a body that bears more than this share of the weight hangs.
 STANDS, BEARS = 5e-3, 0.1
+#: Contacts that bear less than this share of the weight do not carry the robot: it falls or bounces.
+CARRIED = 0.5
 #: Time in which levers come to their rate and near their angle [s], and rate below which they are let stand [rad/s].
 _SWINGS, _STILL = 0.03, 5e-3
 LED = np.array([FRONT, REAR])
@@ -127,8 +129,9 @@ class Passed(eqx.Module):
         stored: in motion, height, contacts and windings, of the whole robot [J].
         body: share of all normal force that the body bears [-].
         grip: share of what its friction could hold that the ground gives to all that rolls [-].
-        centre: x of the centre of mass [m]; base: how far the outermost contacts are behind and ahead of it [m], of
-            a sample the furthest, as contacts that leave the ground for some steps bear nevertheless.
+        centre: x of the centre of mass [m]; base: how far the outermost contacts are behind and ahead of it [m], -inf
+            while contacts do not carry the robot; of a sample the furthest, as contacts that leave the ground for
+            some steps bear nevertheless.
     """
 
     time: Scalar
@@ -150,9 +153,10 @@ class Passed(eqx.Module):
 
     @property
     def margin(self) -> Scalar:
-        """How far gravity's line through the centre of mass is within the outermost contacts [m]; 0 without any."""
+        """Distance by which gravity's line through the centre of mass is within the outermost contacts [m]; NaN of a
+        robot that falls or bounces."""
         least = jnp.min(self.base, axis=-1)
-        return jnp.where(jnp.isfinite(least), least, 0.0)
+        return jnp.where(jnp.isfinite(least), least, jnp.nan)
 
 
 class System(eqx.Module):
@@ -442,14 +446,17 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
         body=jnp.sum(at.force * (1 - at.rolls)) / jnp.maximum(total, 1e-9),
         grip=jnp.sum(jnp.abs(pulled.force) * at.rolls) / jnp.maximum(held, 1e-9),
         centre=centre,
-        base=_base(centre, at),
+        base=_base(centre, at, CARRIED * GRAVITY * matrix[0, 0]),
     )
     return after, spent, passed
 
 
-def _base(centre: Scalar, at: Footing) -> Float[Array, " 2"]:
-    """How far the outermost contacts are behind and ahead of the centre of mass [m], level ground assumed below."""
-    bears, ahead = at.force > 0, at.place - centre
+def _base(centre: Scalar, at: Footing, least: Scalar) -> Float[Array, " 2"]:
+    """Distances of the outermost contacts behind and ahead of the centre of mass [m], level ground assumed below.
+
+    -inf where all contacts together bear less than `least` [N].
+    """
+    bears, ahead = (at.force > 0) & (jnp.sum(at.force) >= least), at.place - centre
     return jnp.stack([jnp.max(jnp.where(bears, way, -jnp.inf)) for way in (-ahead, ahead)])
 
 
@@ -557,7 +564,8 @@ def sampled(run: System, state: Any, first: Scalar, steps: Scalar, samples: int)
         def small(j: Array, carry: Any) -> Any:
             *after, passed = advance(run, carry[0], first + (k * steps + j) * run.step, carry[1])
             base = jnp.maximum(passed.base, carry[2].base)
-            return (*after, dataclasses.replace(passed, base=base))
+            carried = (j < steps - 1) | jnp.all(jnp.isfinite(passed.base))  # at the instant that stands for the sample
+            return (*after, dataclasses.replace(passed, base=jnp.where(carried, base, -jnp.inf)))
 
         nothing = jax.eval_shape(lambda: advance(run, motion, first, energy)[2])
         nothing = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf, x.dtype), nothing)
