@@ -564,7 +564,8 @@ def sampled(run: System, state: Any, first: Scalar, steps: Scalar, samples: int)
         def small(j: Array, carry: Any) -> Any:
             *after, passed = advance(run, carry[0], first + (k * steps + j) * run.step, carry[1])
             base = jnp.maximum(passed.base, carry[2].base)
-            carried = (j < steps - 1) | jnp.all(jnp.isfinite(passed.base))  # at the instant that stands for the sample
+            # The last step is the instant that stands for the sample.
+            carried = (j < steps - 1) | jnp.all(jnp.isfinite(passed.base))
             return (*after, dataclasses.replace(passed, base=jnp.where(carried, base, -jnp.inf)))
 
         nothing = jax.eval_shape(lambda: advance(run, motion, first, energy)[2])
