@@ -153,8 +153,8 @@ class Passed(eqx.Module):
 
     @property
     def margin(self) -> Scalar:
-        """Distance by which gravity's line through the centre of mass is within the outermost contacts [m]; NaN of a
-        robot that falls or bounces."""
+        """Distance from gravity's line through the centre of mass to the nearer of the outermost contacts [m], negative
+        beyond them; NaN of a robot that falls or bounces."""
         least = jnp.min(self.base, axis=-1)
         return jnp.where(jnp.isfinite(least), least, jnp.nan)
 
