@@ -129,9 +129,9 @@ class Passed(eqx.Module):
         stored: in motion, height, contacts and windings, of the whole robot [J].
         body: share of all normal force that the body bears [-].
         grip: share of what its friction could hold that the ground gives to all that rolls [-].
-        centre: x of the centre of mass [m]; base: how far the outermost contacts are behind and ahead of it [m], -inf
-            while contacts do not carry the robot; of a sample the furthest, as contacts that leave the ground for
-            some steps bear nevertheless.
+        carried: share of the weight that all contacts bear [-].
+        centre: x of the centre of mass [m]; base: how far the outermost contacts are behind and ahead of it [m], of
+            a sample the furthest, as contacts that leave the ground for some steps bear nevertheless.
     """
 
     time: Scalar
@@ -148,15 +148,18 @@ class Passed(eqx.Module):
     normal: Scalar
     body: Scalar
     grip: Scalar
+    carried: Scalar
     centre: Scalar
     base: Float[Array, " 2"]
 
     @property
     def margin(self) -> Scalar:
-        """Distance from gravity's line through the centre of mass to the nearer of the outermost contacts [m], negative
-        beyond them; NaN of a robot that falls or bounces."""
+        """Distance from gravity's line through the centre of mass to the nearer of the outermost contacts [m].
+
+        Negative where the line is beyond them, NaN of a robot that falls or bounces.
+        """
         least = jnp.min(self.base, axis=-1)
-        return jnp.where(jnp.isfinite(least), least, jnp.nan)
+        return jnp.where(jnp.isfinite(least) & (self.carried >= CARRIED), least, jnp.nan)
 
 
 class System(eqx.Module):
@@ -445,18 +448,16 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
         normal=total,
         body=jnp.sum(at.force * (1 - at.rolls)) / jnp.maximum(total, 1e-9),
         grip=jnp.sum(jnp.abs(pulled.force) * at.rolls) / jnp.maximum(held, 1e-9),
+        carried=total / (GRAVITY * matrix[0, 0]),
         centre=centre,
-        base=_base(centre, at, CARRIED * GRAVITY * matrix[0, 0]),
+        base=_base(centre, at),
     )
     return after, spent, passed
 
 
-def _base(centre: Scalar, at: Footing, least: Scalar) -> Float[Array, " 2"]:
-    """Distances of the outermost contacts behind and ahead of the centre of mass [m], level ground assumed below.
-
-    -inf where all contacts together bear less than `least` [N].
-    """
-    bears, ahead = (at.force > 0) & (jnp.sum(at.force) >= least), at.place - centre
+def _base(centre: Scalar, at: Footing) -> Float[Array, " 2"]:
+    """How far the outermost contacts are behind and ahead of the centre of mass [m], level ground assumed below."""
+    bears, ahead = at.force > 0, at.place - centre
     return jnp.stack([jnp.max(jnp.where(bears, way, -jnp.inf)) for way in (-ahead, ahead)])
 
 
@@ -564,9 +565,7 @@ def sampled(run: System, state: Any, first: Scalar, steps: Scalar, samples: int)
         def small(j: Array, carry: Any) -> Any:
             *after, passed = advance(run, carry[0], first + (k * steps + j) * run.step, carry[1])
             base = jnp.maximum(passed.base, carry[2].base)
-            # The last step is the instant that stands for the sample.
-            carried = (j < steps - 1) | jnp.all(jnp.isfinite(passed.base))
-            return (*after, dataclasses.replace(passed, base=jnp.where(carried, base, -jnp.inf)))
+            return (*after, dataclasses.replace(passed, base=base))
 
         nothing = jax.eval_shape(lambda: advance(run, motion, first, energy)[2])
         nothing = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf, x.dtype), nothing)
