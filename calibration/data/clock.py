@@ -21,9 +21,9 @@ def from_the_first(name: str, meaning: Meaning, cells: Sequence[str], runs: Sequ
     """Returns cells of a column of time as the time since the first of their run, and a note where that changes them.
 
     A run begins at its first row, whatever its clock shows there: the time since a controller started, or a time of
-    day. Times of day are dates and times as ISO 8601 writes them or with a date as 25.11.2026, or numbers that are
-    all beyond the largest time (seconds since 1970). Times without a date that fall back by more than half a day have
-    passed midnight. A column with a cell that is no time is returned as it is, and the reader refuses that cell.
+    day. Times of day follow ISO 8601, or have a date as 25.11.2026, or are numbers beyond the largest time (seconds
+    since 1970). Times without a date that fall back by more than half a day have passed midnight. A column with a
+    cell that is no time is returned as it is, and the reader refuses that cell.
 
     Args:
         name: of the file; meaning: of the column; runs: `run_id` of each cell.

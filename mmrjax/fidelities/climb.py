@@ -49,6 +49,8 @@ GAIN, PATIENCE = 5e-3, 2.0
 ON_GROUND = 4e-4
 #: A belt slower than this [m/s] stands; a body that bears more than this share of the weight hangs.
 STANDS, BEARS = 5e-3, 0.1
+#: Contacts that bear less than this share of the weight do not carry the robot: it falls or bounces.
+CARRIED = 0.5
 #: Time in which levers come to their rate and near their angle [s], and rate below which they are let stand [rad/s].
 _SWINGS, _STILL = 0.03, 5e-3
 LED = np.array([FRONT, REAR])
@@ -127,6 +129,7 @@ class Passed(eqx.Module):
         stored: in motion, height, contacts and windings, of the whole robot [J].
         body: share of all normal force that the body bears [-].
         grip: share of what its friction could hold that the ground gives to all that rolls [-].
+        carried: share of the weight that all contacts bear [-].
         centre: x of the centre of mass [m]; base: how far the outermost contacts are behind and ahead of it [m], of
             a sample the furthest, as contacts that leave the ground for some steps bear nevertheless.
     """
@@ -145,14 +148,18 @@ class Passed(eqx.Module):
     normal: Scalar
     body: Scalar
     grip: Scalar
+    carried: Scalar
     centre: Scalar
     base: Float[Array, " 2"]
 
     @property
     def margin(self) -> Scalar:
-        """How far gravity's line through the centre of mass is within the outermost contacts [m]; 0 without any."""
+        """Distance from gravity's line through the centre of mass to the nearer of the outermost contacts [m].
+
+        Negative where the line is beyond them, NaN of a robot that falls or bounces.
+        """
         least = jnp.min(self.base, axis=-1)
-        return jnp.where(jnp.isfinite(least), least, 0.0)
+        return jnp.where(jnp.isfinite(least) & (self.carried >= CARRIED), least, jnp.nan)
 
 
 class System(eqx.Module):
@@ -441,6 +448,7 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
         normal=total,
         body=jnp.sum(at.force * (1 - at.rolls)) / jnp.maximum(total, 1e-9),
         grip=jnp.sum(jnp.abs(pulled.force) * at.rolls) / jnp.maximum(held, 1e-9),
+        carried=total / (GRAVITY * matrix[0, 0]),
         centre=centre,
         base=_base(centre, at),
     )

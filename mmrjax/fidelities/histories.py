@@ -6,10 +6,10 @@ stiffly accurate (Alexander, Diagonally implicit Runge-Kutta methods for stiff O
 of Newton's method at the solution, so that a direction more costs one tangent of the rates a stage, instead of a
 rollout.
 
-After a jump of the voltage the current lags by L / R, often much less than a step, and SDIRK2 leaves up to a fifth of
-the jump to the end of such a step. So the lag of the last jump decays exponentially in every step, and the method
-follows the rest (an integrating factor; Lawson, Generalized Runge-Kutta processes for stable systems with large
-Lipschitz constants, SIAM J. Numer. Anal. 4 (1967)).
+After a jump of the voltage the current lags by L / R, often much less than a step. SDIRK2 leaves up to a fifth of the
+jump to the end of such a step. So the lag of the last jump decays exponentially in every step, and the method follows
+the rest (an integrating factor; Lawson, Generalized Runge-Kutta processes for stable systems with large Lipschitz
+constants, SIAM J. Numer. Anal. 4 (1967)).
 """
 
 from __future__ import annotations
@@ -177,8 +177,8 @@ class _Step(eqx.Module):
     def rates_at_start(
         self, constant: Conditions, rate: Callable[[Array, Conditions], Array], y: Float[Array, " unknowns"]
     ) -> Float[Array, "rates ..."]:
-        """Rates of the current where it starts, as before the last jump of what drives it, now, and with a little
-        more current, which tells how soon it follows; none where no lag follows. Before a run nothing drives it."""
+        """Rates of the current at its start: as driven before the last jump, as driven now, and with a little more
+        current, which tells how soon it follows. None where no lag follows. Before a run nothing drives it."""
         if self.before is None:
             return jnp.zeros((0, *rate(y, self.held(constant)).shape))
         now = self.held(constant)

@@ -140,7 +140,7 @@ def over_time(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
     last = np.where(finite.any(-1), finite.shape[-1] - 1 - np.argmax(finite[..., ::-1], -1), 0)
     rows = np.arange(len(last))
     motors = float(robot.sides) * np.asarray(history.signals.current)
-    columns[PEAK] = np.maximum(_peaks(time, np.abs(motors)), 0.0)
+    columns[PEAK] = np.maximum(_peaks(jnp.asarray(time), jnp.asarray(np.abs(motors))), 0.0)
     columns["displacement_m"], columns["time_end_s"] = np.array(history.distance)[rows, last], time[rows, last]
     empty = (status == BATTERY_EMPTY) & ~finite[rows, -1]
     if empty.any():

@@ -79,7 +79,7 @@ def instants(found: Drawable) -> list[tuple[str, int]]:
     picked = {
         "start": 0,
         "largest pitch": int(np.argmax(np.abs(t["pitch_deg"]))),
-        "least margin": int(np.argmin(t["margin_mm"])),
+        "least margin": int(np.argmin(np.nan_to_num(t["margin_mm"], nan=np.inf))),
         "largest motor current": int(np.argmax(np.abs(t["traction_current_A"]))),
         "half way": int(np.argmin(np.abs(t["x_mm"] - (t["x_mm"][0] + t["x_mm"].max()) / 2))),
         "end": len(t["time_s"]) - 1,

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -28,7 +29,7 @@ def _largest(time: np.ndarray, values: np.ndarray) -> float:
     """Value of the largest size of a sampled curve, between its samples too; NaN of none."""
     if len(values) < 3:
         return float(values[np.argmax(np.abs(values))]) if values.size else np.nan
-    return float(np.sign(values[np.argmax(np.abs(values))]) * peak(time, np.abs(values)))
+    return float(np.sign(values[np.argmax(np.abs(values))]) * peak(jnp.asarray(time), jnp.asarray(np.abs(values))))
 
 
 @dataclasses.dataclass(frozen=True)

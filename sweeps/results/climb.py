@@ -212,7 +212,7 @@ class ClimbResult:
             "furthest_mm": float(1000 * self.climb.furthest[0]),
             "pitch_most_deg": float(t["pitch_deg"].max()),
             "pitch_least_deg": float(t["pitch_deg"].min()),
-            "margin_least_mm": float(t["margin_mm"].min()),
+            "margin_least_mm": float(np.fmin.reduce(t["margin_mm"])),
             "traction_current_most_A": float(np.abs(t["traction_current_A"]).max()),
             "front_current_most_A": float(np.abs(t["front_current_A"]).max()),
             "rear_current_most_A": float(np.abs(t["rear_current_A"]).max()),
