@@ -204,7 +204,8 @@ class _Reader:
 def _holds(kind: type, name: str) -> bool:
     """True if instances of a dataclass hold a value by that name: a field, or what they compute once and keep."""
     kept = inspect.getattr_static(kind, name, None)
-    return name in kind.__dataclass_fields__ or isinstance(kept, functools.cached_property)
+    fields: dict[str, Any] = getattr(kind, "__dataclass_fields__", {})
+    return name in fields or isinstance(kept, functools.cached_property)
 
 
 def _on_device(x: np.ndarray, weak: bool) -> Any:
@@ -212,14 +213,14 @@ def _on_device(x: np.ndarray, weak: bool) -> Any:
 
     made = jnp.asarray(x)
     if weak:  # a program is compiled anew for an array of the other kind
-        made.aval = made.aval.update(weak_type=True)  # type: ignore[attr-defined, misc]
+        made.aval = made.aval.update(weak_type=True)  # type: ignore[misc]
     return made
 
 
 def _named_class(kind: type) -> tuple[str, str, list[float] | None]:
     """Module and name of a class, and the factors of an effect that differs from it by its priors alone."""
     plain = getattr(kind, "plain", None)
-    known, factors = (kind, None) if plain is None else (plain, list(kind.factors))  # type: ignore[attr-defined]
+    known, factors = (kind, None) if plain is None else (plain, list(vars(kind)["factors"]))
     name = known.__module__, known.__qualname__
     if _class(*name, None) is not known:
         raise Unwritable(".".join(name))
