@@ -27,7 +27,7 @@ from mmrjax.effects.scaled import scaled
 
 #: Packages whose dataclasses a file may name, and modules whose functions it may.
 PACKAGES = ("mmrjax", "calibration")
-FUNCTIONS = ("calibration.discovery.setups",)
+FUNCTIONS = ("calibration.discovery.setups", "calibration.discovery.menu")
 #: Kinds of arrays that are bytes alone.
 KINDS = "biufcSU"
 
