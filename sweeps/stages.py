@@ -27,7 +27,7 @@ from mmrjax.effects.scaled import scaled
 
 #: Packages whose dataclasses a file may name, and modules whose functions it may.
 PACKAGES = ("mmrjax", "calibration")
-FUNCTIONS = ("calibration.discovery.setups",)
+FUNCTIONS = ("calibration.discovery.setups", "calibration.discovery.menu")
 #: Kinds of arrays that are bytes alone.
 KINDS = "biufcSU"
 
@@ -208,7 +208,8 @@ class _Reader:
 def _holds(kind: type, name: str) -> bool:
     """True if instances of a dataclass hold a value by that name: a field, or what they compute once and keep."""
     kept = inspect.getattr_static(kind, name, None)
-    return name in kind.__dataclass_fields__ or isinstance(kept, functools.cached_property)
+    fields: dict[str, Any] = getattr(kind, "__dataclass_fields__", {})
+    return name in fields or isinstance(kept, functools.cached_property)
 
 
 def _on_device(x: np.ndarray, weak: bool) -> Any:
@@ -224,7 +225,7 @@ def _on_device(x: np.ndarray, weak: bool) -> Any:
 def _named_class(kind: type) -> tuple[str, str, list[float] | None]:
     """Module and name of a class, and the factors of an effect that differs from it by its priors alone."""
     plain = getattr(kind, "plain", None)
-    known, factors = (kind, None) if plain is None else (plain, list(kind.factors))  # type: ignore[attr-defined]
+    known, factors = (kind, None) if plain is None else (plain, list(vars(kind)["factors"]))
     name = known.__module__, known.__qualname__
     if _class(*name, None) is not known:
         raise Unwritable(".".join(name))

@@ -24,6 +24,7 @@ from mmrjax import channels, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME, OF_CHANNELS
 from mmrjax.fidelities.steady import IMPLICIT
+from sweeps import stages
 
 PAIRS = {
     ("series_resistance", "supply_sag"): {"one motor, 6T2A", "one motor, 4W2T", "stall, one motor"},
@@ -505,3 +506,9 @@ def test_finer_steps_are_within_the_tables_ranges(rover):
     assert series.steps == (0.4, 0.6, 0.07)
     level = experiments.more_runs("slip", "current", reach(rover, grid([12.0], [0.0], [0.0]), channels.USUAL))
     assert (level.low, level.high, level.slope, level.payload) == (6.0, 12.0, 0.0, 0.0)
+
+
+def test_every_experiment_is_kept_in_a_stage(tmp_path):
+    stages.write(tmp_path / "menu", MENU)
+    assert stages.read(tmp_path / "menu") == MENU
+    assert {type(e) for e in MENU} == {menu.Act, menu.Run}
