@@ -116,6 +116,7 @@ def test_interrupted_draws_are_taken_up(robot, runs, posterior, tmp_path, monkey
     again = uncertainty.intervals(robot, posterior, runs, chunked(DRAWS), DRAWS, folder)
     assert len(computed) == 4 - kept  # nothing is left to do
     same(again.columns, whole.columns)
+    folder.close()
 
 
 def test_what_takes_long_runs_in_parts_and_says_how_far_it_is(robot, runs, monkeypatch):
