@@ -243,6 +243,7 @@ class RunFolder(Folder):
                 self._lock = self._entered()
             self._begin_or_take_up()
         except OSError as error:
+            self.close()
             raise BadConfiguration(
                 f"--out: {path} cannot be written ({error.strerror}); choose another path"
             ) from error

@@ -119,6 +119,7 @@ def test_interrupted_draws_are_taken_up(robot, runs, posterior, tmp_path, monkey
     again = uncertainty.intervals(robot, posterior, runs, chunked(DRAWS), DRAWS, folder)
     assert len(computed) == 4 - kept  # nothing is left to do
     same(again.columns, whole.columns)
+    folder.close()
 
 
 @pytest.mark.slow
