@@ -767,7 +767,6 @@ def assemble_result(
         errors_held_out={k: (error(a), error(b)) for k, (a, b) in seen.held_out.items()},
         held_out_worse=preference.worse(seen.held_out, error),
         alternatives_held_out=compared,
-        percent_of=observe.percent_of,
         noise=_noise(runs, noise, type(observe)),
         settings=settings,
         replicates=len(left.test.null.single),

@@ -402,5 +402,4 @@ def errors(
 ) -> Errors:
     """Errors of every channel [%, and in σ] over the rows that count and have a simulated value."""
     simulated = np.where(included[:, None], simulated, np.nan)
-    percent = problem.observe.percent(simulated, measured)
-    return channel_errors(problem.channels, simulated, measured, sd, percent)
+    return channel_errors(problem.channels, simulated, measured, sd)

@@ -19,6 +19,7 @@ from calibration.discovery.notes import Asked, Instruction, NameSupport, RuledOu
 from calibration.discovery.prediction import Gain
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
+from calibration.inference.errors import OF_SIZE
 from calibration.inference.notes import HeldByPrior, Notes, Pair
 from calibration.inference.posterior import determined_together
 from calibration.inference.residual_clusters import ResidualCluster
@@ -443,7 +444,6 @@ class DiscoveryResult:
         held_out_worse: where the latter rise.
         alternatives_held_out: of a class, compared by data held out; empty where there is one, or where that takes
             long and was not asked for.
-        percent_of: what errors in percent are of.
         noise: channel → source and median sd [%].
         settings: the statistical constants; replicates: of the bootstrap, that settled.
         remarks: what is worth saying.
@@ -491,7 +491,6 @@ class DiscoveryResult:
     errors_held_out: dict[str, tuple[Errors, Errors]]
     held_out_worse: tuple[Worse, ...]
     alternatives_held_out: tuple[HeldOutAlternative, ...]
-    percent_of: str
     noise: dict[str, dict[str, Any]]
     settings: Settings
     replicates: int
@@ -589,7 +588,7 @@ class DiscoveryResult:
                 "as_stated": {"fitted": self.errors_as_stated, "held_out": self.errors_as_stated},
                 **{w: {"fitted": self.errors[k], "held_out": main[k]} for k, w in enumerate(whens)},
             },
-            "errors_percent_of": self.percent_of,
+            "errors_percent_of": OF_SIZE,
             "held_out_by": held,
             "held_out_worse": [dataclasses.asdict(w) for w in self.held_out_worse],
             "alternatives_held_out": [dataclasses.asdict(a) for a in self.alternatives_held_out],

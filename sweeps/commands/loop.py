@@ -22,6 +22,7 @@ from calibration.discovery.resolve import resolve
 from calibration.discovery.result import REFIT_FILE, DiscoveryResult
 from calibration.discovery.settings import fewest_replicates
 from calibration.inference import blocks, observers, priors
+from calibration.inference.errors import OF_SIZE
 from calibration.words import loop as said_of
 from sweeps import config as configuration
 from sweeps.console import pulse, say, tell
@@ -191,7 +192,7 @@ def print_discovery(found: DiscoveryResult) -> None:
         say(found.resolved.statement)
         for note in found.resolved.notes:
             say(f"- track model: {note}")
-    errors = Table(title=f"rms error [% of the {found.percent_of}]", title_justify="left")
+    errors = Table(title=f"rms error [% of the {OF_SIZE}]", title_justify="left")
     for heading in ("", "rows", *(c.label for c in found.channels)):
         errors.add_column(heading, justify="right" if heading else "left")
     whens = (0,) if found.verdict == "none" else (0, 1)

@@ -14,7 +14,7 @@ from calibration.data.columns import Layout
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference import blocks
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
-from calibration.inference.errors import OF_SIZE, percent_error, root_mean_square
+from calibration.inference.errors import root_mean_square
 from calibration.inference.notes import FarFromPrior
 from calibration.words import fits
 from calibration.words import loop as words
@@ -84,7 +84,7 @@ class Change:
     """What an effect of the robot that is written changes in the readings of the runs.
 
     Attributes:
-        channel: the one that it changes most; rms: by how much [%], of what errors are percent of.
+        channel: the one that it changes most; rms: by how much [% of its measured rms].
         without, with_it: simulated without and with it, all else alike [SI], shape (rows,).
     """
 
@@ -105,15 +105,15 @@ def changes(found: DiscoveryResult) -> dict[str, Change]:
         results = mm.simulate(robot, conditions)
         return {c.name: np.asarray(getattr(results, c.name)) for c in found.channels}
 
-    with_it, most = shown(found.robot), {}
+    with_it, most, measured = shown(found.robot), {}, found.readings_of_rows.measured
     for name in added:
         without = shown(params.replace(found.robot, {f"effects.{name}.amplitude": params.as_float(0.0)}))
         moved = []
-        for c in found.channels:
+        for k, c in enumerate(found.channels):
             a, b = without[c.name], with_it[c.name]
-            percent = percent_error(b[found.included], a[found.included], crosses_zero=found.percent_of == OF_SIZE)
-            if np.isfinite(percent).any():
-                moved.append(Change(c, root_mean_square(percent), a, b))
+            size = root_mean_square(measured[found.included, k])
+            if np.isfinite(size) and size > 0:
+                moved.append(Change(c, 100 * root_mean_square((b - a)[found.included]) / size, a, b))
         if moved:
             most[name] = max(moved, key=lambda change: change.rms)
     return most

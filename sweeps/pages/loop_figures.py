@@ -214,7 +214,7 @@ def null(before: Evidence) -> Figure:
 
 
 def errors(found: DiscoveryResult) -> Figure:
-    """rms error (35) before and after, fitted and held out by every kind of block."""
+    """rms error before and after, fitted and held out by every kind of block."""
     lines = {"fitted": found.errors}
     lines |= {f"held out by\n{blocks.in_words(k, ', ')}": v for k, v in found.errors_held_out.items()}
     fig, grid = figure(1, len(found.channels), 2.9, sharey=False)

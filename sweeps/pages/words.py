@@ -112,7 +112,7 @@ GLOSSARY = {
     "refit": "the same model with its parameters fitted to the runs, and nothing added",
     "seen, held out": "errors of runs that the fit was made with, and of runs that it has not seen: a whole "
     "slope, voltage or configuration at a time",
-    "rms error": "root of the mean square of simulated less measured, in percent of the reading",
+    "rms error": "root of the mean square of simulated less measured, in percent of that of the measured readings",
     "σ (sd)": "standard deviation of an instrument: 2 of 3 readings are within 1 σ of the truth, 19 of 20 within 2 σ",
     "misfit, χ²": "sum of (simulated less measured)² / σ² over all readings; noise alone leaves about one a reading",
     "prior": "what a bench or a maker states of a parameter, with its standard deviation, before any "
