@@ -25,6 +25,7 @@ from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, filled, fit_base, fit_candidates, start
 from calibration.discovery.classes import Classes, classes, cosines
+from calibration.discovery.description import undescribed, unused
 from calibration.discovery.discrepancy import CurveBeside, locate
 from calibration.discovery.experiments import Proposal, denser, no_menu, separating
 from calibration.discovery.hidden import hidden
@@ -37,6 +38,7 @@ from calibration.discovery.notes import (
     KeptOut,
     Late,
     LostReplicates,
+    Missed,
     Missing,
     NameSupport,
     NameTest,
@@ -92,6 +94,8 @@ EITHER_WAY = 0.05
 LATE = 4.0
 #: Share of rows set aside beyond which that is said first.
 MANY = 0.03
+#: Prior sds beyond which a base parameter is worth a look.
+FAR = 3.0
 #: Is told what the loop does next.
 Tell = Callable[[Note | str], None]
 
@@ -272,7 +276,7 @@ class LoopStages:
     """What the stages up to a verdict found.
 
     Attributes:
-        verdict: `none`, `named`, `class` or `unnamed`.
+        verdict: `none`, `named`, `class`, `unnamed` or `undescribed`.
         screened: the base fit, rows that stand alone set aside; left: what it leaves.
         sds: the noise that the verdict is with.
         searched: what was tried; alike: what cannot be told apart, where a name is given.
@@ -281,6 +285,7 @@ class LoopStages:
         held_out: the alternatives compared by data held out, where these chose the leader.
         beside: the curve of what the base leaves, where something is missing.
         predicted: what fits predict of data held out, as of `prediction.smallest`.
+        missed: channels that the model does not describe; unused: columns that vary and have no role.
     """
 
     verdict: str
@@ -294,6 +299,8 @@ class LoopStages:
     held_out: tuple[HeldOutAlternative, ...] = ()
     beside: CurveBeside | None = None
     predicted: Predicted = dataclasses.field(default_factory=dict)
+    missed: tuple[Missed, ...] = ()
+    unused: tuple[str, ...] = ()
 
     @property
     def members(self) -> tuple[tuple[str, ...], ...]:
@@ -409,7 +416,9 @@ def trace(
         progress(Step("bootstrap", (settings.replicates,)))
         screened, left = keep(f"bootstrap {k}", functools.partial(tested, screened))
         if not left.test.rejected and screened.cluster is None:
-            return LoopStages("none", screened, left, sds)
+            missed = undescribed(screened.base.space, runs, sds.noise, left.linear)
+            word = "undescribed" if missed else "none"
+            return LoopStages(word, screened, left, sds, missed=missed, unused=unused(runs))
         progress(Step("effects"))
         later(screened.base)
         screened, left, searched = keep(f"search {k}", functools.partial(tried, screened, left))
@@ -426,6 +435,9 @@ def trace(
     beside, predicted = CurveBeside(space, base, left, bases), Predicted()
     model, searched, stood = choose(runs, screened, left, searched, settings, progress, beside, predicted)
     stages = functools.partial(LoopStages, beside=beside, predicted=predicted)
+    missed = undescribed(space, runs, sds.noise, left.linear, None if model is None else model[1].linear)
+    if missed:
+        return stages("undescribed", screened, left, sds, searched, missed=missed, unused=unused(runs))
     if model is None:
         return stages("unnamed", screened, left, sds, searched, where=beside.where, standing=stood)
 
@@ -622,6 +634,7 @@ def summary(traced: LoopStages, numbers: np.ndarray) -> Summary:
     space, alike = traced.screened.base.space, traced.alike
     support = None if traced.standing is None else traced.standing.numbered(numbers)
     best = None if traced.searched is None else traced.searched.best
+    base = traced.screened.base.candidate
     aside, counting = len(traced.screened.outliers), int(space.included.sum())
     many = aside > MANY * (aside + counting)
     return Summary(
@@ -635,6 +648,9 @@ def summary(traced: LoopStages, numbers: np.ndarray) -> Summary:
         of=aside + counting,
         noise=traced.sds.remarks if traced.sds.factors and traced.verdict == "none" else (),
         cluster=traced.screened.cluster,
+        missed=traced.missed,
+        unused=traced.unused,
+        far=tuple(n for n, z in zip(space.coordinates.base.names, base.z[: space.free], strict=True) if abs(z) > FAR),
     )
 
 
@@ -821,7 +837,9 @@ def _residuals(
 
 
 def _proposal(space: CandidateSpace, traced: LoopStages, settings: Settings) -> Proposal | None:
-    """What to do next; None where nothing is left to tell apart."""
+    """What to do next; None where nothing is left to tell apart, or the model does not describe the runs."""
+    if traced.verdict == "undescribed":
+        return None
     if not space.bare.observe.menu:
         return no_menu(space) if traced.verdict != "none" else None
     if traced.verdict == "unnamed" and traced.where is not None:
@@ -856,7 +874,7 @@ def remarks(found: DiscoveryResult) -> Notes:
     for rows, why in ((found.unusable, "unusable"), (found.outliers, "outliers")):
         if rows:
             said.append(KeptOut(rows, why))
-    far = {name: abs(p.shift_after) for name, p in found.base_shift.items() if abs(p.shift_after) > 3}
+    far = {name: abs(p.shift_after) for name, p in found.base_shift.items() if abs(p.shift_after) > FAR}
     said += [FarFromPrior(name, x, "loop") for name, x in far.items()]
     held = tuple(name for name in found.held_by_prior if name not in far)
     said += [HeldByPrior(held)] * bool(held)

@@ -176,17 +176,27 @@ class Missing:
     test: NameTest | None = None
 
 
+class Missed(NamedTuple):
+    """A channel that a refit misses: rms error and estimated noise over its measured rms [-]."""
+
+    channel: str
+    error: float
+    noise: float
+
+
 @dataclasses.dataclass(frozen=True)
 class Summary:
     """A verdict with all that its statement says.
 
     Attributes:
-        verdict: `none`, `named`, `class` or `unnamed`; p: family-wise.
+        verdict: `none`, `named`, `class`, `unnamed` or `undescribed`; p: family-wise.
         where: something is missing, or remains.
         missing: the effects found, established or tentative; `unnamed` has none that are established.
         nearest: effects that come nearest where none may be named; support: whether names stand.
         aside, of: rows that lie off alone where these are many, of how many; 0 else.
         noise: sds that are off, where that is all; cluster: what rows that lie off have in common.
+        missed: channels that the model does not describe; unused: columns of numbers that vary and are not used;
+            far: base parameters beyond three prior sds.
     """
 
     verdict: str
@@ -199,6 +209,9 @@ class Summary:
     of: int = 0
     noise: tuple[NoiseOff, ...] = ()
     cluster: Cluster | None = None
+    missed: tuple[Missed, ...] = ()
+    unused: tuple[str, ...] = ()
+    far: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)

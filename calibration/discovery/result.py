@@ -504,6 +504,11 @@ class DiscoveryResult:
         return words.statement(self.summary)
 
     @property
+    def refit_alone(self) -> bool:
+        """True where nothing is proposed next to the refit."""
+        return self.verdict in ("none", "undescribed")
+
+    @property
     def standing(self) -> str:
         """Why names do not stand, or beside what they do, in words; "" where there is nothing to say."""
         return words.reason(self.support)
@@ -564,6 +569,7 @@ class DiscoveryResult:
         return {
             "schema": SCHEMA,
             "verdict": self.verdict,
+            "missed": [m._asdict() for m in self.summary.missed],
             "statement": self.statement,
             "rows": len(self.runs),
             "rows_used": int(self.included.sum()),

@@ -49,6 +49,8 @@ def statement(said: notes.Summary) -> str:
 
 def _verdict(said: notes.Summary) -> str:
     where, p = said.where, said.p
+    if said.verdict == "undescribed":
+        return _undescribed(said)
     if said.verdict == "none":
         return f"Nothing is missing: what the fitted model leaves is what noise leaves (family-wise p = {p:.2g})."
     if said.verdict == "unnamed" and where is not None:
@@ -64,6 +66,22 @@ def _verdict(said: notes.Summary) -> str:
     in_model = _tentative([one for one in said.missing if not one.established], said.support)
     left = "" if where is None else f" Something remains in the {bases.in_words(where.place)}."
     return f"Missing: {'; '.join(names)} (family-wise p {p_value(p)}).{in_model}{left}"
+
+
+def _undescribed(said: notes.Summary) -> str:
+    """That a model does not describe the runs, by how much, and what to check."""
+    each = [
+        f"{channels.find(m.channel).label} by {100 * m.error:.0f} % of its measured rms"
+        + (f" (its noise is estimated as {100 * m.noise:.0f} %)" if m.noise > m.error else "")
+        for m in said.missed
+    ]
+    check = [f"columns that vary and are not used ({', '.join(said.unused)})"] * bool(said.unused)
+    check += [f"parameters far from their priors ({', '.join(said.far)})"] * bool(said.far)
+    check += ["units, signs and sides of the columns"]
+    return (
+        f"This model does not describe these runs: refitted, it misses {', '.join(each)}. No effect is named. "
+        f"Check first: {'; '.join(check)}."
+    )
 
 
 def brief(said: notes.Summary) -> str:
@@ -166,6 +184,8 @@ def answer(found: DiscoveryResult) -> str:
     """Whether the model is complete, in a sentence."""
     if found.verdict == "none":
         return "Yes, as far as these runs can show: what the fitted model leaves is noise."
+    if found.verdict == "undescribed":
+        return "No verdict: this model does not describe these runs."
     sure, weak = ([e for e in found.effects if is_established(found, e) == want] for want in (True, False))
     lacks = found.unnamed
     if lacks is not None and not weak:
@@ -361,7 +381,7 @@ def ruled_out(found: DiscoveryResult) -> str:
     if found.verdict != "unnamed":
         better = tuple(a for a in candidates if a.rise_chi2 < -same)
         candidates = better or tuple(a for a in candidates if a.rise_chi2 <= same)
-    if not candidates or found.verdict == "none":
+    if not candidates or found.verdict in ("none", "undescribed"):
         return ""
     first = min(candidates, key=lambda a: (len(a.effects), a.rise_chi2))
     what = "the curve" if found.verdict == "unnamed" else "what is proposed"

@@ -163,7 +163,7 @@ def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> Non
 def print_discovery(found: DiscoveryResult) -> None:
     """Verdict, effects, errors and remarks, for a person; the answer and the next step last."""
     say(f"{found.verdict}: {found.statement}")
-    if not found.robot.has_ground and found.verdict != "none":
+    if not found.robot.has_ground and found.effects:
         say("The track balance of a shaft is what its load loses.")
     for said in (said_of.standing(found), said_of.ruled_out(found)):
         if said:
@@ -195,7 +195,7 @@ def print_discovery(found: DiscoveryResult) -> None:
     errors = Table(title=f"rms error [% of the {OF_SIZE}]", title_justify="left")
     for heading in ("", "rows", *(c.label for c in found.channels)):
         errors.add_column(heading, justify="right" if heading else "left")
-    whens = (0,) if found.verdict == "none" else (0, 1)
+    whens = (0,) if found.refit_alone else (0, 1)
     when = ("before", "after")
     lines = {"as stated, nothing fitted": found.errors_as_stated}
     lines |= {f"{when[k]}, fitted": found.errors[k] for k in whens}
@@ -206,7 +206,7 @@ def print_discovery(found: DiscoveryResult) -> None:
         errors.add_row(text, f"{max(e['rows'] for e in by.values())}/{len(found.runs)}", *cells)
     say(errors)
     if Layout.of(found.robot).crosses_zero:
-        shown_fits = {when: by for when, by in found.rms.items() if found.verdict != "none" or "before" in when}
+        shown_fits = {when: by for when, by in found.rms.items() if not (found.refit_alone and "after" in when)}
         say(words.describe_rms(shown_fits))
     if found.sensitivity:
         say(f"{said_of.at_other_noise(found.sensitivity)}")

@@ -41,19 +41,24 @@ def rows_of(found: DiscoveryResult) -> dict[str, np.ndarray]:
     return table
 
 
+def _drawn(found: DiscoveryResult) -> str:
+    """The verdict as figures take it, which is `none` where they show the refit alone."""
+    return "none" if found.refit_alone else found.verdict
+
+
 def _run_by_run(album: Album, found: DiscoveryResult) -> None:
     table = rows_of(found)
-    album.add("before_after", lambda: loop_figures.before_after(table, found.channels, found.verdict))
-    album.add("defects", lambda: loop_figures.defects(table, found.verdict, Layout.of(found.robot).crosses_zero))
+    album.add("before_after", lambda: loop_figures.before_after(table, found.channels, _drawn(found)))
+    album.add("defects", lambda: loop_figures.defects(table, _drawn(found), Layout.of(found.robot).crosses_zero))
 
 
 def _over_time(album: Album, found: DiscoveryResult) -> None:
     assert isinstance(found.detail, TimeStatistics)
     detail = found.detail
     album.add(
-        "before_after", lambda: loop_figures.over_time(found.runs, rows_of(found), found.channels, found.verdict)
+        "before_after", lambda: loop_figures.over_time(found.runs, rows_of(found), found.channels, _drawn(found))
     )
-    album.add("series", lambda: loop_figures.time_statistics(detail, found.channels, found.verdict))
+    album.add("series", lambda: loop_figures.time_statistics(detail, found.channels, _drawn(found)))
 
 
 #: What a page shows of one kind of data, by the type of the result's detail.
@@ -134,7 +139,7 @@ def would_be_seen(found: DiscoveryResult) -> list[dict[str, Any]]:
 def unseen(found: DiscoveryResult) -> list[dict[str, Any]]:
     """Errors of the refit and with what was found, by kind of block held out, with the rows that each reaches; marked
     where they are better or worse."""
-    total, many = len(found.runs), found.verdict != "none"
+    total, many = len(found.runs), not found.refit_alone
     lines = []
     for kind, both in {"": found.errors, **found.errors_held_out}.items():
         worse = {w.channel for w in found.held_out_worse if w.kind == kind}
@@ -158,7 +163,7 @@ def summary(found: DiscoveryResult) -> list[dict[str, Any]]:
     where those seen are better or worse than in the line before."""
     unseen = next(iter(found.errors_held_out.values()), ({}, {}))
     lines = [("as stated", found.errors_as_stated, {}), ("fitted again", found.errors[0], unseen[0])]
-    if found.verdict != "none":
+    if not found.refit_alone:
         lines.append(("with what was found", found.errors[1], unseen[1]))
     shown, before = [], dict[str, float]()
     for what, seen, held in lines:
