@@ -19,7 +19,7 @@ from calibration.discovery.notes import CurveOver, NameSupport, NameTest
 from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import augment_with_columns
 from calibration.discovery.search import Search, diagnose
-from calibration.discovery.settings import settings_for
+from calibration.discovery.settings import WITHOUT_NAME, settings_for
 from calibration.discovery.smooth import FALL, LENGTHS, PRODUCT, SIZES, WIDE, smooth, surface
 from calibration.discovery.standing import (
     _chosen_again,
@@ -402,17 +402,17 @@ def test_effect_has_to_be_the_strongest_again_without_blocks_that_leave_half_of_
     space = SimpleNamespace(included=np.ones(toy.rows, bool), library=library)
     both = np.concatenate([a, b], 1)
     few, most, others = rows < 4, rows < 11, rows >= 16
-    settings = SETTLED.settings
-    again = lambda *blocks: _chosen_again(space, "a", (jacobian, residual, a), both, blocks, settings)  # noqa: E731
+    settings, family = SETTLED.settings, (space.library["a"].family(),)
+    again = lambda *blocks: _chosen_again(space, family, (jacobian, residual, a), both, blocks, settings)  # noqa: E731
     assert again(few, others) == 1.0 and again(most) == 1.0 and again() == 1.0
     b3 = np.append(2.0 * a[:, 0] * (at < 4) + 2.5 * b[:, 0], np.zeros(2))  # only the first rows show it
-    assert _chosen_again(space, "a", (jacobian, b3, a), both, (few, others), settings) == 0.5
+    assert _chosen_again(space, family, (jacobian, b3, a), both, (few, others), settings) == 0.5
     # What data cannot tell from it, of whatever family, does not take its place.
     near = a * (1 + 0.05 * random.standard_normal(a.shape))
     of_near = np.append(2.0 * near[:, 0], np.zeros(2))  # which is the stronger of the two
-    assert _chosen_again(space, "a", (jacobian, of_near, a), np.concatenate([a, near], 1), (few,), settings) == 1.0
+    assert _chosen_again(space, family, (jacobian, of_near, a), np.concatenate([a, near], 1), (few,), settings) == 1.0
     none = dataclasses.replace(settings, same=0.0, form=0.0)
-    assert _chosen_again(space, "a", (jacobian, of_near, a), np.concatenate([a, near], 1), (few,), none) == 0.0
+    assert _chosen_again(space, family, (jacobian, of_near, a), np.concatenate([a, near], 1), (few,), none) == 0.0
 
 
 def candidate_of(*effects):
@@ -518,7 +518,7 @@ def test_two_slips_do_not_stand_for_a_law_that_the_library_lacks(monkeypatch):
 def test_sliding_speed_that_grows_gets_no_name(monkeypatch):
     for sigmas, seed in ((12.0, 1), (30.0, 2)):
         found = SETTLED.trace(growing(monkeypatch, sigmas, seed))
-        assert found.verdict == "unnamed" and found.members == () and not found.standing.stands
+        assert found.verdict in WITHOUT_NAME and found.members == () and not found.standing.stands
         assert found.where.balance == "slip" and found.families == ("slip that changes with speed",)
 
 
@@ -568,5 +568,5 @@ def test_supply_that_sags_over_time_gets_no_name(monkeypatch):
         dataclasses.replace(settings_for(Histories, 300), slots=2), {n: BY_NAME[n] for n in names}, STATED | dynamic
     )
     found = analyst.trace(table(made))
-    assert found.verdict == "unnamed" and not found.standing.stands and found.members == ()
+    assert found.verdict in WITHOUT_NAME and not found.standing.stands and found.members == ()
     assert {found.where.balance, *found.where.alike} & {"electrical", "supply"} and found.where.variable == "time"

@@ -10,7 +10,16 @@ import numpy as np
 import pytest
 
 from calibration.discovery import notes as of_loop
-from calibration.discovery.notes import CurveOver, FreedValue, Missing, NameSupport, NameTest, RuledOut, Summary
+from calibration.discovery.notes import (
+    CurveOver,
+    FreedValue,
+    Mechanism,
+    Missing,
+    NameSupport,
+    NameTest,
+    RuledOut,
+    Summary,
+)
 from calibration.discovery.result import Formula, Sensitivity, Worse
 from calibration.inference import notes as of_fit
 from calibration.inference.lack_of_fit import Adequacy
@@ -463,9 +472,45 @@ def test_verdict_tells_what_is_tentative():
     curve = NameSupport(False, "curve alone", curves=(OVER,))
     place = SimpleNamespace(place="slip", variable="slope", alike=("slip",), variables_alike=(), family="slip")
     only = Missing(("b",), (), ("slip",), False)
-    said = loop.statement(Summary("unnamed", 0.001, place, (only,), support=curve))
+    said = loop.statement(Summary("place", 0.001, place, (only,), support=curve))
     assert "no effect of the library is established" in said
     assert said.endswith("predicts better: b (one smooth curve in the slip balance over slope leaves nothing).")
+
+
+def test_a_mechanism_is_stated_with_what_it_explains_and_predicts():
+    found = Mechanism(("loss torque that changes with speed", "slip"), ("a",), 0.99, 0.8, 0.1, 1.0)
+    place = SimpleNamespace(place="track", variable="speed_motor", alike=("track",), variables_alike=(), family="x")
+    said = loop.statement(Summary("mechanism", 0.001, place, mechanism=found))
+    assert said.startswith(
+        "Missing: a loss torque that changes with speed or a slip, established as a mechanism: it "
+    )
+    assert "explains 99 % of the excess misfit, gains 0.8 nat" in said and "8.0 standard errors" in said
+    weak = dataclasses.replace(found, families=("slip",), share=0.3, gain=0.1)
+    said = loop.statement(Summary("place", 0.001, place, mechanism=weak))
+    assert (
+        "No mechanism is established: the best one is a slip, but it explains only 30 % of the excess misfit and"
+        in said
+    )
+    assert loop.brief(Summary("mechanism", 0.001, place, mechanism=weak)) == "mechanism: slip"
+
+
+def test_every_doubt_about_a_mechanism_has_words():
+    none = Mechanism(("a", "b", "c", "d"), (), 0.1, 0.0, np.inf, 0.0)
+    assert set(none.fails) == set(loop.NO_MECHANISM) and all(loop.no_mechanism(none).split())
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        ([4.0, 1.0, 0.5], "falls from 4 N·m at 95.5 rpm to 0.5 N·m at 955 rpm"),
+        ([0.5, 6.0, 1.0], "rises from 0.5 N·m at 95.5 rpm to 1 N·m at 955 rpm, by way of 6 N·m at 191 rpm"),
+    ],
+)
+def test_the_course_of_a_curve_is_told_by_its_ends(value, said):
+    at = np.array([10.0, 20.0, 100.0])
+    curve = SimpleNamespace(window=None, variable="speed_motor", at=at, value=np.array(value), unit="N·m")
+    assert loop.course(curve) == said
+    assert loop.course(SimpleNamespace(**vars(curve) | {"window": {}})) == ""
 
 
 def test_verdicts_at_other_noise_are_one_sentence():
@@ -477,8 +522,8 @@ def test_verdicts_at_other_noise_are_one_sentence():
     assert loop.at_other_noise([other(0.7, "class", sure, weak), other(1.4, "class", sure, weak)]) == (
         "with 0.7 and with 1.4 times that noise the verdict is class: a established, b tentative"
     )
-    assert loop.at_other_noise([other(0.5, "unnamed", weak), other(2, "none")]) == (
-        "with 0.5 times that noise the verdict is unnamed: b tentative; with 2 times that noise the verdict is none"
+    assert loop.at_other_noise([other(0.5, "place", weak), other(2, "none")]) == (
+        "with 0.5 times that noise the verdict is place: b tentative; with 2 times that noise the verdict is none"
     )
 
 
@@ -526,12 +571,12 @@ def test_names_say_what_would_explain_more_than_they():
         return SimpleNamespace(effects=dict.fromkeys(names, 1.0), rise_chi2=rise, why="too large")
 
     near, better = candidate(-2.0, "a"), candidate(-30.4, "b", "c")
-    assert loop.ruled_out(of("named", candidate(6.5, "a"))) == "" == loop.ruled_out(of("unnamed"))
+    assert loop.ruled_out(of("named", candidate(6.5, "a"))) == "" == loop.ruled_out(of("place"))
     assert loop.ruled_out(of("named", near)).startswith("a would explain as much as what is proposed, but is")
     assert loop.ruled_out(of("class", near, better)) == (
         "b and c would explain 30 σ² more than what is proposed, but are ruled out by size or sign alone: too large."
     )
-    assert loop.ruled_out(of("unnamed", better, near)).startswith("a would explain as much as the curve, but is")
+    assert loop.ruled_out(of("place", better, near)).startswith("a would explain as much as the curve, but is")
 
 
 def errors(rows, rms):

@@ -31,6 +31,7 @@ from calibration.discovery.experiments import Proposal, denser, no_menu, separat
 from calibration.discovery.hidden import hidden
 from calibration.discovery.kept import Keep
 from calibration.discovery.location import DiscrepancyLocation
+from calibration.discovery.mechanism import mechanism
 from calibration.discovery.notes import (
     AssumedNoise,
     Copies,
@@ -38,6 +39,7 @@ from calibration.discovery.notes import (
     KeptOut,
     Late,
     LostReplicates,
+    Mechanism,
     Missed,
     Missing,
     NameSupport,
@@ -64,7 +66,7 @@ from calibration.discovery.result import (
 )
 from calibration.discovery.score_tests import Statistics, bootstrap
 from calibration.discovery.search import Search, diagnose, path, search
-from calibration.discovery.settings import FIT, HELD_OUT, Settings, settings_for
+from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings, settings_for
 from calibration.discovery.standing import standing
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
@@ -276,7 +278,7 @@ class LoopStages:
     """What the stages up to a verdict found.
 
     Attributes:
-        verdict: `none`, `named`, `class`, `unnamed` or `undescribed`.
+        verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
         screened: the base fit, rows that stand alone set aside; left: what it leaves.
         sds: the noise that the verdict is with.
         searched: what was tried; alike: what cannot be told apart, where a name is given.
@@ -285,6 +287,7 @@ class LoopStages:
         held_out: the alternatives compared by data held out, where these chose the leader.
         beside: the curve of what the base leaves, where something is missing.
         predicted: what fits predict of data held out, as of `prediction.smallest`.
+        mechanism: where no name stands, established or not.
         missed: channels that the model does not describe; unused: columns that vary and have no role.
     """
 
@@ -299,6 +302,7 @@ class LoopStages:
     held_out: tuple[HeldOutAlternative, ...] = ()
     beside: CurveBeside | None = None
     predicted: Predicted = dataclasses.field(default_factory=dict)
+    mechanism: Mechanism | None = None
     missed: tuple[Missed, ...] = ()
     unused: tuple[str, ...] = ()
 
@@ -323,8 +327,10 @@ class LoopStages:
     @property
     def families(self) -> tuple[str, ...]:
         """Families of what is established: of the members of each class, or where something without a name is."""
-        if self.alike is not None and self.verdict != "unnamed":
+        if self.alike is not None and self.verdict not in WITHOUT_NAME:
             return tuple(f for each, name in zip(self.alike.families, self._named, strict=True) if name for f in each)
+        if self.verdict == "mechanism" and self.mechanism is not None:
+            return self.mechanism.families
         return () if self.where is None else (self.where.family,)
 
     @property
@@ -438,16 +444,22 @@ def trace(
     missed = undescribed(space, runs, sds.noise, left.linear, None if model is None else model[1].linear)
     if missed:
         return stages("undescribed", screened, left, sds, searched, missed=missed, unused=unused(runs))
+    named = [] if model is None else [stood.established(e) for e in model[0].effects]
+    level, found = "", None
+    if not any(named):
+        progress(Step("mechanism"))
+        ladder = [c for c in (*searched.ladder, *([] if model is None else model[:1]))]
+        found = mechanism(space, runs, base, left, ladder, bases, beside, predicted, settings)
+        level = "place" if found is None or found.fails else "mechanism"
     if model is None:
-        return stages("unnamed", screened, left, sds, searched, where=beside.where, standing=stood)
+        return stages(level, screened, left, sds, searched, where=beside.where, standing=stood, mechanism=found)
 
     searched = dataclasses.replace(searched, best=model[0], diagnosis=model[1])
     best, after = model
-    named = [stood.established(e) for e in best.effects]
     progress(Step("alike", (best.effects,)))
     alike = classes(space, base, best, searched.ladder, left, settings)
     if not any(named):
-        return stages("unnamed", screened, left, sds, searched, alike, beside.where, standing=stood)
+        return stages(level, screened, left, sds, searched, alike, beside.where, standing=stood, mechanism=found)
     compared: tuple[HeldOutAlternative, ...] = ()
     if settings.prefer == HELD_OUT:
         progress(Step("held out"))
@@ -642,12 +654,13 @@ def summary(traced: LoopStages, numbers: np.ndarray) -> Summary:
         traced.left.test.p_value,
         traced.where,
         missing=() if alike is None else missing(space, alike, support),
-        nearest=best.effects if traced.verdict == "unnamed" and best is not None else (),
+        nearest=best.effects if traced.verdict in WITHOUT_NAME and best is not None else (),
         support=support,
         aside=aside if many else 0,
         of=aside + counting,
         noise=traced.sds.remarks if traced.sds.factors and traced.verdict == "none" else (),
         cluster=traced.screened.cluster,
+        mechanism=traced.mechanism,
         missed=traced.missed,
         unused=traced.unused,
         far=tuple(n for n, z in zip(space.coordinates.base.names, base.z[: space.free], strict=True) if abs(z) > FAR),
@@ -686,7 +699,7 @@ def assemble_result(
     screened, left, where, noise = traced.screened, traced.left, traced.where, traced.sds.noise
     space, base, best, ends = screened.base.space, screened.base.candidate, traced.best, traced.ends
     curve = beside = None
-    if traced.verdict == "unnamed" and traced.beside is not None:
+    if traced.verdict in WITHOUT_NAME and traced.beside is not None:
         progress(Step("shape"))
         curve, beside = traced.beside.curve, traced.beside.diagnosis
     observe, rows = space.bare.observe, len(runs)
@@ -709,7 +722,7 @@ def assemble_result(
     seen = findings.readings(runs, noise.sd, before, after, known[0], None if best is base else known[1])
     error = lambda simulated: findings.errors(space.bare, simulated, seen.measured, seen.sd, included)  # noqa: E731
     compared = traced.held_out
-    if traced.alike is not None and traced.verdict != "unnamed" and not compared and not observe.long:
+    if traced.alike is not None and traced.verdict not in WITHOUT_NAME and not compared and not observe.long:
         compared = preference.compared(space, runs, best, traced.alike)
     gain, kept = _gain(space, runs, seen), True
     if gain is not None and (curve is not None or best is not base):
@@ -730,9 +743,9 @@ def assemble_result(
     remains = None
     if traced.alike is not None:
         found = findings.found_effects(space, base, best, traced.alike, left.test, settings)
-        remains = None if where is None or traced.verdict == "unnamed" else where
+        remains = None if where is None or traced.verdict in WITHOUT_NAME else where
     concealed: tuple[HiddenEffect, ...] = ()
-    if traced.alike is not None and traced.verdict != "unnamed":
+    if traced.alike is not None and traced.verdict not in WITHOUT_NAME:
         ask = observe.menu and not observe.long
         concealed = findings.hidden_effects(
             space, hidden(space, best, traced.alike, left, traced.ends, settings, ask=ask)
@@ -842,7 +855,7 @@ def _proposal(space: CandidateSpace, traced: LoopStages, settings: Settings) -> 
         return None
     if not space.bare.observe.menu:
         return no_menu(space) if traced.verdict != "none" else None
-    if traced.verdict == "unnamed" and traced.where is not None:
+    if traced.verdict in WITHOUT_NAME and traced.where is not None:
         return denser(space, traced.where, settings)
     return None if traced.alike is None else separating(space, traced.best, traced.alike, settings)
 

@@ -176,6 +176,43 @@ class Missing:
     test: NameTest | None = None
 
 
+#: What a mechanism needs: share of the excess misfit, standard errors of its gain on data held out.
+HALF, SURE = 0.5, 2.0
+#: Mechanisms that data may not tell apart for one of them to be stated.
+FEW = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class Mechanism:
+    """Which equation lacks something and what drives it, by the effects or the smooth curve that explain most of it.
+
+    Attributes:
+        families: equation and driver in words, the best first, then those that explain as much.
+        effects: of the library in its place, () for a curve.
+        share: of the excess misfit, χ² less its expectation, that it explains [-].
+        gain, se: on data held out, over the readings that it changes [nat a reading].
+        again: share of the informative blocks of runs without which it is found again [-].
+    """
+
+    families: tuple[str, ...]
+    effects: tuple[str, ...]
+    share: float
+    gain: float
+    se: float
+    again: float
+
+    @property
+    def fails(self) -> tuple[str, ...]:
+        """Rows of `words.loop.NO_MECHANISM`: what speaks against it; empty where it is established."""
+        doubts = {
+            "share": self.share < HALF,
+            "gain": not self.gain > SURE * self.se,
+            "again": self.again < AGAIN,
+            "many": len(self.families) > FEW,
+        }
+        return tuple(doubt for doubt, holds in doubts.items() if holds)
+
+
 class Missed(NamedTuple):
     """A channel that a refit misses: rms error and estimated noise over its measured rms [-]."""
 
@@ -189,12 +226,13 @@ class Summary:
     """A verdict with all that its statement says.
 
     Attributes:
-        verdict: `none`, `named`, `class`, `unnamed` or `undescribed`; p: family-wise.
+        verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`; p: family-wise.
         where: something is missing, or remains.
-        missing: the effects found, established or tentative; `unnamed` has none that are established.
+        missing: the effects found, established or tentative; without names none is established.
         nearest: effects that come nearest where none may be named; support: whether names stand.
         aside, of: rows that lie off alone where these are many, of how many; 0 else.
         noise: sds that are off, where that is all; cluster: what rows that lie off have in common.
+        mechanism: where no name stands, established or not.
         missed: channels that the model does not describe; unused: columns of numbers that vary and are not used;
             far: base parameters beyond three prior sds.
     """
@@ -209,6 +247,7 @@ class Summary:
     of: int = 0
     noise: tuple[NoiseOff, ...] = ()
     cluster: Cluster | None = None
+    mechanism: Mechanism | None = None
     missed: tuple[Missed, ...] = ()
     unused: tuple[str, ...] = ()
     far: tuple[str, ...] = ()

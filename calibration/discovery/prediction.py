@@ -42,9 +42,16 @@ class HeldOutScore:
     blocks: dict[str, np.ndarray]
     reading: dict[str, Readings] = dataclasses.field(default_factory=dict)
 
-    def gain(self, over: HeldOutScore) -> Gain:
-        """How much better it is than another's, over the readings of both."""
+    def gain(self, over: HeldOutScore, where: Bool[np.ndarray, "rows channels"] | None = None) -> Gain:
+        """How much better it is than another's, over the readings of both.
+
+        Args:
+            where: readings that count; None: all.
+        """
+        if not self.by_kind:
+            return Gain(0.0, np.inf)
         each = np.stack([x - over.by_kind[kind] for kind, x in self.by_kind.items()])
+        each = each if where is None else np.where(where, each, np.nan)
         scored = np.isfinite(each)
         counts = scored.sum((0, 2))
         rows = counts > 0

@@ -15,7 +15,7 @@ from calibration.data.runs import WHEN, Runs
 from calibration.data.writing import write_json, write_table
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.notes import Asked, Instruction, NameSupport, RuledOut, Summary
+from calibration.discovery.notes import Asked, Instruction, Mechanism, NameSupport, RuledOut, Summary
 from calibration.discovery.prediction import Gain
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
@@ -29,7 +29,7 @@ from calibration.words.notes import sentence, sentences
 from mmrjax.channels import Channel
 from mmrjax.robot import Robot
 
-SCHEMA = "mmrjax.loop/2"
+SCHEMA = "mmrjax.loop/3"
 #: The robot whose running gear the track model found.
 TRACK_FILE = "robot_track.toml"
 #: The robot fitted with nothing added.
@@ -417,7 +417,8 @@ class DiscoveryResult:
     """All that the loop found.
 
     Attributes:
-        verdict: `none`, `named`, `class` or `unnamed`; summary: with all that its statement says.
+        verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
+        summary: the verdict with all that its statement says.
         robot: the one that is written; refit: with nothing added; written: whether what was found is in it.
         gain: of what was found over the refit, on data held out; None where nothing can be.
         converged: whether the fit of that robot is an optimum; posterior: of all that was fitted.
@@ -569,6 +570,7 @@ class DiscoveryResult:
         return {
             "schema": SCHEMA,
             "verdict": self.verdict,
+            "mechanism": None if self.summary.mechanism is None else _mechanism(self.summary.mechanism, self.unnamed),
             "missed": [m._asdict() for m in self.summary.missed],
             "statement": self.statement,
             "rows": len(self.runs),
@@ -711,6 +713,12 @@ def _effect(e: FoundEffect, support: NameSupport | None) -> dict[str, Any]:
         "members": {name: dataclasses.asdict(m) for name, m in e.members.items()},
         "stated_values": {name: dataclasses.asdict(s) for name, s in e.stated.items()},
     }
+
+
+def _mechanism(m: Mechanism, curve: UnnamedDiscrepancy | None) -> dict[str, Any]:
+    found = {n: getattr(m, n) for n in ("share", "gain", "again")} | {"se": m.se if np.isfinite(m.se) else None}
+    listed = {n: list(getattr(m, n)) for n in ("families", "effects", "fails")}
+    return {**listed, **found, "established": not m.fails, "course": "" if curve is None else words.course(curve)}
 
 
 def _unnamed(d: UnnamedDiscrepancy) -> dict[str, Any]:

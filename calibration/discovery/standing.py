@@ -303,7 +303,9 @@ def name_tests(
                 _evidence_over_curves(space, whole, others, effect, seen[others.active], bases, settings),
                 run,
                 root_without,
-                _chosen_again(space, effect, judged, np.asarray(signatures), blocks, settings),
+                _chosen_again(
+                    space, (space.library[effect].family(),), judged, np.asarray(signatures), blocks, settings
+                ),
                 next((c.effects for c in better if effect not in c.effects), ()),
                 own in lacks,
                 "run" if space.bare.observe.long else "row",
@@ -417,22 +419,47 @@ def _put_back(
     return np.delete(jacobian, [k, k + len(best.active)], 1), left, signatures
 
 
+def chosen_again(
+    space: CandidateSpace,
+    base: Candidate,
+    best: Candidate,
+    left: Diagnosis,
+    families: Sequence[str],
+    bases: Bases,
+    blocks: Sequence[np.ndarray],
+    settings: Settings,
+) -> float:
+    """Share of the blocks without which an effect of these families still explains as much as any of the library, of
+    those that leave half of what is known of the first effect of a candidate; 1 where there are none.
+
+    Args:
+        left: what the base leaves.
+    """
+    effect, linear = best.effects[0], left.linear
+    judged = _beside(space, linear, bases, (), effect)
+    if _root(*judged) ** 2 < PROMISED * 2 * (base.cost - best.cost):
+        linear = diagnose(space, best, bases, left.test.null, settings).linear
+        judged = _put_back(space, best, effect, _beside(space, linear, bases, (), effect))
+    return _chosen_again(space, families, judged, np.asarray(linear.signatures), blocks, settings)
+
+
 def _chosen_again(
     space: CandidateSpace,
-    effect: str,
+    families: Sequence[str],
     beside: tuple[np.ndarray, ...],
     signatures: np.ndarray,
     blocks: Sequence[np.ndarray],
     settings: Settings,
 ) -> float:
-    """Share of the blocks without which an effect of its family still explains as much as any of the library, as
-    `classes` has it, of those that leave half of what is known of it; 1 where there are none.
+    """Share of the blocks without which an effect of these families still explains as much as any of the library, as
+    `classes` has it, of those that leave half of what is known of an effect; 1 where there are none.
 
     Args:
-        beside: Jacobian, residual and its own signatures, as `_root` takes them; signatures: of the library, there.
+        beside: Jacobian, residual and the effect's own signatures, as `_root` takes them.
+        signatures: of the library, there.
     """
-    library, family, again = space.library, space.library[effect].family(), []
-    akin = np.array([library[name].family() == family for name in library.names])[library.of]
+    library, again = space.library, []
+    akin = np.array([library[name].family() in families for name in library.names])[library.of]
     whole = _left_of(*beside)[0].max()
     for out in blocks:
         kept = _kept(space, out, len(signatures))

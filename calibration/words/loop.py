@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calibration.discovery import notes
-from calibration.discovery.settings import FIT, HELD_OUT
+from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME
 from calibration.inference import bases
 from calibration.inference import blocks as blocks_room
 from calibration.words import fits
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         Resolved,
         Sensitivity,
         StatedValue,
+        UnnamedDiscrepancy,
         Worse,
     )
 
@@ -53,8 +54,13 @@ def _verdict(said: notes.Summary) -> str:
         return _undescribed(said)
     if said.verdict == "none":
         return f"Nothing is missing: what the fitted model leaves is what noise leaves (family-wise p = {p:.2g})."
-    if said.verdict == "unnamed" and where is not None:
-        text = _without_name(where, p, "is established" if said.missing else "explains it")
+    if said.verdict in WITHOUT_NAME and where is not None:
+        found = said.mechanism
+        if said.verdict == "mechanism" and found is not None:
+            text = f"Missing: {_mechanism(found)} (family-wise p {p_value(p)}). No law of the library is established."
+        else:
+            text = _without_name(where, p, "is established" if said.missing else "explains it")
+            text += f" No mechanism is established: {no_mechanism(found)}." if found is not None else ""
         if said.missing:
             text += _tentative(said.missing, said.support)
         elif said.nearest:
@@ -84,9 +90,64 @@ def _undescribed(said: notes.Summary) -> str:
     )
 
 
+def _mechanism(found: notes.Mechanism) -> str:
+    """A mechanism with its evidence."""
+    return f"a {' or a '.join(found.families)}, established as a mechanism: it {evidence(found)}"
+
+
+def evidence(found: notes.Mechanism) -> str:
+    """How large a mechanism is, what it predicts, and whether it is found again."""
+    errors = f", {found.gain / found.se:.1f} standard errors" if 0 < found.se < math.inf else ""
+    return (
+        f"explains {100 * found.share:.0f} % of the excess misfit, gains {found.gain:.2g} nat a reading that it "
+        f"changes on runs that the fit has not seen{errors}, and is found again in {100 * found.again:.0f} % of the "
+        "data with a block left out"
+    )
+
+
+#: What speaks against a mechanism.
+NO_MECHANISM = {
+    "share": "it explains only {share:.0f} % of the excess misfit",
+    "gain": "on runs that its fit has not seen it gains {0.gain:.2g} ± {0.se:.2g} nat a reading",
+    "again": "it is found again in only {again:.0f} % of the data with a block left out",
+    "many": "{many} mechanisms explain as much",
+}
+
+
+def no_mechanism(found: notes.Mechanism) -> str:
+    """What speaks against the mechanism that explains most."""
+    numbers = {"share": 100 * found.share, "again": 100 * found.again, "many": len(found.families)}
+    why = [NO_MECHANISM[name].format(found, **numbers) for name in found.fails]
+    return f"the best one is a {found.families[0]}, but {' and '.join(why)}"
+
+
+def course(d: UnnamedDiscrepancy) -> str:
+    """Course of a smooth curve in words, with its values at both ends; empty for one that is over no variable."""
+    if d.window is not None or d.variable not in bases.VARIABLES or len(d.at) < 2:
+        return ""
+    ends = [f"{d.value[k]:.2g} {d.unit} at {_level(d.variable, d.at[k])}" for k in (0, -1)]
+    k = int(np.argmax(np.abs(d.value - np.interp(d.at, d.at[[0, -1]], d.value[[0, -1]]))))
+    between = f", by way of {d.value[k]:.2g} {d.unit} at {_level(d.variable, d.at[k])}"
+    bent = not min(d.value[0], d.value[-1]) <= d.value[k] <= max(d.value[0], d.value[-1])
+    verb = "rises" if d.value[-1] > d.value[0] else "falls"
+    return f"{verb} from {ends[0]} to {ends[1]}{between * bent}"
+
+
+#: Units in which people set the variables of a curve, and their SI values.
+_SET_IN = {"speed_motor": ("rpm", math.pi / 30), "slope": ("°", math.pi / 180), "speed": ("mm/s", 1e-3)}
+
+
+def _level(variable: str, x: float) -> str:
+    units = {"voltage": "V", "current": "A", "payload": "kg", "time": "s"}
+    unit, factor = _SET_IN.get(variable, (units.get(variable, ""), 1.0))
+    return f"{x / factor:.3g} {unit}".rstrip()
+
+
 def brief(said: notes.Summary) -> str:
     """A verdict, and the effects in the model by their leaders."""
     found = []
+    if said.verdict == "mechanism" and said.mechanism is not None:
+        found.append(" or ".join(said.mechanism.families))
     for word, established in (("established", True), ("tentative", False)):
         names = [one.names[0] for one in said.missing if one.established == established]
         found += [f"{', '.join(names)} {word}"] * bool(names)
@@ -187,7 +248,10 @@ def answer(found: DiscoveryResult) -> str:
     if found.verdict == "undescribed":
         return "No verdict: this model does not describe these runs."
     sure, weak = ([e for e in found.effects if is_established(found, e) == want] for want in (True, False))
-    lacks = found.unnamed
+    lacks, stated = found.unnamed, found.summary.mechanism
+    if found.verdict == "mechanism" and stated is not None:
+        over = f", which {course(lacks)}" if lacks is not None and course(lacks) else ""
+        return f"No: missing is a {' or a '.join(stated.families)}{over}. Its exact law is not established."
     if lacks is not None and not weak:
         place = bases.in_words(lacks.channel or lacks.balance)
         return f"No. Something is missing in the {place}, and nothing in the library explains it."
@@ -343,7 +407,7 @@ def standing(found: DiscoveryResult) -> str:
     """Why names do not stand, or beside what they do, in a sentence; empty where there is nothing to say."""
     if not found.standing:
         return ""
-    if found.verdict == "unnamed":
+    if found.verdict in WITHOUT_NAME:
         return f"Why no name: {found.standing}."
     return f"{found.standing[0].upper()}{found.standing[1:]}."
 
@@ -378,13 +442,13 @@ def why_ruled_out(reasons: Sequence[notes.RuledOut]) -> str:
 def ruled_out(found: DiscoveryResult) -> str:
     """What would explain the data better than what is proposed, or as well, but for its size; empty for nothing."""
     candidates, same = found.implausible, found.settings.same
-    if found.verdict != "unnamed":
+    if found.verdict not in WITHOUT_NAME:
         better = tuple(a for a in candidates if a.rise_chi2 < -same)
         candidates = better or tuple(a for a in candidates if a.rise_chi2 <= same)
     if not candidates or found.verdict in ("none", "undescribed"):
         return ""
     first = min(candidates, key=lambda a: (len(a.effects), a.rise_chi2))
-    what = "the curve" if found.verdict == "unnamed" else "what is proposed"
+    what = "the curve" if found.verdict in WITHOUT_NAME else "what is proposed"
     more = first.rise_chi2 < -found.settings.same
     gain = f"{-first.rise_chi2:.0f} σ² more than {what}" if more else f"as much as {what}"
     are = "are" if len(first.effects) > 1 else "is"

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from calibration.data.table import Runs
 from calibration.discovery.result import DiscoveryResult, Evidence, UnnamedDiscrepancy
+from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import blocks
 from calibration.inference.bases import in_words
 from calibration.inference.details import TimeStatistics
@@ -337,7 +338,7 @@ def defects(table: dict[str, np.ndarray], verdict: str, crosses_zero: bool = Fal
     Args:
         crosses_zero: whether readings may (`Layout.crosses_zero`): drawn are the equations that they close.
     """
-    whens = ("before",) if verdict in ("none", "unnamed") else ("before", "after")
+    whens = ("before",) if verdict in ("none", *WITHOUT_NAME) else ("before", "after")
     drawn = {b: DEFECT_WORDS[b] for b in (closed(table) if crosses_zero else DEFECT_WORDS)}
     fig, grid = figure(len(whens), len(drawn), 2.6 * len(whens) + 0.5, sharex="col", sharey="col")
     for row, when in enumerate(whens):
