@@ -52,7 +52,7 @@ def found(monkeypatch):
         bare=SimpleNamespace(observe=SimpleNamespace(long=False, blocks=("speed",))),
     )  # fmt: skip
     score = HeldOutScore({}, {})
-    monkeypatch.setattr(room.blocks_room, "distinct", lambda *_: {})
+    monkeypatch.setattr(room.blocks_room, "predictable", lambda *_: {})
     monkeypatch.setattr(room, "_held_out", lambda *_: score)
     monkeypatch.setattr(room, "_scored", lambda *_: score)
     monkeypatch.setattr(room, "_reading", lambda *_: None)

@@ -457,7 +457,7 @@ def test_model_holds_what_is_established_and_what_predicts(monkeypatch, adequate
         "fit_candidates",
         lambda space, wanted, settings: [candidate_of(*(n for n in w if n)) for w, _ in wanted],
     )
-    monkeypatch.setattr(discover.blocks_room, "distinct", lambda *a: {"slope": {"0": np.ones(3, bool)}})
+    monkeypatch.setattr(discover.blocks_room, "predictable", lambda *a: {"slope": {"0": np.ones(3, bool)}})
     bare = SimpleNamespace(observe=SimpleNamespace(long=False, blocks=("slope",)))
     screened = SimpleNamespace(
         base=SimpleNamespace(candidate=candidate_of(), space=SimpleNamespace(bare=bare)), bases=()

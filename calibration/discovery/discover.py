@@ -45,6 +45,7 @@ from calibration.discovery.notes import (
     NameSupport,
     NameTest,
     NoiseFromSeries,
+    NotPredictable,
     Outstanding,
     PhasesDiffer,
     RestsOn,
@@ -58,6 +59,7 @@ from calibration.discovery.posterior import of_curve, of_fit
 from calibration.discovery.prediction import Predicted
 from calibration.discovery.result import (
     DiscoveryResult,
+    Errors,
     FoundEffect,
     HeldOutAlternative,
     HiddenEffect,
@@ -497,7 +499,7 @@ def choose(
     if best is None or after is None:
         return None, searched, standing(space, base, searched, left, bases, settings)
     adequate = not after.test.rejected_with_margin
-    kinds = blocks_room.distinct(runs, space.bare.observe.blocks)
+    kinds = blocks_room.predictable(runs, space.bare)
     blocks = [mask for by in kinds.values() for mask in by.values()]
     asked = functools.partial(standing, space, base, searched, left, bases, settings, blocks=blocks, beside=beside)
     stood = asked() if adequate or long else None
@@ -792,8 +794,9 @@ def assemble_result(
         detail=observe.detail(screened.bases, included, left, ends),
         readings_of_rows=seen,
         errors_as_stated=error(seen.as_stated),
-        errors=(error(seen.before), error(seen.after)),
-        errors_held_out={k: (error(a), error(b)) for k, (a, b) in seen.held_out.items()},
+        errors=on_same_rows(seen.before, seen.after, error),
+        errors_held_out={k: on_same_rows(*both, error) for k, both in seen.held_out.items()},
+        held_out_unpredictable=blocks_room.unpredictable(runs, space.bare),
         held_out_worse=preference.worse(seen.held_out, error),
         alternatives_held_out=compared,
         noise=_noise(runs, noise, type(observe)),
@@ -803,6 +806,14 @@ def assemble_result(
     # What happens for a while is not everywhere alike.
     of_noise = of_sds(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
     return dataclasses.replace(result, remarks=(*of_noise, *remarks(result)))
+
+
+def on_same_rows(
+    before: np.ndarray, after: np.ndarray, error: Callable[[np.ndarray], Errors]
+) -> tuple[Errors, Errors]:
+    """Errors of readings before and after, over the rows that both fits predict."""
+    both = np.isfinite(before) & np.isfinite(after)
+    return error(np.where(both, before, np.nan)), error(np.where(both, after, np.nan))
 
 
 def of_sds(sds: Sds, remaining: Residuals) -> tuple[NoiseOff, ...]:
@@ -818,9 +829,9 @@ def _gain(space: CandidateSpace, runs: Runs, seen: ReadingsOfRows) -> prediction
     """By how much what was found predicts better than the refit; None where nothing can be held out."""
     if not seen.held_out:
         return None
-    counts, kinds = space.weight[: len(runs)] > 0, space.bare.observe.blocks
+    counts, kinds = space.weight[: len(runs)] > 0, blocks_room.predictable(runs, space.bare)
     before, after = (
-        prediction.scored({k: x[when] for k, x in seen.held_out.items()}, seen.measured, seen.sd, counts, runs, kinds)
+        prediction.scored({k: x[when] for k, x in seen.held_out.items()}, seen.measured, seen.sd, counts, kinds)
         for when in (0, 1)
     )
     return after.gain(before)
@@ -892,6 +903,7 @@ def remarks(found: DiscoveryResult) -> Notes:
     held = tuple(name for name in found.held_by_prior if name not in far)
     said += [HeldByPrior(held)] * bool(held)
     said += [OnlyTogether(found.together)] * bool(found.together)
+    said += [NotPredictable(found.held_out_unpredictable)] * bool(found.held_out_unpredictable)
     said += found.residual_clusters
     wave = found.unnamed
     if wave is not None and wave.score_free_in_each_run and wave.score < 0.5 * wave.score_free_in_each_run:

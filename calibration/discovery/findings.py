@@ -385,7 +385,7 @@ def readings(
         return held_out(fitted.problem, fitted.z, masks, fitted.active).reading
 
     held, labels = {}, {}
-    for kind, by in blocks_room.distinct(runs, before.problem.observe.blocks).items():
+    for kind, by in blocks_room.predictable(runs, before.problem).items():
         masks = list(by.values())
         first = unseen(before, masks) if known_before is None else known_before[kind]
         later = first

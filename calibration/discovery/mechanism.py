@@ -60,7 +60,7 @@ def mechanism(
     explained = 0.0 if first is None else 2 * (base.cost - first.cost)
     within = max(settings.same, settings.form**2 * explained)
     excess = max(2 * base.cost - float(np.sum(space.weight > 0)), 1e-9)
-    kinds = blocks_room.distinct(runs, space.bare.observe.blocks)
+    kinds = blocks_room.predictable(runs, space.bare)
     blocks = [mask for by in kinds.values() for mask in by.values()]
     if first is not None and (own[0] in best or by_curve <= explained + within):
         alike = [f for f, c in sorted(best.items(), key=lambda x: x[1].cost) if 2 * (c.cost - first.cost) <= within]
@@ -113,7 +113,7 @@ def _held_out(space: CandidateSpace, runs: Runs, candidate: Candidate, predicted
 def _scored(space: CandidateSpace, runs: Runs, reading: dict[str, np.ndarray]) -> HeldOutScore:
     data, rows = space.equipped.data, len(runs)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
-    return prediction.scored(reading, measured, sd, counts, runs, space.bare.observe.blocks)
+    return prediction.scored(reading, measured, sd, counts, blocks_room.predictable(runs, space.bare))
 
 
 def _reading(space: CandidateSpace, candidate: Candidate) -> np.ndarray:

@@ -355,6 +355,12 @@ class Led(Note):
     rise_chi2: float
 
 
+class NotPredictable(Note):
+    """Kinds of blocks that the others cannot predict, as parameters are determined by one block alone."""
+
+    kinds: tuple[str, ...]
+
+
 class LostReplicates(Note):
     """Bootstrap tables that could be fitted again, of those that were asked for."""
 

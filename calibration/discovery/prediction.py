@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -86,19 +86,18 @@ def scored(
     measured: Readings,
     sd: Readings,
     counts: Bool[np.ndarray, "rows channels"],
-    runs: Runs,
-    kinds: Sequence[str],
+    kinds: Mapping[str, Mapping[str, np.ndarray]],
 ) -> HeldOutScore:
     """Scores of readings held out.
 
     Args:
         reading: kind of block → of each row, by a fit that has not seen its block; NaN where it predicts none.
-        counts: whether a reading does; kinds: of blocks, as of an observer.
+        counts: whether a reading does; kinds: of blocks, label → mask of its rows each.
     """
     by_kind, blocks = {}, {}
     norm = math.lgamma((FREEDOM + 1) / 2) - math.lgamma(FREEDOM / 2) - 0.5 * math.log(FREEDOM * math.pi)
-    for kind, by in blocks_room.distinct(runs, kinds).items():
-        block = np.full(len(runs), -1)
+    for kind, by in kinds.items():
+        block = np.full(len(measured), -1)
         for k, mask in enumerate(by.values()):
             block[mask] = k
         off = (reading[kind] - measured) / sd
@@ -120,14 +119,11 @@ def key(candidate: Candidate) -> tuple[tuple[str, ...], bytes]:
 
 def score_of(space: CandidateSpace, runs: Runs, candidate: Candidate) -> HeldOutScore:
     """Scores of a candidate, fitted anew without each block of every kind."""
-    data, rows, kinds = space.equipped.data, len(runs), space.bare.observe.blocks
+    data, rows, kinds = space.equipped.data, len(runs), blocks_room.predictable(runs, space.bare)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
     problem, z, active = space.fit_of(candidate.active, candidate.z)
-    reading = {
-        kind: held_out(problem, z, list(by.values()), active).reading
-        for kind, by in blocks_room.distinct(runs, kinds).items()
-    }
-    return dataclasses.replace(scored(reading, measured, sd, counts, runs, kinds), reading=reading)
+    reading = {kind: held_out(problem, z, list(by.values()), active).reading for kind, by in kinds.items()}
+    return dataclasses.replace(scored(reading, measured, sd, counts, kinds), reading=reading)
 
 
 def smallest(
@@ -144,7 +140,7 @@ def smallest(
         path: candidates by the number of their effects.
         predicted: takes what each of them predicts of data held out.
     """
-    if not blocks_room.distinct(runs, space.bare.observe.blocks):
+    if not blocks_room.predictable(runs, space.bare):
         return None
     candidates = [base, *path]
     scores = [score_of(space, runs, c) for c in candidates]

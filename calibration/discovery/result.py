@@ -441,7 +441,8 @@ class DiscoveryResult:
         detail: what this kind of data tells beside: equations run by run, or memory, orders and drift.
         readings_of_rows: measured and simulated.
         errors_as_stated: rms by channel, of the robot before any fit.
-        errors, errors_held_out: rms by channel, before and after; by kind of block.
+        errors, errors_held_out: rms by channel, before and after, over the rows that both predict; by kind of block.
+        held_out_unpredictable: kinds of blocks of which the others cannot predict some or all.
         held_out_worse: where the latter rise.
         alternatives_held_out: of a class, compared by data held out; empty where there is one, or where that takes
             long and was not asked for.
@@ -490,6 +491,7 @@ class DiscoveryResult:
     errors_as_stated: Errors
     errors: tuple[Errors, Errors]
     errors_held_out: dict[str, tuple[Errors, Errors]]
+    held_out_unpredictable: tuple[str, ...]
     held_out_worse: tuple[Worse, ...]
     alternatives_held_out: tuple[HeldOutAlternative, ...]
     noise: dict[str, dict[str, Any]]
@@ -534,6 +536,15 @@ class DiscoveryResult:
             for simulated in (seen.before, seen.after)
         )
         return before, after
+
+    @property
+    def predicted(self) -> dict[str, tuple[int, int]]:
+        """Kind of block → rows that fits without their block predict, before and after."""
+
+        def rows(reading: np.ndarray) -> int:
+            return int(np.sum(np.isfinite(reading).any(1) & self.included))
+
+        return {kind: (rows(a), rows(b)) for kind, (a, b) in self.readings_of_rows.held_out.items()}
 
     @property
     def rms(self) -> dict[str, dict[str, float]]:
@@ -598,6 +609,7 @@ class DiscoveryResult:
             },
             "errors_percent_of": OF_SIZE,
             "held_out_by": held,
+            "held_out_unpredictable": list(self.held_out_unpredictable),
             "held_out_worse": [dataclasses.asdict(w) for w in self.held_out_worse],
             "alternatives_held_out": [dataclasses.asdict(a) for a in self.alternatives_held_out],
             "prediction": {

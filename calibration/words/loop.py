@@ -501,22 +501,20 @@ def alike(found: DiscoveryResult, e: FoundEffect) -> str:
     return ", or ".join(words for words in (others, values) if words)
 
 
-def worse(found: Sequence[Worse], held_out: Mapping[str, tuple[Errors, Errors]]) -> str:
+def worse(found: Sequence[Worse], predicted: Mapping[str, tuple[int, int]]) -> str:
     """Which errors rise, and where fewer rows are predicted, in a sentence; empty where none does.
 
     Args:
-        held_out: kind of block → errors before and after, each over the rows that it predicts.
+        predicted: kind of block → rows that are predicted before and after.
     """
     parts = []
-    for kind, (before, after) in held_out.items():
+    for kind, (before, after) in predicted.items():
         mine = [w for w in found if w.kind == kind]
         changes = [f"{channels.find(w.channel).label} {_change(w.before, w.after)} %" for w in mine]
-        predicted = {n: (int(before[n]["rows"]), int(after[n]["rows"])) for n in after}
-        if any(w.rows < max(predicted[w.channel]) for w in mine):
+        if any(w.rows < max(before, after) for w in mine):
             changes[-1] += f" (of the {min(w.rows for w in mine)} rows that both predict)"
-        lost = max(was - now for was, now in predicted.values())
-        if lost > 0:
-            changes.append(f"{counted(lost, 'row')} fewer predicted")
+        if before > after:
+            changes.append(f"{counted(before - after, 'row')} fewer predicted")
         if changes:
             parts.append(f"by {blocks_room.in_words(kind)} {', '.join(changes)}")
     return f"Held out, what was found predicts worse: {'; '.join(parts)}." if parts else ""
@@ -677,6 +675,11 @@ SAID: dict[type, str | Callable[[Any], str]] = {
     notes.StillLacks: still_lacks,
     notes.Late: late,
     notes.Led: led,
+    notes.NotPredictable: lambda note: (
+        f"not predictable from the others, so neither scored nor tested: blocks by "
+        f"{' and by '.join(blocks_room.in_words(kind) for kind in note.kinds)} that hold all runs of a configuration "
+        "with parameters of its own"
+    ),
     notes.LostReplicates: "only {settled} of {asked} bootstrap tables could be fitted again; the thresholds are "
     "theirs",
     notes.Outstanding: outstanding,

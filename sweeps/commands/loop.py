@@ -168,7 +168,7 @@ def print_discovery(found: DiscoveryResult) -> None:
     for said in (said_of.standing(found), said_of.ruled_out(found)):
         if said:
             say(said)
-    rise = said_of.worse(found.held_out_worse, found.errors_held_out)
+    rise = said_of.worse(found.held_out_worse, found.predicted)
     if rise:
         say(rise)
     if found.effects:

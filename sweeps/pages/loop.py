@@ -151,10 +151,18 @@ def unseen(found: DiscoveryResult) -> list[dict[str, Any]]:
             mark = "bad" if up else "good" if change < -NOTABLE else ""
             arrow = {"bad": " ↑", "good": " ↓", "": ""}[mark]
             cells.append({"text": " → ".join(texts) + arrow, "mark": mark})
-        rows = [max(int(e["rows"]) for e in one.values()) for one in both[: 1 + many]]
+        rows = max(int(e["rows"]) for e in both[0].values())
         what = f"unseen: another {blocks.in_words(kind)}" if kind else "seen by the fit"
-        shown = f"{rows[0]} → {rows[-1]}" if rows[0] != rows[-1] else str(rows[0])
-        lines.append({"what": what, "cells": cells, "reached": f"{shown} of {total}"})
+        lines.append({"what": what, "cells": cells, "reached": f"{rows} of {total}"})
+    lines += [
+        {
+            "what": f"unseen: another {blocks.in_words(kind)}",
+            "cells": [],
+            "reached": "not predictable from the others",
+        }
+        for kind in found.held_out_unpredictable
+        if kind not in found.errors_held_out
+    ]
     return lines
 
 
@@ -243,7 +251,7 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         alike=alike(found),
         doubts=[words.tentative(found, e) for e in found.effects] + [""] * (found.unnamed is not None),
         other_noise=words.at_other_noise(found.sensitivity),
-        worse=words.worse(found.held_out_worse, found.errors_held_out),
+        worse=words.worse(found.held_out_worse, found.predicted),
         rows=first_rows(rows_of(found)),
         conditions=conditions(rows_of(found)),
         columns=columns(found.channels),
