@@ -81,8 +81,15 @@ def test_it_is_that_of_the_family_that_explains_most(found):
 
 def test_two_laws_of_one_mechanism_are_one(found):
     both, one = fitted("stribeck", "churning", explains=1900.0), fitted("stribeck", explains=1500.0)
-    got = found(one, both, fitted("stribeck", "leads", explains=1950.0), curve=1000.0)
+    twice = fitted("stribeck", "stribeck", explains=1940.0)  # which is no law of the library
+    got = found(one, both, twice, fitted("stribeck", "leads", explains=1950.0), curve=1000.0)
     assert got.families == (FAMILIES["stribeck"],) and set(got.effects) == {"stribeck", "churning"}
+
+
+def test_share_of_the_excess_is_no_more_than_all_where_noise_is_stated_too_large():
+    space, base = SimpleNamespace(weight=np.ones((ROWS, 1))), fitted(explains=0.0)
+    assert room.share_of_excess(space, base, 985.0) == pytest.approx(0.5)
+    assert room.share_of_excess(space, dataclasses.replace(base, cost=ROWS / 2), 20.0) == 1.0
 
 
 def test_mechanisms_that_explain_as_much_are_both_listed(found):

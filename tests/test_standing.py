@@ -326,6 +326,9 @@ def test_name_stands_by_its_score_its_curves_and_its_rows(root, without, evidenc
         dataclasses.replace(test, **bad).established
         for bad in ({"again": 0.75}, {"larger": ("b",)}, {"remains": True}, {"varies": 3.4})
     )
+    # a form that is known to less than a third of the amplitude costs no name
+    assert dataclasses.replace(test, varies=9.0, spread=0.29).established == test.established
+    assert dataclasses.replace(test, varies=9.0, spread=0.31).established is False
     # of a library of three effects chance reaches less than in a dozen looks at the amplitude
     assert dataclasses.replace(test, varies=3.4, by_chance=3.5).established == test.established
     of_runs = dataclasses.replace(test, what="run")  # of histories: chance alone
@@ -349,9 +352,11 @@ def test_amplitude_that_changes_with_a_variable_is_seen_and_one_that_does_not_is
     )
     linear.jacobian = np.concatenate([column[:, None], np.eye(1)])
     noise = rng.standard_normal(2 * rows)
+    sized = dataclasses.replace(candidate_of("a"), z=np.ones(12))
     for share, seen in ((0.0, False), (0.5, True)):
         linear.residual = np.append(noise + column * share * np.repeat(x, 2), 0.0)
-        varies, over, by_chance = _varies_most(space, candidate_of("a"), "a", linear, 0.03)
+        varies, over, by_chance, spread = _varies_most(space, sized, "a", linear, 0.03)
+        assert not seen or spread == pytest.approx(0.5, abs=0.05)  # of an amplitude of 1
         assert (varies > by_chance) == seen and (not seen or over == "slope")
         assert by_chance == pytest.approx(2.67, abs=0.01)  # two variables, along a line or bent: 0.03 / 4, both sides
         # along a straight line, by least squares with the column and without
@@ -362,7 +367,7 @@ def test_amplitude_that_changes_with_a_variable_is_seen_and_one_that_does_not_is
         ]
         assert not seen or varies**2 == pytest.approx(left[0] - left[1], rel=1e-8)
     space.bare.observe.long = True  # a history's readings answer to all of its past
-    assert _varies_most(space, candidate_of("a"), "a", linear, 0.03) == (0.0, "", math.inf)
+    assert _varies_most(space, candidate_of("a"), "a", linear, 0.03) == (0.0, "", math.inf, math.inf)
 
 
 @pytest.mark.parametrize(("single", "lacks"), [(3.4, {"slip"}), (5.0, {"slip", "track"})])

@@ -19,6 +19,7 @@ from calibration.discovery.discrepancy import Discrepancy
 from calibration.discovery.experiments import Proposal
 from calibration.discovery.hidden import Hidden
 from calibration.discovery.location import DiscrepancyLocation
+from calibration.discovery.mechanism import share_of_excess
 from calibration.discovery.notes import RuledOut
 from calibration.discovery.projection import Defect, defect
 from calibration.discovery.result import (
@@ -97,6 +98,7 @@ def found_effects(
                 parameters=_parameters(space, best, slot, settings),
                 p_value=own_p(gains[slot], null),
                 score=float(gains[slot]),
+                share=share_of_excess(space, base, float(gains[slot])),
             )
         )
     return tuple(listed)

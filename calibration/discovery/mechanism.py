@@ -59,7 +59,6 @@ def mechanism(
     first = min(best.values(), key=lambda c: c.cost) if best else None
     explained = 0.0 if first is None else 2 * (base.cost - first.cost)
     within = max(settings.same, settings.form**2 * explained)
-    excess = max(2 * base.cost - float(np.sum(space.weight > 0)), 1e-9)
     kinds = blocks_room.predictable(runs, space.bare)
     blocks = [mask for by in kinds.values() for mask in by.values()]
     if first is not None and (own[0] in best or by_curve <= explained + within):
@@ -67,17 +66,30 @@ def mechanism(
         alike += [f for f in own[:1] if f not in alike and by_curve >= explained - within]
         seen, reading = _held_out(space, runs, first, predicted), _reading(space, first)
         again = chosen_again(space, base, first, left, alike, bases, blocks, settings)
-        share, effects = max(explained, by_curve if own[0] in alike else 0.0) / excess, first.effects
+        most, effects = max(explained, by_curve if own[0] in alike else 0.0), first.effects
     elif space.bare.observe.long:
         return None  # refits of histories with a curve take long
     else:
-        alike, effects, share = list(own), (), by_curve / excess
+        alike, effects, most = list(own), (), by_curve
         told = {k: held_out(curve.problem, curve.z, list(by.values())).reading for k, by in kinds.items()}
         seen, reading = _scored(space, runs, told), curve.reading
         again = _curve_again(space, left, bases, own, blocks, settings)
     changed = _changed(space, runs, _reading(space, base), reading)
     gain = seen.gain(_held_out(space, runs, base, predicted), changed)
-    return Mechanism(tuple(dict.fromkeys(alike)), effects, float(share), gain.mean, gain.se, again)
+    return Mechanism(
+        tuple(dict.fromkeys(alike)), effects, share_of_excess(space, base, most), gain.mean, gain.se, again
+    )
+
+
+def share_of_excess(space: CandidateSpace, base: Candidate, explained: float) -> float:
+    """Share of the excess misfit that so much is [-]: of χ² of the base, priors included, less its expectation, which is
+    the number of readings. No more than all: with noise that is stated too large there is less excess than that.
+
+    Args:
+        explained: fall of χ² [σ²].
+    """
+    excess = 2 * base.cost - float(np.sum(space.weight > 0))
+    return float(explained / max(excess, explained, 1e-300))
 
 
 def _of_one_family(space: CandidateSpace, ladder: Sequence[Candidate]) -> dict[str, Candidate]:
@@ -85,7 +97,8 @@ def _of_one_family(space: CandidateSpace, ladder: Sequence[Candidate]) -> dict[s
     found: dict[str, Candidate] = {}
     for c in ladder:
         families = {space.library[name].family() for name in c.effects}
-        if len(families) == 1 and c.plausible and np.isfinite(c.cost):
+        once = len(set(c.effects)) == len(c.effects)
+        if len(families) == 1 and once and c.plausible and np.isfinite(c.cost):
             (family,) = families
             found[family] = min(found.get(family, c), c, key=lambda x: x.cost)
     return found

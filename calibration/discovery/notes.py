@@ -34,6 +34,8 @@ BETTER = 5.0
 #: Share of its root that an effect has to keep without any one run: without a row of a table, whose readings may be
 #: wrong by themselves; without a run of a history, hundreds of samples, chance is asked alone.
 KEPT = {"row": 1 / math.sqrt(3), "run": 0.0}
+#: Share of itself by which an amplitude may change over a variable without costing a law its name.
+FORM = 0.3
 #: Share of the blocks left out, of those that leave half of what is known of an effect, in which it has to be chosen
 #: again.
 AGAIN = 0.8
@@ -55,6 +57,7 @@ class NameTest:
         what: a run is called, `row` or `run`.
         varies: root of what an amplitude that changes with a variable explains beside the largest set [σ]; over: that
             variable; by_chance: what chance leaves to as many variables, whatever the library has.
+        spread: by how much of itself the amplitude changes at either end of that variable [-].
     """
 
     effect: str
@@ -71,6 +74,7 @@ class NameTest:
     varies: float = 0.0
     over: str = ""
     by_chance: float = 0.0
+    spread: float = math.inf
 
     @property
     def stands(self) -> bool:
@@ -92,9 +96,14 @@ class NameTest:
             "blocks": self.again < AGAIN,
             "larger": bool(self.larger),
             "remains": self.remains,
-            "form": self.varies > max(self.needed, self.by_chance),
+            "form": self.shows_form and self.spread > FORM,
         }
         return tuple(doubt for doubt, holds in doubts.items() if holds)
+
+    @property
+    def shows_form(self) -> bool:
+        """Whether a change of its amplitude over a variable is more than chance."""
+        return self.varies > max(self.needed, self.by_chance)
 
     @property
     def established(self) -> bool:
@@ -251,6 +260,21 @@ class Summary:
     missed: tuple[Missed, ...] = ()
     unused: tuple[str, ...] = ()
     far: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Headline:
+    """What holds at every noise that was tried.
+
+    Attributes:
+        level: of the claims, a verdict; `open` where it depends on the noise whether anything is missing.
+        claims: laws, mechanisms or places, each with those that data cannot tell from it.
+        factors: on the noise.
+    """
+
+    level: str
+    claims: tuple[tuple[str, ...], ...]
+    factors: tuple[float, ...]
 
 
 @dataclasses.dataclass(frozen=True)

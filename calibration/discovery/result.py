@@ -14,8 +14,9 @@ from calibration.data.posterior import Posterior
 from calibration.data.runs import WHEN, Runs
 from calibration.data.writing import write_json, write_table
 from calibration.discovery.clusters import Cluster
+from calibration.discovery.headline import headline
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.notes import Asked, Instruction, Mechanism, NameSupport, RuledOut, Summary
+from calibration.discovery.notes import Asked, Headline, Instruction, Mechanism, NameSupport, RuledOut, Summary
 from calibration.discovery.prediction import Gain
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
@@ -87,6 +88,7 @@ class FoundEffect:
         balance, unit: that it enters; equation, source: from its docstring.
         parameters: its amplitude and shape; p_value: its own, against the strongest of all effects in each bootstrap
             table; score: rise of χ² without it, all else fitted again [σ²].
+        share: of the excess misfit, χ² less its expectation, that this is [-].
     """
 
     name: str
@@ -100,6 +102,7 @@ class FoundEffect:
     parameters: dict[str, Estimate]
     p_value: float
     score: float
+    share: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -507,6 +510,11 @@ class DiscoveryResult:
         return words.statement(self.summary)
 
     @property
+    def headline(self) -> Headline:
+        """What holds at every noise that was tried."""
+        return headline(self.summary, [(s.factor, s.summary) for s in self.sensitivity])
+
+    @property
     def refit_alone(self) -> bool:
         """True where nothing is proposed next to the refit."""
         return self.verdict in ("none", "undescribed")
@@ -583,6 +591,7 @@ class DiscoveryResult:
             "verdict": self.verdict,
             "mechanism": None if self.summary.mechanism is None else _mechanism(self.summary.mechanism, self.unnamed),
             "missed": [m._asdict() for m in self.summary.missed],
+            "headline": dataclasses.asdict(self.headline) | {"statement": words.headline(self.headline)},
             "statement": self.statement,
             "rows": len(self.runs),
             "rows_used": int(self.included.sum()),
@@ -722,6 +731,10 @@ def _effect(e: FoundEffect, support: NameSupport | None) -> dict[str, Any]:
         "parameters": {name: dataclasses.asdict(p) for name, p in e.parameters.items()},
         "p_value": e.p_value,
         "score": e.score,
+        "share": e.share,
+        "accuracy_of_form": None
+        if test is None or not test.shows_form
+        else {"over": test.over, "share": test.spread},
         "members": {name: dataclasses.asdict(m) for name, m in e.members.items()},
         "stated_values": {name: dataclasses.asdict(s) for name, s in e.stated.items()},
     }

@@ -329,9 +329,10 @@ def _lacks(space: CandidateSpace, seen: Diagnosis, bases: Bases) -> set[str]:
 
 def _varies_most(
     space: CandidateSpace, best: Candidate, effect: str, linear: Linearization, share: float
-) -> tuple[float, str, float]:
+) -> tuple[float, str, float, float]:
     """Root of the most that an amplitude explains which changes with a variable, along a line or bent [σ], all else
-    fitted again; the variable; and what chance leaves to so many looks (Bonferroni 1936).
+    fitted again; the variable; what chance leaves to so many looks (Bonferroni 1936); and the change at an end of the
+    variable over the amplitude [-].
 
     What a law of another form leaves beside a name is, to first order, that name's own term with an amplitude that
     differs from place to place: so few columns see what a family of curves, with many more, leaves to chance. Of
@@ -340,18 +341,23 @@ def _varies_most(
     Args:
         linear: the fit of the candidate, linearised; share: of clean tables in which chance exceeds that.
     """
-    most = 0.0, ""
+    most = 0.0, "", math.inf
     if space.bare.observe.long:
-        return *most, math.inf
+        return *most[:2], math.inf, math.inf
     jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
-    of_row = jacobian[: linear.readings, space.free + best.active.index(effect)].reshape(linear.rows, -1)
+    slot = space.free + best.active.index(effect)
+    of_row = jacobian[: linear.readings, slot].reshape(linear.rows, -1)
     variables = [v for v in (*VARIABLES, "speed") if _varies(linear, v, space.included)]
     for variable in variables:
         at = linear.in_travel(bases_room.SHAFTS, variable)[0].reshape(-1, linear.rows).mean(0)
         x = bases_room.scaled(np.nan_to_num(at), space.included.astype(float))
         changed = np.stack([(of_row * shape[:, None]).ravel() for shape in (x, 2 * x**2 - 1)], 1)
-        most = max(most, (_root(jacobian, residual, changed), variable))
-    return *most, NormalDist().inv_cdf(1 - share / (4 * max(len(variables), 1)))  # two shapes, either sign
+        left, told = _left_of(jacobian, residual, changed)
+        for k, root in enumerate(_roots(jacobian, residual, changed)):
+            spread = abs(told[k] / max(left[k], 1e-300) / best.z[slot]) if best.z[slot] else math.inf
+            most = max(most, (float(root), variable, float(spread)))
+    chance = NormalDist().inv_cdf(1 - share / (4 * max(len(variables), 1)))  # two shapes, either sign
+    return *most[:2], chance, most[2]
 
 
 def _evidence_over_curves(

@@ -74,6 +74,25 @@ def _verdict(said: notes.Summary) -> str:
     return f"Missing: {'; '.join(names)} (family-wise p {p_value(p)}).{in_model}{left}"
 
 
+def headline(found: notes.Headline) -> str:
+    """What holds at every noise that was tried, in a sentence."""
+    *first, last = [f"{f:g}" for f in found.factors]
+    at = f"At {', '.join(first)} and {last} times the noise" if first else "At the stated noise"
+    claims = " and ".join(f"a {' or a '.join(c)}" for c in found.claims)
+    laws = " and ".join(" or ".join(c) for c in found.claims)
+    places = " and ".join(" or ".join(bases.in_words(p) for p in c) for c in found.claims)
+    held = {
+        "none": "nothing is missing",
+        "undescribed": "this model does not describe these runs",
+        "open": "the answer differs: whether anything is missing depends on the noise",
+        "named": f"{laws} is established as a law",
+        "class": f"one of {laws} is established",
+        "mechanism": f"{claims} is established as a mechanism",
+        "place": f"something is missing in the {places}" if places else "something is missing, in no one place",
+    }
+    return f"{at} {held[found.level]}"
+
+
 def _undescribed(said: notes.Summary) -> str:
     """That a model does not describe the runs, by how much, and what to check."""
     each = [
@@ -277,6 +296,9 @@ def how_sure(found: DiscoveryResult, effect: FoundEffect) -> str:
     test = None if found.support is None else found.support.test_of(effect.name)
     if is_established(found, effect):
         known = "" if test is None else f": {test.root:.1f} σ, where chance reaches {test.needed:.1f}"
+        if test is not None and test.shows_form:
+            over = test.over.replace("_", " ")
+            known += f"; accuracy of its form ±{100 * test.spread:.0f} % over {over}"
         return f"established{known}"
     return f"tentative: it predicts, but {doubts(test)}" if doubts(test) else "tentative"
 
@@ -380,7 +402,7 @@ DOUBTS = {
     "blocks": ("blocks", "is chosen again in {again:.0f} % of the data with a block left out"),
     "larger": ("size", "has a rival of an implausible size ({larger})"),
     "remains": ("equation", "leaves something in its own equation"),
-    "form": ("its form", "would have another size at other values of {0.over} ({0.varies:.1f} σ)"),
+    "form": ("its form", "changes{spread} over {over_variable} ({0.varies:.1f} σ)"),
 }
 
 
@@ -390,6 +412,8 @@ def doubts(test: notes.NameTest | None) -> str:
         return ""
     over = ", ".join(_over(c.place, *c.variables) for c in test.curves)
     said = {"beside": over and f" beside smooth curves ({over})", "larger": " and ".join(test.larger)}
+    said |= {"over_variable": test.over.replace("_", " ")}
+    said["spread"] = f" by ±{100 * test.spread:.0f} %" if math.isfinite(test.spread) else ""
     *first, last = [DOUBTS[d][1].format(test, **said, again=100 * test.again) for d in test.fails]
     return f"{', '.join(first)} and {last}" if first else last
 

@@ -162,6 +162,9 @@ def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> Non
 
 def print_discovery(found: DiscoveryResult) -> None:
     """Verdict, effects, errors and remarks, for a person; the answer and the next step last."""
+    first = found.headline
+    if len(first.factors) > 1:
+        say(f"{first.level}: {said_of.headline(first)}.")
     say(f"{found.verdict}: {found.statement}")
     if not found.robot.has_ground and found.effects:
         say("The track balance of a shaft is what its load loses.")
@@ -180,10 +183,13 @@ def print_discovery(found: DiscoveryResult) -> None:
         for e in found.effects:
             shown.add_row(
                 said_of.called(found, e), ", or ".join(e.families), said_of.size(e),
-                f"{e.score:.0f}", f"{e.p_value:.2g}", said_of.alike(found, e) or "-",
+                f"{e.score:.0f} ({100 * e.share:.0f} %)", f"{e.p_value:.2g}", said_of.alike(found, e) or "-",
             )  # fmt: skip
         say(shown)
-        say("lowers misfit by: rise of χ² without it, all else refitted; own p: among the strongest of the library")
+        say(
+            "lowers misfit by: rise of χ² without it, all else refitted (share of the excess misfit); own p: among "
+            "the strongest of the library"
+        )
     if found.hidden:
         say(said_of.hidden(found))
     if found.unnamed is not None:
