@@ -82,8 +82,8 @@ def mechanism(
 
 
 def share_of_excess(space: CandidateSpace, base: Candidate, explained: float) -> float:
-    """Share of the excess misfit that so much is [-]: of χ² of the base, priors included, less its expectation, which is
-    the number of readings. No more than all: with noise that is stated too large there is less excess than that.
+    """Share of the excess misfit that so much is [-]: of χ² of the base, priors included, less its expectation, the
+    number of readings. No more than all: with noise that is stated too large there is less excess than that.
 
     Args:
         explained: fall of χ² [σ²].

@@ -154,15 +154,11 @@ def unseen(found: DiscoveryResult) -> list[dict[str, Any]]:
         rows = max(int(e["rows"]) for e in both[0].values())
         what = f"unseen: another {blocks.in_words(kind)}" if kind else "seen by the fit"
         lines.append({"what": what, "cells": cells, "reached": f"{rows} of {total}"})
-    lines += [
-        {
-            "what": f"unseen: another {blocks.in_words(kind)}",
-            "cells": [],
-            "reached": "not predictable from the others",
-        }
-        for kind in found.held_out_unpredictable
-        if kind not in found.errors_held_out
-    ]
+    blank = [{"text": "-", "mark": ""} for _ in found.channels]
+    for kind in found.held_out_unpredictable:
+        if kind not in found.errors_held_out:
+            what, why = f"unseen: another {blocks.in_words(kind)}", "not predictable from the others"
+            lines.append({"what": what, "cells": blank, "reached": why})
     return lines
 
 
