@@ -105,7 +105,9 @@ def test_a_curve_that_explains_more_takes_the_place_of_effects_of_another_mechan
     assert got.families == (SPEED.family,) and got.effects == () and got.again == 0.9
     assert found(fitted("leads", explains=1880.0), curve=1900.0).effects == ("leads",)
     assert found(fitted("stribeck", explains=1900.0, plausible=False), curve=1900.0).effects == ()
-    assert found(fitted("leads", explains=1500.0), curve=1900.0, long=True) is None
+    where = dataclasses.replace(SPEED, explained=1900.0)  # histories: by what it explains linearly
+    assert found(fitted("leads", explains=1500.0), curve=np.nan, where=where, long=True) is None
+    assert found(fitted("stribeck", explains=1500.0), curve=np.nan, where=where, long=True).effects == ("stribeck",)
 
 
 def test_readings_that_it_changes_are_those_it_moves_by_half_of_the_most_moved_channel():

@@ -52,10 +52,11 @@ def mechanism(
         left: what the base leaves; ladder: candidates that were fitted; beside: the curve of what the base leaves.
         predicted: what fits predict of data held out, where it is known.
     """
-    best = _of_one_family(space, ladder)
-    curve = beside.curve
-    by_curve = curve.chi2[0] - curve.chi2[1] - OF_CURVE
-    own = _families_of(beside.where)
+    best, own = _of_one_family(space, ladder), _families_of(beside.where)
+    if space.bare.observe.long:  # whose curves take long to fit
+        by_curve = beside.where.explained - OF_CURVE
+    else:
+        by_curve = beside.curve.chi2[0] - beside.curve.chi2[1] - OF_CURVE
     first = min(best.values(), key=lambda c: c.cost) if best else None
     explained = 0.0 if first is None else 2 * (base.cost - first.cost)
     within = max(settings.same, settings.form**2 * explained)
@@ -70,6 +71,7 @@ def mechanism(
     elif space.bare.observe.long:
         return None  # refits of histories with a curve take long
     else:
+        curve = beside.curve
         alike, effects, most = list(own), (), by_curve
         told = {k: held_out(curve.problem, curve.z, list(by.values())).reading for k, by in kinds.items()}
         seen, reading = _scored(space, runs, told), curve.reading
