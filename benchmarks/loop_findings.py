@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 #: What a result may hold beside its verdict.
-FURTHER = ("families", "events", "events_alike", "noise_factor", "implausible", "hidden", "stands_for")
+FURTHER = ("families", "mechanism", "events", "events_alike", "noise_factor", "implausible", "hidden", "stands_for")
 
 
 def plain(x: Any) -> Any:
@@ -116,7 +116,7 @@ def _held_out(runs: Any, found: Any) -> dict[str, Any]:
     from calibration.inference.held_out import held_out
 
     space, base, best = found.screened.base.space, found.screened.base.candidate, found.best
-    kinds = blocks_room.distinct(runs, space.bare.observe.blocks)
+    kinds = blocks_room.predictable(runs, space.bare)
     if not kinds:
         return {}
     data, rows = space.equipped.data, len(runs)
@@ -130,7 +130,7 @@ def _held_out(runs: Any, found: Any) -> dict[str, Any]:
         }
 
     def score(seen: dict[str, np.ndarray]) -> Any:
-        return prediction.scored(seen, measured, sd, counts, runs, space.bare.observe.blocks)
+        return prediction.scored(seen, measured, sd, counts, kinds)
 
     before, after = reading(base), reading(best)
     gain, refit = score(after).gain(score(before)), score(before)

@@ -11,6 +11,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+#: Verdicts without an established name; `unnamed` in lines of campaigns before schema 3.
+WITHOUT_NAME = ("mechanism", "place", "unnamed")
+
 #: Channels, whose readings may be off.
 CHANNELS = ("total_current", "motor_speed", "speed")
 #: Balances that act on the same of the three equations that current, motor speed and speed close.
@@ -92,7 +95,7 @@ def everything(x: dict) -> bool:
 
 def placed(x: dict) -> bool:
     """Whether what has no name is in the truth's equation."""
-    return x["verdict"] == "unnamed" and _equation(x) == EQUATION[x["truth"][0]["balance"]]
+    return x["verdict"] in WITHOUT_NAME and _equation(x) == EQUATION[x["truth"][0]["balance"]]
 
 
 def _equation(x: dict) -> str:
@@ -106,7 +109,7 @@ def false_finding(x: dict) -> bool:
 
 def located(x: dict) -> bool:
     """Whether a finding has a name or a place; that the noise is not as stated has neither."""
-    return x["verdict"] in ("named", "class") or (x["verdict"] == "unnamed" and bool(x.get("where")))
+    return x["verdict"] in ("named", "class") or (x["verdict"] in WITHOUT_NAME and bool(x.get("where")))
 
 
 def family_right(x: dict) -> bool:
@@ -138,7 +141,7 @@ def in_place(x: dict, alike: bool = False) -> bool:
     over = {"order": ("order", "row"), "time": ("time",)}.get(where.get("variable", ""), (where.get("variable"),))
     over = (*over, truth.get("name", "").split(".")[0])  # of a condition, all of whose rows are shifted
     variables = {x["where"][1], *(x.get("variables_alike", ()) if alike else ())} if x["where"] else set()
-    if x["verdict"] == "unnamed" and right and variables & set(over):
+    if x["verdict"] in WITHOUT_NAME and right and variables & set(over):
         return True
     for event in (*(x.get("events") or ()), *((x.get("events_alike") or ()) if alike else ())):
         if not isinstance(event, dict):
@@ -322,7 +325,7 @@ def library(f: Figures, kind: str = "library") -> None:
     )
     alone = [x for x in strong if len(x["truth"][0].get("class_oracle", ())) == 1]
     f.say("  single name right, where noise-free data leave one", alone, lambda x: contains(x) and single(x))
-    f.say("  unnamed", strong, lambda x: x["verdict"] == "unnamed")
+    f.say("  unnamed", strong, lambda x: x["verdict"] in WITHOUT_NAME)
     f.say("  two or more effects named", strong, lambda x: len(x["classes"]) > 1)
     weak = [x for x in those if sigmas(x["truth"][0]) < 5]
     f.say(f"{kind}, weaker: a wrong name or class", weak, lambda x: x["classes"] and not contains(x))
@@ -355,12 +358,12 @@ def outside(f: Figures, kind: str) -> None:
     f.say(
         "  unnamed in the very balance",
         free,
-        lambda x: x["verdict"] == "unnamed" and x["where"] and x["where"][0] == x["truth"][0]["balance"],
+        lambda x: x["verdict"] in WITHOUT_NAME and x["where"] and x["where"][0] == x["truth"][0]["balance"],
     )
     f.say(
         "  the very balance among those said to act alike",
         free,
-        lambda x: x["verdict"] == "unnamed" and x["where"] and x["truth"][0]["balance"] in x["where"][2],
+        lambda x: x["verdict"] in WITHOUT_NAME and x["where"] and x["truth"][0]["balance"] in x["where"][2],
     )
     f.say(f"{kind}, with a mimic: a library name", mimics, lambda x: x["classes"])
     f.say("  unnamed in the right equation", mimics, placed)

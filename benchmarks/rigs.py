@@ -153,7 +153,7 @@ def _library(f: scores.Figures) -> None:
         f.say(f"  {low} to {high} sigma" if high < 99 else f"  >= {low} sigma", some, scores.contains)
     f.say("  something found", strong, scores.false_finding)
     f.say("  a single name that is given is right", [x for x in strong if scores.single(x)], scores.contains)
-    f.say("  unnamed", strong, lambda x: x["verdict"] == "unnamed")
+    f.say("  unnamed", strong, lambda x: x["verdict"] in scores.WITHOUT_NAME)
     f.say("  two or more effects named", strong, lambda x: len(x["classes"]) > 1)
     alone = [x for x in strong if len(x["truth"][0]["class_oracle"]) == 1]
     f.say(

@@ -87,4 +87,4 @@ plt.show()
 # %%
 print(found.next_experiment.name)
 print(found.next_experiment.description)
-assert found.verdict in ("named", "class", "unnamed") and after["total_current"]["rms_percent"] < 5
+assert found.verdict in ("named", "class", "mechanism", "place") and after["total_current"]["rms_percent"] < 5

@@ -20,6 +20,7 @@ from calibration.discovery import discover
 from calibration.discovery.candidates import fit_base
 from calibration.discovery.outliers import screen
 from calibration.discovery.score_tests import bootstrap, diagnosed, normal_deviate, score_tests
+from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import bases, noise
 from calibration.inference.held_out import held_out
 from calibration.inference.linearization import PROBED, amplitude_of, scored, shape_of
@@ -140,7 +141,7 @@ def outside():
 def test_effect_outside_the_library_gets_no_name(outside):
     found = outside.traced
     where = found.where
-    assert found.verdict == "unnamed" and found.members == () and found.left.test.rejected
+    assert found.verdict in WITHOUT_NAME and found.members == () and found.left.test.rejected
     assert found.searched is not None and not found.standing.stands and found.standing.why
     assert where.balance == "electrical" and {"electrical", "supply"} <= set(where.alike)
     assert where.variable in bases.VARIABLES and found.families == (where.family,)
@@ -149,7 +150,7 @@ def test_effect_outside_the_library_gets_no_name(outside):
 @pytest.mark.slow
 def test_effect_outside_the_library_is_a_curve_in_the_result(outside):
     found = SETTLED.result(outside.traced, outside.runs)
-    assert found.verdict == "unnamed" and found.effects == () and found.after.adequate
+    assert found.verdict in WITHOUT_NAME and found.effects == () and found.after.adequate
     where = found.unnamed
     assert where.balance == "electrical" and {"electrical", "supply"} <= set(where.balances_alike)
     assert where.variable in bases.VARIABLES and [e.name for e in found.robot.effects] == [where.effect]

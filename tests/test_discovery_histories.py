@@ -17,7 +17,7 @@ from calibration.data.runs import Runs
 from calibration.discovery.adequacy import AdequacyTest
 from calibration.discovery.discrepancy import fit_discrepancy, locate
 from calibration.discovery.score_tests import bootstrap, diagnosed
-from calibration.discovery.settings import settings_for
+from calibration.discovery.settings import WITHOUT_NAME, settings_for
 from calibration.discovery.standing import standing
 from calibration.inference import bases, noise
 from calibration.inference.linearization import PROBED, scored, shape_of
@@ -131,7 +131,7 @@ def test_wave_outside_the_library_gets_its_balance_and_order_but_no_name(oval):
 def test_wave_without_a_name_is_in_the_result(oval):
     found = ANALYST.result(oval.traced, oval.runs)
     where = locate(oval.left, oval.bases, oval.space.included)
-    assert found.verdict == "unnamed" and found.effects == () and found.after.adequate
+    assert found.verdict in WITHOUT_NAME and found.effects == () and found.after.adequate
     assert (found.unnamed.balance, found.unnamed.variable) == (where.balance, where.variable)
     assert found.unnamed.defect is None and found.unnamed.score > 0.5 * oval.label["sigmas"] ** 2
 

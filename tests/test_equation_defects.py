@@ -9,7 +9,6 @@ import pytest
 
 import mmrjax as mm
 from calibration.inference.details import EquationDefects
-from calibration.inference.errors import OF_SIZE
 from calibration.inference.observers.settled import EQUATIONS, SettledLinearization, _defects
 from calibration.inference.observers.turns import TurnLinearization
 from mmrjax import channels, effects
@@ -154,6 +153,7 @@ def test_change_of_a_reading_that_crosses_zero_is_of_its_size(monkeypatch):
     monkeypatch.setattr(page.mm, "simulate", lambda *_: SimpleNamespace(yaw_rate=rates.pop(0)))
     found = SimpleNamespace(
         effects=[SimpleNamespace(name="iron_loss")], robot=robot, detail=EquationDefects({}, {}), channels=(yaw,),
-        runs=SimpleNamespace(conditions=lambda robot: None), included=np.ones(3, bool), percent_of=OF_SIZE,
+        runs=SimpleNamespace(conditions=lambda robot: None), included=np.ones(3, bool),
+        readings_of_rows=SimpleNamespace(measured=np.array([[1.0], [-1.0], [0.0]])),
     )  # fmt: skip
     assert page.changes(found)["iron_loss"].rms == pytest.approx(10 * np.sqrt(1.5), rel=1e-6)

@@ -34,7 +34,7 @@ def test_channel_errors_leave_out_what_is_missing():
     found = errors.channel_errors(usual(), simulated, measured, np.ones((2, 3)))
     assert [found[c]["rows"] for c in ("total_current", "motor_speed", "speed")] == [2, 0, 1]
     assert found["total_current"]["rms_sigma"] == pytest.approx(np.sqrt(0.5))
-    assert found["total_current"]["max_percent"] == pytest.approx(20.0)
+    assert found["total_current"]["max_percent"] == pytest.approx(100 / np.sqrt(10))
     assert np.isnan(found["motor_speed"]["rms_percent"])
     assert found["total_current"]["rms"] == pytest.approx(np.sqrt(0.5))
     assert found["speed"]["rms"] == pytest.approx(0.1 / 1e-3)  # in mm/s, as the column

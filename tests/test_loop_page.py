@@ -21,6 +21,7 @@ from calibration.data.writing import finite
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.notes import Asked, NameSupport, NameTest, RuledOut
 from calibration.discovery.result import Alternative, Estimate, HiddenEffect, Resolved, StatedValue
+from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference.identifiability import HELD
 from calibration.words import loop as words
 from mmrjax import channels
@@ -190,7 +191,7 @@ def test_what_is_too_large_is_said_beside_the_verdict(shown, capsys):
     got = shown("heated", capsys)
     (ruled_out,) = (a for a in got.document["implausible"] if list(a["effects"]) == ["winding_heating"])
     times = f"{ruled_out['sizes']['winding_heating']:.2g}"
-    assert got.document["verdict"] == "unnamed" and 2.7 < float(times) < 3.3
+    assert got.document["verdict"] in WITHOUT_NAME and 2.7 < float(times) < 3.3
     said = (
         "winding_heating would explain as much as the curve, but is ruled out by size or sign alone: "
         f"winding_heating at {times} times its largest plausible size; "
@@ -208,7 +209,7 @@ def test_what_happens_for_a_while_has_a_window(shown, capsys):
     got = shown("happening", capsys)
     (effect,) = got.document["effects"]
     window = effect["window"]
-    assert got.document["verdict"] == "unnamed" and window["axis"] == "order"
+    assert got.document["verdict"] in WITHOUT_NAME and window["axis"] == "order"
     # the place is told to within half a window
     assert window["low"] >= 25 and window["high"] <= 50
     assert f"in runs {window['low']:.0f} to {window['high']:.0f}" in got.printed
@@ -286,6 +287,10 @@ def test_errors_better_and_worse_are_marked_with_the_rows_that_are_reached(shown
     assert [line[0] for line in lines] == [
         "seen by the fit",
         *(f"unseen: another {words.blocks_room.in_words(k)}" for k in got.found.errors_held_out),
+        "unseen: another configuration",  # each has friction of its own
+    ]
+    assert lines.pop()[-1] == "not predictable from the others" and got.document["held_out_unpredictable"] == [
+        "configuration"
     ]
     for line, (before, after) in zip(lines, [got.found.errors, *got.found.errors_held_out.values()], strict=True):
         for cell, c in zip(line[1:-1], before, strict=True):

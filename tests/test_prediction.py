@@ -12,11 +12,13 @@ from calibration.data.runs import Runs
 from calibration.discovery import findings, prediction
 from calibration.discovery.discover import discover
 from calibration.discovery.prediction import Gain, HeldOutScore, scored, smallest
+from calibration.inference.blocks import distinct, predictable, unpredictable
 from mmrjax import channels, robots
 from mmrjax.fidelities.steady import steady_batch
 from sweeps.inputs import read_runs
 
 RNG = np.random.default_rng(2)
+NONE_FREE = SimpleNamespace(names=(), tied=())
 SLOPES = np.repeat([0.0, 5.0, 10.0], 4)
 
 
@@ -37,7 +39,7 @@ def test_score_is_the_log_density_and_what_is_not_reached_counts(runs):
     reading["slope"][3, 1] = np.nan
     counts = np.ones((12, 2), bool)
     counts[5] = False
-    found = scored(reading, measured, sd, counts, runs, ("slope", "voltage"))
+    found = scored(reading, measured, sd, counts, distinct(runs, ("slope", "voltage")))
     for kind in reading:
         off = np.where(np.isfinite(reading[kind]), reading[kind], measured + prediction.UNREACHED * sd)
         wanted = stats.t.logpdf((off - measured) / sd, prediction.FREEDOM) - np.log(sd)
@@ -74,7 +76,9 @@ def test_smallest_set_within_one_error_of_the_best_is_chosen(monkeypatch, runs, 
     candidates = [SimpleNamespace(effects=tuple("abc"[:k])) for k in range(4)]
     scores = {c.effects: score(noise[k] + ([0.0, *gains])[k], np.arange(12)) for k, c in enumerate(candidates)}
     monkeypatch.setattr(prediction, "score_of", lambda space, runs, c: scores[c.effects])
-    space = SimpleNamespace(bare=SimpleNamespace(observe=SimpleNamespace(blocks=("slope", "voltage"))))
+    space = SimpleNamespace(
+        bare=SimpleNamespace(base=None, coordinates=NONE_FREE, observe=SimpleNamespace(blocks=("slope", "voltage")))
+    )
     found = smallest(space, runs, candidates[0], candidates[1:])
     assert (found is None) if chosen == 0 else (found is candidates[chosen])
 
@@ -89,7 +93,9 @@ def test_what_candidates_predict_is_kept_and_not_fitted_again(monkeypatch, runs)
         "score_of",
         lambda space, runs, c: dataclasses.replace(score(np.zeros(12), np.arange(12)), reading=shown[c.effects]),
     )
-    space = SimpleNamespace(bare=SimpleNamespace(observe=SimpleNamespace(blocks=("slope", "voltage"))))
+    space = SimpleNamespace(
+        bare=SimpleNamespace(base=None, coordinates=NONE_FREE, observe=SimpleNamespace(blocks=("slope", "voltage")))
+    )
     predicted = {}
     smallest(space, runs, candidates[0], candidates[1:], predicted)
     assert [predicted[prediction.key(c)] for c in candidates] == [shown[c.effects] for c in candidates]
@@ -113,7 +119,11 @@ def test_what_candidates_predict_is_kept_and_not_fitted_again(monkeypatch, runs)
         return SimpleNamespace(reading=np.full((12, 2), -1.0))
 
     monkeypatch.setattr(findings, "held_out", held_out)
-    problem = SimpleNamespace(observe=SimpleNamespace(blocks=("slope",), unreachable=lambda status: status > 0))
+    problem = SimpleNamespace(
+        base=None,
+        coordinates=NONE_FREE,
+        observe=SimpleNamespace(blocks=("slope",), unreachable=lambda status: status > 0),
+    )
     before, after = (Fit(problem, c.z) for c in candidates)
     known = predicted[prediction.key(candidates[0])]
     found = findings.readings(runs, np.ones((12, 2)), before, after, known)
@@ -123,7 +133,9 @@ def test_what_candidates_predict_is_kept_and_not_fitted_again(monkeypatch, runs)
 
 
 def test_nothing_is_chosen_where_nothing_can_be_held_out(runs):
-    space = SimpleNamespace(bare=SimpleNamespace(observe=SimpleNamespace(blocks=())))
+    space = SimpleNamespace(
+        bare=SimpleNamespace(base=None, coordinates=NONE_FREE, observe=SimpleNamespace(blocks=()))
+    )
     assert smallest(space, runs, None, [None]) is None
     assert HeldOutScore({"slope": np.full((2, 1), np.nan)}, {"slope": np.arange(2)}).gain(
         HeldOutScore({"slope": np.zeros((2, 1))}, {"slope": np.arange(2)})
@@ -161,3 +173,30 @@ def test_measured_runs_show_a_voltage_drop_and_a_slip_that_rests_on_a_row(tmp_pa
     shown = steady_batch(again, dataclasses.replace(runs, columns=unweighed).conditions(again)).reading
     swept = np.stack([np.asarray(shown[c.name]) for c in channels.usual()], -1)
     np.testing.assert_allclose(swept, found.readings_of_rows.after, rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("names", "tied", "dropped"),
+    [
+        (("motor.resistance",), (), ()),
+        (("motor.resistance", "a.loss_coulomb"), (), ("a",)),
+        (("a.loss_coulomb", "b.loss_coulomb"), (), ("a", "b")),
+        (("a.loss_coulomb",), (("b.loss_coulomb", 0, 1.0),), ()),  # the others determine it too
+        (("c.loss_coulomb",), (), ()),  # of which the table has no run
+    ],
+)
+def test_a_block_with_parameters_of_its_own_is_not_predicted(names, tied, dropped):
+    """Of two configurations at two voltages each; runs of one at another voltage determine what is its own."""
+    columns = {
+        "configuration": np.repeat(["a", "b"], 4), "supply_voltage_V": np.tile([10.0, 10.0, 20.0, 20.0], 2),
+        "order": np.arange(8.0),
+    }  # fmt: skip
+    runs = Runs("a table", columns)
+    coordinates = SimpleNamespace(names=names, tied=tied)
+    observe = SimpleNamespace(blocks=("configuration", "voltage"))
+    problem = SimpleNamespace(base=None, coordinates=coordinates, observe=observe)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Runs, "configurations_named", lambda self, robot: self["configuration"])
+        kinds, lost = predictable(runs, problem), unpredictable(runs, problem)
+    assert set(kinds.get("configuration", {})) == {"a", "b"} - set(dropped)
+    assert len(kinds["voltage"]) == 2 and lost == (("configuration",) if dropped else ())

@@ -476,7 +476,9 @@ def test_errors_of_a_channels_size_are_finite_where_readings_cross_zero():
     simulated, measured = np.array([[-1.0], [0.0], [1.0]]), np.array([[-1.1], [0.1], [1.0]])
     with np.errstate(divide="ignore", invalid="ignore"):
         assert not np.isfinite(relative_error(simulated, measured)).all()
-    assert sized_error(simulated, measured) == pytest.approx(100 * np.array([[0.1], [-0.1], [0.0]]) / np.sqrt(2 / 3))
+    assert sized_error(simulated, measured) == pytest.approx(
+        100 * np.array([[0.1], [-0.1], [0.0]]) / np.sqrt((1.21 + 0.01 + 1.0) / 3)
+    )
 
 
 def test_a_channel_without_readings_has_no_error_and_no_warning():

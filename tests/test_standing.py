@@ -19,7 +19,7 @@ from calibration.discovery.notes import CurveOver, NameSupport, NameTest
 from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import augment_with_columns
 from calibration.discovery.search import Search, diagnose
-from calibration.discovery.settings import settings_for
+from calibration.discovery.settings import WITHOUT_NAME, settings_for
 from calibration.discovery.smooth import FALL, LENGTHS, PRODUCT, SIZES, WIDE, smooth, surface
 from calibration.discovery.standing import (
     _chosen_again,
@@ -326,6 +326,9 @@ def test_name_stands_by_its_score_its_curves_and_its_rows(root, without, evidenc
         dataclasses.replace(test, **bad).established
         for bad in ({"again": 0.75}, {"larger": ("b",)}, {"remains": True}, {"varies": 3.4})
     )
+    # a form that is known to less than a third of the amplitude costs no name
+    assert dataclasses.replace(test, varies=9.0, spread=0.29).established == test.established
+    assert dataclasses.replace(test, varies=9.0, spread=0.31).established is False
     # of a library of three effects chance reaches less than in a dozen looks at the amplitude
     assert dataclasses.replace(test, varies=3.4, by_chance=3.5).established == test.established
     of_runs = dataclasses.replace(test, what="run")  # of histories: chance alone
@@ -349,9 +352,11 @@ def test_amplitude_that_changes_with_a_variable_is_seen_and_one_that_does_not_is
     )
     linear.jacobian = np.concatenate([column[:, None], np.eye(1)])
     noise = rng.standard_normal(2 * rows)
+    sized = dataclasses.replace(candidate_of("a"), z=np.ones(12))
     for share, seen in ((0.0, False), (0.5, True)):
         linear.residual = np.append(noise + column * share * np.repeat(x, 2), 0.0)
-        varies, over, by_chance = _varies_most(space, candidate_of("a"), "a", linear, 0.03)
+        varies, over, by_chance, spread = _varies_most(space, sized, "a", linear, 0.03)
+        assert not seen or spread == pytest.approx(0.5, abs=0.05)  # of an amplitude of 1
         assert (varies > by_chance) == seen and (not seen or over == "slope")
         assert by_chance == pytest.approx(2.67, abs=0.01)  # two variables, along a line or bent: 0.03 / 4, both sides
         # along a straight line, by least squares with the column and without
@@ -362,7 +367,7 @@ def test_amplitude_that_changes_with_a_variable_is_seen_and_one_that_does_not_is
         ]
         assert not seen or varies**2 == pytest.approx(left[0] - left[1], rel=1e-8)
     space.bare.observe.long = True  # a history's readings answer to all of its past
-    assert _varies_most(space, candidate_of("a"), "a", linear, 0.03) == (0.0, "", math.inf)
+    assert _varies_most(space, candidate_of("a"), "a", linear, 0.03) == (0.0, "", math.inf, math.inf)
 
 
 @pytest.mark.parametrize(("single", "lacks"), [(3.4, {"slip"}), (5.0, {"slip", "track"})])
@@ -402,17 +407,17 @@ def test_effect_has_to_be_the_strongest_again_without_blocks_that_leave_half_of_
     space = SimpleNamespace(included=np.ones(toy.rows, bool), library=library)
     both = np.concatenate([a, b], 1)
     few, most, others = rows < 4, rows < 11, rows >= 16
-    settings = SETTLED.settings
-    again = lambda *blocks: _chosen_again(space, "a", (jacobian, residual, a), both, blocks, settings)  # noqa: E731
+    settings, family = SETTLED.settings, (space.library["a"].family(),)
+    again = lambda *blocks: _chosen_again(space, family, (jacobian, residual, a), both, blocks, settings)  # noqa: E731
     assert again(few, others) == 1.0 and again(most) == 1.0 and again() == 1.0
     b3 = np.append(2.0 * a[:, 0] * (at < 4) + 2.5 * b[:, 0], np.zeros(2))  # only the first rows show it
-    assert _chosen_again(space, "a", (jacobian, b3, a), both, (few, others), settings) == 0.5
+    assert _chosen_again(space, family, (jacobian, b3, a), both, (few, others), settings) == 0.5
     # What data cannot tell from it, of whatever family, does not take its place.
     near = a * (1 + 0.05 * random.standard_normal(a.shape))
     of_near = np.append(2.0 * near[:, 0], np.zeros(2))  # which is the stronger of the two
-    assert _chosen_again(space, "a", (jacobian, of_near, a), np.concatenate([a, near], 1), (few,), settings) == 1.0
+    assert _chosen_again(space, family, (jacobian, of_near, a), np.concatenate([a, near], 1), (few,), settings) == 1.0
     none = dataclasses.replace(settings, same=0.0, form=0.0)
-    assert _chosen_again(space, "a", (jacobian, of_near, a), np.concatenate([a, near], 1), (few,), none) == 0.0
+    assert _chosen_again(space, family, (jacobian, of_near, a), np.concatenate([a, near], 1), (few,), none) == 0.0
 
 
 def candidate_of(*effects):
@@ -457,7 +462,7 @@ def test_model_holds_what_is_established_and_what_predicts(monkeypatch, adequate
         "fit_candidates",
         lambda space, wanted, settings: [candidate_of(*(n for n in w if n)) for w, _ in wanted],
     )
-    monkeypatch.setattr(discover.blocks_room, "distinct", lambda *a: {"slope": {"0": np.ones(3, bool)}})
+    monkeypatch.setattr(discover.blocks_room, "predictable", lambda *a: {"slope": {"0": np.ones(3, bool)}})
     bare = SimpleNamespace(observe=SimpleNamespace(long=False, blocks=("slope",)))
     screened = SimpleNamespace(
         base=SimpleNamespace(candidate=candidate_of(), space=SimpleNamespace(bare=bare)), bases=()
@@ -519,7 +524,7 @@ def test_two_slips_do_not_stand_for_a_law_that_the_library_lacks(monkeypatch):
 def test_sliding_speed_that_grows_gets_no_name(monkeypatch):
     for sigmas, seed in ((12.0, 1), (30.0, 2)):
         found = SETTLED.trace(growing(monkeypatch, sigmas, seed))
-        assert found.verdict == "unnamed" and found.members == () and not found.standing.stands
+        assert found.verdict in WITHOUT_NAME and found.members == () and not found.standing.stands
         assert found.where.balance == "slip" and found.families == ("slip that changes with speed",)
 
 
@@ -571,5 +576,5 @@ def test_supply_that_sags_over_time_gets_no_name(monkeypatch):
         dataclasses.replace(settings_for(Histories, 300), slots=2), {n: BY_NAME[n] for n in names}, STATED | dynamic
     )
     found = analyst.trace(table(made))
-    assert found.verdict == "unnamed" and not found.standing.stands and found.members == ()
+    assert found.verdict in WITHOUT_NAME and not found.standing.stands and found.members == ()
     assert {found.where.balance, *found.where.alike} & {"electrical", "supply"} and found.where.variable == "time"

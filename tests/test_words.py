@@ -10,7 +10,16 @@ import numpy as np
 import pytest
 
 from calibration.discovery import notes as of_loop
-from calibration.discovery.notes import CurveOver, FreedValue, Missing, NameSupport, NameTest, RuledOut, Summary
+from calibration.discovery.notes import (
+    CurveOver,
+    FreedValue,
+    Mechanism,
+    Missing,
+    NameSupport,
+    NameTest,
+    RuledOut,
+    Summary,
+)
 from calibration.discovery.result import Formula, Sensitivity, Worse
 from calibration.inference import notes as of_fit
 from calibration.inference.lack_of_fit import Adequacy
@@ -286,6 +295,11 @@ SAMPLES = [
         "command without --within",
     ),
     (
+        of_loop.NotPredictable(("configuration",)),
+        "not predictable from the others, so neither scored nor tested: blocks by configuration that hold all runs of a "
+        "configuration with parameters of its own",
+    ),
+    (
         of_loop.LostReplicates(400, 500),
         "only 400 of 500 bootstrap tables could be fitted again; the thresholds are theirs",
     ),
@@ -485,9 +499,45 @@ def test_verdict_tells_what_is_tentative():
         place="slip", variable="slope", alike=("slip",), variables_alike=(), family="slip", by_duty=False
     )
     only = Missing(("b",), (), ("slip",), False)
-    said = loop.statement(Summary("unnamed", 0.001, place, (only,), support=curve))
+    said = loop.statement(Summary("place", 0.001, place, (only,), support=curve))
     assert "no effect of the library is established" in said
     assert said.endswith("predicts better: b (one smooth curve in the slip balance over slope leaves nothing).")
+
+
+def test_a_mechanism_is_stated_with_what_it_explains_and_predicts():
+    found = Mechanism(("loss torque that changes with speed", "slip"), ("a",), 0.99, 0.8, 0.1, 1.0)
+    place = SimpleNamespace(place="track", variable="speed_motor", alike=("track",), variables_alike=(), family="x")
+    said = loop.statement(Summary("mechanism", 0.001, place, mechanism=found))
+    assert said.startswith(
+        "Missing: a loss torque that changes with speed or a slip, established as a mechanism: it "
+    )
+    assert "explains 99 % of the excess misfit, gains 0.8 nat" in said and "8.0 standard errors" in said
+    weak = dataclasses.replace(found, families=("slip",), share=0.3, gain=0.1)
+    said = loop.statement(Summary("place", 0.001, place, mechanism=weak))
+    assert (
+        "No mechanism is established: the best one is a slip, but it explains only 30 % of the excess misfit and"
+        in said
+    )
+    assert loop.brief(Summary("mechanism", 0.001, place, mechanism=weak)) == "mechanism: slip"
+
+
+def test_every_doubt_about_a_mechanism_has_words():
+    none = Mechanism(("a", "b", "c", "d"), (), 0.1, 0.0, np.inf, 0.0)
+    assert set(none.fails) == set(loop.NO_MECHANISM) and all(loop.no_mechanism(none).split())
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        ([4.0, 1.0, 0.5], "falls from 4 N·m at 95.5 rpm to 0.5 N·m at 955 rpm"),
+        ([0.5, 6.0, 1.0], "rises from 0.5 N·m at 95.5 rpm to 1 N·m at 955 rpm, by way of 6 N·m at 191 rpm"),
+    ],
+)
+def test_the_course_of_a_curve_is_told_by_its_ends(value, said):
+    at = np.array([10.0, 20.0, 100.0])
+    curve = SimpleNamespace(window=None, variable="speed_motor", at=at, value=np.array(value), unit="N·m")
+    assert loop.course(curve) == said
+    assert loop.course(SimpleNamespace(**vars(curve) | {"window": {}})) == ""
 
 
 def test_verdicts_at_other_noise_are_one_sentence():
@@ -499,8 +549,8 @@ def test_verdicts_at_other_noise_are_one_sentence():
     assert loop.at_other_noise([other(0.7, "class", sure, weak), other(1.4, "class", sure, weak)]) == (
         "with 0.7 and with 1.4 times that noise the verdict is class: a established, b tentative"
     )
-    assert loop.at_other_noise([other(0.5, "unnamed", weak), other(2, "none")]) == (
-        "with 0.5 times that noise the verdict is unnamed: b tentative; with 2 times that noise the verdict is none"
+    assert loop.at_other_noise([other(0.5, "place", weak), other(2, "none")]) == (
+        "with 0.5 times that noise the verdict is place: b tentative; with 2 times that noise the verdict is none"
     )
 
 
@@ -548,33 +598,29 @@ def test_names_say_what_would_explain_more_than_they():
         return SimpleNamespace(effects=dict.fromkeys(names, 1.0), rise_chi2=rise, why="too large")
 
     near, better = candidate(-2.0, "a"), candidate(-30.4, "b", "c")
-    assert loop.ruled_out(of("named", candidate(6.5, "a"))) == "" == loop.ruled_out(of("unnamed"))
+    assert loop.ruled_out(of("named", candidate(6.5, "a"))) == "" == loop.ruled_out(of("place"))
     assert loop.ruled_out(of("named", near)).startswith("a would explain as much as what is proposed, but is")
     assert loop.ruled_out(of("class", near, better)) == (
         "b and c would explain 30 σ² more than what is proposed, but are ruled out by size or sign alone: too large."
     )
-    assert loop.ruled_out(of("unnamed", better, near)).startswith("a would explain as much as the curve, but is")
-
-
-def errors(rows, rms):
-    return {"motor_speed": {"rows": rows, "rms_percent": rms}}
+    assert loop.ruled_out(of("place", better, near)).startswith("a would explain as much as the curve, but is")
 
 
 @pytest.mark.parametrize(
-    ("found", "before", "after", "said"),
+    ("found", "predicted", "said"),
     [
-        ((4.3, 4.72), errors(10, 4.3), errors(10, 4.72), "motor speed 4.3 → 4.7 %"),
-        ((0.141, 0.149), errors(10, 0.141), errors(10, 0.149), "motor speed 0.14 → 0.15 %"),
-        ((4.0, 5.0), errors(8, 4.0), errors(10, 12.0), "motor speed 4.0 → 5.0 % (of the 8 rows that both predict)"),
-        (None, errors(10, 4.0), errors(8, 3.0), "2 rows fewer predicted"),
-        (None, errors(10, 4.0), errors(9, 3.0), "1 row fewer predicted"),
-        (None, errors(10, 4.0), errors(10, 3.0), ""),
+        ((10, 4.3, 4.72), (10, 10), "motor speed 4.3 → 4.7 %"),
+        ((10, 0.141, 0.149), (10, 10), "motor speed 0.14 → 0.15 %"),
+        ((8, 4.0, 5.0), (8, 10), "motor speed 4.0 → 5.0 % (of the 8 rows that both predict)"),
+        (None, (10, 8), "2 rows fewer predicted"),
+        (None, (10, 9), "1 row fewer predicted"),
+        (None, (10, 10), ""),
     ],
 )
-def test_what_is_predicted_worse_is_said_with_its_rows(found, before, after, said):
-    worse = () if found is None else (Worse("voltage", "motor_speed", before["motor_speed"]["rows"], *found),)
+def test_what_is_predicted_worse_is_said_with_its_rows(found, predicted, said):
+    worse = () if found is None else (Worse("voltage", "motor_speed", *found),)
     whole = f"Held out, what was found predicts worse: by voltage {said}."
-    assert loop.worse(worse, {"voltage": (before, after)}) == (whole if said else "")
+    assert loop.worse(worse, {"voltage": predicted}) == (whole if said else "")
 
 
 @pytest.mark.parametrize(

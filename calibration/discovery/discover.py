@@ -25,11 +25,13 @@ from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, filled, fit_base, fit_candidates, start
 from calibration.discovery.classes import Classes, classes, cosines
+from calibration.discovery.description import undescribed, unused
 from calibration.discovery.discrepancy import CurveBeside, locate
 from calibration.discovery.experiments import Proposal, denser, no_menu, separating
 from calibration.discovery.hidden import hidden
 from calibration.discovery.kept import Keep
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
+from calibration.discovery.mechanism import mechanism
 from calibration.discovery.notes import (
     AssumedNoise,
     Copies,
@@ -37,10 +39,13 @@ from calibration.discovery.notes import (
     KeptOut,
     Late,
     LostReplicates,
+    Mechanism,
+    Missed,
     Missing,
     NameSupport,
     NameTest,
     NoiseFromSeries,
+    NotPredictable,
     Outstanding,
     PhasesDiffer,
     RestsOn,
@@ -54,6 +59,7 @@ from calibration.discovery.posterior import of_curve, of_fit
 from calibration.discovery.prediction import Predicted
 from calibration.discovery.result import (
     DiscoveryResult,
+    Errors,
     FoundEffect,
     HeldOutAlternative,
     HiddenEffect,
@@ -62,7 +68,7 @@ from calibration.discovery.result import (
 )
 from calibration.discovery.score_tests import Statistics, bootstrap
 from calibration.discovery.search import Search, diagnose, path, search
-from calibration.discovery.settings import FIT, HELD_OUT, Settings, settings_for
+from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings, settings_for
 from calibration.discovery.standing import standing
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
@@ -92,6 +98,8 @@ EITHER_WAY = 0.05
 LATE = 4.0
 #: Share of rows set aside beyond which that is said first.
 MANY = 0.03
+#: Prior sds beyond which a base parameter is worth a look.
+FAR = 3.0
 #: Is told what the loop does next.
 Tell = Callable[[Note | str], None]
 
@@ -272,7 +280,7 @@ class LoopStages:
     """What the stages up to a verdict found.
 
     Attributes:
-        verdict: `none`, `named`, `class` or `unnamed`.
+        verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
         screened: the base fit, rows that stand alone set aside; left: what it leaves.
         sds: the noise that the verdict is with.
         searched: what was tried; alike: what cannot be told apart, where a name is given.
@@ -281,6 +289,8 @@ class LoopStages:
         held_out: the alternatives compared by data held out, where these chose the leader.
         beside: the curve of what the base leaves, where something is missing.
         predicted: what fits predict of data held out, as of `prediction.smallest`.
+        mechanism: where no name stands, established or not.
+        missed: channels that the model does not describe; unused: columns that vary and have no role.
     """
 
     verdict: str
@@ -294,6 +304,9 @@ class LoopStages:
     held_out: tuple[HeldOutAlternative, ...] = ()
     beside: CurveBeside | None = None
     predicted: Predicted = dataclasses.field(default_factory=dict)
+    mechanism: Mechanism | None = None
+    missed: tuple[Missed, ...] = ()
+    unused: tuple[str, ...] = ()
 
     @property
     def members(self) -> tuple[tuple[str, ...], ...]:
@@ -316,8 +329,10 @@ class LoopStages:
     @property
     def families(self) -> tuple[str, ...]:
         """Families of what is established: of the members of each class, or where something without a name is."""
-        if self.alike is not None and self.verdict != "unnamed":
+        if self.alike is not None and self.verdict not in WITHOUT_NAME:
             return tuple(f for each, name in zip(self.alike.families, self._named, strict=True) if name for f in each)
+        if self.verdict == "mechanism" and self.mechanism is not None:
+            return self.mechanism.families
         return () if self.where is None else (self.where.family,)
 
     @property
@@ -409,7 +424,9 @@ def trace(
         progress(Step("bootstrap", (settings.replicates,)))
         screened, left = keep(f"bootstrap {k}", functools.partial(tested, screened))
         if not left.test.rejected and screened.cluster is None:
-            return LoopStages("none", screened, left, sds)
+            missed = undescribed(screened.base.space, runs, sds.noise, left.linear)
+            word = "undescribed" if missed else "none"
+            return LoopStages(word, screened, left, sds, missed=missed, unused=unused(runs))
         progress(Step("effects"))
         later(screened.base)
         screened, left, searched = keep(f"search {k}", functools.partial(tried, screened, left))
@@ -427,16 +444,25 @@ def trace(
     where = dataclasses.replace(beside.where, by_duty=varied_by_duty(runs))
     model, searched, stood = choose(runs, screened, left, searched, settings, progress, beside, predicted)
     stages = functools.partial(LoopStages, beside=beside, predicted=predicted)
+    missed = undescribed(space, runs, sds.noise, left.linear, None if model is None else model[1].linear)
+    if missed:
+        return stages("undescribed", screened, left, sds, searched, missed=missed, unused=unused(runs))
+    named = [] if model is None else [stood.established(e) for e in model[0].effects]
+    level, found = "", None
+    if not any(named):
+        progress(Step("mechanism"))
+        ladder = [c for c in (*searched.ladder, *([] if model is None else model[:1]))]
+        found = mechanism(space, runs, base, left, ladder, bases, beside, predicted, settings)
+        level = "place" if found is None or found.fails else "mechanism"
     if model is None:
-        return stages("unnamed", screened, left, sds, searched, where=where, standing=stood)
+        return stages(level, screened, left, sds, searched, where=where, standing=stood, mechanism=found)
 
     searched = dataclasses.replace(searched, best=model[0], diagnosis=model[1])
     best, after = model
-    named = [stood.established(e) for e in best.effects]
     progress(Step("alike", (best.effects,)))
     alike = classes(space, base, best, searched.ladder, left, settings)
     if not any(named):
-        return stages("unnamed", screened, left, sds, searched, alike, where, standing=stood)
+        return stages(level, screened, left, sds, searched, alike, where, standing=stood, mechanism=found)
     compared: tuple[HeldOutAlternative, ...] = ()
     if settings.prefer == HELD_OUT:
         progress(Step("held out"))
@@ -474,7 +500,7 @@ def choose(
     if best is None or after is None:
         return None, searched, standing(space, base, searched, left, bases, settings)
     adequate = not after.test.rejected_with_margin
-    kinds = blocks_room.distinct(runs, space.bare.observe.blocks)
+    kinds = blocks_room.predictable(runs, space.bare)
     blocks = [mask for by in kinds.values() for mask in by.values()]
     asked = functools.partial(standing, space, base, searched, left, bases, settings, blocks=blocks, beside=beside)
     stood = asked() if adequate or long else None
@@ -648,6 +674,7 @@ def summary(traced: LoopStages, numbers: np.ndarray) -> Summary:
     space, alike = traced.screened.base.space, traced.alike
     support = None if traced.standing is None else traced.standing.numbered(numbers)
     best = None if traced.searched is None else traced.searched.best
+    base = traced.screened.base.candidate
     aside, counting = len(traced.screened.outliers), int(space.included.sum())
     many = aside > MANY * (aside + counting)
     return Summary(
@@ -655,12 +682,16 @@ def summary(traced: LoopStages, numbers: np.ndarray) -> Summary:
         traced.left.test.p_value,
         traced.where,
         missing=() if alike is None else missing(space, alike, support),
-        nearest=best.effects if traced.verdict == "unnamed" and best is not None else (),
+        nearest=best.effects if traced.verdict in WITHOUT_NAME and best is not None else (),
         support=support,
         aside=aside if many else 0,
         of=aside + counting,
         noise=traced.sds.remarks if traced.sds.factors and traced.verdict == "none" else (),
         cluster=traced.screened.cluster,
+        mechanism=traced.mechanism,
+        missed=traced.missed,
+        unused=traced.unused,
+        far=tuple(n for n, z in zip(space.coordinates.base.names, base.z[: space.free], strict=True) if abs(z) > FAR),
     )
 
 
@@ -696,7 +727,7 @@ def assemble_result(
     screened, left, where, noise = traced.screened, traced.left, traced.where, traced.sds.noise
     space, base, best, ends = screened.base.space, screened.base.candidate, traced.best, traced.ends
     curve = beside = None
-    if traced.verdict == "unnamed" and traced.beside is not None:
+    if traced.verdict in WITHOUT_NAME and traced.beside is not None:
         progress(Step("shape"))
         curve, beside = traced.beside.curve, traced.beside.diagnosis
     observe, rows = space.bare.observe, len(runs)
@@ -719,7 +750,7 @@ def assemble_result(
     seen = findings.readings(runs, noise.sd, before, after, known[0], None if best is base else known[1])
     error = lambda simulated: findings.errors(space.bare, simulated, seen.measured, seen.sd, included)  # noqa: E731
     compared = traced.held_out
-    if traced.alike is not None and traced.verdict != "unnamed" and not compared and not observe.long:
+    if traced.alike is not None and traced.verdict not in WITHOUT_NAME and not compared and not observe.long:
         compared = preference.compared(space, runs, best, traced.alike)
     gain, kept = _gain(space, runs, seen), True
     if gain is not None and (curve is not None or best is not base):
@@ -740,9 +771,9 @@ def assemble_result(
     remains = None
     if traced.alike is not None:
         found = findings.found_effects(space, base, best, traced.alike, left.test, settings)
-        remains = None if where is None or traced.verdict == "unnamed" else where
+        remains = None if where is None or traced.verdict in WITHOUT_NAME else where
     concealed: tuple[HiddenEffect, ...] = ()
-    if traced.alike is not None and traced.verdict != "unnamed":
+    if traced.alike is not None and traced.verdict not in WITHOUT_NAME:
         ask = observe.menu and not observe.long
         concealed = findings.hidden_effects(
             space, hidden(space, best, traced.alike, left, traced.ends, settings, ask=ask)
@@ -789,11 +820,11 @@ def assemble_result(
         detail=observe.detail(screened.bases, included, left, ends),
         readings_of_rows=seen,
         errors_as_stated=error(seen.as_stated),
-        errors=(error(seen.before), error(seen.after)),
-        errors_held_out={k: (error(a), error(b)) for k, (a, b) in seen.held_out.items()},
+        errors=on_same_rows(seen.before, seen.after, error),
+        errors_held_out={k: on_same_rows(*both, error) for k, both in seen.held_out.items()},
+        held_out_unpredictable=blocks_room.unpredictable(runs, space.bare),
         held_out_worse=preference.worse(seen.held_out, error),
         alternatives_held_out=compared,
-        percent_of=observe.percent_of,
         noise=_noise(runs, noise, type(observe)),
         settings=settings,
         replicates=len(left.test.null.single),
@@ -801,6 +832,14 @@ def assemble_result(
     # What happens for a while is not everywhere alike.
     of_noise = of_sds(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
     return dataclasses.replace(result, remarks=(*of_noise, *remarks(result)))
+
+
+def on_same_rows(
+    before: np.ndarray, after: np.ndarray, error: Callable[[np.ndarray], Errors]
+) -> tuple[Errors, Errors]:
+    """Errors of readings before and after, over the rows that both fits predict."""
+    both = np.isfinite(before) & np.isfinite(after)
+    return error(np.where(both, before, np.nan)), error(np.where(both, after, np.nan))
 
 
 def of_sds(sds: Sds, remaining: Residuals) -> tuple[NoiseOff, ...]:
@@ -816,9 +855,9 @@ def _gain(space: CandidateSpace, runs: Runs, seen: ReadingsOfRows) -> prediction
     """By how much what was found predicts better than the refit; None where nothing can be held out."""
     if not seen.held_out:
         return None
-    counts, kinds = space.weight[: len(runs)] > 0, space.bare.observe.blocks
+    counts, kinds = space.weight[: len(runs)] > 0, blocks_room.predictable(runs, space.bare)
     before, after = (
-        prediction.scored({k: x[when] for k, x in seen.held_out.items()}, seen.measured, seen.sd, counts, runs, kinds)
+        prediction.scored({k: x[when] for k, x in seen.held_out.items()}, seen.measured, seen.sd, counts, kinds)
         for when in (0, 1)
     )
     return after.gain(before)
@@ -848,10 +887,12 @@ def _residuals(
 
 
 def _proposal(space: CandidateSpace, traced: LoopStages, settings: Settings) -> Proposal | None:
-    """What to do next; None where nothing is left to tell apart."""
+    """What to do next; None where nothing is left to tell apart, or the model does not describe the runs."""
+    if traced.verdict == "undescribed":
+        return None
     if not space.bare.observe.menu:
         return no_menu(space) if traced.verdict != "none" else None
-    if traced.verdict == "unnamed" and traced.where is not None:
+    if traced.verdict in WITHOUT_NAME and traced.where is not None:
         return denser(space, traced.where, settings)
     return None if traced.alike is None else separating(space, traced.best, traced.alike, settings)
 
@@ -883,11 +924,12 @@ def remarks(found: DiscoveryResult) -> Notes:
     for rows, why in ((found.unusable, "unusable"), (found.outliers, "outliers")):
         if rows:
             said.append(KeptOut(rows, why))
-    far = {name: abs(p.shift_after) for name, p in found.base_shift.items() if abs(p.shift_after) > 3}
+    far = {name: abs(p.shift_after) for name, p in found.base_shift.items() if abs(p.shift_after) > FAR}
     said += [FarFromPrior(name, x, "loop") for name, x in far.items()]
     held = tuple(name for name in found.held_by_prior if name not in far)
     said += [HeldByPrior(held)] * bool(held)
     said += [OnlyTogether(found.together)] * bool(found.together)
+    said += [NotPredictable(found.held_out_unpredictable)] * bool(found.held_out_unpredictable)
     said += found.residual_clusters
     wave = found.unnamed
     if wave is not None and wave.score_free_in_each_run and wave.score < 0.5 * wave.score_free_in_each_run:

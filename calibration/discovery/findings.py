@@ -19,6 +19,7 @@ from calibration.discovery.discrepancy import Discrepancy
 from calibration.discovery.experiments import Proposal
 from calibration.discovery.hidden import Hidden
 from calibration.discovery.location import DiscrepancyLocation
+from calibration.discovery.mechanism import share_of_excess
 from calibration.discovery.notes import RuledOut
 from calibration.discovery.projection import Defect, defect
 from calibration.discovery.result import (
@@ -97,6 +98,7 @@ def found_effects(
                 parameters=_parameters(space, best, slot, settings),
                 p_value=own_p(gains[slot], null),
                 score=float(gains[slot]),
+                share=share_of_excess(space, base, float(gains[slot])),
             )
         )
     return tuple(listed)
@@ -385,7 +387,7 @@ def readings(
         return held_out(fitted.problem, fitted.z, masks, fitted.active).reading
 
     held, labels = {}, {}
-    for kind, by in blocks_room.distinct(runs, before.problem.observe.blocks).items():
+    for kind, by in blocks_room.predictable(runs, before.problem).items():
         masks = list(by.values())
         first = unseen(before, masks) if known_before is None else known_before[kind]
         later = first
@@ -402,5 +404,4 @@ def errors(
 ) -> Errors:
     """Errors of every channel [%, and in σ] over the rows that count and have a simulated value."""
     simulated = np.where(included[:, None], simulated, np.nan)
-    percent = problem.observe.percent(simulated, measured)
-    return channel_errors(problem.channels, simulated, measured, sd, percent)
+    return channel_errors(problem.channels, simulated, measured, sd)

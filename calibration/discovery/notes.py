@@ -34,6 +34,8 @@ BETTER = 5.0
 #: Share of its root that an effect has to keep without any one run: without a row of a table, whose readings may be
 #: wrong by themselves; without a run of a history, hundreds of samples, chance is asked alone.
 KEPT = {"row": 1 / math.sqrt(3), "run": 0.0}
+#: Share of itself by which an amplitude may change over a variable without costing a law its name.
+FORM = 0.3
 #: Share of the blocks left out, of those that leave half of what is known of an effect, in which it has to be chosen
 #: again.
 AGAIN = 0.8
@@ -55,6 +57,7 @@ class NameTest:
         what: a run is called, `row` or `run`.
         varies: root of what an amplitude that changes with a variable explains beside the largest set [σ]; over: that
             variable; by_chance: what chance leaves to as many variables, whatever the library has.
+        spread: by how much of itself the amplitude changes at either end of that variable [-].
     """
 
     effect: str
@@ -71,6 +74,7 @@ class NameTest:
     varies: float = 0.0
     over: str = ""
     by_chance: float = 0.0
+    spread: float = math.inf
 
     @property
     def stands(self) -> bool:
@@ -92,9 +96,14 @@ class NameTest:
             "blocks": self.again < AGAIN,
             "larger": bool(self.larger),
             "remains": self.remains,
-            "form": self.varies > max(self.needed, self.by_chance),
+            "form": self.shows_form and self.spread > FORM,
         }
         return tuple(doubt for doubt, holds in doubts.items() if holds)
+
+    @property
+    def shows_form(self) -> bool:
+        """Whether a change of its amplitude over a variable is more than chance."""
+        return self.varies > max(self.needed, self.by_chance)
 
     @property
     def established(self) -> bool:
@@ -176,17 +185,65 @@ class Missing:
     test: NameTest | None = None
 
 
+#: What a mechanism needs: share of the excess misfit, standard errors of its gain on data held out.
+HALF, SURE = 0.5, 2.0
+#: Mechanisms that data may not tell apart for one of them to be stated.
+FEW = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class Mechanism:
+    """Which equation lacks something and what drives it, by the effects or the smooth curve that explain most of it.
+
+    Attributes:
+        families: equation and driver in words, the best first, then those that explain as much.
+        effects: of the library in its place, () for a curve.
+        share: of the excess misfit, χ² less its expectation, that it explains [-].
+        gain, se: on data held out, over the readings that it changes [nat a reading].
+        again: share of the informative blocks of runs without which it is found again [-].
+    """
+
+    families: tuple[str, ...]
+    effects: tuple[str, ...]
+    share: float
+    gain: float
+    se: float
+    again: float
+
+    @property
+    def fails(self) -> tuple[str, ...]:
+        """Rows of `words.loop.NO_MECHANISM`: what speaks against it; empty where it is established."""
+        doubts = {
+            "share": self.share < HALF,
+            "gain": not self.gain > SURE * self.se,
+            "again": self.again < AGAIN,
+            "many": len(self.families) > FEW,
+        }
+        return tuple(doubt for doubt, holds in doubts.items() if holds)
+
+
+class Missed(NamedTuple):
+    """A channel that a refit misses: rms error and estimated noise over its measured rms [-]."""
+
+    channel: str
+    error: float
+    noise: float
+
+
 @dataclasses.dataclass(frozen=True)
 class Summary:
     """A verdict with all that its statement says.
 
     Attributes:
-        verdict: `none`, `named`, `class` or `unnamed`; p: family-wise.
+        verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`; p: family-wise.
         where: something is missing, or remains.
-        missing: the effects found, established or tentative; `unnamed` has none that are established.
+        missing: the effects found, established or tentative; without names none is established.
         nearest: effects that come nearest where none may be named; support: whether names stand.
         aside, of: rows that lie off alone where these are many, of how many; 0 else.
         noise: sds that are off, where that is all; cluster: what rows that lie off have in common.
+        mechanism: where no name stands, established or not.
+        missed: channels that the model does not describe; unused: columns of numbers that vary and are not used;
+            far: base parameters beyond three prior sds.
     """
 
     verdict: str
@@ -199,6 +256,25 @@ class Summary:
     of: int = 0
     noise: tuple[NoiseOff, ...] = ()
     cluster: Cluster | None = None
+    mechanism: Mechanism | None = None
+    missed: tuple[Missed, ...] = ()
+    unused: tuple[str, ...] = ()
+    far: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Headline:
+    """What holds at every noise that was tried.
+
+    Attributes:
+        level: of the claims, a verdict; `open` where it depends on the noise whether anything is missing.
+        claims: laws, mechanisms or places, each with those that data cannot tell from it.
+        factors: on the noise.
+    """
+
+    level: str
+    claims: tuple[tuple[str, ...], ...]
+    factors: tuple[float, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -301,6 +377,12 @@ class Led(Note):
     prefer: str
     told: float
     rise_chi2: float
+
+
+class NotPredictable(Note):
+    """Kinds of blocks that the others cannot predict, as parameters are determined by one block alone."""
+
+    kinds: tuple[str, ...]
 
 
 class LostReplicates(Note):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -42,9 +42,16 @@ class HeldOutScore:
     blocks: dict[str, np.ndarray]
     reading: dict[str, Readings] = dataclasses.field(default_factory=dict)
 
-    def gain(self, over: HeldOutScore) -> Gain:
-        """How much better it is than another's, over the readings of both."""
+    def gain(self, over: HeldOutScore, where: Bool[np.ndarray, "rows channels"] | None = None) -> Gain:
+        """How much better it is than another's, over the readings of both.
+
+        Args:
+            where: readings that count; None: all.
+        """
+        if not self.by_kind:
+            return Gain(0.0, np.inf)
         each = np.stack([x - over.by_kind[kind] for kind, x in self.by_kind.items()])
+        each = each if where is None else np.where(where, each, np.nan)
         scored = np.isfinite(each)
         counts = scored.sum((0, 2))
         rows = counts > 0
@@ -79,19 +86,18 @@ def scored(
     measured: Readings,
     sd: Readings,
     counts: Bool[np.ndarray, "rows channels"],
-    runs: Runs,
-    kinds: Sequence[str],
+    kinds: Mapping[str, Mapping[str, np.ndarray]],
 ) -> HeldOutScore:
     """Scores of readings held out.
 
     Args:
         reading: kind of block → of each row, by a fit that has not seen its block; NaN where it predicts none.
-        counts: whether a reading does; kinds: of blocks, as of an observer.
+        counts: whether a reading does; kinds: of blocks, label → mask of its rows each.
     """
     by_kind, blocks = {}, {}
     norm = math.lgamma((FREEDOM + 1) / 2) - math.lgamma(FREEDOM / 2) - 0.5 * math.log(FREEDOM * math.pi)
-    for kind, by in blocks_room.distinct(runs, kinds).items():
-        block = np.full(len(runs), -1)
+    for kind, by in kinds.items():
+        block = np.full(len(measured), -1)
         for k, mask in enumerate(by.values()):
             block[mask] = k
         off = (reading[kind] - measured) / sd
@@ -113,14 +119,11 @@ def key(candidate: Candidate) -> tuple[tuple[str, ...], bytes]:
 
 def score_of(space: CandidateSpace, runs: Runs, candidate: Candidate) -> HeldOutScore:
     """Scores of a candidate, fitted anew without each block of every kind."""
-    data, rows, kinds = space.equipped.data, len(runs), space.bare.observe.blocks
+    data, rows, kinds = space.equipped.data, len(runs), blocks_room.predictable(runs, space.bare)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
     problem, z, active = space.fit_of(candidate.active, candidate.z)
-    reading = {
-        kind: held_out(problem, z, list(by.values()), active).reading
-        for kind, by in blocks_room.distinct(runs, kinds).items()
-    }
-    return dataclasses.replace(scored(reading, measured, sd, counts, runs, kinds), reading=reading)
+    reading = {kind: held_out(problem, z, list(by.values()), active).reading for kind, by in kinds.items()}
+    return dataclasses.replace(scored(reading, measured, sd, counts, kinds), reading=reading)
 
 
 def smallest(
@@ -137,7 +140,7 @@ def smallest(
         path: candidates by the number of their effects.
         predicted: takes what each of them predicts of data held out.
     """
-    if not blocks_room.distinct(runs, space.bare.observe.blocks):
+    if not blocks_room.predictable(runs, space.bare):
         return None
     candidates = [base, *path]
     scores = [score_of(space, runs, c) for c in candidates]

@@ -58,7 +58,7 @@ def compared(space: CandidateSpace, runs: Runs, best: Candidate, alike: Classes)
     others = [c for c in experiments.alternatives(best, alike, stated=False).values() if c.plausible]
     data, rows = space.equipped.data, len(runs)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
-    kinds = blocks_room.distinct(runs, space.bare.observe.blocks)
+    kinds = blocks_room.predictable(runs, space.bare)
     if len(others) < 2 or not kinds:
         return ()
 

@@ -14,11 +14,13 @@ from calibration.data.posterior import Posterior
 from calibration.data.runs import WHEN, Runs
 from calibration.data.writing import write_json, write_table
 from calibration.discovery.clusters import Cluster
+from calibration.discovery.headline import headline
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.notes import Asked, Instruction, NameSupport, RuledOut, Summary
+from calibration.discovery.notes import Asked, Headline, Instruction, Mechanism, NameSupport, RuledOut, Summary
 from calibration.discovery.prediction import Gain
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
+from calibration.inference.errors import OF_SIZE
 from calibration.inference.notes import HeldByPrior, Notes, Pair
 from calibration.inference.posterior import determined_together
 from calibration.inference.residual_clusters import ResidualCluster
@@ -28,7 +30,7 @@ from calibration.words.notes import sentence, sentences
 from mmrjax.channels import Channel
 from mmrjax.robot import Robot
 
-SCHEMA = "mmrjax.loop/2"
+SCHEMA = "mmrjax.loop/3"
 #: The robot whose running gear the track model found.
 TRACK_FILE = "robot_track.toml"
 #: The robot fitted with nothing added.
@@ -86,6 +88,7 @@ class FoundEffect:
         balance, unit: that it enters; equation, source: from its docstring.
         parameters: its amplitude and shape; p_value: its own, against the strongest of all effects in each bootstrap
             table; score: rise of χ² without it, all else fitted again [σ²].
+        share: of the excess misfit, χ² less its expectation, that this is [-].
     """
 
     name: str
@@ -99,6 +102,7 @@ class FoundEffect:
     parameters: dict[str, Estimate]
     p_value: float
     score: float
+    share: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -416,7 +420,8 @@ class DiscoveryResult:
     """All that the loop found.
 
     Attributes:
-        verdict: `none`, `named`, `class` or `unnamed`; summary: with all that its statement says.
+        verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
+        summary: the verdict with all that its statement says.
         robot: the one that is written; refit: with nothing added; written: whether what was found is in it.
         gain: of what was found over the refit, on data held out; None where nothing can be.
         converged: whether the fit of that robot is an optimum; posterior: of all that was fitted.
@@ -439,11 +444,11 @@ class DiscoveryResult:
         detail: what this kind of data tells beside: equations run by run, or memory, orders and drift.
         readings_of_rows: measured and simulated.
         errors_as_stated: rms by channel, of the robot before any fit.
-        errors, errors_held_out: rms by channel, before and after; by kind of block.
+        errors, errors_held_out: rms by channel, before and after, over the rows that both predict; by kind of block.
+        held_out_unpredictable: kinds of blocks of which the others cannot predict some or all.
         held_out_worse: where the latter rise.
         alternatives_held_out: of a class, compared by data held out; empty where there is one, or where that takes
             long and was not asked for.
-        percent_of: what errors in percent are of.
         noise: channel → source and median sd [%].
         settings: the statistical constants; replicates: of the bootstrap, that settled.
         remarks: what is worth saying.
@@ -489,9 +494,9 @@ class DiscoveryResult:
     errors_as_stated: Errors
     errors: tuple[Errors, Errors]
     errors_held_out: dict[str, tuple[Errors, Errors]]
+    held_out_unpredictable: tuple[str, ...]
     held_out_worse: tuple[Worse, ...]
     alternatives_held_out: tuple[HeldOutAlternative, ...]
-    percent_of: str
     noise: dict[str, dict[str, Any]]
     settings: Settings
     replicates: int
@@ -503,6 +508,16 @@ class DiscoveryResult:
     def statement(self) -> str:
         """The verdict in one sentence."""
         return words.statement(self.summary)
+
+    @property
+    def headline(self) -> Headline:
+        """What holds at every noise that was tried."""
+        return headline(self.summary, [(s.factor, s.summary) for s in self.sensitivity])
+
+    @property
+    def refit_alone(self) -> bool:
+        """True where nothing is proposed next to the refit."""
+        return self.verdict in ("none", "undescribed")
 
     @property
     def standing(self) -> str:
@@ -529,6 +544,15 @@ class DiscoveryResult:
             for simulated in (seen.before, seen.after)
         )
         return before, after
+
+    @property
+    def predicted(self) -> dict[str, tuple[int, int]]:
+        """Kind of block → rows that fits without their block predict, before and after."""
+
+        def rows(reading: np.ndarray) -> int:
+            return int(np.sum(np.isfinite(reading).any(1) & self.included))
+
+        return {kind: (rows(a), rows(b)) for kind, (a, b) in self.readings_of_rows.held_out.items()}
 
     @property
     def rms(self) -> dict[str, dict[str, float]]:
@@ -565,6 +589,9 @@ class DiscoveryResult:
         return {
             "schema": SCHEMA,
             "verdict": self.verdict,
+            "mechanism": None if self.summary.mechanism is None else _mechanism(self.summary.mechanism, self.unnamed),
+            "missed": [m._asdict() for m in self.summary.missed],
+            "headline": dataclasses.asdict(self.headline) | {"statement": words.headline(self.headline)},
             "statement": self.statement,
             "rows": len(self.runs),
             "rows_used": int(self.included.sum()),
@@ -589,8 +616,9 @@ class DiscoveryResult:
                 "as_stated": {"fitted": self.errors_as_stated, "held_out": self.errors_as_stated},
                 **{w: {"fitted": self.errors[k], "held_out": main[k]} for k, w in enumerate(whens)},
             },
-            "errors_percent_of": self.percent_of,
+            "errors_percent_of": OF_SIZE,
             "held_out_by": held,
+            "held_out_unpredictable": list(self.held_out_unpredictable),
             "held_out_worse": [dataclasses.asdict(w) for w in self.held_out_worse],
             "alternatives_held_out": [dataclasses.asdict(a) for a in self.alternatives_held_out],
             "prediction": {
@@ -703,9 +731,19 @@ def _effect(e: FoundEffect, support: NameSupport | None) -> dict[str, Any]:
         "parameters": {name: dataclasses.asdict(p) for name, p in e.parameters.items()},
         "p_value": e.p_value,
         "score": e.score,
+        "share": e.share,
+        "accuracy_of_form": None
+        if test is None or not test.shows_form
+        else {"over": test.over, "share": test.spread},
         "members": {name: dataclasses.asdict(m) for name, m in e.members.items()},
         "stated_values": {name: dataclasses.asdict(s) for name, s in e.stated.items()},
     }
+
+
+def _mechanism(m: Mechanism, curve: UnnamedDiscrepancy | None) -> dict[str, Any]:
+    found = {n: getattr(m, n) for n in ("share", "gain", "again")} | {"se": m.se if np.isfinite(m.se) else None}
+    listed = {n: list(getattr(m, n)) for n in ("families", "effects", "fails")}
+    return {**listed, **found, "established": not m.fails, "course": "" if curve is None else words.course(curve)}
 
 
 def _unnamed(d: UnnamedDiscrepancy) -> dict[str, Any]:

@@ -14,6 +14,8 @@ SHARES = {
     ("single", "curve", "pair", "chi2"): (0.03, 0.01, 0.004, 0.006),
     ("single", "curve", "pair", "chi2", "white"): (0.03, 0.01, 0.004, 0.003, 0.003),
 }
+#: Verdicts by which something is missing and no effect of the library is established.
+WITHOUT_NAME = ("mechanism", "place")
 #: By what the leader of a class is chosen among its members.
 PREFERENCES = FIT, HELD_OUT = ("fit", "held-out")
 #: How far beyond its threshold a statistic has to be for a fit with effects to be rejected: two sigmas of a

@@ -303,7 +303,9 @@ def name_tests(
                 _evidence_over_curves(space, whole, others, effect, seen[others.active], bases, settings),
                 run,
                 root_without,
-                _chosen_again(space, effect, judged, np.asarray(signatures), blocks, settings),
+                _chosen_again(
+                    space, (space.library[effect].family(),), judged, np.asarray(signatures), blocks, settings
+                ),
                 next((c.effects for c in better if effect not in c.effects), ()),
                 own in lacks,
                 "run" if space.bare.observe.long else "row",
@@ -327,9 +329,10 @@ def _lacks(space: CandidateSpace, seen: Diagnosis, bases: Bases) -> set[str]:
 
 def _varies_most(
     space: CandidateSpace, best: Candidate, effect: str, linear: Linearization, share: float
-) -> tuple[float, str, float]:
+) -> tuple[float, str, float, float]:
     """Root of the most that an amplitude explains which changes with a variable, along a line or bent [σ], all else
-    fitted again; the variable; and what chance leaves to so many looks (Bonferroni 1936).
+    fitted again; the variable; what chance leaves to so many looks (Bonferroni 1936); and the change at an end of the
+    variable over the amplitude [-].
 
     What a law of another form leaves beside a name is, to first order, that name's own term with an amplitude that
     differs from place to place: so few columns see what a family of curves, with many more, leaves to chance. Of
@@ -338,18 +341,23 @@ def _varies_most(
     Args:
         linear: the fit of the candidate, linearised; share: of clean tables in which chance exceeds that.
     """
-    most = 0.0, ""
+    most = 0.0, "", math.inf
     if space.bare.observe.long:
-        return *most, math.inf
+        return *most[:2], math.inf, math.inf
     jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
-    of_row = jacobian[: linear.readings, space.free + best.active.index(effect)].reshape(linear.rows, -1)
+    slot = space.free + best.active.index(effect)
+    of_row = jacobian[: linear.readings, slot].reshape(linear.rows, -1)
     variables = [v for v in (*VARIABLES, "speed") if _varies(linear, v, space.included)]
     for variable in variables:
         at = linear.in_travel(bases_room.SHAFTS, variable)[0].reshape(-1, linear.rows).mean(0)
         x = bases_room.scaled(np.nan_to_num(at), space.included.astype(float))
         changed = np.stack([(of_row * shape[:, None]).ravel() for shape in (x, 2 * x**2 - 1)], 1)
-        most = max(most, (_root(jacobian, residual, changed), variable))
-    return *most, NormalDist().inv_cdf(1 - share / (4 * max(len(variables), 1)))  # two shapes, either sign
+        left, told = _left_of(jacobian, residual, changed)
+        for k, root in enumerate(_roots(jacobian, residual, changed)):
+            spread = abs(told[k] / max(left[k], 1e-300) / best.z[slot]) if best.z[slot] else math.inf
+            most = max(most, (float(root), variable, float(spread)))
+    chance = NormalDist().inv_cdf(1 - share / (4 * max(len(variables), 1)))  # two shapes, either sign
+    return *most[:2], chance, most[2]
 
 
 def _evidence_over_curves(
@@ -417,22 +425,47 @@ def _put_back(
     return np.delete(jacobian, [k, k + len(best.active)], 1), left, signatures
 
 
+def chosen_again(
+    space: CandidateSpace,
+    base: Candidate,
+    best: Candidate,
+    left: Diagnosis,
+    families: Sequence[str],
+    bases: Bases,
+    blocks: Sequence[np.ndarray],
+    settings: Settings,
+) -> float:
+    """Share of the blocks without which an effect of these families still explains as much as any of the library, of
+    those that leave half of what is known of the first effect of a candidate; 1 where there are none.
+
+    Args:
+        left: what the base leaves.
+    """
+    effect, linear = best.effects[0], left.linear
+    judged = _beside(space, linear, bases, (), effect)
+    if _root(*judged) ** 2 < PROMISED * 2 * (base.cost - best.cost):
+        linear = diagnose(space, best, bases, left.test.null, settings).linear
+        judged = _put_back(space, best, effect, _beside(space, linear, bases, (), effect))
+    return _chosen_again(space, families, judged, np.asarray(linear.signatures), blocks, settings)
+
+
 def _chosen_again(
     space: CandidateSpace,
-    effect: str,
+    families: Sequence[str],
     beside: tuple[np.ndarray, ...],
     signatures: np.ndarray,
     blocks: Sequence[np.ndarray],
     settings: Settings,
 ) -> float:
-    """Share of the blocks without which an effect of its family still explains as much as any of the library, as
-    `classes` has it, of those that leave half of what is known of it; 1 where there are none.
+    """Share of the blocks without which an effect of these families still explains as much as any of the library, as
+    `classes` has it, of those that leave half of what is known of an effect; 1 where there are none.
 
     Args:
-        beside: Jacobian, residual and its own signatures, as `_root` takes them; signatures: of the library, there.
+        beside: Jacobian, residual and the effect's own signatures, as `_root` takes them.
+        signatures: of the library, there.
     """
-    library, family, again = space.library, space.library[effect].family(), []
-    akin = np.array([library[name].family() == family for name in library.names])[library.of]
+    library, again = space.library, []
+    akin = np.array([library[name].family() in families for name in library.names])[library.of]
     whole = _left_of(*beside)[0].max()
     for out in blocks:
         kept = _kept(space, out, len(signatures))

@@ -100,6 +100,34 @@ def distinct(runs: Runs, kinds: Sequence[str]) -> dict[str, dict[str, np.ndarray
     return {kind: by for kind, by in found.items() if by}
 
 
+def predictable(runs: Runs, problem: Problem) -> dict[str, dict[str, np.ndarray]]:
+    """Kind → blocks as of `distinct`, of the kinds of a problem's observer, without those that the other rows cannot
+    predict: a block that holds every row of a configuration with free parameters of its own."""
+    names = runs.configurations_named(problem.base)
+    coordinates = problem.coordinates
+    informs = [{_owner(name, names)} for name in coordinates.names]
+    for follower, k, _ in coordinates.tied:
+        informs[k].add(_owner(follower, names))
+    owned = [np.isin(names, list(owners)) for owners in informs if "" not in owners]
+    kinds = {
+        kind: {label: m for label, m in by.items() if not any(m[mine].all() for mine in owned)}
+        for kind, by in distinct(runs, problem.observe.blocks).items()
+    }
+    return {kind: by for kind, by in kinds.items() if by}
+
+
+def unpredictable(runs: Runs, problem: Problem) -> tuple[str, ...]:
+    """Kinds of blocks of which the other rows cannot predict some or all."""
+    every, told = distinct(runs, problem.observe.blocks), predictable(runs, problem)
+    return tuple(kind for kind, by in every.items() if len(told.get(kind, {})) < len(by))
+
+
+def _owner(parameter: str, configurations: np.ndarray) -> str:
+    """The configuration that a parameter belongs to, of those of a table's rows; empty for none."""
+    first = parameter.partition(".")[0]
+    return first if first in configurations else ""
+
+
 @dataclasses.dataclass(frozen=True)
 class HeldOut:
     """Readings that each row gets from the fit that has not seen its block.

@@ -14,24 +14,24 @@ def relative_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
     return 100.0 * (simulated - measured) / simulated
 
 
-#: What errors in percent are of: eq. (35), and where readings cross zero.
-OF_READING, OF_SIZE = "simulated reading, eq. (35)", "channel's root mean square"
+#: What errors in percent of fits are of. A simulated size would make a model that overshoots look better.
+OF_SIZE = "channel's measured root mean square"
 
 
 def sized_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """(CV - EV) / rms(CV) · 100 [%], of the channel's size, which readings that cross zero have too.
+    """(CV - EV) / rms(EV) · 100 [%], with the rms over the rows that have both.
 
     Args:
         simulated, measured: shape (rows, ...).
     """
+    both = np.isfinite(simulated) & np.isfinite(measured)
     with np.errstate(divide="ignore", invalid="ignore"):  # nothing of a channel without readings
-        finite = np.isfinite(simulated)
-        size = np.sqrt(np.sum(np.square(simulated), 0, where=finite) / finite.sum(0))
+        size = np.sqrt(np.sum(np.square(measured), 0, where=both) / both.sum(0))
         return np.asarray(100.0 * (simulated - measured) / size)
 
 
 def percent_error(simulated: np.ndarray, measured: np.ndarray, *, crosses_zero: bool) -> np.ndarray:
-    """Errors [%] of the channel's size where readings may cross zero, else of the reading; shape (rows, ...)."""
+    """Errors of a comparison [%]: of the channel's size where readings may cross zero, else (35)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return (sized_error if crosses_zero else relative_error)(simulated, measured)
 
@@ -93,11 +93,9 @@ def channel_errors(
     Args:
         shown: the channels.
         simulated, measured, sd: [SI], NaN where there is none, shape (rows, channels).
-        percent: errors of the same shape; None takes eq. (35).
+        percent: errors of the same shape; None takes `sized_error`.
     """
-    if percent is None:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            percent = relative_error(simulated, measured)
+    percent = sized_error(simulated, measured) if percent is None else percent
     off = simulated - measured
     answer = {}
     for k, channel in enumerate(shown):

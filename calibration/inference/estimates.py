@@ -10,7 +10,7 @@ from calibration.data.columns import DRIVING
 from calibration.data.runs import Runs
 from calibration.inference import blocks as holdout
 from calibration.inference import priors
-from calibration.inference.errors import channel_errors
+from calibration.inference.errors import channel_errors, sized_error
 from calibration.inference.identifiability import Z95, Identifiability, Profile
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Observer
@@ -129,11 +129,9 @@ def noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np.ndarray
     }
 
 
-def errors(
-    observe: Observer, shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray
-) -> Errors:
-    """Errors by channel, in percent of what the observer says and in σ; arrays of shape (rows, channels)."""
-    return _errors(shown, simulated, measured, sd, observe.percent(simulated, measured))
+def errors(shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray) -> Errors:
+    """Errors by channel; arrays of shape (rows, channels)."""
+    return _errors(shown, simulated, measured, sd, sized_error(simulated, measured))
 
 
 def _errors(
@@ -150,7 +148,7 @@ def _errors(
 
 def held_out(posed: Problem, held: holdout.HeldOut, measured: np.ndarray, sd: np.ndarray) -> HeldOut:
     """Errors on blocks that the fit had not seen, in all and block by block."""
-    percent, lost = posed.observe.percent(held.reading, measured), posed.observe.unreachable(held.status)
+    percent, lost = sized_error(held.reading, measured), posed.observe.unreachable(held.status)
     blocks = {}
     for k, label in enumerate(held.labels):
         inside = held.block == k
@@ -170,7 +168,6 @@ def _counted(rows: np.ndarray) -> tuple[int, ...]:
 
 
 def readings(
-    observe: Observer,
     shown: Sequence[Channel],
     measured: np.ndarray,
     sd: np.ndarray,
@@ -178,7 +175,7 @@ def readings(
     after: np.ndarray,
 ) -> dict[str, ChannelReadings]:
     """Readings by channel; arrays of shape (rows, channels), NaN where there is none."""
-    percent, sigma = observe.percent(after, measured), (after - measured) / sd
+    percent, sigma = sized_error(after, measured), (after - measured) / sd
     return {
         name: ChannelReadings(*(x[:, k] for x in (measured, sd, before, after, percent, sigma)))
         for k, name in enumerate(channels.names(shown))

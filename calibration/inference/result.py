@@ -11,6 +11,7 @@ import numpy as np
 
 from calibration.data import posterior, writing
 from calibration.data.posterior import Posterior
+from calibration.inference.errors import OF_SIZE
 from calibration.inference.identifiability import Identifiability
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.multistart import Starts
@@ -160,7 +161,7 @@ class ChannelErrors:
 
     Attributes:
         rows: how many they are.
-        rms_percent, max_percent: of what `CalibrationResult.percent_of` says; rms_sigma: in sds of the noise.
+        rms_percent, max_percent: of the channel's measured rms; rms_sigma: in sds of the noise.
         rms: in the channel's unit.
     """
 
@@ -261,7 +262,7 @@ class CalibrationResult:
         source: of the runs; channels: that its readings are of, in order; model: the fidelity; seed: of the starts.
         parameters: the free ones, by name; tied: those that follow them, by name.
         noise: by channel.
-        percent_of: what errors in percent are of; axis: column along which the rows of a run follow one another.
+        axis: column along which the rows of a run follow one another.
         errors_before, errors_after: of the robot as given and as calibrated, by channel.
         held_out: by kind of block, in the order in which they tell most.
         conditions: columns of the runs, as in their table; readings: by channel.
@@ -283,7 +284,6 @@ class CalibrationResult:
     parameters: dict[str, Estimate]
     tied: dict[str, Tie]
     noise: dict[str, ChannelNoise]
-    percent_of: str
     axis: str
     errors_before: Errors
     errors_after: Errors
@@ -377,7 +377,7 @@ class CalibrationResult:
                 "parameters": {name: p.to_json() for name, p in self.parameters.items()},
                 "tied": {name: f"{tie.ratio:.4g} x {tie.leader}" for name, tie in self.tied.items()},
                 "noise": _by_name(self.noise),
-                "percent_of": self.percent_of,
+                "percent_of": OF_SIZE,
                 "errors": {
                     # nothing is fitted before, so both are the same
                     "before": {"fitted": before, "held_out": before},

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calibration.discovery import notes
-from calibration.discovery.settings import FIT, HELD_OUT
+from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME
 from calibration.inference import bases
 from calibration.inference import blocks as blocks_room
 from calibration.words import fits
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         Resolved,
         Sensitivity,
         StatedValue,
+        UnnamedDiscrepancy,
         Worse,
     )
 
@@ -49,10 +50,17 @@ def statement(said: notes.Summary) -> str:
 
 def _verdict(said: notes.Summary) -> str:
     where, p = said.where, said.p
+    if said.verdict == "undescribed":
+        return _undescribed(said)
     if said.verdict == "none":
         return f"Nothing is missing: what the fitted model leaves is what noise leaves (family-wise p = {p:.2g})."
-    if said.verdict == "unnamed" and where is not None:
-        text = _without_name(where, p, "is established" if said.missing else "explains it")
+    if said.verdict in WITHOUT_NAME and where is not None:
+        found = said.mechanism
+        if said.verdict == "mechanism" and found is not None:
+            text = f"Missing: {_mechanism(found)} (family-wise p {p_value(p)}). No law of the library is established."
+        else:
+            text = _without_name(where, p, "is established" if said.missing else "explains it")
+            text += f" No mechanism is established: {no_mechanism(found)}." if found is not None else ""
         if said.missing:
             text += _tentative(said.missing, said.support)
         elif said.nearest:
@@ -66,9 +74,99 @@ def _verdict(said: notes.Summary) -> str:
     return f"Missing: {'; '.join(names)} (family-wise p {p_value(p)}).{in_model}{left}"
 
 
+def headline(found: notes.Headline) -> str:
+    """What holds at every noise that was tried, in a sentence."""
+    *first, last = [f"{f:g}" for f in found.factors]
+    at = f"At {', '.join(first)} and {last} times the noise" if first else "At the stated noise"
+    claims = " and ".join(f"a {' or a '.join(c)}" for c in found.claims)
+    laws = " and ".join(" or ".join(c) for c in found.claims)
+    places = " and ".join(" or ".join(bases.in_words(p) for p in c) for c in found.claims)
+    held = {
+        "none": "nothing is missing",
+        "undescribed": "this model does not describe these runs",
+        "open": "the answer differs: whether anything is missing depends on the noise",
+        "named": f"{laws} is established as a law",
+        "class": f"one of {laws} is established",
+        "mechanism": f"{claims} is established as a mechanism",
+        "place": f"something is missing in the {places}" if places else "something is missing, in no one place",
+    }
+    return f"{at} {held[found.level]}"
+
+
+def _undescribed(said: notes.Summary) -> str:
+    """That a model does not describe the runs, by how much, and what to check."""
+    each = [
+        f"{channels.find(m.channel).label} by {100 * m.error:.0f} % of its measured rms"
+        + (f" (its noise is estimated as {100 * m.noise:.0f} %)" if m.noise > m.error else "")
+        for m in said.missed
+    ]
+    check = [f"columns that vary and are not used ({', '.join(said.unused)})"] * bool(said.unused)
+    check += [f"parameters far from their priors ({', '.join(said.far)})"] * bool(said.far)
+    check += ["units, signs and sides of the columns"]
+    return (
+        f"This model does not describe these runs: refitted, it misses {', '.join(each)}. No effect is named. "
+        f"Check first: {'; '.join(check)}."
+    )
+
+
+def _mechanism(found: notes.Mechanism) -> str:
+    """A mechanism with its evidence."""
+    return f"a {' or a '.join(found.families)}, established as a mechanism: it {evidence(found)}"
+
+
+def evidence(found: notes.Mechanism) -> str:
+    """How large a mechanism is, what it predicts, and whether it is found again."""
+    errors = f", {found.gain / found.se:.1f} standard errors" if 0 < found.se < math.inf else ""
+    return (
+        f"explains {100 * found.share:.0f} % of the excess misfit, gains {found.gain:.2g} nat a reading that it "
+        f"changes on runs that the fit has not seen{errors}, and is found again in {100 * found.again:.0f} % of the "
+        "data with a block left out"
+    )
+
+
+#: What speaks against a mechanism.
+NO_MECHANISM = {
+    "share": "it explains only {share:.0f} % of the excess misfit",
+    "gain": "on runs that its fit has not seen it gains {0.gain:.2g} ± {0.se:.2g} nat a reading",
+    "again": "it is found again in only {again:.0f} % of the data with a block left out",
+    "many": "{many} mechanisms explain as much",
+}
+
+
+def no_mechanism(found: notes.Mechanism) -> str:
+    """What speaks against the mechanism that explains most."""
+    numbers = {"share": 100 * found.share, "again": 100 * found.again, "many": len(found.families)}
+    why = [NO_MECHANISM[name].format(found, **numbers) for name in found.fails]
+    return f"the best one is a {found.families[0]}, but {' and '.join(why)}"
+
+
+def course(d: UnnamedDiscrepancy) -> str:
+    """Course of a smooth curve in words, with its values at both ends; empty for one that is over no variable."""
+    if d.window is not None or d.variable not in bases.VARIABLES or len(d.at) < 2:
+        return ""
+    ends = [f"{d.value[k]:.2g} {d.unit} at {_level(d.variable, d.at[k])}" for k in (0, -1)]
+    k = int(np.argmax(np.abs(d.value - np.interp(d.at, d.at[[0, -1]], d.value[[0, -1]]))))
+    between = f", by way of {d.value[k]:.2g} {d.unit} at {_level(d.variable, d.at[k])}"
+    bent = not min(d.value[0], d.value[-1]) <= d.value[k] <= max(d.value[0], d.value[-1])
+    verb = "rises" if d.value[-1] > d.value[0] else "falls"
+    return f"{verb} from {ends[0]} to {ends[1]}{between * bent}"
+
+
+#: Units in which people set the variables of a curve, and their SI values.
+_SET_IN = {"speed_motor": ("rpm", math.pi / 30), "slope": ("°", math.pi / 180), "speed": ("mm/s", 1e-3)}
+
+
+def _level(variable: str, x: float) -> str:
+    units = {"voltage": "V", "current": "A", "payload": "kg", "time": "s"}
+    unit, factor = _SET_IN.get(variable, (units.get(variable, ""), 1.0))
+    return f"{x / factor:.3g} {unit}".rstrip()
+
+
 def brief(said: notes.Summary) -> str:
     """A verdict, and the effects in the model by their leaders."""
     found = []
+    if said.verdict == "mechanism" and said.mechanism is not None:
+        found.append(" or ".join(said.mechanism.families))
     for word, established in (("established", True), ("tentative", False)):
         names = [one.names[0] for one in said.missing if one.established == established]
         found += [f"{', '.join(names)} {word}"] * bool(names)
@@ -167,8 +265,13 @@ def answer(found: DiscoveryResult) -> str:
     """Whether the model is complete, in a sentence."""
     if found.verdict == "none":
         return "Yes, as far as these runs can show: what the fitted model leaves is noise."
+    if found.verdict == "undescribed":
+        return "No verdict: this model does not describe these runs."
     sure, weak = ([e for e in found.effects if is_established(found, e) == want] for want in (True, False))
-    lacks = found.unnamed
+    lacks, stated = found.unnamed, found.summary.mechanism
+    if found.verdict == "mechanism" and stated is not None:
+        over = f", which {course(lacks)}" if lacks is not None and course(lacks) else ""
+        return f"No: missing is a {' or a '.join(stated.families)}{over}. Its exact law is not established."
     if lacks is not None and not weak:
         place = bases.in_words(lacks.channel or lacks.balance)
         return f"No. Something is missing in the {place}, and nothing in the library explains it."
@@ -194,6 +297,9 @@ def how_sure(found: DiscoveryResult, effect: FoundEffect) -> str:
     test = None if found.support is None else found.support.test_of(effect.name)
     if is_established(found, effect):
         known = "" if test is None else f": {test.root:.1f} σ, where chance reaches {test.needed:.1f}"
+        if test is not None and test.shows_form:
+            over = test.over.replace("_", " ")
+            known += f"; accuracy of its form ±{100 * test.spread:.0f} % over {over}"
         return f"established{known}"
     return f"tentative: it predicts, but {doubts(test)}" if doubts(test) else "tentative"
 
@@ -297,7 +403,7 @@ DOUBTS = {
     "blocks": ("blocks", "is chosen again in {again:.0f} % of the data with a block left out"),
     "larger": ("size", "has a rival of an implausible size ({larger})"),
     "remains": ("equation", "leaves something in its own equation"),
-    "form": ("its form", "would have another size at other values of {0.over} ({0.varies:.1f} σ)"),
+    "form": ("its form", "changes{spread} over {over_variable} ({0.varies:.1f} σ)"),
 }
 
 
@@ -307,6 +413,8 @@ def doubts(test: notes.NameTest | None) -> str:
         return ""
     over = ", ".join(_over(c.place, *c.variables) for c in test.curves)
     said = {"beside": over and f" beside smooth curves ({over})", "larger": " and ".join(test.larger)}
+    said |= {"over_variable": test.over.replace("_", " ")}
+    said["spread"] = f" by ±{100 * test.spread:.0f} %" if math.isfinite(test.spread) else ""
     *first, last = [DOUBTS[d][1].format(test, **said, again=100 * test.again) for d in test.fails]
     return f"{', '.join(first)} and {last}" if first else last
 
@@ -324,7 +432,7 @@ def standing(found: DiscoveryResult) -> str:
     """Why names do not stand, or beside what they do, in a sentence; empty where there is nothing to say."""
     if not found.standing:
         return ""
-    if found.verdict == "unnamed":
+    if found.verdict in WITHOUT_NAME:
         return f"Why no name: {found.standing}."
     return f"{found.standing[0].upper()}{found.standing[1:]}."
 
@@ -359,13 +467,13 @@ def why_ruled_out(reasons: Sequence[notes.RuledOut]) -> str:
 def ruled_out(found: DiscoveryResult) -> str:
     """What would explain the data better than what is proposed, or as well, but for its size; empty for nothing."""
     candidates, same = found.implausible, found.settings.same
-    if found.verdict != "unnamed":
+    if found.verdict not in WITHOUT_NAME:
         better = tuple(a for a in candidates if a.rise_chi2 < -same)
         candidates = better or tuple(a for a in candidates if a.rise_chi2 <= same)
-    if not candidates or found.verdict == "none":
+    if not candidates or found.verdict in ("none", "undescribed"):
         return ""
     first = min(candidates, key=lambda a: (len(a.effects), a.rise_chi2))
-    what = "the curve" if found.verdict == "unnamed" else "what is proposed"
+    what = "the curve" if found.verdict in WITHOUT_NAME else "what is proposed"
     more = first.rise_chi2 < -found.settings.same
     gain = f"{-first.rise_chi2:.0f} σ² more than {what}" if more else f"as much as {what}"
     are = "are" if len(first.effects) > 1 else "is"
@@ -418,22 +526,20 @@ def alike(found: DiscoveryResult, e: FoundEffect) -> str:
     return ", or ".join(words for words in (others, values) if words)
 
 
-def worse(found: Sequence[Worse], held_out: Mapping[str, tuple[Errors, Errors]]) -> str:
+def worse(found: Sequence[Worse], predicted: Mapping[str, tuple[int, int]]) -> str:
     """Which errors rise, and where fewer rows are predicted, in a sentence; empty where none does.
 
     Args:
-        held_out: kind of block → errors before and after, each over the rows that it predicts.
+        predicted: kind of block → rows that are predicted before and after.
     """
     parts = []
-    for kind, (before, after) in held_out.items():
+    for kind, (before, after) in predicted.items():
         mine = [w for w in found if w.kind == kind]
         changes = [f"{channels.find(w.channel).label} {_change(w.before, w.after)} %" for w in mine]
-        predicted = {n: (int(before[n]["rows"]), int(after[n]["rows"])) for n in after}
-        if any(w.rows < max(predicted[w.channel]) for w in mine):
+        if any(w.rows < max(before, after) for w in mine):
             changes[-1] += f" (of the {min(w.rows for w in mine)} rows that both predict)"
-        lost = max(was - now for was, now in predicted.values())
-        if lost > 0:
-            changes.append(f"{counted(lost, 'row')} fewer predicted")
+        if before > after:
+            changes.append(f"{counted(before - after, 'row')} fewer predicted")
         if changes:
             parts.append(f"by {blocks_room.in_words(kind)} {', '.join(changes)}")
     return f"Held out, what was found predicts worse: {'; '.join(parts)}." if parts else ""
@@ -594,6 +700,11 @@ SAID: dict[type, str | Callable[[Any], str]] = {
     notes.StillLacks: still_lacks,
     notes.Late: late,
     notes.Led: led,
+    notes.NotPredictable: lambda note: (
+        f"not predictable from the others, so neither scored nor tested: blocks by "
+        f"{' and by '.join(blocks_room.in_words(kind) for kind in note.kinds)} that hold all runs of a configuration "
+        "with parameters of its own"
+    ),
     notes.LostReplicates: "only {settled} of {asked} bootstrap tables could be fitted again; the thresholds are "
     "theirs",
     notes.Outstanding: outstanding,

@@ -13,6 +13,7 @@ STEPS = {
     "effects": "something is missing: fitting every effect that could explain it",
     "more effects": "{} leaves something: fitting further effects beside it",
     "alone": "rows stand alone beside what was found: the same without them",
+    "mechanism": "which mechanism explains most of it?",
     "alike": "what else explains as much as {}?",
     "held out": "which of those predicts best what a fit has not seen?",
     "factors": "the verdict with {} times the {} noise, beside:",

@@ -9,6 +9,7 @@ from rich.table import Table
 from calibration.data.columns import Layout
 from calibration.inference import blocks, priors
 from calibration.inference.calibrate import calibrate as run
+from calibration.inference.errors import OF_SIZE
 from calibration.inference.result import CalibrationResult
 from mmrjax.errors import counted
 from sweeps import config as configuration
@@ -58,7 +59,7 @@ def print_calibration(found: CalibrationResult) -> None:
         marks = "> " * p.interval_open[1] + "< " * p.interval_open[0]  # the end lies further out
         shown.add_row(name, f"{p.value:.4g}", f"{marks}{low} .. {high}", f"{p.shift:+.1f}", found.determined(name))
     say(shown)
-    errors = Table(title=f"rms of simulated - measured [% of {found.percent_of}]", title_justify="left")
+    errors = Table(title=f"rms of simulated - measured [% of {OF_SIZE}]", title_justify="left")
     for heading in ("", "rows", *(c.label for c in found.channels)):
         errors.add_column(heading, justify="right" if heading else "left")
     lines = {"before": found.errors_before, "after": found.errors_after}

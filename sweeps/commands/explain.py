@@ -72,6 +72,7 @@ def names(library: dict[str, type[Effect]]) -> dict[str, list[str]]:
     return {
         "effects": [name for name in library if name not in effects.UNNAMED],
         "statuses": list(words.STATUSES),
+        "verdicts of the loop": list(words.LOOP_VERDICTS),
         "verdicts of a climb": list(VERDICTS),
         "flags": list(words.FLAGS),
         "channels": [c.name for c in channels.EVERY],
@@ -157,6 +158,12 @@ def _verdict(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
         yield "in files", "verdict of result.json of mmrjax climb"
 
 
+def _verdict_of_loop(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+    if name in words.LOOP_VERDICTS:
+        yield "means", words.LOOP_VERDICTS[name]
+        yield "in files", "verdict of result.json of mmrjax loop"
+
+
 def _flag(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     if name in words.FLAGS:
         yield "means", words.FLAGS[name]
@@ -237,6 +244,6 @@ def _bounds(spec: Spec) -> str:
 
 #: What explains a name, by kind.
 EXPLAINED: dict[str, Callable[[str, dict[str, type[Effect]]], Iterator[Line]]] = {
-    "effect": _effect, "status": _status, "verdict of a climb": _verdict, "flag": _flag, "channel": _channel,
-    "output": _output, "parameter": _parameter,
+    "effect": _effect, "status": _status, "verdict of the loop": _verdict_of_loop, "verdict of a climb": _verdict,
+    "flag": _flag, "channel": _channel, "output": _output, "parameter": _parameter,
 }  # fmt: skip

@@ -22,6 +22,7 @@ from calibration.discovery.resolve import check_resolvable, resolve
 from calibration.discovery.result import REFIT_FILE, DiscoveryResult
 from calibration.discovery.settings import fewest_replicates
 from calibration.inference import blocks, observers, priors
+from calibration.inference.errors import OF_SIZE
 from calibration.words import loop as said_of
 from sweeps import config as configuration
 from sweeps.console import pulse, say, tell
@@ -163,13 +164,16 @@ def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> Non
 
 def print_discovery(found: DiscoveryResult) -> None:
     """Verdict, effects, errors and remarks, for a person; the answer and the next step last."""
+    first = found.headline
+    if len(first.factors) > 1:
+        say(f"{first.level}: {said_of.headline(first)}.")
     say(f"{found.verdict}: {found.statement}")
-    if not found.robot.has_ground and found.verdict != "none":
+    if not found.robot.has_ground and found.effects:
         say("The track balance of a shaft is what its load loses.")
     for said in (said_of.standing(found), said_of.ruled_out(found)):
         if said:
             say(said)
-    rise = said_of.worse(found.held_out_worse, found.errors_held_out)
+    rise = said_of.worse(found.held_out_worse, found.predicted)
     if rise:
         say(rise)
     if found.effects:
@@ -181,10 +185,13 @@ def print_discovery(found: DiscoveryResult) -> None:
         for e in found.effects:
             shown.add_row(
                 said_of.called(found, e), ", or ".join(e.families), said_of.size(e),
-                f"{e.score:.0f}", f"{e.p_value:.2g}", said_of.alike(found, e) or "-",
+                f"{e.score:.0f} ({100 * e.share:.0f} %)", f"{e.p_value:.2g}", said_of.alike(found, e) or "-",
             )  # fmt: skip
         say(shown)
-        say("lowers misfit by: rise of χ² without it, all else refitted; own p: among the strongest of the library")
+        say(
+            "lowers misfit by: rise of χ² without it, all else refitted (share of the excess misfit); own p: among "
+            "the strongest of the library"
+        )
     if found.hidden:
         say(said_of.hidden(found))
     if found.unnamed is not None:
@@ -193,10 +200,10 @@ def print_discovery(found: DiscoveryResult) -> None:
         say(found.resolved.statement)
         for note in found.resolved.notes:
             say(f"- track model: {note}")
-    errors = Table(title=f"rms error [% of the {found.percent_of}]", title_justify="left")
+    errors = Table(title=f"rms error [% of the {OF_SIZE}]", title_justify="left")
     for heading in ("", "rows", *(c.label for c in found.channels)):
         errors.add_column(heading, justify="right" if heading else "left")
-    whens = (0,) if found.verdict == "none" else (0, 1)
+    whens = (0,) if found.refit_alone else (0, 1)
     when = ("before", "after")
     lines = {"as stated, nothing fitted": found.errors_as_stated}
     lines |= {f"{when[k]}, fitted": found.errors[k] for k in whens}
@@ -207,7 +214,7 @@ def print_discovery(found: DiscoveryResult) -> None:
         errors.add_row(text, f"{max(e['rows'] for e in by.values())}/{len(found.runs)}", *cells)
     say(errors)
     if Layout.of(found.robot).crosses_zero:
-        shown_fits = {when: by for when, by in found.rms.items() if found.verdict != "none" or "before" in when}
+        shown_fits = {when: by for when, by in found.rms.items() if not (found.refit_alone and "after" in when)}
         say(words.describe_rms(shown_fits))
     if found.sensitivity:
         say(f"{said_of.at_other_noise(found.sensitivity)}")

@@ -14,7 +14,7 @@ from calibration.data.columns import Layout
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference import blocks
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
-from calibration.inference.errors import OF_SIZE, percent_error, root_mean_square
+from calibration.inference.errors import root_mean_square
 from calibration.inference.notes import FarFromPrior
 from calibration.words import fits
 from calibration.words import loop as words
@@ -41,19 +41,24 @@ def rows_of(found: DiscoveryResult) -> dict[str, np.ndarray]:
     return table
 
 
+def _drawn(found: DiscoveryResult) -> str:
+    """The verdict as figures take it, which is `none` where they show the refit alone."""
+    return "none" if found.refit_alone else found.verdict
+
+
 def _run_by_run(album: Album, found: DiscoveryResult) -> None:
     table = rows_of(found)
-    album.add("before_after", lambda: loop_figures.before_after(table, found.channels, found.verdict))
-    album.add("defects", lambda: loop_figures.defects(table, found.verdict, Layout.of(found.robot).crosses_zero))
+    album.add("before_after", lambda: loop_figures.before_after(table, found.channels, _drawn(found)))
+    album.add("defects", lambda: loop_figures.defects(table, _drawn(found), Layout.of(found.robot).crosses_zero))
 
 
 def _over_time(album: Album, found: DiscoveryResult) -> None:
     assert isinstance(found.detail, TimeStatistics)
     detail = found.detail
     album.add(
-        "before_after", lambda: loop_figures.over_time(found.runs, rows_of(found), found.channels, found.verdict)
+        "before_after", lambda: loop_figures.over_time(found.runs, rows_of(found), found.channels, _drawn(found))
     )
-    album.add("series", lambda: loop_figures.time_statistics(detail, found.channels, found.verdict))
+    album.add("series", lambda: loop_figures.time_statistics(detail, found.channels, _drawn(found)))
 
 
 #: What a page shows of one kind of data, by the type of the result's detail.
@@ -84,7 +89,7 @@ class Change:
     """What an effect of the robot that is written changes in the readings of the runs.
 
     Attributes:
-        channel: the one that it changes most; rms: by how much [%], of what errors are percent of.
+        channel: the one that it changes most; rms: by how much [% of its measured rms].
         without, with_it: simulated without and with it, all else alike [SI], shape (rows,).
     """
 
@@ -105,15 +110,15 @@ def changes(found: DiscoveryResult) -> dict[str, Change]:
         results = mm.simulate(robot, conditions)
         return {c.name: np.asarray(getattr(results, c.name)) for c in found.channels}
 
-    with_it, most = shown(found.robot), {}
+    with_it, most, measured = shown(found.robot), {}, found.readings_of_rows.measured
     for name in added:
         without = shown(params.replace(found.robot, {f"effects.{name}.amplitude": params.as_float(0.0)}))
         moved = []
-        for c in found.channels:
+        for k, c in enumerate(found.channels):
             a, b = without[c.name], with_it[c.name]
-            percent = percent_error(b[found.included], a[found.included], crosses_zero=found.percent_of == OF_SIZE)
-            if np.isfinite(percent).any():
-                moved.append(Change(c, root_mean_square(percent), a, b))
+            size = root_mean_square(measured[found.included, k])
+            if np.isfinite(size) and size > 0:
+                moved.append(Change(c, 100 * root_mean_square((b - a)[found.included]) / size, a, b))
         if moved:
             most[name] = max(moved, key=lambda change: change.rms)
     return most
@@ -134,7 +139,7 @@ def would_be_seen(found: DiscoveryResult) -> list[dict[str, Any]]:
 def unseen(found: DiscoveryResult) -> list[dict[str, Any]]:
     """Errors of the refit and with what was found, by kind of block held out, with the rows that each reaches; marked
     where they are better or worse."""
-    total, many = len(found.runs), found.verdict != "none"
+    total, many = len(found.runs), not found.refit_alone
     lines = []
     for kind, both in {"": found.errors, **found.errors_held_out}.items():
         worse = {w.channel for w in found.held_out_worse if w.kind == kind}
@@ -146,10 +151,14 @@ def unseen(found: DiscoveryResult) -> list[dict[str, Any]]:
             mark = "bad" if up else "good" if change < -NOTABLE else ""
             arrow = {"bad": " ↑", "good": " ↓", "": ""}[mark]
             cells.append({"text": " → ".join(texts) + arrow, "mark": mark})
-        rows = [max(int(e["rows"]) for e in one.values()) for one in both[: 1 + many]]
+        rows = max(int(e["rows"]) for e in both[0].values())
         what = f"unseen: another {blocks.in_words(kind)}" if kind else "seen by the fit"
-        shown = f"{rows[0]} → {rows[-1]}" if rows[0] != rows[-1] else str(rows[0])
-        lines.append({"what": what, "cells": cells, "reached": f"{shown} of {total}"})
+        lines.append({"what": what, "cells": cells, "reached": f"{rows} of {total}"})
+    blank = [{"text": "-", "mark": ""} for _ in found.channels]
+    for kind in found.held_out_unpredictable:
+        if kind not in found.errors_held_out:
+            what, why = f"unseen: another {blocks.in_words(kind)}", "not predictable from the others"
+            lines.append({"what": what, "cells": blank, "reached": why})
     return lines
 
 
@@ -158,7 +167,7 @@ def summary(found: DiscoveryResult) -> list[dict[str, Any]]:
     where those seen are better or worse than in the line before."""
     unseen = next(iter(found.errors_held_out.values()), ({}, {}))
     lines = [("as stated", found.errors_as_stated, {}), ("fitted again", found.errors[0], unseen[0])]
-    if found.verdict != "none":
+    if not found.refit_alone:
         lines.append(("with what was found", found.errors[1], unseen[1]))
     shown, before = [], dict[str, float]()
     for what, seen, held in lines:
@@ -238,7 +247,7 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         alike=alike(found),
         doubts=[words.tentative(found, e) for e in found.effects] + [""] * (found.unnamed is not None),
         other_noise=words.at_other_noise(found.sensitivity),
-        worse=words.worse(found.held_out_worse, found.errors_held_out),
+        worse=words.worse(found.held_out_worse, found.predicted),
         rows=first_rows(rows_of(found)),
         conditions=conditions(rows_of(found)),
         columns=columns(found.channels),

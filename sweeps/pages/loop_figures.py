@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from calibration.data.table import Runs
 from calibration.discovery.result import DiscoveryResult, Evidence, UnnamedDiscrepancy
+from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import blocks
 from calibration.inference.bases import in_words
 from calibration.inference.details import TimeStatistics
@@ -214,7 +215,7 @@ def null(before: Evidence) -> Figure:
 
 
 def errors(found: DiscoveryResult) -> Figure:
-    """rms error (35) before and after, fitted and held out by every kind of block."""
+    """rms error before and after, fitted and held out by every kind of block."""
     lines = {"fitted": found.errors}
     lines |= {f"held out by\n{blocks.in_words(k, ', ')}": v for k, v in found.errors_held_out.items()}
     fig, grid = figure(1, len(found.channels), 2.9, sharey=False)
@@ -337,7 +338,7 @@ def defects(table: dict[str, np.ndarray], verdict: str, crosses_zero: bool = Fal
     Args:
         crosses_zero: whether readings may (`Layout.crosses_zero`): drawn are the equations that they close.
     """
-    whens = ("before",) if verdict in ("none", "unnamed") else ("before", "after")
+    whens = ("before",) if verdict in ("none", *WITHOUT_NAME) else ("before", "after")
     drawn = {b: DEFECT_WORDS[b] for b in (closed(table) if crosses_zero else DEFECT_WORDS)}
     fig, grid = figure(len(whens), len(drawn), 2.6 * len(whens) + 0.5, sharex="col", sharey="col")
     for row, when in enumerate(whens):

@@ -100,6 +100,18 @@ def of_curves(names: Sequence[str]) -> str:
     )
 
 
+#: What `verdict` in result.json of the loop means, the least first; an alias after its word.
+LOOP_VERDICTS = {
+    "none": "nothing is missing as far as these runs can show: what the fitted model leaves is noise",
+    "undescribed": "the refitted model misses a channel by more than a quarter of its measured rms, or noise is "
+    "estimated as that large: the statement says what to check first, and no effect is named",
+    "place": "something is missing in one equation, or in those that act alike, and no more is established",
+    "unnamed": "former word for place; a mechanism was called so too until schema mmrjax.loop/3",
+    "mechanism": "what drives the missing term is established, and its equation; its exact law is not",
+    "class": "laws are established, and of at least one these data cannot tell which it is",
+    "named": "one law of the library is established for each thing that is missing",
+}
+
 #: What a page's reader meets and may not know; docs/glossary.md is made of it.
 GLOSSARY = {
     "balance": "one of the model's equations, such as volts along the motor's circuit or torque at the "
@@ -109,10 +121,14 @@ GLOSSARY = {
     "established": "an effect that chance, a smooth curve, one run or one block of runs cannot account for",
     "tentative": "an effect that is in the robot because it predicts better, while something speaks against its name",
     "class": "effects that these data cannot tell apart",
+    "mechanism": "the equation that lacks something and what drives it, without the exact law: it explains half of "
+    "the excess misfit or more, predicts runs that the fit has not seen, and is found again without blocks of runs",
+    "place": "the equation that lacks something, with those that act alike; no mechanism is established",
+    "excess misfit": "χ² beyond what noise alone leaves, about one a reading",
     "refit": "the same model with its parameters fitted to the runs, and nothing added",
     "seen, held out": "errors of runs that the fit was made with, and of runs that it has not seen: a whole "
     "slope, voltage or configuration at a time",
-    "rms error": "root of the mean square of simulated less measured, in percent of the reading",
+    "rms error": "root of the mean square of simulated less measured, in percent of that of the measured readings",
     "σ (sd)": "standard deviation of an instrument: 2 of 3 readings are within 1 σ of the truth, 19 of 20 within 2 σ",
     "misfit, χ²": "sum of (simulated less measured)² / σ² over all readings; noise alone leaves about one a reading",
     "prior": "what a bench or a maker states of a parameter, with its standard deviation, before any "

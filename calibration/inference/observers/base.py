@@ -15,7 +15,6 @@ from jaxtyping import Array, Bool, Float
 from calibration.data.runs import Runs
 from calibration.inference.bases import Bases
 from calibration.inference.details import Detail
-from calibration.inference.errors import OF_READING, OF_SIZE, percent_error
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.noise import Noise
 from calibration.inference.notes import Note
@@ -158,22 +157,6 @@ class Observer(eqx.Module):
     @abc.abstractmethod
     def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Parameters that such data determine beside those that all do: of the drive, and of each chassis."""
-
-    # --- of errors
-
-    @property
-    @abc.abstractmethod
-    def crosses_zero(self) -> bool:
-        """Whether readings may cross zero, so that errors are percent of a channel's size and not of the reading."""
-
-    @property
-    def percent_of(self) -> str:
-        """What errors in percent are of."""
-        return OF_SIZE if self.crosses_zero else OF_READING
-
-    def percent(self, simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
-        """Errors [%] of what `percent_of` says, shape (rows, channels)."""
-        return percent_error(simulated, measured, crosses_zero=self.crosses_zero)
 
     # --- of robots
 

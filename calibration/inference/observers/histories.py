@@ -514,10 +514,6 @@ class Histories(Observer):
         of_runs = jax.vmap(of_run)(self.times, every, self.time[self.rows_of])
         return _by_row(of_runs, self.rows_of, len(self.run))
 
-    @property
-    def crosses_zero(self) -> bool:
-        return True  # they begin at rest
-
     def __call__(self, robot: Robot) -> Observation:
         def of_run(
             conditions: Conditions, times: Array, known: Followed | None, instants: Array, time: Array

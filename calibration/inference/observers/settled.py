@@ -102,7 +102,7 @@ class SettledRuns(Observer):
     """Observer of settled rows: one run a row.
 
     Attributes:
-        fidelity: that simulates them; of_size: whether errors are percent of a channel's size, see `Layout`.
+        fidelity: that simulates them.
     """
 
     word: ClassVar[str] = "run"
@@ -119,7 +119,6 @@ class SettledRuns(Observer):
 
     conditions: Conditions
     fidelity: str = eqx.field(static=True)
-    of_size: bool = eqx.field(default=False, static=True)
 
     @classmethod
     def observes(cls, runs: Runs) -> bool:
@@ -134,7 +133,7 @@ class SettledRuns(Observer):
                 chosen.check(robot, conditions, chosen.facts.resolved())
             except ValueError as error:
                 raise BadConfiguration(f"{runs.source}, settled runs: {error}") from error
-        return cls(conditions, chosen.name, runs.layout.crosses_zero)
+        return cls(conditions, chosen.name)
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
@@ -196,10 +195,6 @@ class SettledRuns(Observer):
     @classmethod
     def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
         return (), ()
-
-    @property
-    def crosses_zero(self) -> bool:
-        return self.of_size
 
     def __call__(self, robot: Robot) -> Observation:
         return self._observed(robot, fidelities.get(self.fidelity).settled(robot, self.conditions))

@@ -98,7 +98,7 @@ class SettledTurns(SettledRuns):
         if fidelity not in (None, first):
             raise BadConfiguration(f"{runs.source}: settled turns are fitted with --model {first}; got {fidelity}")
         found = super().of(runs, robot, fidelity)
-        return cls(found.conditions, found.fidelity, of_size=True)
+        return cls(found.conditions, found.fidelity)
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:

@@ -1,0 +1,62 @@
+"""Whether a model describes runs at all: before that no effect is named."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calibration.data.runs import Runs
+from calibration.discovery.active_set import CandidateSpace
+from calibration.discovery.notes import Missed
+from calibration.inference.lack_of_fit import EXPLAINED, UNDESCRIBED
+from calibration.inference.linearization import Linearization
+from calibration.inference.noise import UNSTATED, Noise
+
+#: Share of a channel's measured rms up to which a fit with effects may miss it where the refit misses more than
+#: `UNDESCRIBED`: what was found is then what the refit lacked.
+MENDED = 0.05
+
+
+def undescribed(
+    space: CandidateSpace, runs: Runs, noise: Noise, refit: Linearization, found: Linearization | None = None
+) -> tuple[Missed, ...]:
+    """Channels that the refit misses by more than `UNDESCRIBED` of their measured rms, or whose estimated noise is
+    that large; none where what was found mends it.
+
+    A channel whose stated noise is that large is described by residuals up to `EXPLAINED` times its sds.
+
+    Args:
+        refit, found: the fit with nothing added and with effects, linearised; None where none was found.
+    """
+    stated = np.array([source not in UNSTATED for source in noise.source])
+    share, sigma = _missed(space, runs, noise, refit)
+    large = (share > UNDESCRIBED) & ~(stated & (sigma <= EXPLAINED))
+    if large.any() and found is not None and np.nanmax(_missed(space, runs, noise, found)[0]) < MENDED:
+        large[:] = False
+    counts = space.weight[: len(runs)] > 0
+    measured = np.where(counts, runs.measured(), np.nan)
+    with np.errstate(invalid="ignore"):
+        noisy = np.sqrt(np.nansum(np.where(counts, noise.sd, 0.0) ** 2, 0) / np.nansum(measured**2, 0))
+    noisy = np.where(stated, 0.0, noisy)
+    return tuple(
+        Missed(c.name, float(share[k]), float(noisy[k]))
+        for k, c in enumerate(runs.channels)
+        if large[k] or noisy[k] > UNDESCRIBED
+    )
+
+
+def _missed(space: CandidateSpace, runs: Runs, noise: Noise, fit: Linearization) -> tuple[np.ndarray, np.ndarray]:
+    """rms error of each channel over its measured rms [-], and in sds [σ], over the readings that count; 0 without
+    any."""
+    rows = len(runs)
+    counts = space.weight[:rows] > 0
+    off = np.where(counts, np.asarray(fit.by_row())[:rows], 0.0)
+    size = np.sqrt(np.sum(np.where(counts, runs.measured(), 0.0) ** 2, 0))
+    error = np.sqrt(np.sum((off * np.where(counts, noise.sd, 0.0)) ** 2, 0))
+    return error / np.maximum(size, 1e-300), np.sqrt(np.sum(off**2, 0) / np.maximum(counts.sum(0), 1))
+
+
+def unused(runs: Runs) -> tuple[str, ...]:
+    """Columns of numbers that vary and have no role."""
+    return tuple(
+        name for name, x in runs.extras.items() if np.issubdtype(x.dtype, np.number) and np.nanmax(x) > np.nanmin(x)
+    )

@@ -1,0 +1,59 @@
+"""What is established at every noise at which a table was looked at: the claim that comes first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from calibration.discovery.notes import Headline, Summary
+from calibration.discovery.settings import WITHOUT_NAME
+
+
+def headline(said: Summary, others: Sequence[tuple[float, Summary]] = ()) -> Headline:
+    """The deepest claims that hold in a verdict and in those at other noises.
+
+    Args:
+        others: factor on the noise and verdict, of each.
+    """
+    every = [said, *(summary for _, summary in others)]
+    factors = tuple(sorted([1.0, *(factor for factor, _ in others)]))
+    if len({_silent(s) for s in every}) > 1:
+        return Headline("open", (), factors)
+    if _silent(said):
+        return Headline(said.verdict, (), factors)
+    laws = _common([[m.names for m in s.missing if m.established] for s in every])
+    if laws:
+        alone = all(len(names) == 1 for names in laws) and not any(m.values for s in every for m in s.missing)
+        return Headline("named" if alone else "class", laws, factors)
+    mechanisms = _common([_mechanisms(s) for s in every])
+    if mechanisms:
+        return Headline("mechanism", mechanisms, factors)
+    places = _common([_places(s) for s in every])
+    return Headline("place", places, factors)
+
+
+def _silent(said: Summary) -> str:
+    """The verdict of a table in which nothing is said to be missing; empty for others."""
+    return said.verdict if said.verdict in ("none", "undescribed") else ""
+
+
+def _mechanisms(said: Summary) -> list[tuple[str, ...]]:
+    """Families of each thing that is established as a law or a mechanism."""
+    found = [m.families for m in said.missing if m.established]
+    return [*found, said.mechanism.families] if said.verdict == "mechanism" and said.mechanism is not None else found
+
+
+def _places(said: Summary) -> list[tuple[str, ...]]:
+    where = said.where
+    if said.verdict in WITHOUT_NAME and where is not None:
+        return [tuple(dict.fromkeys((where.place, *where.alike)))]
+    return []
+
+
+def _common(claims: Sequence[Sequence[tuple[str, ...]]]) -> tuple[tuple[str, ...], ...]:
+    """Claims of the first that share a member with one of each of the others, with what these cannot tell from it."""
+    found = []
+    for claim in claims[0]:
+        alike = [[other for other in those if set(other) & set(claim)] for those in claims[1:]]
+        if all(alike):
+            found.append(tuple(dict.fromkeys([*claim, *(n for those in alike for other in those for n in other)])))
+    return tuple(found)

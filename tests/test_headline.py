@@ -1,0 +1,56 @@
+"""What is claimed first holds at every noise that was tried."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from calibration.discovery.headline import headline
+from calibration.discovery.notes import Mechanism, Missing, Summary
+from calibration.words import loop
+
+DROP, SLIP = "voltage drop that changes with current", "slip that changes with demand"
+
+
+def law(*names, families=(DROP,), established=True):
+    """A verdict with one effect, and what it cannot be told from."""
+    verdict = "place" if not established else "named" if len(names) == 1 else "class"
+    place = SimpleNamespace(place="electrical", alike=("electrical", "supply")) if not established else None
+    return Summary(verdict, 0.001, place, (Missing(names, (), families, established),))
+
+
+def of_mechanism(*families):
+    place = SimpleNamespace(place="electrical", alike=("electrical",))
+    return Summary("mechanism", 0.001, place, mechanism=Mechanism(families, (), 0.9, 1.0, 0.1, 1.0))
+
+
+def nothing(verdict="none"):
+    return Summary(verdict, 0.5, None)
+
+
+@pytest.mark.parametrize(
+    ("own", "others", "level", "claims"),
+    [
+        (law("a"), (law("a"), law("a")), "named", (("a",),)),
+        (law("a"), (law("a", "b"), law("a")), "class", (("a", "b"),)),
+        (law("a"), (law("b"), law("a")), "mechanism", ((DROP,),)),
+        (law("a"), (of_mechanism(DROP), law("a")), "mechanism", ((DROP,),)),
+        (law("a"), (of_mechanism(SLIP, DROP), law("a")), "mechanism", ((DROP, SLIP),)),
+        (law("a"), (of_mechanism(SLIP), law("a")), "place", ()),
+        (law("a", established=False), (law("a", established=False),), "place", (("electrical", "supply"),)),
+        (nothing(), (nothing(), nothing()), "none", ()),
+        (nothing(), (law("a"), nothing()), "open", ()),
+        (law("a"), (nothing("undescribed"),), "open", ()),
+        (of_mechanism(DROP), (), "mechanism", ((DROP,),)),
+    ],
+)
+def test_it_is_the_deepest_claim_that_all_verdicts_hold(own, others, level, claims):
+    found = headline(own, list(zip((0.7, 1.4), others, strict=False)))
+    assert (found.level, found.claims) == (level, claims)
+    assert found.factors == tuple(sorted((1.0, *(0.7, 1.4)[: len(others)])))
+
+
+def test_it_is_said_with_the_noises_at_which_it_holds():
+    said = loop.headline(headline(law("a"), [(0.7, of_mechanism(DROP)), (1.4, law("a"))]))
+    assert said == f"At 0.7, 1 and 1.4 times the noise a {DROP} is established as a mechanism"
+    assert loop.headline(headline(nothing())) == "At the stated noise nothing is missing"
+    assert loop.headline(headline(law("a", "b"))) == "At the stated noise one of a or b is established"

@@ -1,0 +1,119 @@
+"""A mechanism stands by what it explains, predicts and is found again by, whatever its exact law."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from calibration.discovery import mechanism as room
+from calibration.discovery.candidates import Candidate
+from calibration.discovery.location import DiscrepancyLocation
+from calibration.discovery.notes import Mechanism
+from calibration.discovery.prediction import HeldOutScore
+from calibration.discovery.settings import settings_for
+from calibration.inference.observers import SettledRuns
+
+ROWS, BASE = 30, 1000.0
+FAMILIES = {
+    "stribeck": "loss torque that changes with speed", "churning": "loss torque that changes with speed",
+    "leads": "voltage drop that changes with current", "creep": "slip that changes with demand",
+}  # fmt: skip
+SPEED = DiscrepancyLocation("track", "speed_motor", ("track", "gearbox", "motor"), (), 0.0, 0.0)
+
+
+def test_a_mechanism_needs_each_of_its_tests():
+    stands = Mechanism(("a",), (), share=0.5, gain=0.21, se=0.1, again=0.8)
+    assert stands.fails == ()
+    worse = {
+        "share": {"share": 0.49},
+        "gain": {"gain": 0.2},
+        "again": {"again": 0.79},
+        "many": {"families": tuple("abcd")},
+    }
+    assert {name: dataclasses.replace(stands, **change).fails for name, change in worse.items()} == {
+        name: (name,) for name in worse
+    }
+    assert dataclasses.replace(stands, se=np.inf).fails == ("gain",)  # nothing could be held out
+
+
+def fitted(*effects, explains, plausible=True):
+    """A candidate that lowers χ² by so much."""
+    nothing = np.zeros(len(effects))
+    return Candidate(effects, nothing, nothing, BASE - explains / 2, nothing, nothing, plausible, plausible, True)
+
+
+@pytest.fixture
+def found(monkeypatch):
+    """What `mechanism` finds of such candidates and of a curve over a speed that explains so much."""
+    library = {n: SimpleNamespace(family=lambda f=f: f) for n, f in FAMILIES.items()}
+    space = SimpleNamespace(
+        weight=np.ones((ROWS, 1)), library=library, included=np.ones(ROWS, bool),
+        bare=SimpleNamespace(observe=SimpleNamespace(long=False, blocks=("speed",))),
+    )  # fmt: skip
+    score = HeldOutScore({}, {})
+    monkeypatch.setattr(room.blocks_room, "predictable", lambda *_: {})
+    monkeypatch.setattr(room, "_held_out", lambda *_: score)
+    monkeypatch.setattr(room, "_scored", lambda *_: score)
+    monkeypatch.setattr(room, "_reading", lambda *_: None)
+    monkeypatch.setattr(room, "_changed", lambda *_: None)
+    monkeypatch.setattr(room, "_curve_again", lambda *_: 0.9)
+    monkeypatch.setattr(room, "chosen_again", lambda *_: 1.0)
+
+    def of(*ladder, curve, where=SPEED, long=False):
+        space.bare.observe.long = long
+        drawn = SimpleNamespace(chi2=(2 * BASE, 2 * BASE - curve), problem=None, z=None, reading=None)
+        beside = SimpleNamespace(where=where, curve=drawn)
+        return room.mechanism(
+            space, None, fitted(explains=0.0), None, ladder, (), beside, {}, settings_for(SettledRuns)
+        )  # fmt: skip
+
+    return of
+
+
+def test_it_is_that_of_the_family_that_explains_most(found):
+    stribeck, leads = fitted("stribeck", explains=1800.0), fitted("leads", explains=900.0)
+    got = found(leads, stribeck, curve=1900.0)
+    assert got.families == (FAMILIES["stribeck"],) and got.effects == ("stribeck",)
+    assert got.share == pytest.approx((1900 - room.OF_CURVE) / (2 * BASE - ROWS))  # its curve explains more of it
+    assert got.again == 1.0
+
+
+def test_two_laws_of_one_mechanism_are_one(found):
+    both, one = fitted("stribeck", "churning", explains=1900.0), fitted("stribeck", explains=1500.0)
+    twice = fitted("stribeck", "stribeck", explains=1940.0)  # which is no law of the library
+    got = found(one, both, twice, fitted("stribeck", "leads", explains=1950.0), curve=1000.0)
+    assert got.families == (FAMILIES["stribeck"],) and set(got.effects) == {"stribeck", "churning"}
+
+
+def test_share_of_the_excess_is_no_more_than_all_where_noise_is_stated_too_large():
+    space, base = SimpleNamespace(weight=np.ones((ROWS, 1))), fitted(explains=0.0)
+    assert room.share_of_excess(space, base, 985.0) == pytest.approx(0.5)
+    assert room.share_of_excess(space, dataclasses.replace(base, cost=ROWS / 2), 20.0) == 1.0
+
+
+def test_mechanisms_that_explain_as_much_are_both_listed(found):
+    got = found(fitted("stribeck", explains=1800.0), fitted("creep", explains=1740.0), curve=0.0)
+    assert got.families == (FAMILIES["stribeck"], FAMILIES["creep"])
+    got = found(fitted("stribeck", explains=1800.0), fitted("creep", explains=1700.0), curve=0.0)
+    assert got.families == (FAMILIES["stribeck"],)
+
+
+def test_a_curve_that_explains_more_takes_the_place_of_effects_of_another_mechanism(found):
+    """As those of the library imitate a law that it lacks."""
+    got = found(fitted("leads", explains=1500.0), curve=1900.0)
+    assert got.families == (SPEED.family,) and got.effects == () and got.again == 0.9
+    assert found(fitted("leads", explains=1880.0), curve=1900.0).effects == ("leads",)
+    assert found(fitted("stribeck", explains=1900.0, plausible=False), curve=1900.0).effects == ()
+    where = dataclasses.replace(SPEED, explained=1900.0)  # histories: by what it explains linearly
+    assert found(fitted("leads", explains=1500.0), curve=np.nan, where=where, long=True) is None
+    assert found(fitted("stribeck", explains=1500.0), curve=np.nan, where=where, long=True).effects == ("stribeck",)
+
+
+def test_readings_that_it_changes_are_those_it_moves_by_half_of_the_most_moved_channel():
+    sd = np.tile([0.1, 10.0], (ROWS, 1))
+    space = SimpleNamespace(bare=SimpleNamespace(data=SimpleNamespace(sd=sd)), weight=np.ones((ROWS, 2)))
+    before = np.zeros((ROWS, 2))
+    after = np.stack([np.where(np.arange(ROWS) < 20, 1.0, 0.2), np.full(ROWS, 5.0)], 1)
+    changed = room._changed(space, np.zeros(ROWS), before, after)
+    assert changed[:, 0].tolist() == [True] * 20 + [False] * 10 and not changed[:, 1].any()
