@@ -49,6 +49,7 @@ _ONE = "--clean 1 --library 0 --outside 0 --replicates 20 --jobs 1 --out cases.j
 SMALL = {
     "climb_search.py": "--members 4 --generations 1 --tries 1",
     "door.py": "--points 64 --rounds 1",
+    "draw_mutants.py": "--number 1",
     "drive.py": "--batches 2 --repeats 1",
     "effects.py": "--check",
     "loop.py": _ONE,

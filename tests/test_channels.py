@@ -84,7 +84,7 @@ def calibrated(runs, robot):
     observe, measured, sd = observers.kind(runs).of(runs, robot), runs.measured(), runs.deviations()
     known = {
         "robot": robot, "channels": runs.channels, "held_out": {}, "conditions": estimates.conditions(type(observe), runs),
-        "readings": estimates.readings(observe, runs.channels, measured, sd, measured, measured),
+        "readings": estimates.readings(runs.channels, measured, sd, measured, measured),
         "status": np.full(len(runs), "converged"),
     }  # fmt: skip
     return CalibrationResult(**{**dict.fromkeys(f.name for f in dataclasses.fields(CalibrationResult)), **known})

@@ -101,7 +101,7 @@ def test_template_reads_as_written_and_back(tmp_path, kind):
 def test_every_line_of_a_template_that_is_commented_out_reads(tmp_path, kind):
     """Each example line, and the table that it stands in, is valid where its comment sign is taken away."""
     lines = rig_new.template(kind).splitlines()
-    tables = {"# [columns]", "# [rig]"}
+    tables = {"# [columns]", "# [rig]", "# [driver]"}
     stance = (
         lines.index("# [rover.turning]") if "# [rover.turning]" in lines else len(lines)
     )  # to the end, as a whole

@@ -244,7 +244,7 @@ def test_only_what_changes_has_a_value_an_instant(observer, runs):
     np.testing.assert_array_equal(rows.voltage, runs["supply_voltage_V"])
     np.testing.assert_array_equal(rows.slope_deg, runs["slope_deg"])
     np.testing.assert_array_equal(rows.duty, runs["mode"] == "voltage")
-    np.testing.assert_array_equal(rows.open, runs["mode"] == "coast")
+    np.testing.assert_array_equal(rows.open, 1.0 * (runs["mode"] == "coast") - (runs["mode"] == "brake"))
     # held from its sample on, also between samples
     k = int(np.unique(runs["run_id"]).tolist().index("stair"))
     t = np.asarray(observer.times[k])
@@ -372,7 +372,7 @@ def test_columns_of_the_driver_are_read(tmp_path):
             "a,3,6T2A,24,0,0,5,11,,coast")  # fmt: skip
     read = records.read(written(tmp_path, f"{HEADER},duty,mode", *rows))
     found = read.conditions(robots.nominal())
-    assert found.duty.tolist() == [0.5, -1.0, 0.0, 0.0] and found.open.tolist() == [0, 0, 0, 1]
+    assert found.duty.tolist() == [0.5, -1.0, 0.0, 0.0] and found.open.tolist() == [0, 0, -1, 1]
     assert found.voltage.tolist() == [24, -12, 0, 24] and applied(read).tolist() == [12, 12, 0, 0]
     assert set(DRIVEN) <= set(MODES)
 

@@ -506,7 +506,9 @@ def test_verdict_tells_what_is_tentative():
 
 def test_a_mechanism_is_stated_with_what_it_explains_and_predicts():
     found = Mechanism(("loss torque that changes with speed", "slip"), ("a",), 0.99, 0.8, 0.1, 1.0)
-    place = SimpleNamespace(place="track", variable="speed_motor", alike=("track",), variables_alike=(), family="x")
+    place = SimpleNamespace(
+        place="track", variable="speed_motor", alike=("track",), variables_alike=(), family="x", by_duty=False
+    )
     said = loop.statement(Summary("mechanism", 0.001, place, mechanism=found))
     assert said.startswith(
         "Missing: a loss torque that changes with speed or a slip, established as a mechanism: it "

@@ -176,7 +176,7 @@ class CoastDecay(ElectricalEffect):
     amplitude: Scalar = amplitude(
         unit="-",
         meaning="share of the pauses between pulses in which the motors coast",
-        bounds=(-0.2, 1.2),
+        bounds=(-0.5, 1.5),
         sd=0.5,
         source="0 slow decay, 1 fast decay with the current ending at once",
     )
