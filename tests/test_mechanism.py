@@ -103,6 +103,9 @@ def test_a_curve_that_explains_more_takes_the_place_of_effects_of_another_mechan
     """As those of the library imitate a law that it lacks."""
     got = found(fitted("leads", explains=1500.0), curve=1900.0)
     assert got.families == (SPEED.family,) and got.effects == () and got.again == 0.9
+    got = found(fitted("leads", explains=1500.0), fitted("stribeck", explains=1400.0), curve=1900.0)
+    assert got.families == (SPEED.family,) and got.effects == ("stribeck",)  # which has the curve's mechanism
+    assert found(fitted("stribeck", explains=900.0), curve=1900.0).effects == ()
     assert found(fitted("leads", explains=1880.0), curve=1900.0).effects == ("leads",)
     assert found(fitted("stribeck", explains=1900.0, plausible=False), curve=1900.0).effects == ()
     where = dataclasses.replace(SPEED, explained=1900.0)  # histories: by what it explains linearly

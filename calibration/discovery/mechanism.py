@@ -46,7 +46,7 @@ def mechanism(
     settings: Settings,
 ) -> Mechanism | None:
     """The mechanism that explains most of what the base leaves: that of effects of one family of the library, or that
-    of a smooth curve where none of them explains as much; None where there is neither.
+    of a smooth curve where none of them explains as much; None of histories where a curve alone does.
 
     Args:
         left: what the base leaves; ladder: candidates that were fitted; beside: the curve of what the base leaves.
@@ -57,29 +57,36 @@ def mechanism(
         by_curve = beside.where.explained - OF_CURVE
     else:
         by_curve = beside.curve.chi2[0] - beside.curve.chi2[1] - OF_CURVE
-    first = min(best.values(), key=lambda c: c.cost) if best else None
-    explained = 0.0 if first is None else 2 * (base.cost - first.cost)
-    within = max(settings.same, settings.form**2 * explained)
+    by_effects = {family: 2 * (base.cost - c.cost) for family, c in best.items()}
+    explained = by_effects | {own[0]: max(by_curve, by_effects.get(own[0], 0.0))}
+    most = max(explained.values())
+    within = max(settings.same, settings.form**2 * most)
+    alike = sorted((f for f in explained if explained[f] >= most - within), key=lambda f: -explained[f])
+    leader = next((f for f in alike if f in best), alike[0])
+    alike = [leader, *(f for f in alike if f != leader)]
     kinds = blocks_room.predictable(runs, space.bare)
     blocks = [mask for by in kinds.values() for mask in by.values()]
-    if first is not None and (own[0] in best or by_curve <= explained + within):
-        alike = [f for f, c in sorted(best.items(), key=lambda x: x[1].cost) if 2 * (c.cost - first.cost) <= within]
-        alike += [f for f in own[:1] if f not in alike and by_curve >= explained - within]
-        seen, reading = _held_out(space, runs, first, predicted), _reading(space, first)
+    long = space.bare.observe.long
+    if leader in best and (long or by_effects[leader] >= most / 2):
+        first = best[leader]
+        effects, seen, reading = first.effects, _held_out(space, runs, first, predicted), _reading(space, first)
         again = chosen_again(space, base, first, left, alike, bases, blocks, settings)
-        most, effects = max(explained, by_curve if own[0] in alike else 0.0), first.effects
-    elif space.bare.observe.long:
+    elif long:
         return None  # refits of histories with a curve take long
     else:
-        curve = beside.curve
-        alike, effects, most = list(own), (), by_curve
+        curve, effects, alike = beside.curve, (), [*alike, *own]
         told = {k: held_out(curve.problem, curve.z, list(by.values())).reading for k, by in kinds.items()}
         seen, reading = _scored(space, runs, told), curve.reading
-        again = _curve_again(space, left, bases, own, blocks, settings)
+        again = _curve_again(space, left, bases, alike, blocks, settings)
     changed = _changed(space, runs, _reading(space, base), reading)
     gain = seen.gain(_held_out(space, runs, base, predicted), changed)
     return Mechanism(
-        tuple(dict.fromkeys(alike)), effects, share_of_excess(space, base, most), gain.mean, gain.se, again
+        tuple(dict.fromkeys(alike)),
+        effects,
+        share_of_excess(space, base, explained[leader]),
+        gain.mean,
+        gain.se,
+        again,
     )
 
 
