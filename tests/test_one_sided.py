@@ -88,7 +88,7 @@ def one_sided_differences(robot, rows, outputs):
     return jax.jit(jax.vmap(derivative))(np.array(vectors), along, np.array(steps))
 
 
-@pytest.mark.quick("tracked")
+@pytest.mark.quick("frictionless_shaft")
 @pytest.mark.parametrize(
     ("robot", "rows", "outputs"),
     [(tracked, GROUND, OUTPUTS), (bench, SHAFT, OUTPUTS_SHAFT)],
