@@ -10,7 +10,7 @@ from calibration.discovery import mechanism as room
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.notes import Mechanism
-from calibration.discovery.prediction import HeldOutScore
+from calibration.discovery.prediction import Gain, HeldOutScore
 from calibration.discovery.settings import settings_for
 from calibration.inference.observers import SettledRuns
 
@@ -81,6 +81,7 @@ def test_it_is_that_of_the_family_that_explains_most(found):
 
 def test_two_laws_of_one_mechanism_are_one(found):
     both, one = fitted("stribeck", "churning", explains=1900.0), fitted("stribeck", explains=1500.0)
+    # (that of one effect predicts as well, so that the one that explains more is taken)
     twice = fitted("stribeck", "stribeck", explains=1940.0)  # which is no law of the library
     got = found(one, both, twice, fitted("stribeck", "leads", explains=1950.0), curve=1000.0)
     assert got.families == (FAMILIES["stribeck"],) and set(got.effects) == {"stribeck", "churning"}
@@ -107,10 +108,34 @@ def test_a_curve_that_explains_more_takes_the_place_of_effects_of_another_mechan
     assert got.families == (SPEED.family,) and got.effects == ("stribeck",)  # which has the curve's mechanism
     assert found(fitted("stribeck", explains=900.0), curve=1900.0).effects == ()
     assert found(fitted("leads", explains=1880.0), curve=1900.0).effects == ("leads",)
-    assert found(fitted("stribeck", explains=1900.0, plausible=False), curve=1900.0).effects == ()
+    large = fitted("stribeck", explains=1900.0, plausible=False)
+    assert found(large, curve=1900.0).effects == ("stribeck",)  # a mechanism claims no size
+    assert found(dataclasses.replace(large, supplying=("stribeck",)), curve=1900.0).effects == ()
     where = dataclasses.replace(SPEED, explained=1900.0)  # histories: by what it explains linearly
     assert found(fitted("leads", explains=1500.0), curve=np.nan, where=where, long=True) is None
     assert found(fitted("stribeck", explains=1500.0), curve=np.nan, where=where, long=True).effects == ("stribeck",)
+
+
+def test_what_it_explains_next_to_others_counts(found):
+    """As on the paper's runs, whose slip hides half of what the leads explain."""
+    leads, creep = fitted("leads", explains=800.0), fitted("creep", explains=500.0)
+    alone = found(leads, creep, curve=0.0)
+    assert alone.share == pytest.approx(800 / (2 * BASE - ROWS)) and alone.fails[0] == "share"
+    joint = fitted("leads", "creep", explains=1700.0)
+    both = found(leads, creep, fitted("creep", "stribeck", explains=1000.0), joint, curve=0.0)
+    assert both.families == (FAMILIES["leads"],) and both.share == pytest.approx(1200 / (2 * BASE - ROWS))
+
+
+def test_of_mechanisms_that_cannot_be_told_apart_one_that_predicts_is_stated(found, monkeypatch):
+    """A curve has more to fit with, and may predict nothing."""
+    where = dataclasses.replace(SPEED, place="electrical", alike=("electrical",), variables_alike=("current",))
+    gains = iter([-1.0, 1.0])
+    monkeypatch.setattr(HeldOutScore, "gain", lambda *_: Gain(next(gains), 0.1))
+    got = found(fitted("leads", explains=1500.0), curve=1900.0, where=where)
+    assert got.families == (where.family, FAMILIES["leads"]) and got.effects == () and got.gain == 1.0
+    gains = iter([1.0])
+    got = found(fitted("leads", explains=1500.0), curve=1900.0, where=where)
+    assert got.families == (FAMILIES["leads"], where.family) and got.effects == ("leads",)
 
 
 def test_readings_that_it_changes_are_those_it_moves_by_half_of_the_most_moved_channel():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.discrepancy import CurveBeside
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.notes import Mechanism
+from calibration.discovery.notes import HALF, Mechanism
 from calibration.discovery.prediction import HeldOutScore, Predicted
 from calibration.discovery.score_tests import family_columns
 from calibration.discovery.settings import Settings
@@ -30,6 +31,8 @@ from calibration.inference.held_out import held_out
 
 #: Share of the largest rms change of a channel by a mechanism from which on it changes a reading [σ over σ].
 CHANGED = 0.5
+#: Blocks of a kind from which on their scatter tells the error of a gain.
+BLOCKS = 3
 #: Parameters that a curve takes, each of which lowers χ² by one where nothing is missing [σ²].
 OF_CURVE = 5.0
 
@@ -57,37 +60,101 @@ def mechanism(
         by_curve = beside.where.explained - OF_CURVE
     else:
         by_curve = beside.curve.chi2[0] - beside.curve.chi2[1] - OF_CURVE
-    by_effects = {family: 2 * (base.cost - c.cost) for family, c in best.items()}
+    by_effects = _explained(space, base, ladder, best)
     explained = by_effects | {own[0]: max(by_curve, by_effects.get(own[0], 0.0))}
     most = max(explained.values())
     within = max(settings.same, settings.form**2 * most)
     alike = sorted((f for f in explained if explained[f] >= most - within), key=lambda f: -explained[f])
-    leader = next((f for f in alike if f in best), alike[0])
-    alike = [leader, *(f for f in alike if f != leader)]
-    kinds = blocks_room.predictable(runs, space.bare)
+    # What the best curve is as improbable over, it cannot be told from: an effect that goes by it may predict better.
+    alike += [f for f in own if f not in alike and explained[alike[0]] == by_curve]
+    by_name = [f for f in alike if f in best and (space.bare.observe.long or by_effects[f] >= HALF * most)]
+    found: list[Mechanism] = []
+    curve = () if space.bare.observe.long or own[0] in by_name or own[0] not in alike else own[:1]
+    before, reading = _held_out(space, runs, base, predicted), _reading(space, base)
+    for leader in (*by_name[:1], *curve, *by_name[1:]):
+        families = (leader, *(f for f in alike if f != leader))
+        fits = (
+            [
+                _by_effects(space, runs, base, c, left, families, bases, predicted, settings)
+                for c in _few_and_best(space, ladder, best[leader])
+            ]
+            if leader in by_name
+            else [_by_curve(space, runs, left, families, bases, beside, settings)]
+        )
+        gains = [fit.seen.gain(before, _changed(space, runs, reading, fit.reading), BLOCKS) for fit in fits]
+        one, gain = max(zip(fits, gains, strict=True), key=lambda both: both[1].mean / max(both[1].se, 1e-12))
+        share = share_of_excess(space, base, explained.get(leader, 0.0))
+        found.append(Mechanism(families, one.effects, share, gain.mean, gain.se, one.again))
+        if not found[-1].fails:
+            return found[-1]
+    return found[0] if found else None
+
+
+class Evaluated(NamedTuple):
+    """What stands for a mechanism: scores of data held out, what it says of every reading [SI], the share of blocks
+    without which it is found again, and its effects, none of a curve."""
+
+    seen: HeldOutScore
+    reading: np.ndarray
+    again: float
+    effects: tuple[str, ...]
+
+
+def _few_and_best(space: CandidateSpace, ladder: Sequence[Candidate], best: Candidate) -> list[Candidate]:
+    """The best candidate of a family, and where it has several effects the best of one, which may predict better."""
+    family = space.library[best.effects[0]].family()
+    single = [c for c in ladder if len(c.effects) == 1 and space.library[c.effects[0]].family() == family]
+    sound = [c for c in single if c.plausible and np.isfinite(c.cost)]
+    return [best, *([min(sound, key=lambda c: c.cost)] if len(best.effects) > 1 and sound else [])]
+
+
+def _by_effects(
+    space: CandidateSpace,
+    runs: Runs,
+    base: Candidate,
+    candidate: Candidate,
+    left: Diagnosis,
+    families: Sequence[str],
+    bases: Bases,
+    predicted: Predicted,
+    settings: Settings,
+) -> Evaluated:
+    """A candidate in the place of a mechanism."""
+    blocks = [mask for by in blocks_room.predictable(runs, space.bare).values() for mask in by.values()]
+    again = chosen_again(space, base, candidate, left, families, bases, blocks, settings)
+    seen = _held_out(space, runs, candidate, predicted)
+    return Evaluated(seen, _reading(space, candidate), again, candidate.effects)
+
+
+def _by_curve(
+    space: CandidateSpace,
+    runs: Runs,
+    left: Diagnosis,
+    families: Sequence[str],
+    bases: Bases,
+    beside: CurveBeside,
+    settings: Settings,
+) -> Evaluated:
+    """The curve of what the base leaves in that place."""
+    kinds, curve = blocks_room.predictable(runs, space.bare), beside.curve
     blocks = [mask for by in kinds.values() for mask in by.values()]
-    long = space.bare.observe.long
-    if leader in best and (long or by_effects[leader] >= most / 2):
-        first = best[leader]
-        effects, seen, reading = first.effects, _held_out(space, runs, first, predicted), _reading(space, first)
-        again = chosen_again(space, base, first, left, alike, bases, blocks, settings)
-    elif long:
-        return None  # refits of histories with a curve take long
-    else:
-        curve, effects, alike = beside.curve, (), [*alike, *own]
-        told = {k: held_out(curve.problem, curve.z, list(by.values())).reading for k, by in kinds.items()}
-        seen, reading = _scored(space, runs, told), curve.reading
-        again = _curve_again(space, left, bases, alike, blocks, settings)
-    changed = _changed(space, runs, _reading(space, base), reading)
-    gain = seen.gain(_held_out(space, runs, base, predicted), changed)
-    return Mechanism(
-        tuple(dict.fromkeys(alike)),
-        effects,
-        share_of_excess(space, base, explained[leader]),
-        gain.mean,
-        gain.se,
-        again,
-    )
+    told = {k: held_out(curve.problem, curve.z, list(by.values())).reading for k, by in kinds.items()}
+    again = _curve_again(space, left, bases, families, blocks, settings)
+    return Evaluated(_scored(space, runs, told), curve.reading, again, ())
+
+
+def _explained(
+    space: CandidateSpace, base: Candidate, ladder: Sequence[Candidate], best: dict[str, Candidate]
+) -> dict[str, float]:
+    """Fall of χ² by the effects of each family: alone, or next to those of others where that is more [σ²]."""
+    cost = {c.key: c.cost for c in (base, *ladder) if np.isfinite(c.cost) and not c.supplying}
+    found = {family: 2 * (base.cost - alone.cost) for family, alone in best.items()}
+    for effects, having in cost.items():
+        for family in {space.library[name].family() for name in effects} & set(found):
+            others = frozenset(n for n in effects if space.library[n].family() != family)
+            if others in cost:
+                found[family] = max(found[family], 2 * (cost[others] - having))
+    return found
 
 
 def share_of_excess(space: CandidateSpace, base: Candidate, explained: float) -> float:
@@ -102,14 +169,15 @@ def share_of_excess(space: CandidateSpace, base: Candidate, explained: float) ->
 
 
 def _of_one_family(space: CandidateSpace, ladder: Sequence[Candidate]) -> dict[str, Candidate]:
-    """The best candidate of a plausible size of each family that has the effects of that family alone."""
+    """The best candidate of each family that has the effects of that family alone, of a plausible size where there is
+    one: the size of a mechanism is not claimed."""
     found: dict[str, Candidate] = {}
     for c in ladder:
         families = {space.library[name].family() for name in c.effects}
         once = len(set(c.effects)) == len(c.effects)
-        if len(families) == 1 and once and c.plausible and np.isfinite(c.cost):
+        if len(families) == 1 and once and np.isfinite(c.cost) and not c.supplying:
             (family,) = families
-            found[family] = min(found.get(family, c), c, key=lambda x: x.cost)
+            found[family] = min(found.get(family, c), c, key=lambda x: (not x.plausible, x.cost))
     return found
 
 

@@ -42,11 +42,14 @@ class HeldOutScore:
     blocks: dict[str, np.ndarray]
     reading: dict[str, Readings] = dataclasses.field(default_factory=dict)
 
-    def gain(self, over: HeldOutScore, where: Bool[np.ndarray, "rows channels"] | None = None) -> Gain:
+    def gain(
+        self, over: HeldOutScore, where: Bool[np.ndarray, "rows channels"] | None = None, fewest: int = 2
+    ) -> Gain:
         """How much better it is than another's, over the readings of both.
 
         Args:
             where: readings that count; None: all.
+            fewest: blocks of a kind from which on their scatter counts: that of two has one degree of freedom.
         """
         if not self.by_kind:
             return Gain(0.0, np.inf)
@@ -61,7 +64,8 @@ class HeldOutScore:
         mean = float(np.nansum(each) / total)
         # Of rows, and of the blocks of each kind, whose readings share what was not seen.
         off = np.nansum(each, (0, 2)) - mean * counts
-        groups = [np.arange(len(rows)), *self.blocks.values()]
+        several = [by for by in self.blocks.values() if len(np.unique(by[by >= 0])) >= fewest]
+        groups = [np.arange(len(rows)), *several]
         return Gain(mean, max(_error(off[rows], by[rows]) for by in groups) / total)
 
 
