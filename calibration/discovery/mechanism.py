@@ -66,13 +66,14 @@ def mechanism(
     within = max(settings.same, settings.form**2 * most)
     alike = sorted((f for f in explained if explained[f] >= most - within), key=lambda f: -explained[f])
     # What the best curve is as improbable over, it cannot be told from: an effect that goes by it may predict better.
-    alike += [f for f in own if f not in alike and explained[alike[0]] == by_curve]
-    by_name = [f for f in alike if f in best and (space.bare.observe.long or by_effects[f] >= HALF * most)]
+    over = [f for f in own if f not in alike and explained[alike[0]] == by_curve]
+    by_name = [f for f in (*alike, *over) if f in best and (space.bare.observe.long or by_effects[f] >= HALF * most)]
     blocks = [mask for by in blocks_room.predictable(runs, space.bare).values() for mask in by.values()]
     found: list[Mechanism] = []
     curve = () if space.bare.observe.long or own[0] in by_name or own[0] not in alike else own[:1]
     for leader in (*by_name[:1], *curve, *by_name[1:]):
-        families = (leader, *(f for f in alike if f != leader))
+        others = alike if leader in by_name else [*alike, *over]
+        families = (leader, *(f for f in others if f != leader))
         if leader in by_name:
             alone = _few_and_best(space, ladder, best[leader])
             compared = [*(Pair(c, base) for c in alone), pairs[leader]]
