@@ -1,4 +1,4 @@
-"""What is established at every noise at which a table was looked at: the claim that comes first."""
+"""The claim that comes first: established at every noise that was tried."""
 
 from __future__ import annotations
 

@@ -219,8 +219,8 @@ def _curve_again(
     blocks: Sequence[np.ndarray],
     settings: Settings,
 ) -> float:
-    """Share of the blocks without which a smooth curve of one of these families still explains as much as any, of
-    those that leave half of what is known of it; 1 where there are none."""
+    """Share of the informative blocks without which a smooth curve of these families explains as much as any other; 1
+    where there are none. An informative block leaves half of what is known of the curve."""
     linear, names = left.linear, bases_room.names(bases)
     smooth = [k for k, (_, v) in enumerate(names) if v in bases_room.VARIABLES]
     here = DiscrepancyLocation("", "", (), (), 0.0, 0.0)
