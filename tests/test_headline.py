@@ -14,12 +14,12 @@ DROP, SLIP = "voltage drop that changes with current", "slip that changes with d
 def law(*names, families=(DROP,), established=True):
     """A verdict with one effect, and what it cannot be told from."""
     verdict = "place" if not established else "named" if len(names) == 1 else "class"
-    place = SimpleNamespace(place="electrical", alike=("electrical", "supply")) if not established else None
+    place = SimpleNamespace(family=DROP) if not established else None
     return Summary(verdict, 0.001, place, (Missing(names, (), families, established),))
 
 
 def of_mechanism(*families):
-    place = SimpleNamespace(place="electrical", alike=("electrical",))
+    place = SimpleNamespace(family=families[0])
     return Summary("mechanism", 0.001, place, mechanism=Mechanism(families, (), 0.9, 1.0, 0.1, 1.0))
 
 
@@ -36,7 +36,8 @@ def nothing(verdict="none"):
         (law("a"), (of_mechanism(DROP), law("a")), "mechanism", ((DROP,),)),
         (law("a"), (of_mechanism(SLIP, DROP), law("a")), "mechanism", ((DROP, SLIP),)),
         (law("a"), (of_mechanism(SLIP), law("a")), "place", ()),
-        (law("a", established=False), (law("a", established=False),), "place", (("electrical", "supply"),)),
+        (law("a", established=False), (law("a", established=False),), "place", (("voltage drop",),)),
+        (law("a"), (law("a", established=False),), "place", (("voltage drop",),)),
         (nothing(), (nothing(), nothing()), "none", ()),
         (nothing(), (law("a"), nothing()), "open", ()),
         (law("a"), (nothing("undescribed"),), "open", ()),
@@ -52,5 +53,7 @@ def test_it_is_the_deepest_claim_that_all_verdicts_hold(own, others, level, clai
 def test_it_is_said_with_the_noises_at_which_it_holds():
     said = loop.headline(headline(law("a"), [(0.7, of_mechanism(DROP)), (1.4, law("a"))]))
     assert said == f"At 0.7, 1 and 1.4 times the noise a {DROP} is established as a mechanism"
+    weak = loop.headline(headline(law("a"), [(0.7, law("a", established=False))]))
+    assert weak == "At 0.7 and 1 times the noise a voltage drop is missing, and no more is established"
     assert loop.headline(headline(nothing())) == "At the stated noise nothing is missing"
     assert loop.headline(headline(law("a", "b"))) == "At the stated noise one of a or b is established"

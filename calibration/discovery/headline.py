@@ -1,4 +1,4 @@
-"""What is established at every noise at which a table was looked at: the claim that comes first."""
+"""The claim that comes first: established at every noise that was tried."""
 
 from __future__ import annotations
 
@@ -43,10 +43,11 @@ def _mechanisms(said: Summary) -> list[tuple[str, ...]]:
 
 
 def _places(said: Summary) -> list[tuple[str, ...]]:
-    where = said.where
-    if said.verdict in WITHOUT_NAME and where is not None:
-        return [tuple(dict.fromkeys((where.place, *where.alike)))]
-    return []
+    """Equations that lack something, in words: a family without what drives it."""
+    families = _mechanisms(said)
+    if said.verdict in WITHOUT_NAME and said.where is not None:
+        families.append((said.where.family,))
+    return [tuple(dict.fromkeys(f.partition(" that ")[0] for f in those)) for those in families]
 
 
 def _common(claims: Sequence[Sequence[tuple[str, ...]]]) -> tuple[tuple[str, ...], ...]:

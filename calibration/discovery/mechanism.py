@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from calibration.discovery.candidates import Candidate
 from calibration.discovery.discrepancy import CurveBeside
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.notes import HALF, Mechanism
-from calibration.discovery.prediction import HeldOutScore, Predicted
+from calibration.discovery.prediction import Gain, HeldOutScore, Predicted
 from calibration.discovery.score_tests import family_columns
 from calibration.discovery.settings import Settings
 from calibration.discovery.standing import chosen_again
@@ -60,44 +59,49 @@ def mechanism(
         by_curve = beside.where.explained - OF_CURVE
     else:
         by_curve = beside.curve.chi2[0] - beside.curve.chi2[1] - OF_CURVE
-    by_effects = _explained(space, base, ladder, best)
+    pairs = _explained(space, base, ladder, best)
+    by_effects = {family: pair.explained for family, pair in pairs.items()}
     explained = by_effects | {own[0]: max(by_curve, by_effects.get(own[0], 0.0))}
     most = max(explained.values())
     within = max(settings.same, settings.form**2 * most)
     alike = sorted((f for f in explained if explained[f] >= most - within), key=lambda f: -explained[f])
     # What the best curve is as improbable over, it cannot be told from: an effect that goes by it may predict better.
-    alike += [f for f in own if f not in alike and explained[alike[0]] == by_curve]
-    by_name = [f for f in alike if f in best and (space.bare.observe.long or by_effects[f] >= HALF * most)]
+    over = [f for f in own if f not in alike and explained[alike[0]] == by_curve]
+    by_name = [f for f in (*alike, *over) if f in best and (space.bare.observe.long or by_effects[f] >= HALF * most)]
+    blocks = [mask for by in blocks_room.predictable(runs, space.bare).values() for mask in by.values()]
     found: list[Mechanism] = []
     curve = () if space.bare.observe.long or own[0] in by_name or own[0] not in alike else own[:1]
-    before, reading = _held_out(space, runs, base, predicted), _reading(space, base)
     for leader in (*by_name[:1], *curve, *by_name[1:]):
-        families = (leader, *(f for f in alike if f != leader))
-        fits = (
-            [
-                _by_effects(space, runs, base, c, left, families, bases, predicted, settings)
-                for c in _few_and_best(space, ladder, best[leader])
-            ]
-            if leader in by_name
-            else [_by_curve(space, runs, left, families, bases, beside, settings)]
-        )
-        gains = [fit.seen.gain(before, _changed(space, runs, reading, fit.reading), BLOCKS) for fit in fits]
-        one, gain = max(zip(fits, gains, strict=True), key=lambda both: both[1].mean / max(both[1].se, 1e-12))
+        others = alike if leader in by_name else [*alike, *over]
+        families = (leader, *(f for f in others if f != leader))
+        if leader in by_name:
+            alone = _few_and_best(space, ladder, best[leader])
+            compared = [*(Pair(c, base) for c in alone), pairs[leader]]
+            gains = {pair: _gain_of(space, runs, pair, predicted) for pair in compared}
+            pair, gain = max(gains.items(), key=lambda one: one[1].mean / max(one[1].se, 1e-12))
+            effects = tuple(n for n in pair.having.effects if space.library[n].family() == leader)
+            again = chosen_again(space, base, best[leader], left, families, bases, blocks, settings)
+        else:
+            gain, effects = _gain_of_curve(space, runs, base, beside, predicted), ()
+            again = _curve_again(space, left, bases, families, blocks, settings)
         share = share_of_excess(space, base, explained.get(leader, 0.0))
-        found.append(Mechanism(families, one.effects, share, gain.mean, gain.se, one.again))
+        found.append(Mechanism(families, effects, share, gain.mean, gain.se, again))
         if not found[-1].fails:
             return found[-1]
     return found[0] if found else None
 
 
-class Evaluated(NamedTuple):
-    """What stands for a mechanism: scores of data held out, what it says of every reading [SI], the share of blocks
-    without which it is found again, and its effects, none of a curve."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class Pair:
+    """Fits with and without the effects of a mechanism."""
 
-    seen: HeldOutScore
-    reading: np.ndarray
-    again: float
-    effects: tuple[str, ...]
+    having: Candidate
+    without: Candidate
+
+    @property
+    def explained(self) -> float:
+        """Fall of χ² [σ²]."""
+        return 2 * (self.without.cost - self.having.cost)
 
 
 def _few_and_best(space: CandidateSpace, ladder: Sequence[Candidate], best: Candidate) -> list[Candidate]:
@@ -108,52 +112,17 @@ def _few_and_best(space: CandidateSpace, ladder: Sequence[Candidate], best: Cand
     return [best, *([min(sound, key=lambda c: c.cost)] if len(best.effects) > 1 and sound else [])]
 
 
-def _by_effects(
-    space: CandidateSpace,
-    runs: Runs,
-    base: Candidate,
-    candidate: Candidate,
-    left: Diagnosis,
-    families: Sequence[str],
-    bases: Bases,
-    predicted: Predicted,
-    settings: Settings,
-) -> Evaluated:
-    """A candidate in the place of a mechanism."""
-    blocks = [mask for by in blocks_room.predictable(runs, space.bare).values() for mask in by.values()]
-    again = chosen_again(space, base, candidate, left, families, bases, blocks, settings)
-    seen = _held_out(space, runs, candidate, predicted)
-    return Evaluated(seen, _reading(space, candidate), again, candidate.effects)
-
-
-def _by_curve(
-    space: CandidateSpace,
-    runs: Runs,
-    left: Diagnosis,
-    families: Sequence[str],
-    bases: Bases,
-    beside: CurveBeside,
-    settings: Settings,
-) -> Evaluated:
-    """The curve of what the base leaves in that place."""
-    kinds, curve = blocks_room.predictable(runs, space.bare), beside.curve
-    blocks = [mask for by in kinds.values() for mask in by.values()]
-    told = {k: held_out(curve.problem, curve.z, list(by.values())).reading for k, by in kinds.items()}
-    again = _curve_again(space, left, bases, families, blocks, settings)
-    return Evaluated(_scored(space, runs, told), curve.reading, again, ())
-
-
 def _explained(
     space: CandidateSpace, base: Candidate, ladder: Sequence[Candidate], best: dict[str, Candidate]
-) -> dict[str, float]:
-    """Fall of χ² by the effects of each family: alone, or next to those of others where that is more [σ²]."""
-    cost = {c.key: c.cost for c in (base, *ladder) if np.isfinite(c.cost) and not c.supplying}
-    found = {family: 2 * (base.cost - alone.cost) for family, alone in best.items()}
-    for effects, having in cost.items():
+) -> dict[str, Pair]:
+    """Of each family the fits with and without its effects that differ most: alone, or next to those of others."""
+    known = {c.key: c for c in (base, *ladder) if np.isfinite(c.cost) and not c.supplying}
+    found = {family: Pair(alone, base) for family, alone in best.items()}
+    for effects, having in known.items():
         for family in {space.library[name].family() for name in effects} & set(found):
             others = frozenset(n for n in effects if space.library[n].family() != family)
-            if others in cost:
-                found[family] = max(found[family], 2 * (cost[others] - having))
+            if others in known:
+                found[family] = max(found[family], Pair(having, known[others]), key=lambda pair: pair.explained)
     return found
 
 
@@ -189,6 +158,23 @@ def _families_of(where: DiscrepancyLocation) -> tuple[str, ...]:
 
 
 # --- data held out --------------------------------------------------------------------------------------
+
+
+def _gain_of(space: CandidateSpace, runs: Runs, pair: Pair, predicted: Predicted) -> Gain:
+    """By how much a fit predicts better with the effects of a mechanism, over the readings that these change."""
+    seen, before = (_held_out(space, runs, c, predicted) for c in (pair.having, pair.without))
+    changed = _changed(space, runs, _reading(space, pair.without), _reading(space, pair.having))
+    return seen.gain(before, changed, BLOCKS)
+
+
+def _gain_of_curve(
+    space: CandidateSpace, runs: Runs, base: Candidate, beside: CurveBeside, predicted: Predicted
+) -> Gain:
+    """The same of the curve of what the base leaves."""
+    curve, kinds = beside.curve, blocks_room.predictable(runs, space.bare)
+    told = {kind: held_out(curve.problem, curve.z, list(by.values())).reading for kind, by in kinds.items()}
+    changed = _changed(space, runs, _reading(space, base), curve.reading)
+    return _scored(space, runs, told).gain(_held_out(space, runs, base, predicted), changed, BLOCKS)
 
 
 def _held_out(space: CandidateSpace, runs: Runs, candidate: Candidate, predicted: Predicted) -> HeldOutScore:
@@ -233,8 +219,8 @@ def _curve_again(
     blocks: Sequence[np.ndarray],
     settings: Settings,
 ) -> float:
-    """Share of the blocks without which a smooth curve of one of these families still explains as much as any, of
-    those that leave half of what is known of it; 1 where there are none."""
+    """Share of the informative blocks without which a smooth curve of these families explains as much as any other; 1
+    where there are none. An informative block leaves half of what is known of the curve."""
     linear, names = left.linear, bases_room.names(bases)
     smooth = [k for k, (_, v) in enumerate(names) if v in bases_room.VARIABLES]
     here = DiscrepancyLocation("", "", (), (), 0.0, 0.0)

@@ -435,8 +435,8 @@ def chosen_again(
     blocks: Sequence[np.ndarray],
     settings: Settings,
 ) -> float:
-    """Share of the blocks without which an effect of these families still explains as much as any of the library, of
-    those that leave half of what is known of the first effect of a candidate; 1 where there are none.
+    """Share of the informative blocks without which an effect of these families explains as much as any other; 1
+    where there are none. An informative block leaves half of what is known of the candidate's first effect.
 
     Args:
         left: what the base leaves.

@@ -80,7 +80,6 @@ def headline(found: notes.Headline) -> str:
     at = f"At {', '.join(first)} and {last} times the noise" if first else "At the stated noise"
     claims = " and ".join(f"a {' or a '.join(c)}" for c in found.claims)
     laws = " and ".join(" or ".join(c) for c in found.claims)
-    places = " and ".join(" or ".join(bases.in_words(p) for p in c) for c in found.claims)
     held = {
         "none": "nothing is missing",
         "undescribed": "this model does not describe these runs",
@@ -88,7 +87,7 @@ def headline(found: notes.Headline) -> str:
         "named": f"{laws} is established as a law",
         "class": f"one of {laws} is established",
         "mechanism": f"{claims} is established as a mechanism",
-        "place": f"something is missing in the {places}" if places else "something is missing, in no one place",
+        "place": f"{claims or 'something'} is missing, and no more is established",
     }
     return f"{at} {held[found.level]}"
 
