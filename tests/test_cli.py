@@ -77,6 +77,7 @@ def test_simulate_drive_leaves_a_history_that_ends_on_its_run(mmrjax, tmp_path):
         assert float(history[-1][column]) == pytest.approx(float(end[column]), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_simulate_runs_from_a_file_of_conditions(mmrjax, tmp_path):
     (tmp_path / "plan.csv").write_text(
         "configuration,supply_voltage_V,payload_kg,slope_deg,run_id,note\n6T2A,24,2,3,a,x\n"

@@ -146,6 +146,7 @@ def check_settled(run, point, where):
         np.testing.assert_allclose(np.asarray(end)[where], np.asarray(root)[where], rtol=1e-3, err_msg=channel)
 
 
+@pytest.mark.slow
 def test_drive_settles_on_steady_over_table8(robot, table8, drive_table8, steady_table8, times_fine):
     """Within 2 s wherever it grips; the rest of what `steady` can hold after 60 s.
 
@@ -268,6 +269,7 @@ def test_status_follows_from_what_the_robot_does(robot, gain, sliding, status):
     assert bool(slips(robot, end)) is (sliding > 0.02)
 
 
+@pytest.mark.slow
 def test_drive_statuses(small):
     _, go = small
     runs = Conditions(

@@ -958,6 +958,7 @@ def test_mass_offset_is_mass_of_the_wheeled_robot():
     _same(_steady_with(mass_offset=1.6), _steady_with({"4W2T.mass": 11.5 + 1.6}))
 
 
+@pytest.mark.slow
 def test_winding_heating_is_resistance_at_the_settled_temperature():
     with_it = _steady_with(winding_heating=1.0)
     for k in range(CONDITIONS.voltage.size):
@@ -1269,6 +1270,7 @@ def _slopes(outputs):
     return jax.jit(jax.vmap(jacobian, in_axes=(None, 0)))(THETA, RUNS)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("share", [0.0, 1.0], ids=["standstill", "moving"])
 def test_rates_with_all_effects_have_finite_derivatives_by_every_parameter(share):
     """What `drive` integrates, at standstill and on the way."""

@@ -167,6 +167,7 @@ def test_theory_of_the_mesh_gives_less_back(robot):
 # --- standing ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("configuration", "mode", "slope"), [(0, "brake", 15.0), (0, "speed", 20.0), (1, "speed", 20.0)]
 )

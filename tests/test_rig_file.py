@@ -486,6 +486,7 @@ def test_rig_check_says_what_a_file_is(mmrjax, bench):
     assert "382 rpm/V" in out and "LOOK" not in out and "Without data" in out
 
 
+@pytest.mark.slow
 def test_rig_check_says_what_a_table_can_determine(mmrjax, bench):
     """Friction of motor and load act alike on current and speed, as does the gear's loss: the wider prior gives way."""
     code, out, _ = mmrjax("rig", "check", "my-rig.toml", "runs.csv", "--json")

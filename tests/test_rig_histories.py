@@ -253,6 +253,7 @@ def imposed_speed(tmp_path, runs, filled=written):
     return robot, filled(tmp_path, robot, columns, [0.01])
 
 
+@pytest.mark.slow
 def test_a_defect_moves_the_current_of_an_imposed_speed_at_once(tmp_path):
     """The sum over all knots against the derivative by a constant defect."""
     robot, runs = imposed_speed(tmp_path, 1)

@@ -374,6 +374,7 @@ def test_a_parameter_without_a_prior_of_some_width_is_refused(mmrjax, tmp_path):
     assert got == 2 and "--parameters motor.friction_viscous: its prior has no width" in err
 
 
+@pytest.mark.slow
 def test_candidates_are_read_as_tables_of_runs(mmrjax, tmp_path):
     (tmp_path / "bad.csv").write_text("configuration,supply_voltage_V,payload_kg\n6T2A,24,3\n")
     got, _, err = mmrjax(*SMALL, "--candidates", "bad.csv")
