@@ -274,6 +274,7 @@ def test_samples_of_one_run_with_two_configurations_are_refused(measured):
         quick(changed(measured, time_s=np.arange(20.0)), model="drive")
 
 
+@pytest.mark.slow
 def test_histories_need_drive(measured):
     with pytest.raises(
         BadConfiguration, match="--model steady: measured holds time histories; they need --model drive"

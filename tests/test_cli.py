@@ -96,6 +96,7 @@ def test_battery_sags_and_ends_clearly(mmrjax, tmp_path):
     assert code == 0 and "battery_empty: the battery has no charge left" in out
 
 
+@pytest.mark.slow
 def test_compare_gives_equation_35(mmrjax, tmp_path):
     code, out, _ = mmrjax("compare", "measured", "--no-report", "--out", "c", *CLIMBS)
     assert code == 0 and "R²" in out
@@ -668,6 +669,7 @@ def test_former_names_of_parameters_load_with_a_note(mmrjax, tmp_path):
     assert table(tmp_path / "o" / "runs.csv")[0]["total_mass_kg"] == "12"
 
 
+@pytest.mark.slow
 def test_missing_readings_weigh_nothing_and_are_said(mmrjax, tmp_path):
     full = f"{HEADER}\n6T2A,15,13.1,0,0,2.3,4930,420\n6T2A,15,13.1,0,5,2.75,4800,400\n6T2A,15,13.1,0,10,3,4745,390\n"
     (tmp_path / "full.csv").write_text(full)

@@ -299,6 +299,7 @@ def test_histories_that_do_not_start_from_rest_are_refused(runs):
     Histories.check_start(runs, known(runs), robots.nominal())
 
 
+@pytest.mark.slow
 def test_assumed_noise_of_histories_does_not_vanish_at_the_start(runs):
     bare = {k: v for k, v in runs.columns.items() if "_sd_" not in k}
     made = Runs("bare", bare)

@@ -67,6 +67,7 @@ def test_results_are_a_pytree_whole_or_not_yet(robot, whole):
     np.testing.assert_array_equal(again.status, whole.status)
 
 
+@pytest.mark.slow
 def test_nothing_is_computed_outside_of_compiled_code(robot, primitives):
     """160 gathers and 22 concatenations outside took twenty times as long as the equations."""
     runs = mm.Conditions(**MIXED).resolved(robot)

@@ -291,6 +291,7 @@ def test_drive_statuses(small):
     assert names(short.result)[0] == "not_settled"
 
 
+@pytest.mark.slow
 def test_a_robot_that_stands_ends_as_steady_says(small):
     """Parked, held on slopes either way, and stalled."""
     robot, go = small
@@ -314,6 +315,7 @@ def test_drive_out_of_steps_has_failed(robot):
     assert names(run.result) == ["failed"]
 
 
+@pytest.mark.slow
 def test_drive_discharges_a_full_battery_to_its_clear_end(small):
     """Charge is what flowed; the voltage falls all the way; past the capacity the run says so."""
     robot, go = small

@@ -72,7 +72,7 @@ def shown():
     return of
 
 
-@pytest.mark.quick(3)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [None, *laws.LIBRARY])
 def test_menu_agrees_with_the_generators_own_physics(name, shown):
     p, term = settled.perturbed(np.random.default_rng(5), scale=0.5), None
@@ -369,6 +369,7 @@ def test_level_table_without_payload_asks_for_neither_slope_nor_payload(rover):
     assert max(max(r.voltage) for r in runs) <= 12.0
 
 
+@pytest.mark.slow
 def test_higher_voltage_needs_a_rating_and_is_watched(rover):
     rated = robot_file.change(rover, {"motor.voltage_limit": 18.0}, where="test")
     within = reach(rated, ROVERS_TABLE, channels.USUAL)

@@ -174,6 +174,7 @@ def log(tmp_path, robot, noise, dry=DRY):
     return records.read(tmp_path / "log.csv", robot=robot)
 
 
+@pytest.mark.slow
 def test_histories_follow_a_current_that_changes(robot, tmp_path):
     runs = log(tmp_path, robot, 0.0)
     made = observers.kind(runs).of(runs, robot)

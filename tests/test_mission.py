@@ -187,6 +187,7 @@ def test_what_friction_cannot_hold_rolls_back(robot):
     assert STATUSES[int(found.status[0, 0])] == "rolls_back"
 
 
+@pytest.mark.slow
 def test_standing_and_breaking_away_agree_with_steady(robot):
     """A robot at rest starts where steady finds travel, and stays where steady finds none."""
     from mmrjax.fidelities.steady import steady_batch

@@ -403,6 +403,7 @@ def test_an_export_has_conditions_in_the_units_of_their_columns(folder):
     assert numbers(table(folder / "charge" / "runs.csv"))["discharge_mAh"].tolist() == [0.0, 500.0]
 
 
+@pytest.mark.slow
 def test_files_of_compare_hold_the_numbers_of_runs(made):
     compared = made("compare", "compare", "measured", "--no-report")
     sound(compared)

@@ -181,6 +181,7 @@ def test_members_of_another_calibration_are_refused(posed, known, tmp_path):
     assert len(Members(noisier, file)._kept) == SIZE  # the noise is none of what was run
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("content", [b"", b"no file of members", b"PK\x03\x04 cut off"], ids=["empty", "text", "cut"])
 def test_file_that_holds_no_members_is_refused(posed, tmp_path, content):
     file = tmp_path / "members.npz"
@@ -206,6 +207,7 @@ def test_damaged_members_are_refused_before_the_first_search(tmp_path, monkeypat
     assert [p.name for p in tmp_path.iterdir()] == ["kept.npz"]
 
 
+@pytest.mark.slow
 def test_full_disk_is_said_and_leaves_what_was_there(posed, known, tmp_path, monkeypatch):
     file = tmp_path / "members.npz"
     evolve(posed, known, 1, file)

@@ -66,6 +66,7 @@ def test_highest_step_falls_by_what_the_levers_mass_moves(robot):
     assert 1e3 * float(limits(robot, run(180.0, FLUSH)).step) == pytest.approx(231.6, abs=0.1)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(("angle", "millimetres"), [(45.0, 202), (60.0, 235), (90.0, 262)])
 def test_raised_tips(robot, angle, millimetres):
     found = limits(robot, run(angle, angle))

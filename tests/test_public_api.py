@@ -333,6 +333,7 @@ def test_vmap_and_jit_go_through(robot):
     assert len(batch.table().splitlines()) == 4
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(("model", "transform"), [("steady", jax.grad), ("drive", lambda f: f)])
 def test_a_turn_passes_jit_though_its_default_duty_is_a_tracer_there(robot, model, transform):
     """Traced, not compiled."""

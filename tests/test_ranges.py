@@ -97,6 +97,7 @@ def test_wrong_units_are_refused_with_the_factor_and_the_likely_unit(runs, case)
         check_ranges(scaled(runs, column, factor), robots.nominal())
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("case", ["m/s", "rad/s"])
 def test_wrong_units_of_histories_are_refused(histories, case):
     column, factor, says = WRONG[case]

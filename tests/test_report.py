@@ -203,6 +203,7 @@ def test_run_without_numbers_says_why(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_power_chain_sums_to_what_supply_and_slope_give():
     runs = _runs(("6T2A", "4W2T"), (15.0, 33.0), 8.0, (-20.0, -5.0, 0.0, 10.0))
     keep = runs["status"] == "converged"

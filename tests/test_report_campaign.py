@@ -55,6 +55,7 @@ def test_page_of_a_sweep_in_which_nothing_settles_has_no_figures(page, tmp_path)
     assert drawn((tmp_path / "s" / "report.html").read_text()) == set()
 
 
+@pytest.mark.slow
 def test_page_of_one_axis_has_one_band(page):
     page("[axes]\nvoltage = '15:33:1'\n")
 

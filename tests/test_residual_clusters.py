@@ -88,6 +88,7 @@ def by_wheel(size):
     return lambda runs, columns: size * np.array([1.2, -0.3, -0.9])[columns["idle_wheel"].astype(int) - 1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channel", [*(pytest.param(c, marks=pytest.mark.slow) for c in (CURRENT, MOTOR)), SPEED])
 def test_a_hidden_column_is_found_in_its_channel(channel):
     name = ("total_current", "motor_speed", "speed")[channel]
@@ -118,6 +119,7 @@ def test_levels_that_differ_in_one_configuration_alone_are_found_within_it():
     assert {m.within for m in hits[0][0].levels} == {"6T2A", "4W2T"}
 
 
+@pytest.mark.slow
 def test_levels_whose_sign_follows_the_travel_are_found():
     def both_ways(seed, size):
         made = left(seed)

@@ -66,6 +66,7 @@ def by_steady():
     return simulated()
 
 
+@pytest.mark.slow
 def test_where_travel_asks_for_too_much_steady_says_what_an_independent_sum_says(by_steady):
     """Of gravity less rolling resistance against adhesion, and of the motors' torque where movers slide at V_s."""
     values, runs = draw(4000, 1)
@@ -93,6 +94,7 @@ def test_where_travel_asks_for_too_much_steady_says_what_an_independent_sum_says
     assert min((held & spins).sum(), (held & ~spins).sum(), falls.sum()) > 100
 
 
+@pytest.mark.slow
 def test_a_robot_that_its_drive_and_the_ground_hold_stands():
     """6T2A on 17 degrees: gravity less rolling is 0.77 of the adhesion, travel would take 1.14 of it."""
     voltage = np.array([0.0, 0.5, 0.9, -0.02, 3.0, 24.0])

@@ -266,6 +266,7 @@ def test_levels_are_thirds_of_the_limit_to_two_digits(tmp_path):
 # --- sweep --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_sweep_of_a_bench_has_one_axis(mmrjax, tmp_path):
     rig = of_kind(tmp_path, "bench")
     code, out, err = mmrjax("sweep", "--robot", rig, "--set", "motor.voltage_limit=24", "--out", "run")

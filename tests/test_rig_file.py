@@ -478,6 +478,7 @@ def bench(mmrjax, tmp_path):
     return robot
 
 
+@pytest.mark.slow
 def test_rig_check_says_what_a_file_is(mmrjax, bench):
     code, out, err = mmrjax("rig", "check", "my-rig.toml")
     assert (code, err) == (0, "")

@@ -458,6 +458,7 @@ def test_a_gear_ratio_upside_down_is_said(tmp_path):
         check_ranges(runs, params.replace(robot, {"gearbox.ratio": 1 / 16.0}))
 
 
+@pytest.mark.slow
 def test_readings_in_another_unit_are_refused_with_the_unit(tmp_path):
     robot = bench("voltage", ("motor_speed",))
     columns = {"supply_voltage_V": np.array([6.0, 9, 12, 24])}

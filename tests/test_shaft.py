@@ -153,6 +153,7 @@ def test_derivatives_of_an_imposed_history_are_differences():
     np.testing.assert_allclose(slope, difference, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_beginning_of_a_history_has_derivatives():
     def speed(x):
         rig = Rig(begins=Begins({"begin": Begin(motor_speed=x)}))

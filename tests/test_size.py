@@ -249,6 +249,7 @@ def test_step_that_is_asked_for_decides_the_design(robot):
     assert 0.6 <= best.radius / float(robot.radius_pulley) < 0.75
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("name", sorted(QUANTITIES))
 def test_ratings_of_parts_are_asked_somewhere_whatever_else_is(robot, name):
     """Of a robot that only has to turn, climb or be light too."""

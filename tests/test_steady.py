@@ -44,6 +44,7 @@ def test_steady_matches_reference_root_over_table8(grid, steady_table8):
     assert compared == 126
 
 
+@pytest.mark.slow
 def test_steady_matches_reference_root_on_battery(robot, grid):
     rows = grid[::3]  # voltage plays no part
     for charge in (0.0, 3000.0, 7000.0):

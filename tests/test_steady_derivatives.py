@@ -70,6 +70,7 @@ def test_steady_derivatives_without_an_answer_are_finite(conditions, theta, deri
     np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_steady_derivatives_at_zero_slip_are_finite(theta, derivatives):
     """A slope at which nothing has to be held: demand, sliding and slip are all zero."""
     run = Conditions(voltage=24.0, slope_deg=np.degrees(-np.arctan(0.06)))

@@ -33,7 +33,7 @@ def exact(radius):
     return np.array([radius / 2**0.5, radius / 2**0.5, radius**2 / 2**0.5])
 
 
-@pytest.mark.quick(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("linear", [False, True])
 def test_root_and_derivatives_are_exact(linear):
     """A circle is not linear: one pass is then not all, whatever was said."""
@@ -101,7 +101,7 @@ def holds_callback(program: str) -> bool:
     return "callback" in program
 
 
-@pytest.mark.quick(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev, jax.hessian])
 def test_steady_programs_hold_no_host_callback(rebuild, theta, derivative):
     runs = Conditions(voltage=[15.0, 24.0, 33.0], slope_deg=5.0)
@@ -114,6 +114,7 @@ def test_steady_programs_hold_no_host_callback(rebuild, theta, derivative):
     assert not holds_callback(lowered(jax.vmap(derivative(readings), in_axes=(None, 0)), few, runs))
 
 
+@pytest.mark.slow
 def test_search_for_callbacks_can_fail():
     def called(x):
         return jax.pure_callback(np.sin, jax.ShapeDtypeStruct(x.shape, x.dtype), x)

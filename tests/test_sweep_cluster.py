@@ -239,6 +239,7 @@ class Completed(list):
     add, is_empty = list.append, lambda self: not self
 
 
+@pytest.mark.slow
 def test_chunks_that_workers_compute_are_those_of_this_process(job, monkeypatch):
     """What travels, computed where it arrives, in a process that has not yet seen the job; here this one."""
     import distributed

@@ -433,6 +433,7 @@ def begun(sweep, monkeypatch, tmp_path):
     return lambda *options: sweep("s", "--robot", "robot.toml", *options)
 
 
+@pytest.mark.slow
 def test_sweep_of_another_configuration_is_refused(begun, sweep, tmp_path):
     for options, what in (
         (["--chunk", "50"], r"configuration (chunk was 40, is 50)"),
@@ -447,6 +448,7 @@ def test_sweep_of_another_configuration_is_refused(begun, sweep, tmp_path):
     assert begun()[0] == 0  # nothing was lost
 
 
+@pytest.mark.slow
 def test_sweep_of_other_data_code_or_versions_is_refused_saying_which(begun, monkeypatch, tmp_path):
     robot = tmp_path / "robot.toml"
     text = robot.read_text()
@@ -471,6 +473,7 @@ def test_sweep_of_other_data_code_or_versions_is_refused_saying_which(begun, mon
     monkeypatch.undo()
 
 
+@pytest.mark.slow
 def test_force_begins_anew(begun, tmp_path):
     code, _, err = begun("--chunk", "50", "--force")
     assert code == 0 and "goes on after" not in err

@@ -97,6 +97,7 @@ def test_chunks_of_draws_change_no_interval(robot, runs, posterior):
     same(whole.columns, parted.columns, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_interrupted_draws_are_taken_up(robot, runs, posterior, tmp_path, monkeypatch):
     whole = uncertainty.intervals(robot, posterior, runs, chunked(DRAWS), DRAWS)
     folder, computed, honest = RunFolder(tmp_path / "r", {}), [], scale.Compiled.__call__

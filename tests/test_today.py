@@ -178,6 +178,7 @@ def test_a_voltage_beside_the_battery_is_refused(mmrjax, tmp_path):
     assert err.startswith("mmrjax: runs.csv row 1, supply_voltage_V: got 24 beside --battery, whose charge sets")
 
 
+@pytest.mark.slow
 def test_a_sweep_on_the_battery_has_no_axis_of_voltages(mmrjax, tmp_path):
     code, _, _ = mmrjax("sweep", "--battery", "--slopes", "0,5", "--payloads", "0,8", "--out", "a")
     assert code == 0
@@ -241,6 +242,7 @@ def test_readings_without_a_sign_are_refused_backward(tmp_path, row, sentence):
         runs.read(tmp_path / "mine.csv")
 
 
+@pytest.mark.slow
 def test_compare_takes_readings_with_their_signs(mmrjax, tmp_path):
     (tmp_path / "mine.csv").write_text(f"{COLUMNS}\n6T2A,15,13.1,0,0,2.1,5292\n6T2A,-15,13.1,0,0,-2.1,-5292\n")
     code, out, _ = mmrjax("compare", "mine.csv", "--no-report", "--out", "a")

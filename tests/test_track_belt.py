@@ -25,7 +25,7 @@ def test_belt_is_840_mm_with_grousers_every_35(path):
     assert TEETH_BELT / GROUSERS == 7
 
 
-@pytest.mark.quick(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("recess", [0.0, 3e-4])
 def test_tip_rates_are_derivatives_of_its_place(path, recess):
     gear = params.replace(path.gear, {"guide_recess": jnp.asarray(recess)})

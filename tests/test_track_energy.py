@@ -77,6 +77,7 @@ def ledger(robot):
     return {name: np.asarray(value) for name, value in run(RUNS).items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", range(4))
 def test_energy_in_is_lost_or_stored(ledger, k):
     """To 0.5 % of what the supply gave."""
@@ -85,6 +86,7 @@ def test_energy_in_is_lost_or_stored(ledger, k):
     assert spent == pytest.approx(ledger["in"][k], rel=5e-3)
 
 
+@pytest.mark.slow
 def test_every_loss_takes_energy(ledger):
     for name in set(ledger) - {"in", "stored", "contact", "guide"}:
         assert (ledger[name] > 0).all(), name
@@ -121,6 +123,7 @@ def test_averages_hardly_depend_on_the_contact_stiffness(averages, robot):
     np.testing.assert_allclose(averages(stiffer, 1e-4), averages(robot, 1e-4), rtol=3e-3)
 
 
+@pytest.mark.slow
 def test_ledger_can_fail(ledger):
     """Leaving out any one loss of a tracked run upsets the balance, damping of contact and belt apart."""
     for name in set(ledger) - {"in", "contact", "belt"}:

@@ -74,6 +74,7 @@ def test_gif_moves(scenes, tmp_path):
     assert (np.abs(last - first).sum(axis=-1) > 60).mean() > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("imageio_ffmpeg") is None, reason="the extra `video` is not installed")
 def test_mp4_is_written(scenes, tmp_path):
     file = render(scenes(1), tmp_path / "robot.mp4", begin=0.02, end=0.03, slow=10, rate=20)

@@ -62,6 +62,7 @@ def test_effect_moves_the_turn_and_mirrors(name):
     np.testing.assert_allclose(mirrored, (moved * sign)[swap], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_friction_of_a_side_is_that_of_a_second_implementation():
     robot, more = robots.nominal(), 0.002
     dry = float(robot.motor.friction_coulomb)

@@ -49,6 +49,7 @@ def turns(robot):
     return jax.device_get(motion), np.array(STATUSES)[np.asarray(status)]
 
 
+@pytest.mark.slow
 def test_turns_are_found_past_kinks_of_friction_and_gears():
     """Of robots whose open side is dragged slowly: rates grow on the way to where the run settles. Drawn from 2000
     random ones, 37 of which were `not_settled`."""
@@ -142,7 +143,7 @@ def flat(m):
 PLANE = ("speed", "speed_lateral", "yaw_rate", "heading", "place_x", "place_y", "discharge")
 
 
-@pytest.mark.quick(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("configuration", CONFIGURATIONS)
 def test_energy_in_is_what_sinks_take_and_what_is_stored(robot, configuration):
     run = mm.Conditions(
@@ -328,7 +329,7 @@ def test_load_moves_to_the_outer_side_and_to_the_rear_as_forces_say():
     assert float(held.normal[1] - held.normal[0]) == pytest.approx(2 * float(held.moved), rel=1e-9)
 
 
-@pytest.mark.quick(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("height", "lifts"), [(0.06, False), (0.2, True)])
 @pytest.mark.parametrize("on_tracks", [0.0, 1.0])
 def test_forces_and_their_derivatives_are_those_of_loads_in_balance(height, lifts, on_tracks):

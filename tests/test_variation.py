@@ -46,6 +46,7 @@ def test_configuration_is_an_index_and_total_mass_may_be_none_before():
     assert Variation(robots.nominal(), ("total_mass",)).axes["total_mass"].value is None
 
 
+@pytest.mark.slow
 def test_evaluate_steady_is_each_point_by_itself(variation):
     found = evaluate(variation, "steady", jnp.asarray(VALUES), Conditions(), {}, ("total_current", "speed", "flags"))
     for k, row in enumerate(VALUES):

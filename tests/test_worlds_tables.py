@@ -99,6 +99,7 @@ def test_library_is_of_every_effect_that_steady_runs_show():
     assert {law.cls for law in laws.OUTSIDE.values()} == {""} and len(laws.OUTSIDE) >= 6
 
 
+@pytest.mark.slow
 def test_clean_tables_agree_with_steady(package):
     assert CLEAN.shape[1] == 180
     np.testing.assert_allclose(package(), CLEAN, rtol=1e-9)
