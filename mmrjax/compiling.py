@@ -56,8 +56,8 @@ def compiled(function: Callable[P, T], *, options: dict[str, Any] | None = None)
     """
     inner, kept, traced = eqx.filter_jit(function), Programs(function, options), set[Hashable]()
 
-    def run(arguments: tuple[tuple, dict[str, Any]]) -> T:
-        program = kept.of(arguments)
+    def run(structure: Hashable | None, arguments: tuple[tuple, dict[str, Any]]) -> T:
+        program = kept.of_structure(structure, arguments)
         return inner(*arguments[0], **arguments[1]) if program is None else program(arguments)
 
     @functools.wraps(function)
@@ -65,9 +65,9 @@ def compiled(function: Callable[P, T], *, options: dict[str, Any] | None = None)
         arguments = for_equations((args, named))
         structure = structure_of(arguments)
         if structure is not None and structure in traced:
-            return run(arguments)
+            return run(structure, arguments)
         with TRACING:
-            found = run(arguments)
+            found = run(structure, arguments)
         if structure is not None:
             traced.add(structure)
         return found

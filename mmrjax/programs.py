@@ -96,11 +96,12 @@ class Programs:
 
     def of(self, arguments: tuple[tuple, dict[str, Any]]) -> Program | None:
         """The program for positional and named arguments; None where none may be kept."""
+        return self.of_structure(structure_of(arguments), arguments)
+
+    def of_structure(self, structure: Hashable | None, arguments: tuple[tuple, dict[str, Any]]) -> Program | None:
+        """The program for arguments whose structure is known (`structure_of`); None where none may be kept."""
         folder = os.environ.get(VARIABLE, "")
-        if not folder or not _keeps() or not _private(folder):
-            return None
-        structure = structure_of(arguments)
-        if structure is None:
+        if structure is None or not folder or not _keeps() or not _private(folder):
             return None
         with self._lock:
             first = structure not in self._found

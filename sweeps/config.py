@@ -706,7 +706,7 @@ def _keys(kind: type[Part], file: Path, beside: type[Part] | None) -> dict[str, 
 
 
 def resolve_beside(kind: type[C], file: Path | None, options: dict[str, Any], trust: bool = False) -> C:
-    """What a command is told beside its configuration, of which a file has the keys of `[solver]` alone.
+    """Returns the options of a command outside its configuration; a file may state their `[solver]` keys only.
 
     Args:
         trust: as of `resolve`.
