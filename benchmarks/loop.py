@@ -269,6 +269,7 @@ def summary(lines: list[dict]) -> list[str]:
     """The figures of a campaign."""
     f = scores.Figures(lines)
     scores.findings(f)
+    scores.mechanisms(f)
     scores.clean(f, ("clean", "clean_wide"))
     scores.noise(f)
     scores.library(f)

@@ -38,6 +38,27 @@ DRIVEN: dict[str, tuple[str, ...]] = {
     "weight_transfer": ("slope",), "sinkage": ("payload",), "belt_creep": LOADS, "nonlinear_slip": LOADS,
     "speed_slip": SPEEDS, "load_slip": LOADS,
 }  # fmt: skip
+#: What drives each law that the library does not hold, in the words of `Effect.driver`: one variable, or the two of
+#: which either is a right answer.
+DRIVERS: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("resonance_bump", "root_friction", "friction_step", "rotor_whirl", "belt_flutter",
+                     "heave_resonance", "lost_counts"), ("speed",)),
+    **dict.fromkeys(("supply_hunting", "polyfuse", "range_switch"), ("current",)),
+    **dict.fromkeys(("backlash_dither", "thrust_washer"), ("load",)), "commutation_step": ("voltage", "speed"),
+    "guide_binding": ("weight", "load"), "slope_rolling": ("slope",), "ratcheting": ("demand", "speed"),
+    "gear_viscosity": ("speed", "load"), "loaded_chatter": ("speed", "load"), "tooth_climb": ("slope", "speed"),
+    "ammeter_two_things": ("current", "speed"), "speed_two_things": ("demand", "speed"),
+    "buck_source": ("current", "voltage"), "rail_dropout": ("voltage", "current"),
+    "commutation_spark": ("current", "speed"), "commutation_lag": ("speed", "load"),
+    "grease_thinning": ("speed", "load"), "mixed_mesh": ("load", "speed"), "tight_side_flexing": ("load", "speed"),
+    "guide_glide": ("speed", "weight"), "rear_hysteresis": ("slope", "speed"), "top_heavy": ("slope", "load"),
+    "hop": ("speed", "load"), "tread_heating": ("demand", "speed"), "order_two": ("order 2",), "warming": ("time",),
+    "supply_recovery": ("time",),
+}  # fmt: skip
+#: Laws of `DRIVERS` of one variable, though two words stand for it.
+ONE_DRIVER = ("commutation_step", "guide_binding")
+#: Drivers that a table of settled runs varies by the same columns: load by payload and slope.
+SAME_DRIVER = ({"load", "slope", "weight", "demand", "configuration"}, {"voltage", "duty"})
 #: Properties by which clean cases are looked at again: name, edges of the bins.
 BINS: tuple[tuple[str, tuple[float, ...]], ...] = (
     ("adhesion", (0.2, 0.35, 0.5, 0.75, 1.0)),
@@ -128,6 +149,60 @@ def _equation_of(truth: dict) -> str:
     return EQUATION[truth["balance"]]
 
 
+# --- mechanisms -------------------------------------------------------------------------------------
+
+
+def established_families(x: dict) -> list[tuple[str, ...]]:
+    """Families of each thing that a verdict establishes as a law or as a mechanism."""
+    from mmrjax.effects import BY_NAME
+
+    if x["verdict"] == "mechanism":
+        return [tuple(x["mechanism"]["families"])]
+    if x["verdict"] not in ("named", "class"):
+        return []
+    return [tuple(dict.fromkeys(BY_NAME[n].family() for n in c if n in BY_NAME)) for c in x["classes"]]
+
+
+def same_mechanism(family: str, truth: dict, loosely: bool = False) -> bool:
+    """True if a family is the mechanism of a truth: what it enters, and what drives it.
+
+    Args:
+        loosely: take drivers for the same that settled runs vary by the same columns, and balances for the same that
+            close one equation.
+    """
+    from mmrjax.effects import BY_NAME
+    from mmrjax.effects.base import EQUATION as WORDS
+
+    if truth["class"] and not loosely:
+        return family == BY_NAME[truth["class"]].family()
+    what, _, driver = family.partition(" that changes with ")
+    what = what.removesuffix(" that is the same share everywhere")
+    if truth["class"]:
+        own = BY_NAME[truth["class"]]
+        drivers, enters = {own.driver}, own.family().partition(" that ")[0]
+    else:
+        drivers = set(DRIVERS[truth["name"]])
+        enters = WORDS.get(truth["balance"], f"reading of {truth['balance'].replace('_', ' ')}")
+    if loosely:
+        drivers |= {v for same in SAME_DRIVER if same & drivers for v in same}
+        equation = {word: EQUATION.get(balance, balance) for balance, word in WORDS.items()}
+        what, enters = equation.get(what, what), equation.get(enters, enters)
+    return what == enters and driver in drivers
+
+
+def mechanism_right(x: dict, loosely: bool = False) -> bool:
+    """True if a law or a mechanism is established, and each that is has the mechanism of a truth."""
+    found = established_families(x)
+    return bool(found) and not mechanism_wrong(x, loosely)
+
+
+def mechanism_wrong(x: dict, loosely: bool = False) -> bool:
+    """True if something is established that holds the mechanism of no truth among those that it cannot be told from."""
+    return any(
+        not any(same_mechanism(f, t, loosely) for f in those for t in x["truth"]) for those in established_families(x)
+    )
+
+
 def in_place(x: dict, alike: bool = False) -> bool:
     """Whether a drift, a cluster or an event is placed: over the right variable in the right equation, or by an event
     that shares half of its rows or of its time with the truth.
@@ -208,7 +283,7 @@ def _found(f: Figures, what: str, those: Sequence[dict]) -> None:
     count = max((len(x.get("truth", ())) for x in those), default=0)
     if count == 0:
         f.say(f"{what}: rejected (goal <= 5 %)", those, false_finding)
-        f.say("  something established (goal <= 1 %)", those, lambda x: wrong(x, "established"))
+        f.say("  something established (goal <= 1 %)", those, established_families)
         f.say("  something tentative", those, lambda x: wrong(x, "tentative"))
         for name in sorted({x.get("stratum", "") for x in those}):
             stratum(f, f"rejected, stratum {name}", [x for x in those if x.get("stratum", "") == name])
@@ -265,6 +340,32 @@ def all_in(x: dict, *standings: str) -> bool:
     """Whether each truth is in the class of an effect of one of these standings."""
     classes = [e["class"] for e in x["effects"] if e["standing"] in standings]
     return all(any(t["class"] in c for c in classes) for t in x["truth"])
+
+
+def mechanisms(f: Figures) -> None:
+    """Right and wrong mechanisms, of laws or of what has no law, by kind; the levels that verdicts reach."""
+    known = [x for x in f.lines if "verdict" in x]
+    for kind in dict.fromkeys(x["kind"] for x in known):
+        those = [x for x in known if x["kind"] == kind and x.get("truth")]
+        those = [x for x in those if all(t["class"] or t.get("name") in DRIVERS for t in x["truth"])]
+        those = [x for x in those if all(sigmas(t) >= 5 for t in x["truth"])]
+        foreign = any(not t["class"] for x in those for t in x["truth"])
+        goals = ("85", "3") if foreign else ("97", "3")
+        f.say(f"{kind}: right mechanism established (goal >= {goals[0]} %)", those, mechanism_right)
+        f.say("  where balances and drivers that act alike count", those, lambda x: mechanism_right(x, True))
+        f.say(f"  wrong mechanism (goal <= {goals[1]} %)", those, mechanism_wrong)
+        f.say("  wrong where those that act alike count", those, lambda x: mechanism_wrong(x, True))
+        if foreign:
+            one = [x for x in those if _one_driver(x["truth"][0])]
+            f.say("  one driver: right mechanism established", one, mechanism_right)
+            f.say("  one driver: right where those that act alike count", one, lambda x: mechanism_right(x, True))
+            f.say("  one driver: wrong mechanism", one, mechanism_wrong)
+        if those:
+            f.note(f"  levels: {dict(Counter(x['verdict'] for x in those))}")
+
+
+def _one_driver(truth: dict) -> bool:
+    return truth["name"] in ONE_DRIVER or len(DRIVERS.get(truth["name"], ())) == 1
 
 
 def clean(f: Figures, kinds: Sequence[str]) -> None:

@@ -115,6 +115,7 @@ def summary(lines: list[dict]) -> list[str]:
     """The figures of a campaign."""
     f = scores.Figures(lines)
     scores.findings(f)
+    scores.mechanisms(f)
     _clean(f)
     _library(f)
     _outside(f)
