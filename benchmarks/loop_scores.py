@@ -182,7 +182,8 @@ def same_mechanism(family: str, truth: dict, loosely: bool = False) -> bool:
         drivers, enters = {own.driver}, own.family().partition(" that ")[0]
     else:
         drivers = set(DRIVERS[truth["name"]])
-        enters = WORDS.get(truth["balance"], f"reading of {truth['balance'].replace('_', ' ')}")
+        shown = {"range_switch": "total_current", "lost_counts": "motor_speed"}.get(truth["name"], truth["balance"])
+        enters = WORDS.get(shown, f"reading of {shown.replace('_', ' ')}")
     if loosely:
         drivers |= {v for same in SAME_DRIVER if same & drivers for v in same}
         equation = {word: EQUATION.get(balance, balance) for balance, word in WORDS.items()}
@@ -197,7 +198,7 @@ def mechanism_right(x: dict, loosely: bool = False) -> bool:
 
 
 def mechanism_wrong(x: dict, loosely: bool = False) -> bool:
-    """True if something is established that holds the mechanism of no truth among those that it cannot be told from."""
+    """True if something is established that has the mechanism of no truth, alone or among those that act alike."""
     return any(
         not any(same_mechanism(f, t, loosely) for f in those for t in x["truth"]) for those in established_families(x)
     )

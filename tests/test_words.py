@@ -72,6 +72,11 @@ SAMPLES = [
         "state total_mass_kg would",
     ),
     (
+        of_fit.LargerNoise("total_current", 8.3, 12, "stated"),
+        "total_current: 12 pairs of rows at the same conditions scatter 8.3 times as much as the stated noise says; its "
+        "sd is taken 8.3 times as large. Check the repeats, or state the noise with --noise",
+    ),
+    (
         of_fit.Repeats("r.csv", (1, 2), "motor_speed_rpm", (4564.6, 4373.6), "6 sd", ("torque",), 2),
         "r.csv rows 1 and 2, motor_speed_rpm: the same conditions gave 4564.6 and 4373.6, 6 sd apart (and so 2 more); "
         "torque varies there and is not used as a condition: name it under [columns], or give each level of a load a "
@@ -239,12 +244,17 @@ SAMPLES = [
     (
         of_loop.NoiseFromSeries(
             (
-                SeriesNoise(channels.find("total_current"), 0.0639, False, 7.45, "slope_deg", 4),
-                SeriesNoise(channels.find("speed"), 0.0124, True, 7.44, "slope_deg", 4),
+                SeriesNoise(channels.find("total_current"), 0.0546, 0.0133, 7.45, "slope_deg", 4),
+                SeriesNoise(channels.find("speed"), 0.0, 0.0124, 7.44, "slope_deg", 4, 0.004),
             )
         ),
-        "no sd is stated for total_current, speed: total current 0.064 A, speed 1.2 % are estimated from how readings "
-        "scatter along 4 series of slope_deg (7.4 degrees of freedom); state yours with --noise",
+        "no sd is stated for total_current, speed: total current 0.055 A and 1.3 % of the reading, speed 1.2 % of "
+        "the reading (its display steps by 14 mm/s) are estimated from how readings scatter along 4 series of slope_deg (7.4 degrees of freedom); state yours with --noise",
+    ),
+    (
+        of_loop.RefitWorse("total_current", 0.44, 0.54, "estimated"),
+        "total_current: the refit misses it by 54% of its measured rms and the robot as stated by 44%, so the estimated "
+        "noise gives some of its readings too large a weight; state the instrument's with --noise",
     ),
     (of_loop.Copies((3,)), "row 3 is an exact copy of an earlier one and counts once"),
     (of_loop.Copies((3, 4)), "rows 3, 4 are exact copies of earlier ones and count once"),
@@ -524,7 +534,7 @@ def test_a_mechanism_is_stated_with_what_it_explains_and_predicts():
 
 
 def test_every_doubt_about_a_mechanism_has_words():
-    none = Mechanism(("a", "b", "c", "d"), (), 0.1, 0.0, np.inf, 0.0)
+    none = Mechanism(tuple(f"loss torque that changes with {x}" for x in "abcd"), (), 0.1, 0.0, np.inf, 0.0)
     assert set(none.fails) == set(loop.NO_MECHANISM) and all(loop.no_mechanism(none).split())
 
 

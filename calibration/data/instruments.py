@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mmrjax import channels
+from mmrjax.channels import Channel
 from mmrjax.rig import Instrument
 from mmrjax.robot import Robot
 
@@ -20,6 +22,8 @@ SMALLEST, ROUNDING = 1e-5, 1e-9
 #: Fewest different readings that tell a step: of so many random multiples the common divisor is the step itself in
 #: 99 % of tables, of four in 83 %.
 FEWEST = 8
+#: Coarsest step of a display, as a share of the largest reading: coarser multiples are levels that somebody set.
+COARSEST = 0.25
 
 
 def step_of(readings: np.ndarray) -> float:
@@ -38,6 +42,24 @@ def step_of(readings: np.ndarray) -> float:
         if found < SMALLEST * largest:
             return 0.0
     return found
+
+
+def display_step(readings: np.ndarray, channel: Channel) -> float:
+    """Step of the display that shows a channel [SI]: `step_of`, or where too few different readings tell that, the
+    largest power of ten, in the unit of its column and up to `COARSEST` of the largest reading, of which all readings
+    are multiples; 0: none that shows.
+
+    Args:
+        readings: [SI].
+    """
+    step = step_of(readings)
+    levels = np.unique(readings[np.isfinite(readings)]) / channel.factor
+    if step or not 2 <= levels.size < FEWEST:
+        return step
+    largest = float(np.max(np.abs(levels)))
+    powers = 10.0 ** np.arange(math.floor(math.log10(COARSEST * largest)), math.log10(SMALLEST * largest), -1)
+    fits = [p for p in powers if np.all(np.abs(levels / p - np.round(levels / p)) < 1e-6)]
+    return float(fits[0] * channel.factor) if fits else 0.0
 
 
 def infer_instruments(

@@ -48,6 +48,7 @@ from calibration.discovery.notes import (
     NotPredictable,
     Outstanding,
     PhasesDiffer,
+    RefitWorse,
     RestsOn,
     StillLacks,
     Summary,
@@ -98,6 +99,8 @@ EITHER_WAY = 0.05
 LATE = 4.0
 #: Share of rows set aside beyond which that is said first.
 MANY = 0.03
+#: Error of a refit over that of the robot as stated above which it is said [-].
+WORSE = 1.1
 #: Prior sds beyond which a base parameter is worth a look.
 FAR = 3.0
 #: Is told what the loop does next.
@@ -831,7 +834,28 @@ def assemble_result(
     )
     # What happens for a while is not everywhere alike.
     of_noise = of_sds(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
-    return dataclasses.replace(result, remarks=(*of_noise, *remarks(result)))
+    return dataclasses.replace(result, remarks=(*of_noise, *refit_worse(seen, noise, included), *remarks(result)))
+
+
+def refit_worse(seen: ReadingsOfRows, noise: Noise, included: np.ndarray) -> list[RefitWorse]:
+    """Channels whose sds nobody states and that the refit misses by more than the robot as stated does, beyond their
+    noise: the estimate gives some readings too large a weight.
+
+    Args:
+        included: True for rows that count, shape (rows,).
+    """
+    found = []
+    for k, channel in enumerate(noise.channels):
+        rows = included & np.isfinite(seen.measured[:, k] + seen.as_stated[:, k] + seen.before[:, k])
+        if noise.source[k] not in noise_room.UNSTATED or not rows.any():
+            continue
+        stated, refit, size, sd = (
+            float(np.sqrt(np.mean(x[rows, k] ** 2)))
+            for x in (seen.as_stated - seen.measured, seen.before - seen.measured, seen.measured, noise.sd)
+        )
+        if refit > WORSE * stated and refit - stated > sd:
+            found.append(RefitWorse(channel.name, stated / size, refit / size, noise_room.UNSTATED[noise.source[k]]))
+    return found
 
 
 def on_same_rows(

@@ -74,6 +74,7 @@ def mechanism(
     for leader in (*by_name[:1], *curve, *by_name[1:]):
         others = alike if leader in by_name else [*alike, *over]
         families = (leader, *(f for f in others if f != leader))
+        families = tuple(dict.fromkeys((*families, *_in_equations_alike(leader, beside.where))))
         if leader in by_name:
             alone = _few_and_best(space, ladder, best[leader])
             compared = [*(Pair(c, base) for c in alone), pairs[leader]]
@@ -85,7 +86,7 @@ def mechanism(
             gain, effects = _gain_of_curve(space, runs, base, beside, predicted), ()
             again = _curve_again(space, left, bases, families, blocks, settings)
         share = share_of_excess(space, base, explained.get(leader, 0.0))
-        found.append(Mechanism(families, effects, share, gain.mean, gain.se, again))
+        found.append(Mechanism(families, effects, share, gain.mean, gain.se, again, gain.errors))
         if not found[-1].fails:
             return found[-1]
     return found[0] if found else None
@@ -150,6 +151,14 @@ def _of_one_family(space: CandidateSpace, ladder: Sequence[Candidate]) -> dict[s
     return found
 
 
+def _in_equations_alike(family: str, where: DiscrepancyLocation) -> tuple[str, ...]:
+    """The family with the same driver in each equation that these data cannot tell from its own."""
+    equations = [f.partition(" that ") for f in (dataclasses.replace(where, place=p).family for p in where.alike)]
+    what, joint, driver = family.partition(" that ")
+    alike = dict.fromkeys(equation for equation, *_ in equations)
+    return tuple(f"{other}{joint}{driver}" for other in alike) if what in alike else ()
+
+
 def _families_of(where: DiscrepancyLocation) -> tuple[str, ...]:
     """The family of a curve, and those of the places and variables over which one is as improbable."""
     places = [dataclasses.replace(where, place=p) for p in where.alike]
@@ -170,11 +179,36 @@ def _gain_of(space: CandidateSpace, runs: Runs, pair: Pair, predicted: Predicted
 def _gain_of_curve(
     space: CandidateSpace, runs: Runs, base: Candidate, beside: CurveBeside, predicted: Predicted
 ) -> Gain:
-    """The same of the curve of what the base leaves."""
+    """The same of the curve of what the base leaves, over the range of its variable that its fit has seen: a curve
+    says nothing beyond."""
     curve, kinds = beside.curve, blocks_room.predictable(runs, space.bare)
     told = {kind: held_out(curve.problem, curve.z, list(by.values())).reading for kind, by in kinds.items()}
     changed = _changed(space, runs, _reading(space, base), curve.reading)
-    return _scored(space, runs, told).gain(_held_out(space, runs, base, predicted), changed, BLOCKS)
+    score = _scored(space, runs, told)
+    seen = {kind: _seen(space, beside, list(by.values())) for kind, by in kinds.items()}
+    inside = {kind: np.where(seen[kind][:, None], x, np.nan) for kind, x in score.by_kind.items()}
+    score = dataclasses.replace(score, by_kind=inside)
+    return score.gain(_held_out(space, runs, base, predicted), changed, BLOCKS)
+
+
+def _seen(space: CandidateSpace, beside: CurveBeside, masks: Sequence[np.ndarray]) -> np.ndarray:
+    """Rows at which a curve's variable is within the range of the rows outside their block, shape (rows,).
+
+    Args:
+        masks: of the rows of each block.
+    """
+    where, linear, rows = beside.where, beside.left.linear, len(masks[0])
+    seen = np.ones(rows, bool)
+    if where.variable not in bases_room.VARIABLES:
+        return seen
+    x = np.asarray(linear.in_travel(where.place, where.variable)[0], float)
+    if len(x) != len(space.included):  # of turns, whose sides differ
+        return seen
+    for mask in masks:
+        others = x[:rows][space.included[:rows] & ~mask]
+        if len(others):
+            seen[mask] = (x[:rows][mask] >= others.min()) & (x[:rows][mask] <= others.max())
+    return seen
 
 
 def _held_out(space: CandidateSpace, runs: Runs, candidate: Candidate, predicted: Predicted) -> HeldOutScore:

@@ -187,7 +187,7 @@ class Missing:
 
 #: What a mechanism needs: share of the excess misfit, standard errors of its gain on data held out.
 HALF, SURE = 0.5, 2.0
-#: Mechanisms that data may not tell apart for one of them to be stated.
+#: Drivers that data may not tell apart for a mechanism to be stated.
 FEW = 3
 
 
@@ -201,6 +201,7 @@ class Mechanism:
         share: of the excess misfit, χ² less its expectation, that it explains [-].
         gain, se: on data held out, over the readings that it changes [nat a reading].
         again: share of the informative blocks of runs without which it is found again [-].
+        errors: standard errors of the gain, by rows and by each kind of block [nat a reading].
     """
 
     families: tuple[str, ...]
@@ -209,6 +210,12 @@ class Mechanism:
     gain: float
     se: float
     again: float
+    errors: Mapping[str, float] = dataclasses.field(default_factory=dict)
+
+    @property
+    def drivers(self) -> tuple[str, ...]:
+        """What may drive it: the families differ in this, or in the equation alone."""
+        return tuple(dict.fromkeys(f.partition(" that ")[2] for f in self.families))
 
     @property
     def fails(self) -> tuple[str, ...]:
@@ -217,7 +224,7 @@ class Mechanism:
             "share": self.share < HALF,
             "gain": not self.gain > SURE * self.se,
             "again": self.again < AGAIN,
-            "many": len(self.families) > FEW,
+            "many": len(self.drivers) > FEW,
         }
         return tuple(doubt for doubt, holds in doubts.items() if holds)
 
@@ -321,6 +328,16 @@ class NoiseFromSeries(Note):
     """Channels whose sds nobody states, as the scatter along series shows them."""
 
     noise: tuple[SeriesNoise, ...]
+
+
+class RefitWorse(Note):
+    """A channel that the refit misses by more than the robot as stated does: errors over its measured rms [-], and
+    whether its noise is `assumed` or `estimated`."""
+
+    channel: str
+    stated: float
+    refit: float
+    word: str
 
 
 class Copies(Note):

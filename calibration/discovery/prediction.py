@@ -64,17 +64,23 @@ class HeldOutScore:
         mean = float(np.nansum(each) / total)
         # Of rows, and of the blocks of each kind, whose readings share what was not seen.
         off = np.nansum(each, (0, 2)) - mean * counts
-        several = [by for by in self.blocks.values() if len(np.unique(by[by >= 0])) >= fewest]
-        groups = [np.arange(len(rows)), *several]
-        return Gain(mean, max(_error(off[rows], by[rows]) for by in groups) / total)
+        several = {kind: by for kind, by in self.blocks.items() if len(np.unique(by[by >= 0])) >= fewest}
+        groups = {"row": np.arange(len(rows)), **several}
+        errors = {kind: _error(off[rows], by[rows]) / total for kind, by in groups.items()}
+        return Gain(mean, max(errors.values()), errors)
 
 
 @dataclasses.dataclass(frozen=True)
 class Gain:
-    """A difference of two scores and its standard error [nat a reading]."""
+    """A difference of two scores and its standard error [nat a reading].
+
+    Attributes:
+        errors: standard errors by what the scatter is over, rows or the blocks of a kind; `se` is the largest.
+    """
 
     mean: float
     se: float
+    errors: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
 def _error(off: np.ndarray, groups: np.ndarray) -> float:

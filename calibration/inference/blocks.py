@@ -17,6 +17,7 @@ from calibration.inference.problem import Problem
 BLOCKS: dict[str, tuple[str, ...]] = {
     "slope": ("slope_deg",),
     "voltage": ("supply_voltage_V",),
+    "duty": ("duty",),
     "speed": (SPEED,),
     "current": (CURRENT,),
     "payload": ("payload_kg",),
@@ -35,6 +36,8 @@ def in_words(by: str, joint: str = " and ") -> str:
 
 #: Columns of blocks that are labels.
 NO_CONDITIONS = ("configuration", "run_id")
+#: Those whose values have no levels, or are measured.
+GRADED = (SPEED, CURRENT, "duty")
 #: Share of a value by which the next has to be larger to be of another level [-]: a speed or current that is
 #: controlled is measured, and not twice the same. Blocks of a quantity that has no levels.
 APART, PARTS = 0.1, 4
@@ -76,7 +79,7 @@ def blocks(runs: Runs, by: str) -> dict[str, np.ndarray]:
         return {}
     if by == "voltage_configuration" and not runs.layout.complete and len(np.unique(runs["configuration"])) == 1:
         return {}  # those of `voltage`
-    values = {c: levels(runs[c]) if c in (SPEED, CURRENT) else runs[c] for c in columns}
+    values = {c: levels(runs[c]) if c in GRADED else runs[c] for c in columns}
     labels = np.array([" ".join(str(values[c][k]) for c in columns) for k in range(len(runs))])
     changes = varies(runs, BLOCKS[by])
     if changes.all() and by != "run":

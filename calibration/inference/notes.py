@@ -105,6 +105,19 @@ class Unmeasured(Note):
     name: str
 
 
+class LargerNoise(Note):
+    """A channel whose repeats scatter more than its sd says, which is enlarged.
+
+    Attributes:
+        channel: its name; factor: by which; pairs: of repeats; source: `stated` or `assumed`, the sd.
+    """
+
+    channel: str
+    factor: float
+    pairs: int
+    source: str
+
+
 class Repeats(Note):
     """Rows under the same conditions whose readings differ beyond their noise.
 

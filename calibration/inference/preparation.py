@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from calibration.data import instruments, own_mass, rig_facts, robot_file, surfaces
 from calibration.data.runs import Runs
-from calibration.inference import checks, observers
+from calibration.inference import checks, observers, repeats
 from calibration.inference import noise as noise_room
 from calibration.inference.foreign import inherited_priors
 from calibration.inference.noise import Noise
@@ -77,6 +77,7 @@ def prepare(
     as_stated, weighed = robot, own_mass.remarks(robot, runs)
     robot = own_mass.with_table_mass(robot, runs)
     known = (noise_room.inferred if assume else noise_room.from_table)(runs, observe.sizes(runs), noise)
+    known, larger = repeats.enlarged(known, runs)
     robot = observe.with_initial_states(robot, runs, known)
     found = Prepared(robot, observe, known, priors, (), tuple(former), (), (), (), tuple(weighed))
     names = tuple(choose(found))
@@ -87,7 +88,7 @@ def prepare(
         found,
         names=names,
         foreign=tuple(inherited_priors(robot, priors)),
-        checked=tuple(checked),
+        checked=(*larger, *checked),
         begins=tuple(begins),
         doubted=rig_facts.doubts(runs, as_stated),
     )

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         UnnamedDiscrepancy,
         Worse,
     )
+    from calibration.inference.series_noise import SeriesNoise
 
 # --- the verdict ----------------------------------------------------------------------------------------
 
@@ -128,13 +129,13 @@ NO_MECHANISM = {
     "share": "it explains only {share:.0f} % of the excess misfit",
     "gain": "on runs that its fit has not seen it gains {0.gain:.2g} ± {0.se:.2g} nat a reading",
     "again": "it is found again in only {again:.0f} % of the data with a block left out",
-    "many": "{many} mechanisms explain as much",
+    "many": "{many} variables may drive it",
 }
 
 
 def no_mechanism(found: notes.Mechanism) -> str:
     """What speaks against the mechanism that explains most."""
-    numbers = {"share": 100 * found.share, "again": 100 * found.again, "many": len(found.families)}
+    numbers = {"share": 100 * found.share, "again": 100 * found.again, "many": len(found.drivers)}
     why = [NO_MECHANISM[name].format(found, **numbers) for name in found.fails]
     return f"the best one is a {found.families[0]}, but {' and '.join(why)}"
 
@@ -588,14 +589,20 @@ def resolved(found: Resolved) -> str:
 # --- remarks --------------------------------------------------------------------------------------------
 
 
+def in_parts(noise: SeriesNoise) -> str:
+    """An estimated sd: `0.055 A and 1.3 % of the reading`."""
+    parts = [
+        f"{noise.floor / noise.channel.factor:.2g} {noise.channel.unit}" if noise.floor or not noise.share else "",
+        f"{100 * noise.share:.2g} % of the reading" if noise.share else "",
+    ]
+    step = math.sqrt(12) * noise.least / noise.channel.factor
+    shown = f" (its display steps by {step:.2g} {noise.channel.unit})" if noise.least > noise.floor else ""
+    return " and ".join(filter(None, parts)) + shown
+
+
 def noise_from_series(note: notes.NoiseFromSeries) -> str:
     """Channels whose sds are estimated along series."""
-    shown = [
-        f"{s.channel.label} {100 * s.size:.2g} %"
-        if s.share
-        else f"{s.channel.label} {s.size / s.channel.factor:.2g} {s.channel.unit}"
-        for s in note.noise
-    ]
+    shown = [f"{s.channel.label} {in_parts(s)}" for s in note.noise]
     along = dict.fromkeys(f"{s.count} series of {s.axis}" for s in note.noise)
     freedom = min(s.freedom for s in note.noise)
     return (
@@ -692,6 +699,11 @@ def outstanding(note: notes.Outstanding) -> str:
 SAID: dict[type, str | Callable[[Any], str]] = {
     notes.AssumedNoise: "no sd is stated for {channels}: {usual} is assumed; state yours with --noise",
     notes.NoiseFromSeries: noise_from_series,
+    notes.RefitWorse: lambda note: (
+        f"{note.channel}: the refit misses it by {note.refit:.0%} of its measured rms and the robot as stated by "
+        f"{note.stated:.0%}, so the {note.word} noise gives some of its readings too large a weight; state the "
+        "instrument's with --noise"
+    ),
     notes.Copies: copies,
     notes.KeptOut: kept_out,
     notes.PhasesDiffer: "the wave stands at another angle in each run (it explains {free:.0f} σ² free in each, "

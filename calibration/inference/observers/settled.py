@@ -27,6 +27,7 @@ from calibration.inference.notes import Note, Repeats
 from calibration.inference.observers.base import Observer, SearchPolicy
 from calibration.inference.optimizers import Member, Numbers, Optimum, counted, penalties, searches_refilled
 from calibration.inference.problem import Data, Observation, Problem
+from calibration.inference.repeats import same_conditions
 from calibration.words import tables
 from mmrjax import balances, channels, fidelities
 from mmrjax.compiling import SELDOM, compiled
@@ -109,7 +110,7 @@ class SettledRuns(Observer):
     fewest: ClassVar[int] = 6
     sizes_padded: ClassVar[tuple[int, ...]] = (16, 24, 32, 48, 64, 96, 128, 192, 256)
     blocks: ClassVar[tuple[str, ...]] = (
-        "slope", "voltage_configuration", "voltage", "speed", "current", "payload", "configuration",
+        "slope", "voltage_configuration", "voltage", "duty", "speed", "current", "payload", "configuration",
     )  # fmt: skip
     policy: ClassVar[SearchPolicy] = SearchPolicy()
     rows_tell: ClassVar[bool] = True
@@ -149,12 +150,9 @@ class SettledRuns(Observer):
     @classmethod
     def check(cls, runs: Runs, noise: Noise) -> list[Note | str]:
         """Refuses a table of one condition whose readings differ; notes the repeats that differ most."""
-        columns = [c for c in ("configuration", *runs.axes, "surface") if runs.has(c)]
-        measured, alike = runs.measured(), dict[tuple[str, ...], list[int]]()
+        measured, alike = runs.measured(), same_conditions(runs)
         least, found = cls.least(runs), list[Repeats]()
-        for row, key in enumerate(zip(*(runs[c].astype(str).tolist() for c in columns), strict=True)):
-            alike.setdefault(key, []).append(row)
-        for rows in map(np.array, alike.values()):
+        for rows in alike:
             here, sds = measured[rows], noise.sd[rows]
             apart = np.abs(here[:, None] - here)
             mean = np.maximum(np.abs(here[:, None] + here) / 2, least[rows])
@@ -337,6 +335,7 @@ class SettledRuns(Observer):
             columns = {**columns, "supply_voltage_V": columns["supply_voltage_V"] * columns["duty"]}
         if CURRENT in columns and CURRENT in bases_room.axes_of(robot):  # imposed: no channel measures it
             columns = {**columns, bases_room.VARIABLES["current"]: columns[CURRENT]}
+        columns = {**_unmeasured(self, robot, columns), **columns}
         ways = dict.fromkeys(WAYS, np.asarray(_directions(self, robot)))
         told = columns, weight, robot, None, ways
         return (*bases_room.families(*told), *bases_room.windows(*told))
@@ -345,6 +344,28 @@ class SettledRuns(Observer):
         """As the protocol says: a row's residual (simulated less measured) is split among the defects of the
         balances `electrical`, `track` and `slip`, of each side where they are driven apart, that together make it."""
         return EquationDefects(_defects(before.linear, included), _defects(after.linear, included))
+
+
+def _unmeasured(
+    observe: SettledRuns, robot: Robot, columns: Mapping[str, np.ndarray]
+) -> dict[str, Float[np.ndarray, " rows"]]:
+    """Motor speed [rad/s] and motor current [A] of a fit by their columns, where no channel measures one; rigs may
+    show the output alone."""
+    wanted = [v for v in ("speed_motor", "current") if bases_room.VARIABLES[v] not in columns]
+    if bases_room.VARIABLES["speed"] in columns:
+        wanted = [v for v in wanted if v != "speed_motor"]
+    if not wanted or observe.long:
+        return {}
+    fitted = {v: np.asarray(x, float) for v, x in zip(wanted, _signals(observe, robot, tuple(wanted)), strict=True)}
+    return {bases_room.VARIABLES[v]: x for v, x in fitted.items() if np.isfinite(x).all()}
+
+
+@functools.partial(compiled, options=SELDOM)
+def _signals(observe: SettledRuns, robot: Robot, names: tuple[str, ...]) -> tuple[Float[Array, " rows"], ...]:
+    """Signals of a fit at each row's operating point."""
+    signals = jax.vmap(functools.partial(operating_signals, robot))(observe.conditions)
+    rows = jnp.shape(observe.conditions.slope_deg)
+    return tuple(jnp.broadcast_to(getattr(signals, name), rows) for name in names)
 
 
 def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarray]:

@@ -1,0 +1,61 @@
+"""Noise as rows that repeat the same conditions show it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Int
+
+from calibration.data.runs import Runs
+from calibration.inference.noise import UNSTATED, Noise
+from calibration.inference.notes import LargerNoise, Note
+
+#: Fewest differences between repeats that tell a noise: one of two readings may be wrong.
+FEWEST = 3
+#: Probability of a median difference as large from the stated noise, below which the noise is taken to be larger.
+IMPROBABLE = 1e-3
+#: Median of the magnitude of a standard normal number.
+MEDIAN = 0.6745
+
+
+def same_conditions(runs: Runs) -> list[Int[np.ndarray, " rows"]]:
+    """Rows of each set of the same conditions, those of single rows too."""
+    columns = [c for c in ("configuration", *runs.axes, "surface") if runs.has(c)]
+    alike: dict[tuple[str, ...], list[int]] = {}
+    for row, key in enumerate(zip(*(runs[c].astype(str).tolist() for c in columns), strict=True)):
+        alike.setdefault(key, []).append(row)
+    return [np.array(rows) for rows in alike.values()]
+
+
+def enlarged(noise: Noise, runs: Runs) -> tuple[Noise, list[Note]]:
+    """Noise that repeats in a table do not contradict, and a note for each channel whose sd was enlarged.
+
+    The median of the differences between neighbouring repeats decides, so that a few wrong readings do not. An
+    estimate along series has the repeats in it already.
+    """
+    if runs.sampled or runs.has("time_s"):
+        return noise, []
+    pairs = [pair for rows in same_conditions(runs) for pair in zip(rows[:-1], rows[1:], strict=True)]
+    if len(pairs) < FEWEST:
+        return noise, []
+    first, second = np.array(pairs).T
+    apart = np.abs(runs.measured()[first] - runs.measured()[second]) / np.hypot(noise.sd[first], noise.sd[second])
+    factors, notes = {}, []
+    for k, channel in enumerate(noise.channels):
+        told = apart[np.isfinite(apart[:, k]), k]
+        if len(told) < FEWEST or noise.source[k] in ("series", "estimated", "no readings"):
+            continue
+        median = float(np.median(told))
+        if _tail(median, len(told)) < IMPROBABLE:
+            factors[channel.name] = median / MEDIAN
+            notes.append(
+                LargerNoise(channel.name, factors[channel.name], len(told), UNSTATED.get(noise.source[k], "stated"))
+            )
+    return noise.scaled(factors), notes
+
+
+def _tail(median: float, count: int) -> float:
+    """Probability that the median of so many magnitudes of standard normal numbers is as large."""
+    beyond, least = math.erfc(median / math.sqrt(2)), (count + 1) // 2
+    return sum(math.comb(count, k) * beyond**k * (1 - beyond) ** (count - k) for k in range(least, count + 1))
