@@ -29,7 +29,7 @@ def test_a_mechanism_needs_each_of_its_tests():
         "share": {"share": 0.49},
         "gain": {"gain": 0.2},
         "again": {"again": 0.79},
-        "many": {"families": tuple("abcd")},
+        "many": {"families": tuple(f"loss torque that changes with {x}" for x in "abcd")},
     }
     assert {name: dataclasses.replace(stands, **change).fails for name, change in worse.items()} == {
         name: (name,) for name in worse
@@ -130,7 +130,7 @@ def test_of_mechanisms_that_cannot_be_told_apart_one_that_predicts_is_stated(fou
     """A curve has more to fit with, and may predict nothing."""
     where = dataclasses.replace(SPEED, place="electrical", alike=("electrical",), variables_alike=("current",))
     gains = iter([-1.0, -1.0, 1.0])
-    monkeypatch.setattr(HeldOutScore, "gain", lambda *_: Gain(next(gains), 0.1))
+    monkeypatch.setattr(room, "_gain", lambda *_: Gain(next(gains), 0.1))
     got = found(fitted("leads", explains=1500.0), curve=1900.0, where=where)
     assert got.families == (where.family, FAMILIES["leads"]) and got.effects == () and got.gain == 1.0
     # that other curves are as improbable does not count against an effect
@@ -150,3 +150,34 @@ def test_readings_that_it_changes_are_those_it_moves_by_half_of_the_most_moved_c
     after = np.stack([np.where(np.arange(ROWS) < 20, 1.0, 0.2), np.full(ROWS, 5.0)], 1)
     changed = room._changed(space, np.zeros(ROWS), before, after)
     assert changed[:, 0].tolist() == [True] * 20 + [False] * 10 and not changed[:, 1].any()
+
+
+def test_the_error_of_a_gain_is_the_mean_of_its_kinds():
+    """Kinds leave out the same readings: two of them are no more sure than one."""
+    rows = np.repeat(np.arange(6), 2)
+    gains = np.random.default_rng(0).normal(1.0, 1.0, (12, 1))
+    blocks = {"slope": rows, "voltage": np.tile(np.arange(3), 4)}
+    after = HeldOutScore({k: gains for k in blocks}, blocks)
+    before = HeldOutScore({k: np.zeros((12, 1)) for k in blocks}, blocks)
+    changed = np.ones((12, 1), bool)
+    gain = room._gain(after, before, changed)
+    assert gain.mean == pytest.approx(gains.mean())
+    assert gain.se == pytest.approx(np.mean(list(gain.errors.values()))) and set(gain.errors) == set(blocks)
+    assert room._gain(HeldOutScore({}, {}), HeldOutScore({}, {}), changed).se == np.inf
+
+
+def test_equations_that_act_alike_are_listed(found):
+    """A drag of the payload on the ground loads the motors as one on the tracks does."""
+    where = dataclasses.replace(SPEED, alike=("track", "gearbox", "motor", "ground"))
+    got = found(fitted("stribeck", explains=1800.0), curve=1000.0, where=where)
+    assert got.families == (FAMILIES["stribeck"], "resistance to travel that changes with speed")
+    assert got.drivers == ("changes with speed",) and "many" not in got.fails
+
+
+def test_a_curve_is_asked_within_the_range_that_its_fit_has_seen():
+    speed = np.array([1.0, 2.0, 3.0, 4.0, 2.5, 5.0])
+    linear = SimpleNamespace(in_travel=lambda place, variable: (speed, 1.0))
+    beside = SimpleNamespace(where=SPEED, left=SimpleNamespace(linear=linear))
+    space = SimpleNamespace(included=np.ones(6, bool))
+    masks = [np.isin(np.arange(6), rows) for rows in ((0, 4), (1, 2), (3, 5))]
+    np.testing.assert_array_equal(room._seen(space, beside, masks), [False, True, True, False, True, False])

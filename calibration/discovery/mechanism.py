@@ -18,7 +18,7 @@ from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.discrepancy import CurveBeside
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.notes import HALF, Mechanism
+from calibration.discovery.notes import AGAIN, HALF, Mechanism
 from calibration.discovery.prediction import Gain, HeldOutScore, Predicted
 from calibration.discovery.score_tests import family_columns
 from calibration.discovery.settings import Settings
@@ -82,6 +82,8 @@ def mechanism(
             pair, gain = max(gains.items(), key=lambda one: one[1].mean / max(one[1].se, 1e-12))
             effects = tuple(n for n in pair.having.effects if space.library[n].family() == leader)
             again = chosen_again(space, base, best[leader], left, families, bases, blocks, settings)
+            if again < AGAIN:  # several effects together may be found by their sum alone
+                again = max(again, _curve_again(space, left, bases, families, blocks, settings))
         else:
             gain, effects = _gain_of_curve(space, runs, base, beside, predicted), ()
             again = _curve_again(space, left, bases, families, blocks, settings)
@@ -173,7 +175,25 @@ def _gain_of(space: CandidateSpace, runs: Runs, pair: Pair, predicted: Predicted
     """By how much a fit predicts better with the effects of a mechanism, over the readings that these change."""
     seen, before = (_held_out(space, runs, c, predicted) for c in (pair.having, pair.without))
     changed = _changed(space, runs, _reading(space, pair.without), _reading(space, pair.having))
-    return seen.gain(before, changed, BLOCKS)
+    return _gain(seen, before, changed)
+
+
+def _gain(score: HeldOutScore, over: HeldOutScore, changed: np.ndarray) -> Gain:
+    """How much better a score is, over the readings that a mechanism changes.
+
+    Each kind of block leaves out the same readings, so errors of kinds do not average out: the standard error is the
+    mean of theirs, weighted by readings.
+    """
+    kinds = score.by_kind
+    if not kinds:
+        return Gain(0.0, np.inf)
+    by_kind = {k: score.only(k).gain(over.only(k), changed, BLOCKS) for k in kinds}
+    weight = {k: float(np.sum(changed & np.isfinite(kinds[k] - over.by_kind[k]))) for k in kinds}
+    whole = sum(weight.values())
+    if not whole:
+        return Gain(0.0, np.inf)
+    mean, se = (sum(weight[k] / whole * getattr(by_kind[k], x) for k in kinds if weight[k]) for x in ("mean", "se"))
+    return Gain(mean, se, {k: gain.se for k, gain in by_kind.items()})
 
 
 def _gain_of_curve(
@@ -188,7 +208,7 @@ def _gain_of_curve(
     seen = {kind: _seen(space, beside, list(by.values())) for kind, by in kinds.items()}
     inside = {kind: np.where(seen[kind][:, None], x, np.nan) for kind, x in score.by_kind.items()}
     score = dataclasses.replace(score, by_kind=inside)
-    return score.gain(_held_out(space, runs, base, predicted), changed, BLOCKS)
+    return _gain(score, _held_out(space, runs, base, predicted), changed)
 
 
 def _seen(space: CandidateSpace, beside: CurveBeside, masks: Sequence[np.ndarray]) -> np.ndarray:

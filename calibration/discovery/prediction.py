@@ -42,6 +42,10 @@ class HeldOutScore:
     blocks: dict[str, np.ndarray]
     reading: dict[str, Readings] = dataclasses.field(default_factory=dict)
 
+    def only(self, kind: str) -> HeldOutScore:
+        """Scores of one kind of block alone."""
+        return HeldOutScore({kind: self.by_kind[kind]}, {kind: self.blocks[kind]})
+
     def gain(
         self, over: HeldOutScore, where: Bool[np.ndarray, "rows channels"] | None = None, fewest: int = 2
     ) -> Gain:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -36,12 +37,12 @@ def enlarged(noise: Noise, runs: Runs) -> tuple[Noise, list[Note]]:
     """
     if runs.sampled or runs.has("time_s"):
         return noise, []
-    pairs = [pair for rows in same_conditions(runs) for pair in zip(rows[:-1], rows[1:], strict=True)]
+    pairs = [pair for rows in same_conditions(runs) for pair in itertools.pairwise(rows)]
     if len(pairs) < FEWEST:
         return noise, []
     first, second = np.array(pairs).T
     apart = np.abs(runs.measured()[first] - runs.measured()[second]) / np.hypot(noise.sd[first], noise.sd[second])
-    factors, notes = {}, []
+    factors, notes = dict[str, float](), list[Note]()
     for k, channel in enumerate(noise.channels):
         told = apart[np.isfinite(apart[:, k]), k]
         if len(told) < FEWEST or noise.source[k] in ("series", "estimated", "no readings"):

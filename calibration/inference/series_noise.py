@@ -105,8 +105,8 @@ def _of_channel(
     difference = weights @ np.nan_to_num(measured)
     least = float(display_step(measured, channel) / np.sqrt(12))
     forms = []
-    for share in (False, True):
-        scale = weights * (sizes if share else 1.0)
+    for in_share in (False, True):
+        scale = weights * (sizes if in_share else 1.0)
         spread = np.sqrt(np.sum(scale**2, 1))
         unit, scale = difference / spread, scale / spread[:, None]
         sound = _sound(unit)
@@ -117,12 +117,10 @@ def _of_channel(
         freedom = count**2 / float(np.sum(together**2))
         likely = -freedom * float(np.mean(np.log(np.maximum(size * spread[sound], np.finfo(float).tiny))))
         forms.append((likely, size, freedom))
-    (constant, floor, _), (in_share, share, _) = forms
-    odds = float(np.exp(np.clip(constant - in_share, -50, 50)))
-    weights_of_forms = np.array([odds, 1.0]) / (1 + odds)
-    floor, share = np.sqrt(weights_of_forms) * (floor, share) * (weights_of_forms > NEGLIGIBLE)
-    freedom = float(weights_of_forms @ [f for *_, f in forms])
-    return SeriesNoise(channel, float(floor), float(share), freedom, axis, used, least)
+    likely, size, freedom = np.array(forms).T
+    probability = np.exp(likely - likely.max()) / np.exp(likely - likely.max()).sum()
+    floor, share = np.sqrt(probability) * size * (probability > NEGLIGIBLE)
+    return SeriesNoise(channel, float(floor), float(share), float(probability @ freedom), axis, used, least)
 
 
 def _differences(measured: np.ndarray, x: np.ndarray, series: list[np.ndarray]) -> tuple[np.ndarray, int]:

@@ -124,9 +124,9 @@ SAID: dict[type, str | Callable[[Any], str]] = {
     notes.Unmeasured: unmeasured,
     notes.Constant: constant,
     notes.Repeats: repeats,
-    notes.LargerNoise: "{channel}: {pairs} pairs of rows at the same conditions scatter {factor:.2g} times as much as "
-    "the {source} noise says; its sd is taken {factor:.2g} times as large. Check the repeats, or state the noise with "
-    "--noise",
+    notes.LargerNoise: "{channel}: {pairs} pairs of rows at the same conditions scatter {factor:.2g} times as much "
+    "as the {source} noise says; its sd is taken {factor:.2g} times as large. Check the repeats, or state the noise "
+    "with --noise",
     notes.Turned: "{source}, {theirs}: off by {off:.2g} (rms) from what the file's numbers give, with the other sign "
     'by {turned:.2g}; if it is turned round, state [columns] {column} = {{column = "{theirs}", factor = -1}}',
     notes.StiffSupply: "{column} is {value:g} in every row: taken for a stiff supply; if it is no reading, remove "
