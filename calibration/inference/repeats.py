@@ -35,7 +35,7 @@ def enlarged(noise: Noise, runs: Runs) -> tuple[Noise, list[Note]]:
     The median of the differences between neighbouring repeats decides, so that a few wrong readings do not. An
     estimate along series has the repeats in it already.
     """
-    if runs.sampled or runs.has("time_s"):
+    if runs.sampled:
         return noise, []
     pairs = [pair for rows in same_conditions(runs) for pair in itertools.pairwise(rows)]
     if len(pairs) < FEWEST:
