@@ -504,7 +504,7 @@ def test_finer_steps_are_within_the_tables_ranges(rover):
     within = reach(rover, ROVERS_TABLE, channels.USUAL)
     series = experiments.more_runs("slip", "voltage", within)
     assert (series.low, series.high, series.slope, series.payload) == (6.0, 12.0, 8.0, 1.0)
-    assert series.steps == (0.4, 0.6, 0.07)
+    assert series.steps == (0.5, 0.5, 0.1)
     level = experiments.more_runs("slip", "current", reach(rover, grid([12.0], [0.0], [0.0]), channels.USUAL))
     assert (level.low, level.high, level.slope, level.payload) == (6.0, 12.0, 0.0, 0.0)
 

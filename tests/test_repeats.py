@@ -8,6 +8,7 @@ import pytest
 from calibration.data import robot_file
 from calibration.data.runs import Runs
 from calibration.data.table import Layout
+from calibration.discovery import discover
 from calibration.inference import noise, repeats
 from calibration.inference.observers import SettledRuns
 from calibration.inference.preparation import prepare
@@ -69,3 +70,15 @@ def test_every_command_takes_the_larger_noise():
     ready = prepare(runs, robot_file.load("nominal"), "current=0.02A,motor_speed=0.5%")
     assert [type(n).__name__ for n in ready.checked][:1] == ["LargerNoise"]
     assert ready.noise.sd[0, 0] > 0.1
+
+
+@pytest.mark.parametrize(
+    ("levels", "here", "beside"),
+    [
+        ([-0.40216, -0.40214, -0.2, 0.3], -0.40216, (-0.5, -0.3)),  # the same level as measured is no neighbour
+        ([12.0, 18.0, 24.0], 18.0, (15.0, 21.0)),
+        ([3.0, 3.0], 3.0, ()),
+    ],
+)
+def test_runs_beside_a_row_are_at_levels_that_a_person_sets(levels, here, beside):
+    assert discover.levels_beside(np.array(levels), here) == pytest.approx(beside)

@@ -315,7 +315,7 @@ def test_root_is_that_of_what_a_column_explains_beside_others(toy):
         (6.9, 5.8, 11.6, True, None),
         (10.6, 4.3, 14.1, True, 10),  # it keeps less than 1/√3 of its root without that row
         (4.0, 3.1, 0.0, True, 10),  # and is less than chance then
-        (3.2, 3.1, 50.0, False, 10),  # less than chance with all
+        (3.2, 3.1, 50.0, False, None),  # less than chance with all, so no row decides
         (8.0, 7.0, -9.5, False, None),  # a curve in its place is the better explanation
     ],
 )
@@ -332,7 +332,7 @@ def test_name_stands_by_its_score_its_curves_and_its_rows(root, without, evidenc
     # of a library of three effects chance reaches less than in a dozen looks at the amplitude
     assert dataclasses.replace(test, varies=3.4, by_chance=3.5).established == test.established
     of_runs = dataclasses.replace(test, what="run")  # of histories: chance alone
-    assert of_runs.rests_on == (10 if without < 3.3 else None)
+    assert of_runs.rests_on == (10 if without < 3.3 <= root else None)
     renumbered = NameSupport(True, tests=(test,)).numbered(np.arange(1, 21) * 2)
     assert renumbered.rests_on("a") == (None if rests_on is None else 20) and renumbered.rests_on("b") is None
 

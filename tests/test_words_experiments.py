@@ -131,13 +131,13 @@ def test_instructions_are_said():
 
 #: Reach, variable, and what is said of more runs along it.
 MORE = [
-    (ONE, "voltage", "Repeat at one slope and payload with the supply voltage from 6 to 12 V in steps of 0.4 V"),
+    (ONE, "voltage", "Repeat at one slope and payload with the supply voltage from 6 to 12 V in steps of 0.5 V"),
     (
         ONE,
         "slope",
-        "Repeat at one voltage and payload with the slope from 0 to 8 deg in steps of 0.6 deg, and downhill",
+        "Repeat at one voltage and payload with the slope from 0 to 8 deg in steps of 0.5 deg, and downhill",
     ),
-    (ONE, "payload", "Repeat at one voltage and slope with the payload from 0 to 1 kg in steps of 0.07 kg"),
+    (ONE, "payload", "Repeat at one voltage and slope with the payload from 0 to 1 kg in steps of 0.1 kg"),
     (
         ONE,
         "current",
@@ -157,11 +157,19 @@ MORE = [
         "everything is warm; watch the winding's temperature (125 °C is allowed)",
     ),
     (ONE, "air_humidity", "Repeat with air humidity in even small steps from its least to its largest"),
-    (BENCH, "voltage", "Repeat with the supply voltage in 15 even steps up to 12 V"),
-    (BENCH, "speed", "Repeat with the supply voltage in 15 even steps from crawl to 12 V"),
-    (BENCH, "current", "Repeat at 12 V with a brake that is raised in 15 even steps"),
-    (DRIVEN, "speed_motor", "Repeat with the motor speed in 15 even steps up to 2000 rpm"),
-    (DRIVEN, "current", "Repeat at one motor speed with a brake that is raised in 15 even steps"),
+    (BENCH, "voltage", "Repeat with the supply voltage up to 12 V in steps of 1 V"),
+    (BENCH, "speed", "Repeat with the supply voltage from crawl to 12 V in steps of 1 V"),
+    (
+        BENCH,
+        "current",
+        "Repeat at 12 V with a load (a brake on a shaft, a pull on a carriage) that is raised in 15 steps",
+    ),
+    (DRIVEN, "speed_motor", "Repeat with the motor speed up to 2000 rpm in steps of 100 rpm"),
+    (
+        DRIVEN,
+        "current",
+        "Repeat at one motor speed with a load (a brake on a shaft, a pull on a carriage) that is raised in 15 steps",
+    ),
     (
         ONE,
         "order 2 of the driving shaft",
@@ -198,13 +206,13 @@ def test_more_runs_are_said_within_reach(reach, variable, said):
 @pytest.mark.parametrize(
     ("reach", "variable", "said"),
     [
-        (BENCH, "voltage", "Repeat with the duty in 15 even steps up to 0.9 at 12 V"),
-        (BENCH, "speed", "Repeat with the duty in 15 even steps from crawl to 0.9 at 12 V"),
-        (ONE, "voltage", "Repeat at one slope and payload with the duty in 15 even steps up to 0.9 at 12 V"),
+        (BENCH, "voltage", "Repeat with the duty up to 0.9 in steps of 0.05 at 12 V"),
+        (BENCH, "speed", "Repeat with the duty from crawl to 0.9 in steps of 0.05 at 12 V"),
+        (ONE, "voltage", "Repeat at one slope and payload with the duty up to 0.9 in steps of 0.05 at 12 V"),
         (
             ONE,
             "speed_motor",
-            "Repeat on the level, unladen, with the duty in 15 even steps from crawl to 0.9 at 12 V",
+            "Repeat on the level, unladen, with the duty from crawl to 0.9 in steps of 0.05 at 12 V",
         ),
     ],
 )
@@ -219,3 +227,19 @@ def test_every_kind_of_runs_has_words():
     metered = dataclasses.replace(BENCH, measured=("motor_current", "output_torque"))
     acts = {k for r in (REACH, metered) for e in menu.menu(r) if isinstance(e, menu.Act) for k in e.kinds}
     assert acts == {"weigh", *words.ACTS} and set(words.ACTS) == {*words.UNITS, "zero reading"}
+
+
+@pytest.mark.parametrize(
+    ("span", "count", "step"),
+    [(17.178, 15, 1.0), (199.0, 15, 10.0), (12.0, 14, 1.0), (0.9, 15, 0.05), (3e4, 14, 2000.0)],
+)
+def test_steps_are_those_that_a_person_sets(span, count, step):
+    assert menu.step_of_settings(span, count) == pytest.approx(step)
+    last = menu.last_setting(span, step)
+    assert last <= span * (1 + menu.ABOUT) < last + step and last / step == pytest.approx(round(last / step))
+
+
+def test_a_temperature_that_nobody_stated_is_not_watched():
+    stated, unknown = (more_runs("slip", "time", dataclasses.replace(ONE, hot=t)) for t in (125.0, 1e9))
+    assert "(125 °C is allowed)" in words.instruction(stated)
+    assert words.instruction(unknown).count("watch the winding's temperature;") == 1

@@ -8,6 +8,7 @@ from __future__ import annotations
 import concurrent.futures
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -99,6 +100,8 @@ EITHER_WAY = 0.05
 LATE = 4.0
 #: Share of rows set aside beyond which that is said first.
 MANY = 0.03
+#: Share of the range of a series by which levels differ that are not the same one as measured [-].
+LEVEL = 0.02
 #: Error of a refit over that of the robot as stated above which it is said [-].
 WORSE = 1.1
 #: Prior sds beyond which a base parameter is worth a look.
@@ -989,8 +992,24 @@ def _rests_on(found: DiscoveryResult, test: NameTest) -> RestsOn:
     at = {c: str(runs[c][row]) if runs[c].dtype.kind == "U" else float(runs[c][row]) for c in columns}
     for axis in sorted(runs.axes, key=lambda axis: axis != series_noise.FIRST):
         series = next((rows for rows in series_noise.series_of(runs, axis) if row in rows), None)
-        x, here = np.unique(runs[axis][row if series is None else series]), float(runs[axis][row])
-        if len(x) > 1:
-            step = np.diff(x)[max(int(np.searchsorted(x, here)) - 1, 0)]
-            return RestsOn(test, at, axis, (here - step / 2, here + step / 2))
+        x, here = runs[axis][row if series is None else series], float(runs[axis][row])
+        beside = levels_beside(np.asarray(x, float), here)
+        if beside:
+            return RestsOn(test, at, axis, beside)
     return RestsOn(test, at)
+
+
+def levels_beside(x: np.ndarray, here: float) -> tuple[float, ...]:
+    """Levels half a step below and above one of a series, rounded to what a person sets; none where the others do
+    not differ from it by `LEVEL` of their range.
+
+    Args:
+        x: levels of the series; here: that of the row.
+    """
+    apart = np.abs(x - here)
+    others = apart[apart > LEVEL * np.ptp(x)]
+    if not others.size:
+        return ()
+    unit = 10.0 ** math.floor(math.log10(others.min() / 2))
+    step, at = round(others.min() / 2 / unit) * unit, round(here / unit) * unit
+    return tuple(float(f"{v:.6g}") for v in (at - step, at + step))

@@ -246,7 +246,7 @@ def fit_discrepancy(
         problem=problem,
         reading=np.asarray(seen.reading[k]),
         converged=bool(found.converged[k]),
-        proposal=propose(linear, balance, included, at_base),
+        proposal=propose(linear, balance, included, at_base, voltage=space.bare.base.rig.shows_voltage),
     )
 
 

@@ -1,4 +1,4 @@
-"""A formula proposed for a discrepancy: sparse regression over a dictionary of dimensionless monomials."""
+"""A formula proposed for a discrepancy: one term of a dictionary of dimensionless monomials."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ SYMBOL = {"electrical": "ΔU", "track": "ΔM_t", "ground": "ΔF_f", "slip": "ΔV
 FADING = {"time": ("t", " s"), "order": ("k", "")}
 #: Exponents of a factor alone, and in a product of two.
 POWERS, POWERS_PRODUCT = (-1.0, 0.5, 1.0, 2.0, 3.0), (-1.0, 0.5, 1.0, 2.0)
-#: Second terms that are tried beside each first one.
-SECONDS = 40
+#: Share of what the curve explains that a single term has to explain to be proposed [-].
+MOST = 0.9
 #: Signals that settled travel ties to a ratio of the dictionary.
 SAME_AS = {"speed": "speed_motor"}
 #: Least ratio, over its largest, at which an inverse is safe.
@@ -36,12 +36,23 @@ MARK = "a proposal, not a finding"
 
 @dataclasses.dataclass(frozen=True)
 class Ratio:
-    """A signal over a fixed value of its unit: dimensionless. `unit` is that value as text."""
+    """A signal over a value in its unit: dimensionless."""
 
     symbol: str
     unit: str
     of: str
-    over: float
+    over: float = 1.0
+
+    @property
+    def value(self) -> str:
+        """What the signal is divided by, with its unit."""
+        return f"{self.over:g} {self.unit}".rstrip()
+
+    def scaled(self, x: np.ndarray) -> Ratio:
+        """The same over the largest of these ratios, rounded to one digit, so that factors are of the size of what
+        they are of."""
+        most = float(np.max(np.abs(x), initial=0.0)) * self.over
+        return dataclasses.replace(self, over=float(f"{most:.0e}")) if most > 0 else self
 
     def __call__(self, linear: Linearization, place: str) -> np.ndarray:
         x, _ = linear.in_travel(place, self.of)
@@ -49,12 +60,12 @@ class Ratio:
 
 
 RATIOS = (
-    Ratio("ω_m", "700 rad/s", "speed_motor", 700.0),
-    Ratio("I", "2 A", "current", 2.0),
-    Ratio("U", "24 V", "voltage", 24.0),
-    Ratio("sin α", "0.1", "slope", 0.1),
-    Ratio("m_c", "5 kg", "payload", 5.0),
-    Ratio("ω", "1 rad/s", "yaw_rate", 1.0),
+    Ratio("ω_m", "rad/s", "speed_motor"),
+    Ratio("I", "A", "current"),
+    Ratio("U", "V", "voltage"),
+    Ratio("sin α", "", "slope"),
+    Ratio("m_c", "kg", "payload"),
+    Ratio("ω", "rad/s", "yaw_rate"),
 )
 #: Rise of the BIC for each variable but the one that the curve is over: one of so many is looked for.
 FOREIGN = 2 * float(np.log(len(RATIOS)))
@@ -62,9 +73,10 @@ FOREIGN = 2 * float(np.log(len(RATIOS)))
 
 @dataclasses.dataclass(frozen=True)
 class Monomial:
-    """A product of powers of ratios: (index into RATIOS, exponent) of each factor."""
+    """A product of powers of ratios: (index into `ratios`, exponent) of each factor."""
 
     factors: tuple[tuple[int, float], ...]
+    ratios: tuple[Ratio, ...] = RATIOS
 
     @property
     def complexity(self) -> float:
@@ -74,21 +86,21 @@ class Monomial:
     @property
     def variables(self) -> tuple[str, ...]:
         """Signals that it depends on."""
-        return tuple(RATIOS[k].of for k, _ in self.factors)
+        return tuple(self.ratios[k].of for k, _ in self.factors)
 
     def __str__(self) -> str:
-        said = (f"({RATIOS[k].symbol}/{RATIOS[k].unit})" + (f"^{p:g}" if p != 1 else "") for k, p in self.factors)
-        return " ".join(said)
+        over = ((self.ratios[k], p) for k, p in self.factors)
+        return " ".join(f"({r.symbol}/{r.value})" + (f"^{p:g}" if p != 1 else "") for r, p in over)
 
 
-def dictionary(ratios: np.ndarray) -> dict[Monomial, np.ndarray]:
+def dictionary(ratios: np.ndarray, of: tuple[Ratio, ...] = RATIOS) -> dict[Monomial, np.ndarray]:
     """Monomials that can be written down for these ratios, with their values by row.
 
     A root needs ratios that are never negative, an inverse ones that stay off zero; a ratio that does not vary
     is left out, as is all but the first of monomials that are proportional to each other here.
 
     Args:
-        ratios: shape (rows, ratios).
+        ratios: values, shape (rows, ratios); of: what they are of.
     """
     low, high = ratios.min(0), ratios.max(0)
     lively = [k for k in range(ratios.shape[1]) if high[k] - low[k] > 1e-6 * max(abs(high[k]), abs(low[k]), 1e-9)]
@@ -111,17 +123,18 @@ def dictionary(ratios: np.ndarray) -> dict[Monomial, np.ndarray]:
         value = np.prod([ratios[:, k] ** p for k, p in factors], 0)
         norm = np.linalg.norm(value)
         if norm > 0 and not any(abs(value @ d) > (1 - 1e-9) * norm for d in directions):
-            found[Monomial(factors)] = value
+            found[Monomial(factors, of)] = value
             directions.append(value / norm)
     return found
 
 
 @dataclasses.dataclass(frozen=True)
 class Proposal:
-    """A formula for a discrepancy, by sparse regression over a dictionary of dimensionless monomials.
+    """A formula for a discrepancy: one term of a dictionary of dimensionless monomials.
 
     Attributes:
-        formula: e.g. `ΔU = 0.42 V (I/2 A)^2 (U/24 V)`, "" where no term shows; mark: that it is a proposal.
+        formula: e.g. `ΔU = 0.42 V (I/2 A)^2`, "" where no single term shows `MOST` of the curve; mark: that it is a
+            proposal.
         terms: its monomials; coefficients, sds: of each [unit of the balance].
         variables: signals that it depends on, without repeats.
         explained: fall of χ² at the base fit.
@@ -140,14 +153,17 @@ class Proposal:
     mark: str = MARK
 
 
-def propose(linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth) -> Proposal:
-    """The formula of at most two terms with the least BIC; a simpler one where that costs no evidence.
+def propose(
+    linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth, *, voltage: bool = True
+) -> Proposal:
+    """The term with the least BIC that explains `MOST` of the curve; a simpler one where that costs no evidence. None
+    is proposed where no single term does: the curve is then described by its values.
 
-    Forward selection from every first term, with the seconds that help it most, so that a pair is not lost
-    because neither of it is the best alone. A variable other than the curve's has to earn its place.
+    A variable other than the curve's has to earn its place.
 
     Args:
         counts: whether a row counts, shape (rows,); curve: what the formula is weighed against.
+        voltage: True for a rig on which a voltage is set or read.
     """
     if curve.wave:
         return _harmonic(balance, curve)
@@ -156,8 +172,10 @@ def propose(linear: Linearization, balance: str, counts: np.ndarray, curve: Smoo
     if curve.variable in FADING:
         return _decay(linear, balance, counts, curve)
     counts = linear.at_points(counts)
-    ratios = np.stack([r(linear, balance) for r in RATIOS], 1)
-    known = dictionary(ratios[counts])
+    known_of = [r for r in RATIOS if voltage or r.of != "voltage"]
+    scaled = tuple(r.scaled(r(linear, balance)[counts]) for r in known_of)
+    ratios = np.stack([r(linear, balance) for r in scaled], 1)
+    known = dictionary(ratios[counts], scaled)
     terms = list(known)
     if not terms:  # all runs alike
         return Proposal("", (), (), (), (), 0.0, 0.0, 0)
@@ -169,44 +187,25 @@ def propose(linear: Linearization, balance: str, counts: np.ndarray, curve: Smoo
     scale = np.sqrt(np.maximum(np.diag(a), 0))
     visible = scale > 1e-3 * np.linalg.norm(signature(linear, balance, shapes), axis=0)
     scale = np.where(visible, scale, 1.0)
-    a, b = a / scale / scale[:, None], np.where(visible, b / scale, 0.0)
+    b = np.where(visible, b / scale, 0.0)
     cost = np.log(3 * counts.sum())
-    one = b**2
-    cosine = np.where(visible[:, None] & visible, a, 0.0)
-    apart = 1 - cosine**2
-    two = np.where(
-        apart > 1e-2, (one[:, None] + one - 2 * cosine * b[:, None] * b) / np.maximum(apart, 1e-2), one[:, None]
-    )
-    ranked: list[tuple[tuple[int, ...], float]] = [((int(k),), cost - one[k]) for k in np.flatnonzero(visible)]
-    for (k,), _ in tuple(ranked):
-        second = [int(j) for j in np.argsort(-two[k])[:SECONDS] if j != k and two[k, j] > one[k]]
-        ranked += [((k, j), 2 * cost - two[k, j]) for j in second]
-    if not ranked:
-        return Proposal("", (), (), (), (), 0.0, 0.0, len(terms))
+    explained = b**2
     located = {SAME_AS.get(curve.variable, curve.variable)}
-    foreign_of = [frozenset(term.variables) - located for term in terms]
-    foreign = [len(frozenset().union(*(foreign_of[k] for k in chosen))) for chosen, _ in ranked]
-    dear = [bic + FOREIGN * n for (_, bic), n in zip(ranked, foreign, strict=True)]
-    near = [c for c, bic in zip(ranked, dear, strict=True) if bic < min(dear) + NO_EVIDENCE]
-    chosen, bic = min(near, key=lambda c: (sum(terms[k].complexity for k in c[0]), c[1]))
-    part = np.ix_(chosen, chosen)
-    inverse = np.linalg.inv(a[part])
-    value = inverse @ b[list(chosen)] / scale[list(chosen)]
-    sd = np.sqrt(np.diag(inverse)) / scale[list(chosen)]
-    unit = PLACES[balance][0]
-    picked = tuple(terms[k] for k in chosen)
-    said = " ".join(
-        f"{'-' if v < 0 else '+' if i else ''}{' ' if i else ''}{abs(v):.2g} {unit} {t}"
-        for i, (v, t) in enumerate(zip(value, picked, strict=True))
-    )
+    foreign = np.array([len(frozenset(term.variables) - located) for term in terms])
+    dear = np.where(visible & (explained >= MOST * curve.explained), FOREIGN * foreign - explained, np.inf)
+    if not np.isfinite(dear).any():
+        return Proposal("", (), (), (), (), 0.0, 0.0, len(terms))
+    near = np.flatnonzero(dear < dear.min() + NO_EVIDENCE)
+    k = min(near.tolist(), key=lambda j: (terms[j].complexity, dear[j]))
+    size, sd = float(b[k] / scale[k]), float(1 / scale[k])
     return Proposal(
-        formula=f"{SYMBOL[balance]} = {said}",
-        terms=picked,
-        coefficients=tuple(map(float, value)),
-        sds=tuple(map(float, sd)),
-        variables=tuple(dict.fromkeys(v for t in picked for v in t.variables)),
-        explained=float(len(chosen) * cost - bic),
-        gain=float(curve.freedom * cost - curve.explained - bic),
+        formula=f"{SYMBOL[balance]} = {size:.2g} {PLACES[balance][0]} {terms[k]}",
+        terms=(terms[k],),
+        coefficients=(size,),
+        sds=(sd,),
+        variables=tuple(dict.fromkeys(terms[k].variables)),
+        explained=float(explained[k]),
+        gain=float((curve.freedom - 1) * cost - curve.explained + explained[k]),
         tried=len(terms),
     )
 

@@ -12,12 +12,17 @@ from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
 from mmrjax.effects.base import EQUATION, THE_SIDE
 
+#: Spread of the supply voltage over that of the duty, each over its largest, below which the duty alone is set [-].
+SAGS = 0.3
+
 
 def varied_by_duty(runs: Runs) -> bool:
-    """True if the motors' voltage varies in a table with the duty alone, at one supply voltage."""
+    """True if the motors' voltage varies in a table by the duty, at about one supply voltage: one that is measured
+    sags a little."""
     if not (runs.has("duty") and runs.has(SUPPLY)):
         return False
-    return len(np.unique(np.abs(runs["duty"]))) > 1 and len(np.unique(np.abs(runs[SUPPLY]))) == 1
+    duty, supply = (float(np.ptp(x) / max(np.max(x), 1e-300)) for x in map(np.abs, (runs["duty"], runs[SUPPLY])))
+    return duty > 0 and supply < SAGS * duty
 
 
 @dataclasses.dataclass(frozen=True)

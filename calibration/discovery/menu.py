@@ -113,6 +113,24 @@ def round_significant(value: float, digits: int = 2) -> float:
     return float(f"{value:.{digits - 1}e}")
 
 
+#: Steps in which people set a quantity, times powers of ten.
+STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
+#: By how much a setting may exceed the largest that the table used, as its readings scatter [-].
+ABOUT = 0.01
+
+
+def step_of_settings(span: float, count: int) -> float:
+    """The step of `STEPS` nearest, in proportion, to that of so many even steps over a span."""
+    step = span / count
+    power = 10.0 ** math.floor(math.log10(step))
+    return round_significant(min((s * power for s in STEPS), key=lambda s: abs(math.log(s / step))))
+
+
+def last_setting(most: float, step: float) -> float:
+    """The largest multiple of a step that does not exceed about a number."""
+    return float(f"{step * math.floor(most * (1 + ABOUT) / step + 1e-9):.6g}")
+
+
 def floor_significant(value: float) -> float:
     """The largest number of two digits that does not exceed a positive one."""
     step = 10.0 ** (math.floor(math.log10(value)) - 1)

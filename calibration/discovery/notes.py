@@ -83,7 +83,9 @@ class NameTest:
 
     @property
     def rests_on(self) -> int | None:
-        """Number of the row without which it would not stand; None where it needs none."""
+        """Number of the row without which it would not stand; None where it needs none, or does not stand with it."""
+        if self.root < self.needed:
+            return None
         return self.row if self.root_without < max(self.needed, KEPT[self.what] * self.root) else None
 
     @property

@@ -132,7 +132,7 @@ def watch(about: Watch) -> str:
         return f"the supply: {about.voltage:g} V is more than the table's {about.used:g} V"
     settles = math.isfinite(about.temperature)
     would = f"would reach {about.temperature:.0f} °C" if settles else "would burn: no temperature settles"
-    allowed = "" if about.allowed is None else f" ({about.allowed:.0f} °C is allowed)"
+    allowed = "" if about.allowed is None else _allowed(about.allowed)
     heats = f"a winding left on {would}{allowed}"
     return {
         "held": f"current × time: {about.current:.2g} A in a motor that does not turn, and so is not cooled; {heats}"
@@ -140,6 +140,11 @@ def watch(about: Watch) -> str:
         "braked": f"the brake and the winding's temperature: {heats}; seconds are enough for a reading",
         "run": f"the winding's temperature: {heats}; keep the runs short",
     }[about.how]
+
+
+def _allowed(temperature: float) -> str:
+    """What a winding may reach, where somebody has stated it."""
+    return f" ({temperature:.0f} °C is allowed)" if temperature < menu.UNLIMITED else ""
 
 
 # --- what is proposed -----------------------------------------------------------------------------------
@@ -200,11 +205,17 @@ def _again(happens: bases.Window) -> str:
 
 def _steps(what: MoreRuns, first: str = "") -> str:
     """`the supply voltage in 15 even steps up to 8 V`: what drives the motors, as the table varied it."""
-    begun = f" from {first}" if first else ""
+    top = menu.round_significant(what.top)
     if what.by_duty:
-        most = max(what.within.duties)
-        return f"the duty in {what.runs} even steps{begun} {'to' if first else 'up to'} {most:g} at {what.top:g} V"
-    return f"the supply voltage in {what.runs} even steps{begun} {'to' if first else 'up to'} {what.top:g} V"
+        return f"the duty{_up_to(max(what.within.duties), what.runs, first=first)} at {top:g} V"
+    return f"the supply voltage{_up_to(what.top, what.runs, 'V', first)}"
+
+
+def _up_to(most: float, runs: int, unit: str = "", first: str = "") -> str:
+    """` from crawl to 12 V in steps of 1 V`: levels that a person can set."""
+    step = menu.step_of_settings(most, runs)
+    last, by = (f"{x:g} {unit}".rstrip() for x in (menu.last_setting(most, step), step))
+    return f" from {first} to {last} in steps of {by}" if first else f" up to {last} in steps of {by}"
 
 
 def _usual(what: MoreRuns) -> dict[str, str]:
@@ -231,7 +242,7 @@ def _usual(what: MoreRuns) -> dict[str, str]:
         "speed": "Repeat on the level, unladen, with the travelling speed in even steps from crawl to its largest, "
         f"some {within.speed:.2g} m/s at {high:g} V",
         "time": f"Record one condition from a cold start for ten minutes, at {low:g} V rather than more, and again "
-        f"at once while everything is warm; watch the winding's temperature ({within.hot:g} °C is allowed)",
+        f"at once while everything is warm; watch the winding's temperature{_allowed(within.hot)}",
         "order": "Repeat the table in another order, rows that were first last, and one condition again after every "
         "fifth run",
     }
@@ -243,8 +254,8 @@ def _of_level(what: MoreRuns) -> dict[str, str]:
     level = "Repeat on the level, unladen," if within.has_ground else "Repeat"
     of_speed = within.imposed == "motor_speed"
     most = max(within.levels, default=within.motor_speed if of_speed else within.current)
-    one, top = ("motor speed", f"{most / RPM:.0f} rpm") if of_speed else ("motor current", f"{most:.3g} A")
-    turning = f"with the {one} in {what.runs} even steps up to {top}"
+    one, levels = ("motor speed", (most / RPM, "rpm")) if of_speed else ("motor current", (most, "A"))
+    turning = f"with the {one}{_up_to(levels[0], what.runs, levels[1])}"
     words = {
         "speed_motor": f"{level} {turning}",
         "speed": f"{level} {turning}, and so the travelling speed",
@@ -253,16 +264,20 @@ def _of_level(what: MoreRuns) -> dict[str, str]:
         "time": f"Record one {one} from a cold start for ten minutes, and again at once while all is warm",
     }
     if not within.has_ground:
-        words["current"] = f"{level} at one {one} with a brake that is raised in {what.runs} even steps"
+        words["current"] = f"{level} at one {one} with {_LOAD} that is raised in {what.runs} steps"
     return words
+
+
+#: What loads a shaft, and a carriage.
+_LOAD = "a load (a brake on a shaft, a pull on a carriage)"
 
 
 def _of_shaft(what: MoreRuns) -> dict[str, str]:
     """By variable, where the load is a shaft."""
-    crawl = f"Repeat with {_steps(what, 'crawl')}"
+    crawl, top = f"Repeat with {_steps(what, 'crawl')}", menu.round_significant(what.top)
     return {
         "voltage": f"Repeat with {_steps(what)}",
         "speed_motor": crawl,
         "speed": crawl,
-        "current": f"Repeat at {what.top:g} V with a brake that is raised in {what.runs} even steps",
+        "current": f"Repeat at {top:g} V with {_LOAD} that is raised in {what.runs} steps",
     }

@@ -33,6 +33,15 @@ if TYPE_CHECKING:
     )
     from calibration.inference.series_noise import SeriesNoise
 
+#: χ² from which on its digits are not printed [σ²].
+LARGE = 1e5
+
+
+def misfit(chi2: float) -> str:
+    """A χ² or a difference of two: `8088`, and `1e+08` where digits would say nothing."""
+    return f"{chi2:.0f}" if abs(chi2) < LARGE else f"{chi2:.0e}"
+
+
 # --- the verdict ----------------------------------------------------------------------------------------
 
 
@@ -475,7 +484,7 @@ def ruled_out(found: DiscoveryResult) -> str:
     first = min(candidates, key=lambda a: (len(a.effects), a.rise_chi2))
     what = "the curve" if found.verdict in WITHOUT_NAME else "what is proposed"
     more = first.rise_chi2 < -found.settings.same
-    gain = f"{-first.rise_chi2:.0f} σ² more than {what}" if more else f"as much as {what}"
+    gain = f"{misfit(-first.rise_chi2)} σ² more than {what}" if more else f"as much as {what}"
     are = "are" if len(first.effects) > 1 else "is"
     return (
         f"{' and '.join(first.effects)} would explain {gain}, but {are} ruled out by size or sign alone: {first.why}."

@@ -185,7 +185,7 @@ def print_discovery(found: DiscoveryResult) -> None:
         for e in found.effects:
             shown.add_row(
                 said_of.called(found, e), ", or ".join(e.families), said_of.size(e),
-                f"{e.score:.0f} ({100 * e.share:.0f} %)", f"{e.p_value:.2g}", said_of.alike(found, e) or "-",
+                f"{said_of.misfit(e.score)} ({100 * e.share:.0f} %)", f"{e.p_value:.2g}", said_of.alike(found, e) or "-",
             )  # fmt: skip
         say(shown)
         say(
