@@ -93,14 +93,14 @@ class Monomial:
         return " ".join(f"({r.symbol}/{r.value})" + (f"^{p:g}" if p != 1 else "") for r, p in over)
 
 
-def dictionary(ratios: np.ndarray, of: tuple[Ratio, ...] = RATIOS) -> dict[Monomial, np.ndarray]:
+def dictionary(ratios: np.ndarray, kinds: tuple[Ratio, ...] = RATIOS) -> dict[Monomial, np.ndarray]:
     """Monomials that can be written down for these ratios, with their values by row.
 
     A root needs ratios that are never negative, an inverse ones that stay off zero; a ratio that does not vary
     is left out, as is all but the first of monomials that are proportional to each other here.
 
     Args:
-        ratios: values, shape (rows, ratios); of: what they are of.
+        ratios: values, shape (rows, ratios); kinds: signal and scale of each.
     """
     low, high = ratios.min(0), ratios.max(0)
     lively = [k for k in range(ratios.shape[1]) if high[k] - low[k] > 1e-6 * max(abs(high[k]), abs(low[k]), 1e-9)]
@@ -123,7 +123,7 @@ def dictionary(ratios: np.ndarray, of: tuple[Ratio, ...] = RATIOS) -> dict[Monom
         value = np.prod([ratios[:, k] ** p for k, p in factors], 0)
         norm = np.linalg.norm(value)
         if norm > 0 and not any(abs(value @ d) > (1 - 1e-9) * norm for d in directions):
-            found[Monomial(factors, of)] = value
+            found[Monomial(factors, kinds)] = value
             directions.append(value / norm)
     return found
 

@@ -766,6 +766,7 @@ def _unnamed(d: UnnamedDiscrepancy) -> dict[str, Any]:
         "effect": d.effect,
         "score_free_in_each_run": d.score_free_in_each_run,
         "curve": curve,
+        "course": words.course(d),
         "proposal": d.proposal.to_json(),
     }
 

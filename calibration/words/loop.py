@@ -161,6 +161,14 @@ def course(d: UnnamedDiscrepancy) -> str:
     return f"{verb} from {ends[0]} to {ends[1]}{between * bent}"
 
 
+def proposed_formula(d: UnnamedDiscrepancy) -> str:
+    """The formula of a curve, or its course where no single term explains it."""
+    if d.proposal.expression:
+        return f"{d.proposal.formula} ({d.proposal.mark})"
+    what = course(d)
+    return f"The curve {what}; {NO_FORMULA}" if what else NO_FORMULA
+
+
 #: Units in which people set the variables of a curve, and their SI values.
 _SET_IN = {"speed_motor": ("rpm", math.pi / 30), "slope": ("°", math.pi / 180), "speed": ("mm/s", 1e-3)}
 
@@ -370,7 +378,7 @@ def refit_header(found: DiscoveryResult, robot_name: str) -> str:
 
 
 #: In the place of a formula.
-NO_FORMULA = "none: no term shows in these data"
+NO_FORMULA = "no single term explains 90 % of it"
 
 # --- whether names stand --------------------------------------------------------------------------------
 

@@ -185,7 +185,8 @@ def print_discovery(found: DiscoveryResult) -> None:
         for e in found.effects:
             shown.add_row(
                 said_of.called(found, e), ", or ".join(e.families), said_of.size(e),
-                f"{said_of.misfit(e.score)} ({100 * e.share:.0f} %)", f"{e.p_value:.2g}", said_of.alike(found, e) or "-",
+                f"{said_of.misfit(e.score)} ({100 * e.share:.0f} %)", f"{e.p_value:.2g}",
+                said_of.alike(found, e) or "-",
             )  # fmt: skip
         say(shown)
         say(
@@ -195,7 +196,7 @@ def print_discovery(found: DiscoveryResult) -> None:
     if found.hidden:
         say(said_of.hidden(found))
     if found.unnamed is not None:
-        say(f"{found.unnamed.proposal.formula} ({found.unnamed.proposal.mark})")
+        say(said_of.proposed_formula(found.unnamed))
     if found.resolved is not None:
         say(found.resolved.statement)
         for note in found.resolved.notes:
