@@ -104,6 +104,7 @@ def summary(lines: list[dict]) -> list[str]:
     """The figures of a campaign."""
     f = scores.Figures(lines)
     scores.findings(f)
+    scores.mechanisms(f)
     clean, library, outside = f.of("clean"), f.of("library"), f.of("outside")
     f.say("clean: a false finding (goal <= 5 %)", clean, scores.false_finding)
     f.say("  with a name", clean, lambda x: x["classes"])

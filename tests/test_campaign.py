@@ -33,6 +33,37 @@ def test_all_classes_of_several_truths_are_wanted_once_each():
     assert not scores.everything(line(classes=[["a"], ["b"], ["c"], ["d"]], truth=truth))
 
 
+SPEED, TRAVEL = "loss torque that changes with speed", "resistance to travel that changes with speed"
+
+
+@pytest.mark.parametrize(
+    ("found", "right", "wrong"),
+    [
+        (line("mechanism", mechanism={"families": [SPEED]}), True, False),
+        (line("mechanism", mechanism={"families": [TRAVEL, SPEED]}), True, False),
+        (line("mechanism", mechanism={"families": [TRAVEL]}), False, True),
+        (line("mechanism", mechanism={"families": ["loss torque that changes with load"]}), False, True),
+        (line("class", classes=[["churning", "windage"]]), True, False),
+        (line("class", classes=[["churning"], ["supply_sag"]]), False, True),
+        (line("place"), False, False),
+    ],
+)
+def test_a_mechanism_is_right_where_its_equation_and_its_driver_are(found, right, wrong):
+    for truth in ({"class": "stribeck_track"}, {"class": "", "name": "friction_step", "balance": "track"}):
+        said = found | {"truth": [truth]}
+        assert (scores.mechanism_right(said), scores.mechanism_wrong(said)) == (right, wrong)
+    assert scores.mechanism_wrong(found | {"truth": []}) == bool(scores.established_families(found))
+
+
+def test_what_acts_alike_counts_apart():
+    truth = {"class": "", "name": "guide_binding", "balance": "track"}
+    assert not scores.same_mechanism("resistance to travel that changes with slope", truth)
+    assert scores.same_mechanism("resistance to travel that changes with slope", truth, loosely=True)
+    assert not scores.same_mechanism("slip that changes with slope", truth, loosely=True)
+    every = {**laws.OUTSIDE, **laws.OUTSIDE_RIGS, **foreign.FOREIGN}
+    assert set(every) <= set(scores.DRIVERS)
+
+
 def test_a_drift_is_placed_over_the_order_in_its_equation():
     truth = [{"balance": "track", "where": {"variable": "order"}}]
     assert scores.in_place(line("unnamed", where=["gearbox", "order", []], truth=truth))

@@ -438,6 +438,24 @@ def test_blocks_of_an_imposed_speed_are_its_levels(tmp_path):
     assert blocks.blocks(runs, "voltage") == {} == blocks.blocks(runs, "slope")
 
 
+def test_blocks_of_a_duty_hold_data_out_where_it_alone_varies(tmp_path):
+    robot = bench("voltage", ("output_speed",))
+    rows = "".join(f"12,{d},{50 * d}\n" for d in (0.3, 0.3, 0.6, 0.6, 0.9, 0.9))
+    runs = read(tmp_path, f"supply_voltage_V,duty,output_speed_rad_s\n{rows}", robot)
+    assert [m.tolist().count(True) for m in blocks.blocks(runs, "duty").values()] == [2, 2, 2]
+    assert "duty" in blocks.distinct(runs, observers.kind(runs).blocks)
+
+
+def test_curves_are_over_the_fitted_motor_speed_where_only_the_output_is_read(tmp_path):
+    robot = bench("voltage", ("output_speed",))
+    rows = "".join(f"{u},{2 * u}\n" for u in range(4, 12))
+    runs = read(tmp_path, f"supply_voltage_V,output_speed_rad_s\n{rows}", robot)
+    observe = observers.kind(runs).of(runs, robot)
+    found = observe.bases(dict(runs.columns), np.ones(len(runs), bool), robot)
+    variables = {variable for _, variable in bases.names(found)}
+    assert {"speed_motor", "current", "voltage"} <= variables
+
+
 def test_what_is_said_of_constant_conditions_is_of_the_rig(tmp_path):
     robot = bench()
     runs = read(tmp_path, f"{BENCH}900,0.4\n900,0.41\n900,0.4\n900,0.41\n", robot)
