@@ -71,6 +71,16 @@ def test_settled_rigs_with_a_brake_are_those_of_another_implementation():
         ).any()  # a brake without effect would be seen
 
 
+def test_a_torque_that_changes_from_step_to_step_is_followed():
+    """A run from rest, which the torque begins to turn back before the current has risen."""
+    times = grid(np.linspace(0, 0.6, 13))
+    run = jax.jit(lambda x: histories(bench(), Conditions(voltage=24.0, load_torque=x), jnp.asarray(times)))
+    changes = run(0.3 + 0.2 * np.sin(8 * times)).speed_motor
+    end = float(run(np.full(len(times), 0.3)).speed_motor[-1])
+    assert np.isfinite(changes).all() and abs(float(changes[-1]) - end) > 1.0
+    assert 0.05 * end + 3.0 * current_of(end, 0.3) == pytest.approx(24.0, rel=1e-3)  # back-EMF and what torque takes
+
+
 def _steady(torque):
     return steady_batch(bench(), Conditions(voltage=VOLTS, load_torque=torque))
 
