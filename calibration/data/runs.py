@@ -37,6 +37,7 @@ from calibration.data.table import Runs
 from mmrjax import channels
 from mmrjax.channels import MM, RPM, Channel
 from mmrjax.errors import counted
+from mmrjax.robot import NO_BRAKE
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
@@ -141,7 +142,7 @@ def _read(
                 _refuse_stated(name, cells)
                 continue
             if meaning.column in layout.idle:
-                _refuse_ground(name, meaning, cells)
+                _refuse_idle(name, meaning, cells, layout)
                 continue
             values = []
             for k, cell in enumerate(cells, 1):
@@ -310,13 +311,16 @@ def _fill(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) 
         columns.setdefault(column, np.full(rows, value))
 
 
-def _refuse_ground(name: str, meaning: Meaning, cells: list[str]) -> None:
+def _refuse_idle(name: str, meaning: Meaning, cells: list[str], layout: Layout) -> None:
+    why = (
+        f"{NO_BRAKE}; state slope_deg or payload_kg, or describe the load as a shaft"
+        if layout.has_ground
+        else "the robot's load is a shaft, on which no slope, payload or mass acts; remove the column, or describe "
+        "the load as a vehicle"
+    )
     for row, cell in enumerate(cells, 1):
         if cell.strip("0.-") != "":
-            raise BadData(
-                f"{name} row {row}, {meaning.shown}: got {cell}; the robot's load is a shaft, on which no slope, "
-                "payload or mass acts; remove the column, or describe the load as a vehicle"
-            )
+            raise BadData(f"{name} row {row}, {meaning.shown}: got {cell}; {why}")
 
 
 def _refuse_stated(name: str, voltages: list[str]) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.data import sides, surfaces
-from calibration.data.columns import CIRCUITS, DRIVEN, DUTY, HEADING, IMPOSED, LEVERS, SUPPLY, TIME, Layout
+from calibration.data.columns import CIRCUITS, DRIVEN, DUTY, HEADING, IMPOSED, LEVERS, LOAD, SUPPLY, TIME, Layout
 from calibration.data.errors import BadData, choices
 from mmrjax import channels
 from mmrjax.channels import Channel
@@ -102,7 +102,8 @@ class Runs:
     def axes(self) -> tuple[str, ...]:
         """Columns of the conditions that its runs have, what is imposed first."""
         duty = () if self.sampled else DUTY
-        return tuple(c for c in (*self.layout.axes, *duty, *self.layout.sides, *HEADING, *LEVERS) if self.has(c))
+        further = (*duty, *self.layout.sides, *HEADING, *LEVERS, LOAD)
+        return tuple(c for c in (*self.layout.axes, *further) if self.has(c))
 
     @property
     def pulled(self) -> bool:
@@ -243,6 +244,7 @@ class Runs:
             adhesion_lateral=lateral if apart else None,
             **apart,
             **{name: self[name] for name in LEVERS if self.has(name)},
+            load_torque=self[LOAD] if self.has(LOAD) else None,
             total_mass=self["total_mass_kg"] if self.has("total_mass_kg") else None,
             order=self["order"] if self.has("order") else 0.0,
             duty=np.where(held, 0.0, self["duty"] if self.has("duty") else 1.0),

@@ -109,7 +109,7 @@ class SettledRuns(Observer):
     fewest: ClassVar[int] = 6
     sizes_padded: ClassVar[tuple[int, ...]] = (16, 24, 32, 48, 64, 96, 128, 192, 256)
     blocks: ClassVar[tuple[str, ...]] = (
-        "slope", "voltage_configuration", "voltage", "speed", "current", "payload", "configuration",
+        "slope", "voltage_configuration", "voltage", "speed", "current", "payload", "load_torque", "configuration",
     )  # fmt: skip
     policy: ClassVar[SearchPolicy] = SearchPolicy()
     rows_tell: ClassVar[bool] = True
