@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import difflib
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
 from calibration.data import units
@@ -64,6 +65,9 @@ REQUIRED, OWN = ("configuration", *CONDITIONS), ("total_mass_kg",)
 DEFAULTS = {"slope_deg": 0.0, "payload_kg": 0.0, SUPPLY: 0.0}
 #: Conditions that act on a vehicle alone, and on a load on a shaft alone.
 ON_GROUND, ON_SHAFT = ("total_mass_kg", "payload_kg", "slope_deg"), (LOAD,)
+
+#: How alike the names of two columns are at least for one to be meant by the other.
+ALIKE = 0.6
 
 _OF_CONDITIONS = {
     SUPPLY: Quantity("supply_voltage", units.VOLTAGE, CONDITIONS[SUPPLY]),
@@ -301,6 +305,24 @@ class Layout:
     def spellings(self) -> tuple[str, ...]:
         """Every name that a column of a file may have and that means something, in any unit."""
         return (*self._by_name(), *(column for _, column, _ in self.mapped))
+
+    def nearest(self, name: str, stated: Collection[str]) -> str:
+        """The column, in the unit of `name`, that a column without a role is most like: by its name, else as the only
+        condition in its unit; empty where it is like none.
+
+        Args:
+            stated: columns that the table has, which are left out.
+        """
+        none = {*stated, *self.idle, *self.deviation_columns}
+        lacking = {column: quantity for column, quantity in self.quantities().items() if column not in none}
+        spelled = {s: (column, unit) for column, q in lacking.items() for s, unit in q.columns().items()}
+        unit = units.at_the_end(name, {unit for _, unit in spelled.values()})
+        pool = [s for s, (column, own) in spelled.items() if own == unit or (unit is None and s == column)]
+        close = difflib.get_close_matches(name.casefold(), [s.casefold() for s in pool], 1, ALIKE)
+        if close:
+            return next(s for s in pool if s.casefold() == close[0])
+        alone = [s for s in pool if unit and spelled[s][0] not in self.measured_columns]
+        return alone[0] if len(alone) == 1 else ""
 
     def expected(self, column: str) -> str:
         """The column, and where the robot's file says that it is read from."""

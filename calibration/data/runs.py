@@ -21,6 +21,7 @@ from calibration.data.columns import (
     DRIVEN,
     DUTY,
     HEADING,
+    LOAD,
     SIDES,
     SPEED,
     SPEEDS,
@@ -33,7 +34,7 @@ from calibration.data.columns import (
     Meaning,
 )
 from calibration.data.errors import BadConfiguration, BadData, InputError, choices, number, parsed
-from calibration.data.table import Runs
+from calibration.data.table import Runs, driven_on
 from mmrjax import channels
 from mmrjax.channels import MM, RPM, Channel
 from mmrjax.errors import counted
@@ -184,6 +185,7 @@ def _read(
         "show magnitude alone, and magnitudes are compared"
         for i in unsigned
     )
+    notes += tuple(_drives(name, columns, layout))
     headings = {m.column: m.shown for m in meanings if m is not None}
     return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest(), extras, layout, notes, headings)
 
@@ -272,6 +274,17 @@ def _lacks(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterato
             )
 
 
+def _drives(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
+    """A sentence on settled rows in which a load torque without a sign drives a shaft that runs backward."""
+    on = np.flatnonzero(driven_on(columns, layout))
+    if on.size and not set(TIME) & set(columns) and columns[LOAD].min() >= 0:
+        more = f", and so in {on.size} rows" if on.size > 1 else ""
+        yield (
+            f"{name} row {on[0] + 1}, {LOAD}: got {number(columns[LOAD][on[0]])} where the shaft is driven "
+            f"backward{more}: it turns the shaft on there; a brake's torque is negative backward"
+        )
+
+
 def _with_channels(name: str, header: list[str], layout: Layout, more: Sequence[Channel]) -> Layout:
     """`layout` with those of some more channels of which a file has a column."""
     meanings = dataclasses.replace(layout, channels=channels.EVERY).meanings(name, header)
@@ -352,8 +365,8 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
             continue
         # Gravity may drive a motor: only up the slope, or on the flat, its current has the sign of its voltage.
         backward = (imposed < 0) & ((columns["slope_deg"] <= 0) | channel.zero_at_rest)
-        if not channel.zero_at_rest and (layout.weight or "duty" in columns):
-            continue  # gravity may drive a motor; a bridge that reverses the voltage reverses the supply's current
+        if not channel.zero_at_rest and (layout.weight or "duty" in columns or driven_on(columns, layout).any()):
+            continue  # the load may drive a motor; a bridge that reverses the voltage reverses the supply's current
         doubt = _doubt(columns, channel)
         wrong = np.flatnonzero(backward & (readings > (doubt if layout.crosses_zero else 0.0)))
         forward = (imposed > 0) & (columns["slope_deg"] >= 0) & (not channel.zero_at_rest)

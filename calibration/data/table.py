@@ -20,6 +20,12 @@ if TYPE_CHECKING:
     from mmrjax.robot import Robot
 
 
+def driven_on(columns: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray:
+    """True for rows whose stated load torque turns the shafts the way in which they are driven, shape (rows,)."""
+    imposed = columns[layout.imposed_column]
+    return columns[LOAD] * imposed < 0 if LOAD in columns else np.zeros(len(imposed), bool)
+
+
 @dataclasses.dataclass(frozen=True)
 class Runs:
     """A table of runs, one row each (or one row a sample, with `time_s` among the columns).
@@ -107,8 +113,9 @@ class Runs:
 
     @property
     def pulled(self) -> bool:
-        """Whether gravity, or a constant torque, may drive the motors."""
-        return self.layout.weight or (self.has("slope_deg") and bool(self["slope_deg"].any()))
+        """Whether gravity, a constant torque or a motor as the load may drive the motors."""
+        sloped = self.has("slope_deg") and bool(self["slope_deg"].any())
+        return self.layout.weight or sloped or bool(driven_on(self.columns, self.layout).any())
 
     def turns_round(self, channel: Channel) -> bool:
         """Whether a channel's readings have the sign of what drives the motors: a speed's do, and a current's where
