@@ -11,6 +11,11 @@ from test_worlds_rigs import steady
 from worlds import logs, rigs
 
 import mmrjax as mm
+from calibration.data import robot_file
+from calibration.data import runs as records
+from calibration.data.errors import BadData
+from calibration.inference import bases, blocks
+from calibration.inference.observers import Histories, SettledRuns
 from mmrjax import balances
 from mmrjax.conditions import Conditions
 from mmrjax.errors import UsageError
@@ -146,3 +151,138 @@ def test_a_brake_on_a_vehicle_is_refused():
     profile = mm.profile.profile([0.0, 1.0], load_torque=0.1)
     with pytest.raises(UsageError, match="load_torque: the robot is a vehicle"):
         mm.simulate(mm.nominal(), mm.Conditions(), profile=profile)
+
+
+RIG = """
+base = "none"
+{head}
+[motor]
+resistance = 0.5
+torque_constant = 0.05
+friction_coulomb = 0.01
+[gearbox]
+ratio = 1
+efficiency_load = 1.0
+[brake]
+load = "shaft"
+inertia = 1e-4
+loss_coulomb = 0.0
+"""
+
+
+def read(tmp_path, lines, head=""):
+    (tmp_path / "rig.toml").write_text(RIG.format(head=head))
+    (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
+    robot = robot_file.read(tmp_path / "rig.toml")
+    return records.read(tmp_path / "runs.csv", robot=robot), robot
+
+
+@pytest.mark.parametrize(
+    ("column", "head", "factor"),
+    [
+        ("load_torque_Nm", "", 1.0),
+        ("load_torque_mNm", "", 1e-3),
+        ("load_torque_kNm", "", 1e3),
+        ("M_b", '[columns]\nload_torque_mNm = "M_b"', 1e-3),
+        ("M_b", '[columns]\nload_torque_Nm = {column = "M_b", factor = -0.1}', -0.1),
+    ],
+)
+def test_the_torque_of_a_row_is_read_in_its_unit(tmp_path, column, head, factor):
+    lines = [f"supply_voltage_V,motor_speed_rpm,{column}", "24,4000,0.2", "12,2000,0"]
+    runs, rig = read(tmp_path, lines, head)
+    np.testing.assert_allclose(runs.conditions(rig).load_torque, [0.2 * factor, 0.0])
+    assert "load_torque_Nm" in runs.axes
+
+
+@pytest.mark.parametrize(
+    ("cell", "said"),
+    [
+        ("", "runs.csv row 1, load_torque_Nm: got an empty cell; expected a number, -10000 to 10000"),
+        ("nan", "runs.csv row 1, load_torque_Nm: got nan; expected -10000 to 10000"),
+        ("inf", "runs.csv row 1, load_torque_Nm: got inf; expected -10000 to 10000"),
+        ("25000", "runs.csv row 1, load_torque_Nm: got 25000; is it in mNm? then name the column load_torque_mNm; "),
+        ("200 mNm", "write numbers alone, in Nm, or name the column load_torque_mNm"),
+    ],
+)
+def test_a_torque_that_is_none_is_refused(tmp_path, cell, said):
+    with pytest.raises(BadData) as error:
+        read(tmp_path, ["supply_voltage_V,motor_speed_rpm,load_torque_Nm", f"24,4000,{cell}"])
+    assert said in str(error.value)
+
+
+def test_columns_that_may_be_the_torque_are_asked_about(tmp_path):
+    with pytest.raises(BadData, match=r"unknown column load_torque; did you mean load_torque_Nm\?"):
+        read(tmp_path, ["supply_voltage_V,motor_speed_rpm,load_torque", "24,4000,0"])
+    with pytest.raises(BadData, match="load_torque_Nm and load_torque_mNm state the same"):
+        read(tmp_path, ["supply_voltage_V,motor_speed_rpm,load_torque_Nm,load_torque_mNm", "24,4000,0,0"])
+
+
+def test_a_table_of_a_vehicle_with_a_brake_is_refused(tmp_path):
+    head = "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,load_torque_mNm"
+    path = tmp_path / "runs.csv"
+    path.write_text(f"{head}\n6T2A,24,15,0,0,3,0\n6T2A,24,15,0,0,3,20\n")
+    with pytest.raises(BadData) as error:
+        records.read(path, robot=mm.nominal())
+    assert str(error.value) == (
+        "runs.csv row 2, load_torque_mNm: got 20; the robot is a vehicle, whose load is its ground, and a brake's torque "
+        "acts on a shaft; state slope_deg or payload_kg, or describe the load as a shaft"
+    )
+
+
+def test_a_torque_without_a_sign_is_said_to_drive_a_shaft_that_runs_backward(tmp_path):
+    lines = [
+        "supply_voltage_V,motor_speed_rpm,motor_current_A,load_torque_Nm",
+        "24,4000,4.2,0.2",
+        "-24,-4400,3.8,0.2",
+    ]
+    channels = 'channels = ["motor_speed", "motor_current"]'
+    runs, _ = read(tmp_path, lines, channels)
+    assert (
+        runs.pulled
+        and (
+            "runs.csv row 2, load_torque_Nm: got 0.2 where the shaft is driven backward: it turns the shaft on there; a "
+            "brake's torque is negative backward"
+        )
+        in runs.notes
+    )
+    lines[2] = "-24,-4000,-4.2,-0.2"
+    runs, _ = read(tmp_path, lines, channels)
+    assert not runs.pulled and not any("backward" in note for note in runs.notes)
+
+
+@pytest.mark.parametrize("between", ["held", "linear"])
+def test_a_log_holds_the_torque_of_every_sample(tmp_path, between):
+    time = np.arange(12) * 0.05
+    torque = np.round(0.1 + 0.05 * np.sin(20 * time), 4)
+    lines = ["time_s,supply_voltage_V,motor_speed_rpm,load_torque_Nm"]
+    lines += [f"{t:.2f},24,{1e4 * t:.6g},{m}" for t, m in zip(time, torque, strict=True)]
+    runs, rig = read(tmp_path, lines, f'between_rows = "{between}"')
+    observe = Histories.of(runs, rig)
+    held, times = np.asarray(observe.conditions.load_torque)[0], np.asarray(observe.times)[0]
+    middle = 0.5 * (times[1:] + times[:-1])
+    at = np.interp(middle, time, torque) if between == "linear" else torque[np.searchsorted(time, middle) - 1]
+    moving = np.diff(times) > 0
+    np.testing.assert_allclose(held[:-1][moving], at[moving])
+    assert observe.driven.load_torque.min() >= torque.min()
+
+
+def test_rows_are_held_out_by_levels_of_the_torque(tmp_path):
+    torque = [0.1, 0.1003, 0.2, 0.2004, 0.4, 0.4001]
+    lines = ["supply_voltage_V,motor_speed_rpm,load_torque_Nm", *(f"24,{4000 - 900 * m:.6g},{m}" for m in torque)]
+    runs, _ = read(tmp_path, lines)
+    found = blocks.distinct(runs, SettledRuns.blocks)
+    assert list(found) == ["load_torque"] and [int(m.sum()) for m in found["load_torque"].values()] == [2, 2, 2]
+    assert blocks.in_words("load_torque") == "load torque"
+
+
+def test_a_drift_that_goes_with_the_torque_is_none():
+    """Tables of a brake are sorted by its torque; their order then shows no drift of its own."""
+    columns = {
+        "configuration": np.full(18, "brake"), "order": np.arange(18.0), "supply_voltage_V": np.full(18, 24.0),
+        "total_current_A": np.linspace(0, 9, 18),
+    }  # fmt: skip
+    rig = bench()
+    for with_torque in (False, True):
+        known = columns | ({"load_torque_Nm": np.linspace(0, 0.5, 18)} if with_torque else {})
+        over = {variable for basis in bases.families(known, np.ones(18), rig) for _, variable in basis.names}
+        assert ("order" in over) != with_torque
