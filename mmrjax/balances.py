@@ -96,6 +96,7 @@ def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar 
         battery=conditions.battery,
         discharge=state.discharge,
         order=conditions.order,
+        load_torque=conditions.load_torque,
         memory=state.memory,
         current=state.current,
         speed_motor=state.speed_motor,
@@ -175,10 +176,16 @@ def motor(robot: Robot, signals: Signals) -> Signals:
     )
 
 
+def torque_held(chassis: Shaft, signals: Signals) -> Scalar:
+    """Torque that acts against forward rotation of a shaft whichever way it turns: its own and a brake's [N·m]."""
+    own = chassis.torque_load(signals.angle)
+    return own if signals.load_torque is None else own + signals.load_torque
+
+
 def travel(robot: Robot, chassis: Load, signals: Signals) -> Signals:
     """Forces along the slope that traction has to overcome [N]; of a shaft what its load takes at the radius."""
     if isinstance(chassis, Shaft):
-        demand = chassis.torque_load(signals.angle) / chassis.radius
+        demand = torque_held(chassis, signals) / chassis.radius
         none = jnp.zeros_like(demand)
         return _fill(signals, resistance=none, gravity=demand, demand=demand, adhesion_limit=none + jnp.inf)
     resistance = chassis.ground.force_resistance(signals.normal, signals.direction_travel)
@@ -376,7 +383,7 @@ def _within_backlash(robot: Robot, chassis: Shaft, signals: Signals, gap: Scalar
         torque_gear=mesh + own,
         torque_output=mesh,
         acceleration=chassis.radius
-        * (mesh - loss - chassis.torque_load(signals.angle))
+        * (mesh - loss - torque_held(chassis, signals))
         / (chassis.inertia + inertia_added),
     )
 

@@ -54,6 +54,8 @@ class Conditions(eqx.Module):
         adhesion_lateral: as `adhesion`, across the travel; None: `adhesion`.
         levers_front_deg, levers_rear_deg: angles at which the levers stand, 0 along the wheelbase outward, positive
             up, 180 folded [deg]; None: those of the running gear, as folded as it states them.
+        load_torque: torque of a brake, or of a motor as the load, on the output of each drive [N·m]: positive against
+            forward rotation, whichever way it turns; of a load on a shaft alone; None: none.
     """
 
     configuration: Int[Array, "..."] | np.ndarray
@@ -81,6 +83,7 @@ class Conditions(eqx.Module):
     adhesion_lateral: Float[Array, "..."] | None
     levers_front_deg: Float[Array, "..."] | None
     levers_rear_deg: Float[Array, "..."] | None
+    load_torque: Float[Array, "..."] | None
 
     def __init__(
         self,
@@ -109,6 +112,7 @@ class Conditions(eqx.Module):
         adhesion_lateral: Number | None = None,
         levers_front_deg: Number | None = None,
         levers_rear_deg: Number | None = None,
+        load_torque: Number | None = None,
     ) -> None:
         # arrays are of other conditions, or of a table; what a user writes down is a number or some
         if not isinstance(duty, np.ndarray | jax.Array | None) and None not in (duty_left, duty_right):
@@ -124,6 +128,7 @@ class Conditions(eqx.Module):
         others |= {"duty_left": duty_left, "duty_right": duty_right, "open_left": open_left, "open_right": open_right}
         others |= {"motor_speed_left": motor_speed_left, "motor_speed_right": motor_speed_right}
         others |= {"levers_front_deg": levers_front_deg, "levers_rear_deg": levers_rear_deg}
+        others |= {"load_torque": load_torque}
         optional = {name: _number(value) for name, value in others.items() if value is not None}
         shapes = [x.shape for x in (which, *numbers, *optional.values())]
         try:

@@ -22,7 +22,10 @@ MODES = ("voltage", "motor_speed", "speed", "brake", "coast")
 VOLTAGE, MOTOR_SPEED, SPEED, BRAKE, COAST = range(len(MODES))
 
 #: What a profile may state for each row besides the mode, and of which a row keeps what the conditions say if not.
-CONDITIONS = ("voltage", "duty", "duty_left", "duty_right", "slope_deg", "payload", "adhesion", "adhesion_lateral")
+CONDITIONS = (
+    "voltage", "duty", "duty_left", "duty_right", "slope_deg", "payload", "adhesion", "adhesion_lateral",
+    "load_torque",
+)  # fmt: skip
 #: What it may state besides, which is no condition.
 FURTHER = ("voltage_left", "voltage_right", "yaw_rate", "current_other")
 #: What drives the sides apart, stated of both or of none.
@@ -39,9 +42,9 @@ class Profile(eqx.Module):
         mode: index into `MODES` of the segment that a row begins, shape (rows,).
         demand: motor speed [rad/s] or ground speed [m/s] where the mode asks for one, else not used, shape (rows,).
         voltage: of the external supply [V]; duty: share of the supply's voltage [-]; slope_deg: [deg]; payload: [kg];
-            adhesion, adhesion_lateral: as a ratio to the robot's surface, along and across [-]; current_other: of
-            other consumers on the battery [A]. Shape (rows,), or None: as the conditions (the robot, for
-            current_other) say.
+            adhesion, adhesion_lateral: as a ratio to the robot's surface, along and across [-]; load_torque: of a
+            brake on the output of each drive, of a load on a shaft [N·m]; current_other: of other consumers on the
+            battery [A]. Shape (rows,), or None: as the conditions (the robot, for current_other) say.
         duty_left, duty_right: as `duty`, of either side; voltage_left, voltage_right: given to the motors of either
             side [V], as a share of what the source has at no load; yaw_rate: demanded beside a ground speed, positive
             to the left [rad/s]. Stating any of them makes the robot free to turn.
@@ -60,6 +63,7 @@ class Profile(eqx.Module):
     payload: Float[Array, " rows"] | None = None
     adhesion: Float[Array, " rows"] | None = None
     adhesion_lateral: Float[Array, " rows"] | None = None
+    load_torque: Float[Array, " rows"] | None = None
     voltage_left: Float[Array, " rows"] | None = None
     voltage_right: Float[Array, " rows"] | None = None
     yaw_rate: Float[Array, " rows"] | None = None

@@ -32,6 +32,7 @@ _CONDITIONS = {
     "total_mass_kg": ("total mass", "kg", 2),
     "payload_kg": ("payload", "kg", 2),
     "slope_deg": ("slope", "deg", 2),
+    "load_torque_Nm": ("load torque", "N·m", 4),
 }
 _WORDS = {"status": ("status", "", 0), "flags": ("flags", "", 0)}
 
@@ -137,6 +138,8 @@ class Results:
         columns = {column: np.asarray(getattr(conditions, name)) for name, column in as_table.items()}
         columns["supply_voltage_V"] = np.where(np.asarray(conditions.battery) > 0.5, np.nan, conditions.voltage)
         columns |= {as_table[name]: nan for name in self.stated if name in as_table}
+        torque = nan if "load_torque" in self.stated else conditions.load_torque
+        braked = {} if torque is None else {"load_torque_Nm": np.asarray(torque)}
         found = outputs.columns(self.result, self.channels, self.further)
         if self.mission is not None:
             found = {name: found[name] for name in (*missions.names("turned" in self.mission.total.of), *CODES)}
@@ -146,6 +149,7 @@ class Results:
             "total_mass_kg": nan if "payload" in self.stated else np.asarray(self.total_mass),
             "payload_kg": columns["payload_kg"],
             "slope_deg": columns["slope_deg"],
+            **braked,
             **found,
         }
 
@@ -174,6 +178,7 @@ class Results:
                 "supply_voltage_V",
                 "slope_deg",
                 "payload_kg",
+                *(["load_torque_Nm"] if "load_torque_Nm" in content else []),
                 *shown,
                 *self.further,
                 "status",

@@ -207,6 +207,10 @@ class Robot(eqx.Module):
         return tuple(effect for effect in self.effects if effect.memory_size is not None)
 
 
+#: Why no torque can be stated on the output of a vehicle.
+NO_BRAKE = "the robot is a vehicle, whose load is its ground, and a brake's torque acts on a shaft"
+
+
 def cannot_turn(robot: Robot, names: Iterable[str]) -> str | None:
     """Why a robot whose sides are driven apart cannot be computed in these configurations; None where it can."""
     if not robot.has_ground:

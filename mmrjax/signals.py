@@ -104,6 +104,7 @@ class Signals(eqx.Module):
     battery: Scalar = UNSET  # 1 where the on-board battery feeds the motors
     discharge: Scalar = UNSET
     order: Scalar = UNSET  # place in the sequence of runs [-]
+    load_torque: Scalar | None = None  # of a brake on the output, against forward rotation [N·m]
     memory: Mapping[str, Scalar] = eqx.field(default_factory=dict)  # of effects, by name; empty: settled
     current: Scalar = UNSET  # I_d of one motor [A]
     speed_motor: Scalar = UNSET  # [rad/s]

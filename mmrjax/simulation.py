@@ -22,7 +22,7 @@ from mmrjax.params import Scalar
 from mmrjax.profile import Profile
 from mmrjax.programs import has_tracer
 from mmrjax.results import Results
-from mmrjax.robot import Robot, cannot_turn
+from mmrjax.robot import NO_BRAKE, Robot, cannot_turn
 from mmrjax.signals import CODES, Result
 from mmrjax.tables import CONDITION_LIMITS
 
@@ -89,6 +89,7 @@ def simulate(
     _check_conditions(conditions)
     _check_battery(robot, conditions)
     _check_turning(robot, conditions, profile)
+    _check_brake(robot, conditions, profile)
     turns = conditions.turns or (profile is not None and profile.turns)
     if not (turns or has_tracer(robot.effects)) and (unlike := robot.unlike):
         warnings.warn(f"{', '.join(unlike)}: {STRAIGHT}; {OF_TURNS[0]}=1, {OF_TURNS[1]}=1 let it turn", stacklevel=2)
@@ -134,6 +135,13 @@ def _check_turning(robot: Robot, conditions: Conditions, profile: Profile | None
         return
     if why := cannot_turn(robot, [robot.configurations.names[k] for k in np.unique(conditions.configuration)]):
         raise UsageError(f"{freed[0]}: {why}")
+
+
+def _check_brake(robot: Robot, conditions: Conditions, profile: Profile | None) -> None:
+    """Refuse the torque of a brake on a vehicle."""
+    braked = conditions.load_torque is not None or (profile is not None and profile.load_torque is not None)
+    if braked and robot.has_ground:
+        raise UsageError(f"load_torque: {NO_BRAKE}; state slope_deg or payload")
 
 
 def _check_profile(model: str, profile: Any, options: Mapping[str, float | None]) -> None:

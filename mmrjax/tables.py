@@ -50,6 +50,7 @@ CONDITION_LIMITS: dict[str, tuple[float, float, str]] = {
     "adhesion_lateral": (1e-3, 100.0, ""),
     "levers_front_deg": (-180.0, 180.0, "deg"),
     "levers_rear_deg": (-180.0, 180.0, "deg"),
+    "load_torque": (-1e4, 1e4, "N·m"),
 }
 
 

@@ -49,6 +49,7 @@ CONDITIONS: dict[str, str] = {
     "adhesion_lateral": "the same as adhesion, across the travel",
     "levers_front_deg": "angle of the front levers, 0 along the wheelbase outward, positive up, 180 folded",
     "levers_rear_deg": "angle of the rear levers, 0 along the wheelbase outward, positive up, 180 folded",
+    "load_torque": "torque of a brake on the output of each drive, positive against forward rotation",
 }
 #: What every point has beside its outputs: code into `signals.STATUSES`, bit mask over `signals.FLAGS`.
 STATUS, FLAGS = CODES

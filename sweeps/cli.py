@@ -456,7 +456,7 @@ app.add_typer(rig, name="rig")
 def new(
     file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The file to write.")],
     kind: Annotated[
-        str, typer.Option(help="tracked, wheeled, bench, pendulum, servo, linear or carriage.")
+        str, typer.Option(help="tracked, wheeled, bench, dyno, pendulum, servo, linear or carriage.")
     ] = "bench",
     force: Annotated[bool, typer.Option("--force", help="Replace the file where there is one.")] = False,
 ) -> int:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from calibration.data.columns import CONDITIONS, ROWS, SIDES
+from calibration.data.columns import BRAKED, CONDITIONS, LOAD, ROWS, SIDES
 from calibration.data.errors import BadConfiguration, choices, parsed
 from calibration.data.input_files import toml_content, toml_text
 from mmrjax import channels, fidelities
@@ -25,6 +25,8 @@ Payload = Annotated[float, Field(ge=_PAYLOAD[0], le=_PAYLOAD[1], allow_inf_nan=F
 _SPEED = channels.find("motor_speed").range
 _CURRENT = channels.find("motor_current").range
 MotorCurrent = Annotated[float, Field(ge=_CURRENT[0], le=_CURRENT[1], allow_inf_nan=False)]
+_TORQUE = BRAKED[LOAD]
+LoadTorque = Annotated[float, Field(ge=_TORQUE[0], le=_TORQUE[1], allow_inf_nan=False)]
 MotorSpeed = Annotated[float, Field(ge=_SPEED[0], le=_SPEED[1], allow_inf_nan=False)]
 Voltage = Annotated[float, Field(ge=_VOLTAGE[0], le=_VOLTAGE[1], allow_inf_nan=False)]
 #: The fidelity that follows profiles.
@@ -205,6 +207,10 @@ class OneRun(Part):
         None, "Angle of the front levers, 0 along the wheelbase outward, positive up, 180 folded", usual="the robot's"
     )
     levers_rear_deg: float | None = about(None, "The same of the rear levers", usual="the robot's")
+    load_torque_Nm: float | None = about(
+        None, "Torque of a brake on the output of each drive (N·m), against forward rotation, of a load on a shaft",
+        usual="none", flag="--load-torque",
+    )  # fmt: skip
 
 
 class GridPart(Part):
@@ -230,6 +236,10 @@ class GridPart(Part):
         None, "Slopes, positive uphill (deg), of a rig 0", usual=_shown(SLOPES_DEG)
     )
     surface: str | None = about(None, SURFACE, usual=f"{BENCH}; of a rig none")
+    load_torques_Nm: Annotated[tuple[LoadTorque, ...], Field(min_length=1)] | None = about(
+        None, "Torques of a brake on the output of each drive (N·m), of a load on a shaft", usual="none",
+        flag="--load-torques",
+    )  # fmt: skip
 
 
 class InferencePart(Part):
@@ -348,7 +358,8 @@ class ProfilePart(FidelityPart):
     profile: Annotated[str, Field(min_length=1)] | None = about(
         None,
         "A mission over time: a CSV with time_s (s) and any of speed_mm_s, motor_speed_rpm, duty, mode, "
-        "supply_voltage_V, slope_deg, payload_kg, surface, current_other_A; with sides duty_left and duty_right, "
+        "supply_voltage_V, slope_deg, payload_kg, load_torque_Nm, surface, current_other_A; with sides duty_left and "
+        "duty_right, "
         "voltage_left_V and voltage_right_V, or yaw_rate_rad_s beside speed; or stair, stop_and_go, shuttle, patrol "
         "(docs/missions.md)",
     )
@@ -783,6 +794,7 @@ def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given
         "voltages_V": _VOLTAGE,
         "motor_speeds_rpm": _SPEED,
         "motor_currents_A": _CURRENT,
+        "load_torques_Nm": _TORQUE,
     }
     allowed = ranges.get(key)
     if allowed is not None and limits:

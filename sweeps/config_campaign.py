@@ -21,7 +21,8 @@ from sweeps.flags import flags
 KEYS = ("axes", "samples", "conditions", "outputs", "storage", "compression", "profile", "obstacle")
 #: Options of a grid, which a file with axes of its own has no use for.
 GRID = (
-    "configurations", "voltages_V", "motor_speeds_rpm", "payloads_kg", "slopes_deg", "surface", "battery",
+    "configurations", "voltages_V", "motor_speeds_rpm", "payloads_kg", "slopes_deg", "load_torques_Nm", "surface",
+    "battery",
     "discharge_mAh",
 )  # fmt: skip
 EXPORTS = ("csv", "parquet")
@@ -168,6 +169,7 @@ def of_grid(grid: Sweep) -> Campaign:
         "voltage": None if grid.battery else grid.voltages_V,
         "motor_speed": None if speeds is None else tuple(n * RPM for n in speeds),
         "payload": grid.payloads_kg,
+        "load_torque": grid.load_torques_Nm,
         "slope_deg": grid.slopes_deg,
     }
     # every run of the grid with every robot drawn, which the store keeps along its last dimension

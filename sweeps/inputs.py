@@ -174,7 +174,8 @@ def one_run(
     column = layout.imposed_column
     for other in (c for c, _ in IMPOSED.values() if c != column and c in given):
         raise BadConfiguration(imposed.refused(robot, OPTIONS[other], OPTIONS[column]))
-    imposed.check_acting(robot, (OPTIONS[key] for key in given if key in layout.idle))
+    idle = [OPTIONS[key] for key in given if key in layout.idle]
+    imposed.check_acting(robot, idle, idle)
     if battery:
         imposed.check_battery(robot)
     elif column not in given:

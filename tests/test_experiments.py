@@ -475,8 +475,26 @@ def test_harmless_run_has_nothing_to_watch():
 
 def test_every_kind_is_on_the_packaged_menu_and_no_other():
     metered = menu.menu(dataclasses.replace(REACH, measured=("motor_current",)))
-    kinds = {k for e in (*MENU, *metered) for k in e.kinds}
+    braked = menu.menu(dataclasses.replace(REACH, has_ground=False, torques=(0.0, 0.5)))
+    kinds = {k for e in (*MENU, *metered, *braked) for k in e.kinds}
     assert kinds == {*menu.KINDS, "6T2A", "4W2T"}
+
+
+def test_runs_against_a_brake_have_its_torque():
+    within = dataclasses.replace(REACH, has_ground=False, measured=("motor_speed",), torques=(0.0, 0.1, 0.5))
+    made = menu.menu(within)
+    batch = predicted.batch(made, within.measured)
+    torque = np.asarray(batch.conditions.load_torque)
+    assert torque.tolist() == [m for r in made if isinstance(r, menu.Run) for m in r.torque]
+    assert torque.max() == 0.5 and (torque * np.asarray(batch.conditions.voltage) >= 0).all()  # it brakes either way
+    run = next(r for r in made if "other torques" in r.kinds)
+    done = np.asarray(run.torque) < 0.5  # it stalls the motor
+    kept = menu.carried_out(run, menu.possible(run, done), *plain(run)[1:], within)
+    assert set(kept.torque) == set(run.torque) - {0.5} and len(kept.voltage) == len(kept.torque)
+    assert (
+        predicted.batch(menu.menu(dataclasses.replace(within, torques=())), ("motor_speed",)).conditions.load_torque
+        is None
+    )
 
 
 def test_unknown_experiments_are_refused_with_the_choices():

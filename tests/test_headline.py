@@ -57,3 +57,16 @@ def test_it_is_said_with_the_noises_at_which_it_holds():
     assert weak == "At 0.7 and 1 times the noise a voltage drop is missing, and no more is established"
     assert loop.headline(headline(nothing())) == "At the stated noise nothing is missing"
     assert loop.headline(headline(law("a", "b"))) == "At the stated noise one of a or b is established"
+
+
+def test_what_only_some_noises_cannot_tell_apart_comes_after_what_all_list():
+    found = headline(of_mechanism(SLIP, DROP), [(0.7, of_mechanism(DROP)), (1.4, of_mechanism(DROP, "x that is"))])
+    assert found.claims == ((DROP, SLIP, "x that is"),) and found.shared == (1,)
+    said = loop.headline(found)
+    assert f"a {DROP} (not told at each noise from a {SLIP} or a x that is) is established" in said
+
+
+def test_one_mechanism_is_claimed_once():
+    """Two laws of one family, of which another noise leaves the mechanism alone."""
+    two = Summary("class", 0.001, None, (*law("a").missing, *law("b").missing))
+    assert headline(two, [(0.7, of_mechanism(DROP, SLIP))]).claims == ((DROP, SLIP),)

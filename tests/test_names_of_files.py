@@ -53,6 +53,7 @@ MORE = {
     "ambient_C": "ambient temperature",
     "left_V": "at the left motor", "right_V": "at the right motor", "heading_deg": "from uphill, positive to the left",
     "discharge_mAh": "charge already taken from the battery",
+    "load_torque_Nm": "of a brake on the output of each drive", "load_torques_Nm": "axis of load_torque_Nm",
     "levers_front_deg": "0 along the wheelbase outward, positive up", "levers_rear_deg": "the same of the rear ones",
     # posture and what geometry allows
     "contact_mm": "length of the contact", "load_front_percent": "of the load at the front",

@@ -88,6 +88,24 @@ SAMPLES = [
         "remove it",
     ),
     (
+        of_fit.Repeats("r.csv", (1, 2), "motor_speed_rpm", (45.0, 43.0), "5%", ("M_b_mNm",), near="load_torque_mNm"),
+        "r.csv rows 1 and 2, motor_speed_rpm: the same conditions gave 45 and 43, 5% apart; M_b_mNm varies there and is "
+        'not used as a condition: state [columns] load_torque_mNm = "M_b_mNm", or give each level of a load a '
+        "configuration",
+    ),
+    (
+        of_fit.Unused("r.csv", (("M_b_Nm", "load_torque_Nm"), ("room", ""))),
+        "r.csv: M_b_Nm, room vary from row to row and are not used; if M_b_Nm is load_torque_Nm, state [columns] "
+        'load_torque_Nm = "M_b_Nm" in the robot\'s file',
+    ),
+    (of_fit.Unused("r.csv", (("room", ""),)), "r.csv: room varies from row to row and is not used"),
+    (
+        of_fit.NoLoadGives("r.csv", "output_torque_Nm", "M", 0.974),
+        "r.csv, M: friction and a constant torque of a load leave 97% of its variance unexplained; if a brake sets it, "
+        'it is a condition: state [columns] load_torque_Nm = "M" in the robot\'s file, and take output_torque out of '
+        "its channels",
+    ),
+    (
         of_fit.Turned("r.csv", "motor_current_A", "Iq", 8.04, 0.31),
         "r.csv, Iq: off by 8 (rms) from what the file's numbers give, with the other sign by 0.31; if it is turned "
         'round, state [columns] motor_current_A = {column = "Iq", factor = -1}',

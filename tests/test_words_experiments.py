@@ -23,6 +23,8 @@ ONE = Reach(
 LEVEL = dataclasses.replace(ONE, used=(Used("rover", 0, (12.0,), (0.0,), (0.0,), 4.0),))
 BENCH = dataclasses.replace(LEVEL, has_ground=False)
 DRIVEN = dataclasses.replace(BENCH, imposed="motor_speed", levels=(52.36, 209.44))
+BRAKED = dataclasses.replace(BENCH, measured=("motor_current", "motor_speed"), torques=(0.0, 0.4, 0.8))
+HELD = dataclasses.replace(DRIVEN, torques=(0.0, 0.0412))
 
 
 def on(reach):
@@ -54,6 +56,22 @@ def test_the_zero_of_every_meter_is_read_at_rest():
         f"zero of {label}": f"Switch the motors off, at rest and with no load; read the {label}"
         for label in ("motor current", "output torque")
     }
+
+
+def test_a_brake_is_set_where_there_is_one():
+    said = on(BRAKED)
+    assert said["other torques, rover"] == (
+        "rover: run at 12 V against a brake of 0.1, 0.2, 0.6 and 0.8 N·m; read motor current and motor speed"
+    )
+    assert said["reverse, rover"] == (
+        "rover: run the other way round at -12 V against a brake of 0 and -0.2 N·m; read motor current and motor speed"
+    )
+    assert "brake" not in said["other voltages, rover"]
+    assert not any("brake" in text for text in on(BENCH).values())
+    assert "other torques, rover" not in on(dataclasses.replace(BRAKED, torques=(0.0,)))
+    assert on(HELD)["other torques, rover"].startswith(
+        "rover: run at 500 and 2000 rpm of the motor against a brake of 10, 21, 31 and 41 mN·m; read"
+    )
 
 
 def test_runs_follow_their_conditions():
@@ -159,17 +177,11 @@ MORE = [
     (ONE, "air_humidity", "Repeat with air humidity in even small steps from its least to its largest"),
     (BENCH, "voltage", "Repeat with the supply voltage up to 12 V in steps of 1 V"),
     (BENCH, "speed", "Repeat with the supply voltage from crawl to 12 V in steps of 1 V"),
-    (
-        BENCH,
-        "current",
-        "Repeat at 12 V with a load (a brake on a shaft, a pull on a carriage) that is raised in 15 steps",
-    ),
+    (BENCH, "current", "Repeat with the supply voltage from crawl to 12 V in steps of 1 V"),  # it has no brake
+    (BRAKED, "current", "Repeat at 12 V with the brake's torque up to 0.8 N·m in steps of 0.05 N·m"),
     (DRIVEN, "speed_motor", "Repeat with the motor speed up to 2000 rpm in steps of 100 rpm"),
-    (
-        DRIVEN,
-        "current",
-        "Repeat at one motor speed with a load (a brake on a shaft, a pull on a carriage) that is raised in 15 steps",
-    ),
+    (DRIVEN, "current", "Repeat with the motor speed up to 2000 rpm in steps of 100 rpm"),
+    (HELD, "current", "Repeat at one motor speed with the brake's torque up to 40 mN·m in steps of 2.5 mN·m"),
     (
         ONE,
         "order 2 of the driving shaft",

@@ -60,6 +60,7 @@ def steady(w, *effects):
     """mmrjax's readings of a world [SI], shape (channels, rows), and its statuses."""
     c = w.conditions
     imposed = {"motor_speed": padded(c.motor_speed)} if w.rig.wide else {}
+    imposed |= {"load_torque": padded(c.load_torque)} if c.load_torque.any() else {}
     slope = np.degrees(padded(c.slope))
     asked = Conditions(0, padded(c.supply), slope, padded(c.payload), duty=padded(c.duty), **imposed)
     found = steady_batch(dataclasses.replace(robot(w), effects=effects), asked)

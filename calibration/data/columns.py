@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import difflib
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
 from calibration.data import units
@@ -50,6 +51,9 @@ HEADING: dict[str, tuple[float, float]] = {"heading_deg": (-360.0, 360.0)}
 LEVERS: dict[str, tuple[float, float]] = {
     name: CONDITION_LIMITS[name][:2] for name in ("levers_front_deg", "levers_rear_deg")
 }
+#: Torque of a brake on the output of each drive, positive against forward rotation.
+LOAD = "load_torque_Nm"
+BRAKED: dict[str, tuple[float, float]] = {LOAD: CONDITION_LIMITS["load_torque"][:2]}
 #: Place of a row in the sequence in which runs were made; without it that of the row in the file.
 ORDER: dict[str, tuple[float, float]] = {"order": (0.0, 1e9)}
 #: Columns that say when a row was measured; a table without either was measured in the order of its rows.
@@ -59,8 +63,11 @@ WORDS = ("configuration", "surface", "run_id", "mode")
 REQUIRED, OWN = ("configuration", *CONDITIONS), ("total_mass_kg",)
 #: What a column that a table may lack is then.
 DEFAULTS = {"slope_deg": 0.0, "payload_kg": 0.0, SUPPLY: 0.0}
-#: Conditions that act on a vehicle alone.
-ON_GROUND = ("total_mass_kg", "payload_kg", "slope_deg")
+#: Conditions that act on a vehicle alone, and on a load on a shaft alone.
+ON_GROUND, ON_SHAFT = ("total_mass_kg", "payload_kg", "slope_deg"), (LOAD,)
+
+#: How alike the names of two columns are at least for one to be meant by the other.
+ALIKE = 0.6
 
 _OF_CONDITIONS = {
     SUPPLY: Quantity("supply_voltage", units.VOLTAGE, CONDITIONS[SUPPLY]),
@@ -74,6 +81,7 @@ _OF_CONDITIONS = {
     **{name: Quantity(name.removesuffix("_V"), units.VOLTAGE, limits) for name, limits in VOLTS.items()},
     "heading_deg": Quantity("heading", units.ANGLE, HEADING["heading_deg"]),
     **{name: Quantity(name.removesuffix("_deg"), units.ANGLE, limits) for name, limits in LEVERS.items()},
+    LOAD: Quantity("load_torque", units.of_channel("output_torque"), BRAKED[LOAD]),
 }
 
 
@@ -81,7 +89,8 @@ def ranges() -> dict[str, tuple[float, float]]:
     """Least and greatest value of every number column."""
     readings = {c.column: c.range for c in channels.EVERY}
     deviations = {c.sd_column: (0.0, c.sd_largest) for c in channels.EVERY}
-    return {**CONDITIONS, **readings, **deviations, **TIME, **DUTY, **SIDES, **VOLTS, **HEADING, **LEVERS, **ORDER}
+    conditions = {**CONDITIONS, **DUTY, **SIDES, **VOLTS, **HEADING, **LEVERS, **BRAKED}
+    return {**conditions, **readings, **deviations, **TIME, **ORDER}
 
 
 def _of_channel(channel: Channel) -> dict[str, Quantity]:
@@ -184,7 +193,7 @@ class Layout:
     @property
     def idle(self) -> tuple[str, ...]:
         """Columns of conditions that do not act on its load."""
-        return () if self.has_ground else (*ON_GROUND, *LEVERS, "surface")
+        return ON_SHAFT if self.has_ground else (*ON_GROUND, *LEVERS, "surface")
 
     @property
     def imposed_column(self) -> str:
@@ -225,8 +234,7 @@ class Layout:
         driven: tuple[str, ...] = DRIVING if self.imposed == "voltage" else ()
         if self.sides:
             driven = (*driven, *self.sides, *(VOLTS if self.imposed == "voltage" else ()), *HEADING)
-        if self.has_ground:
-            driven = (*driven, *LEVERS)
+        driven = (*driven, *(LEVERS if self.has_ground else ON_SHAFT))
         named = ("configuration", *self.axes, SUPPLY, *self.measured_columns, *self.deviation_columns, "surface")
         return tuple(dict.fromkeys(c for c in (*named, "run_id", "time_s", *driven, *ORDER) if c not in self.idle))
 
@@ -244,7 +252,7 @@ class Layout:
         for channel in channels.EVERY:
             if channel in self.channels or channel.column in (self.imposed_column, *self.sides):
                 found |= _of_channel(channel)
-        known = (*self.known(), *ON_GROUND)
+        known = (*self.known(), *ON_GROUND, *ON_SHAFT)
         return {column: quantity for column, quantity in found.items() if column in known}
 
     def meanings(self, source: str, header: list[str]) -> list[Meaning | None]:
@@ -281,7 +289,7 @@ class Layout:
 
     def _by_name(self) -> Mapping[str, Meaning]:
         """Every name of a column, in any unit, with what it means."""
-        known = (*self.known(), *ON_GROUND)
+        known = (*self.known(), *ON_GROUND, *ON_SHAFT)
         quantities = self.quantities()
         found = {
             name: Meaning(column, name, quantity, unit)
@@ -297,6 +305,24 @@ class Layout:
     def spellings(self) -> tuple[str, ...]:
         """Every name that a column of a file may have and that means something, in any unit."""
         return (*self._by_name(), *(column for _, column, _ in self.mapped))
+
+    def nearest(self, name: str, stated: Collection[str]) -> str:
+        """The column, in the unit of `name`, that a column without a role is most like: by its name, else as the only
+        condition in its unit; empty where it is like none.
+
+        Args:
+            stated: columns that the table has, which are left out.
+        """
+        none = {*stated, *self.idle, *self.deviation_columns}
+        lacking = {column: quantity for column, quantity in self.quantities().items() if column not in none}
+        spelled = {s: (column, unit) for column, q in lacking.items() for s, unit in q.columns().items()}
+        unit = units.at_the_end(name, {unit for _, unit in spelled.values()})
+        pool = [s for s, (column, own) in spelled.items() if own == unit or (unit is None and s == column)]
+        close = difflib.get_close_matches(name.casefold(), [s.casefold() for s in pool], 1, ALIKE)
+        if close:
+            return next(s for s in pool if s.casefold() == close[0])
+        alone = [s for s in pool if unit and spelled[s][0] not in self.measured_columns]
+        return alone[0] if len(alone) == 1 else ""
 
     def expected(self, column: str) -> str:
         """The column, and where the robot's file says that it is read from."""

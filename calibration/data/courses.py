@@ -7,11 +7,11 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from calibration.data.columns import SUPPLY
+from calibration.data.columns import LOAD, SUPPLY
 from calibration.data.runs import Runs
 
 #: Columns of which every sample of a run may have a value of its own. A stated mass may change as the payload does.
-CHANGING = ("supply_voltage_V", "slope_deg", "payload_kg", "total_mass_kg", "surface", "duty", "mode")
+CHANGING = ("supply_voltage_V", "slope_deg", "payload_kg", "total_mass_kg", LOAD, "surface", "duty", "mode")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array
 
 from calibration.data import delimited, input_files, units
+from calibration.data.columns import LOAD, SUPPLY
 from calibration.data.errors import BadConfiguration, BadData, choices, is_number, number
 from calibration.data.units import Quantity
 from mmrjax import channels
@@ -64,6 +65,7 @@ QUANTITIES: dict[str, Quantity] = {
     "yaw_rate": _speed("yaw_rate"),
     "slope_deg": Quantity("slope", units.ANGLE, _range("slope_deg"), slope=True),
     "payload": Quantity("payload", units.MASS, _range("payload")),
+    "load_torque": Quantity("load_torque", units.of_channel("output_torque"), _range("load_torque")),
     "current_other": Quantity("current_other", units.CURRENT, _CURRENT_OTHER),
 }
 #: Columns of which a row has at most one, and the mode that each means.
@@ -74,7 +76,7 @@ DEMANDS = {
 #: Demanded beside a speed.
 YAW_RATE = "yaw_rate"
 #: What a row may not leave empty where the file has the column.
-HELD = ("voltage", "slope_deg", "payload", "current_other")
+HELD = ("voltage", "slope_deg", "payload", "load_torque", "current_other")
 MODE, SURFACE = "mode", "surface"
 #: What a comment line may set of the state that a mission begins in: field of `Start`, least, greatest, and the SI
 #: value of one.
@@ -138,7 +140,7 @@ class ProfileTable:
     @property
     def stated(self) -> tuple[str, ...]:
         """Columns of conditions that it states, as a table of runs names them."""
-        names = {"voltage": "supply_voltage_V", "slope_deg": "slope_deg", "payload": "payload_kg"}
+        names = {"voltage": SUPPLY, "slope_deg": "slope_deg", "payload": "payload_kg", "load_torque": LOAD}
         return (
             *(column for name, column in names.items() if name in self.values),
             *([SURFACE] if self.surface else []),

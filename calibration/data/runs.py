@@ -21,6 +21,7 @@ from calibration.data.columns import (
     DRIVEN,
     DUTY,
     HEADING,
+    LOAD,
     SIDES,
     SPEED,
     SPEEDS,
@@ -33,10 +34,11 @@ from calibration.data.columns import (
     Meaning,
 )
 from calibration.data.errors import BadConfiguration, BadData, InputError, choices, number, parsed
-from calibration.data.table import Runs
+from calibration.data.table import Runs, driven_on
 from mmrjax import channels
 from mmrjax.channels import MM, RPM, Channel
 from mmrjax.errors import counted
+from mmrjax.robot import NO_BRAKE
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
@@ -141,7 +143,7 @@ def _read(
                 _refuse_stated(name, cells)
                 continue
             if meaning.column in layout.idle:
-                _refuse_ground(name, meaning, cells)
+                _refuse_idle(name, meaning, cells, layout)
                 continue
             values = []
             for k, cell in enumerate(cells, 1):
@@ -183,6 +185,7 @@ def _read(
         "show magnitude alone, and magnitudes are compared"
         for i in unsigned
     )
+    notes += tuple(_drives(name, columns, layout))
     headings = {m.column: m.shown for m in meanings if m is not None}
     return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest(), extras, layout, notes, headings)
 
@@ -271,6 +274,17 @@ def _lacks(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterato
             )
 
 
+def _drives(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
+    """A sentence on settled rows in which a load torque without a sign drives a shaft that runs backward."""
+    on = np.flatnonzero(driven_on(columns, layout))
+    if on.size and not set(TIME) & set(columns) and columns[LOAD].min() >= 0:
+        more = f", and so in {on.size} rows" if on.size > 1 else ""
+        yield (
+            f"{name} row {on[0] + 1}, {LOAD}: got {number(columns[LOAD][on[0]])} where the shaft is driven "
+            f"backward{more}: it turns the shaft on there; a brake's torque is negative backward"
+        )
+
+
 def _with_channels(name: str, header: list[str], layout: Layout, more: Sequence[Channel]) -> Layout:
     """`layout` with those of some more channels of which a file has a column."""
     meanings = dataclasses.replace(layout, channels=channels.EVERY).meanings(name, header)
@@ -310,13 +324,16 @@ def _fill(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) 
         columns.setdefault(column, np.full(rows, value))
 
 
-def _refuse_ground(name: str, meaning: Meaning, cells: list[str]) -> None:
+def _refuse_idle(name: str, meaning: Meaning, cells: list[str], layout: Layout) -> None:
+    why = (
+        f"{NO_BRAKE}; state slope_deg or payload_kg, or describe the load as a shaft"
+        if layout.has_ground
+        else "the robot's load is a shaft, on which no slope, payload or mass acts; remove the column, or describe "
+        "the load as a vehicle"
+    )
     for row, cell in enumerate(cells, 1):
         if cell.strip("0.-") != "":
-            raise BadData(
-                f"{name} row {row}, {meaning.shown}: got {cell}; the robot's load is a shaft, on which no slope, "
-                "payload or mass acts; remove the column, or describe the load as a vehicle"
-            )
+            raise BadData(f"{name} row {row}, {meaning.shown}: got {cell}; {why}")
 
 
 def _refuse_stated(name: str, voltages: list[str]) -> None:
@@ -348,8 +365,8 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
             continue
         # Gravity may drive a motor: only up the slope, or on the flat, its current has the sign of its voltage.
         backward = (imposed < 0) & ((columns["slope_deg"] <= 0) | channel.zero_at_rest)
-        if not channel.zero_at_rest and (layout.weight or "duty" in columns):
-            continue  # gravity may drive a motor; a bridge that reverses the voltage reverses the supply's current
+        if not channel.zero_at_rest and (layout.weight or "duty" in columns or driven_on(columns, layout).any()):
+            continue  # the load may drive a motor; a bridge that reverses the voltage reverses the supply's current
         doubt = _doubt(columns, channel)
         wrong = np.flatnonzero(backward & (readings > (doubt if layout.crosses_zero else 0.0)))
         forward = (imposed > 0) & (columns["slope_deg"] >= 0) & (not channel.zero_at_rest)

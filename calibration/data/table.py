@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.data import sides, surfaces
-from calibration.data.columns import CIRCUITS, DRIVEN, DUTY, HEADING, IMPOSED, LEVERS, SUPPLY, TIME, Layout
+from calibration.data.columns import CIRCUITS, DRIVEN, DUTY, HEADING, IMPOSED, LEVERS, LOAD, SUPPLY, TIME, Layout
 from calibration.data.errors import BadData, choices
 from mmrjax import channels
 from mmrjax.channels import Channel
@@ -18,6 +18,12 @@ from mmrjax.tables import adhesion_ratio, lateral_ratio
 if TYPE_CHECKING:
     from mmrjax.conditions import Conditions
     from mmrjax.robot import Robot
+
+
+def driven_on(columns: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray:
+    """True for rows whose stated load torque turns the shafts the way in which they are driven, shape (rows,)."""
+    imposed = columns[layout.imposed_column]
+    return columns[LOAD] * imposed < 0 if LOAD in columns else np.zeros(len(imposed), bool)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,12 +108,14 @@ class Runs:
     def axes(self) -> tuple[str, ...]:
         """Columns of the conditions that its runs have, what is imposed first."""
         duty = () if self.sampled else DUTY
-        return tuple(c for c in (*self.layout.axes, *duty, *self.layout.sides, *HEADING, *LEVERS) if self.has(c))
+        further = (*duty, *self.layout.sides, *HEADING, *LEVERS, LOAD)
+        return tuple(c for c in (*self.layout.axes, *further) if self.has(c))
 
     @property
     def pulled(self) -> bool:
-        """Whether gravity, or a constant torque, may drive the motors."""
-        return self.layout.weight or (self.has("slope_deg") and bool(self["slope_deg"].any()))
+        """Whether gravity, a constant torque or a motor as the load may drive the motors."""
+        sloped = self.has("slope_deg") and bool(self["slope_deg"].any())
+        return self.layout.weight or sloped or bool(driven_on(self.columns, self.layout).any())
 
     def turns_round(self, channel: Channel) -> bool:
         """Whether a channel's readings have the sign of what drives the motors: a speed's do, and a current's where
@@ -243,6 +251,7 @@ class Runs:
             adhesion_lateral=lateral if apart else None,
             **apart,
             **{name: self[name] for name in LEVERS if self.has(name)},
+            load_torque=self[LOAD] if self.has(LOAD) else None,
             total_mass=self["total_mass_kg"] if self.has("total_mass_kg") else None,
             order=self["order"] if self.has("order") else 0.0,
             duty=np.where(held, 0.0, self["duty"] if self.has("duty") else 1.0),

@@ -7,6 +7,7 @@ import numpy as np
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.notes import Missed
+from calibration.inference import unused as unused_room
 from calibration.inference.lack_of_fit import EXPLAINED, UNDESCRIBED
 from calibration.inference.linearization import Linearization
 from calibration.inference.noise import UNSTATED, Noise
@@ -56,7 +57,6 @@ def _missed(space: CandidateSpace, runs: Runs, noise: Noise, fit: Linearization)
 
 
 def unused(runs: Runs) -> tuple[str, ...]:
-    """Columns of numbers that vary and have no role."""
-    return tuple(
-        name for name, x in runs.extras.items() if np.issubdtype(x.dtype, np.number) and np.nanmax(x) > np.nanmin(x)
-    )
+    """Columns of numbers that vary and have no role, and a torque at the output that a brake may set."""
+    without = [name for note in unused_room.unused(runs) for name, _ in note.columns]
+    return (*without, *(f"{note.theirs} as a condition" for note in unused_room.no_load_gives(runs)))

@@ -24,11 +24,11 @@ def headline(said: Summary, others: Sequence[tuple[float, Summary]] = ()) -> Hea
     if laws:
         alone = all(len(names) == 1 for names in laws) and not any(m.values for s in every for m in s.missing)
         return Headline("named" if alone else "class", laws, factors)
-    mechanisms = _common([_mechanisms(s) for s in every])
-    if mechanisms:
-        return Headline("mechanism", mechanisms, factors)
-    places = _common([_places(s) for s in every])
-    return Headline("place", places, factors)
+    for level, of in (("mechanism", _mechanisms), ("place", _places)):
+        claims = [of(s) for s in every]
+        if (found := _common(claims)) or level == "place":
+            break
+    return Headline(level, found, factors, tuple(_shared(claim, claims) for claim in found))
 
 
 def _silent(said: Summary) -> str:
@@ -51,10 +51,19 @@ def _places(said: Summary) -> list[tuple[str, ...]]:
 
 
 def _common(claims: Sequence[Sequence[tuple[str, ...]]]) -> tuple[tuple[str, ...], ...]:
-    """Claims of the first that share a member with one of each of the others, with what these cannot tell from it."""
-    found = []
+    """Claims of the first that share a member with one of each of the others: the members that all of them list come
+    first, then what some cannot tell from these. A claim that another one contains is left out."""
+    found: list[tuple[str, ...]] = []
     for claim in claims[0]:
         alike = [[other for other in those if set(other) & set(claim)] for those in claims[1:]]
         if all(alike):
-            found.append(tuple(dict.fromkeys([*claim, *(n for those in alike for other in those for n in other)])))
-    return tuple(found)
+            every = dict.fromkeys([*claim, *(n for those in alike for other in those for n in other)])
+            shared = [n for n in every if n in claim and all(any(n in o for o in those) for those in alike)]
+            found.append((*shared, *(n for n in every if n not in shared)))
+    kept = [c for k, c in enumerate(found) if not any(set(c) <= set(o) for o in (*found[:k],))]
+    return tuple(c for c in kept if not any(set(c) < set(o) for o in kept))
+
+
+def _shared(claim: tuple[str, ...], claims: Sequence[Sequence[tuple[str, ...]]]) -> int:
+    """Number of the leading members of a claim that every verdict lists."""
+    return sum(all(any(n in other for other in those) for those in claims) for n in claim)

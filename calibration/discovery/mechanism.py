@@ -155,7 +155,8 @@ def _of_one_family(space: CandidateSpace, ladder: Sequence[Candidate]) -> dict[s
 
 def _in_equations_alike(family: str, where: DiscrepancyLocation) -> tuple[str, ...]:
     """The family with the same driver in each equation that these data cannot tell from its own."""
-    equations = [f.partition(" that ") for f in (dataclasses.replace(where, place=p).family for p in where.alike)]
+    places = [p for p in where.alike if not bases_room.in_readings(p)]  # an instrument is not put beside a cause
+    equations = [dataclasses.replace(where, place=p).family.partition(" that ") for p in places]
     what, joint, driver = family.partition(" that ")
     alike = dict.fromkeys(equation for equation, *_ in equations)
     return tuple(f"{other}{joint}{driver}" for other in alike) if what in alike else ()

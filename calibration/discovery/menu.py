@@ -27,6 +27,7 @@ from mmrjax.signals import Signals, State
 KINDS = (
     "weigh", "zero current", "zero reading", "shunt", "strobe", "timing", "bare motor", "stall", "one motor",
     "braked motor", "reverse", "downhill", "lifted", "payload", "other voltages", "steepest slope", "crawl",
+    "other torques",
 )  # fmt: skip
 #: Share of the adhesion that a slope steeper than the table's may take by the fitted robot [-].
 GRIP = 0.95
@@ -79,6 +80,7 @@ class Run:
         repeats: readings that are averaged.
         watch: what can be damaged, and what shows that it will be.
         imposed: what is in the place of the voltage, see `Rig`; `motor_speed`: [rad/s]; `motor_current`: [A].
+        torque: of a brake on the output, against forward rotation [N·m]; empty: there is no brake.
     """
 
     name: str
@@ -99,6 +101,7 @@ class Run:
     imposed: str = "voltage"
     where: str = ""
     motors: int = 1
+    torque: tuple[float, ...] = ()
 
     def read(self, shown: tuple[str, ...]) -> tuple[int, ...]:
         """Positions of the channels that are read, among all that are shown."""
@@ -233,15 +236,17 @@ def _runs(
     sides: int | None = None,
     brake: float = 0.0,
     steepest: bool = False,
+    torques: Sequence[float] = (0.0,),
 ) -> Run:
-    """Runs under every combination of slopes and voltages."""
-    each = list(itertools.product(dict.fromkeys(slopes), dict.fromkeys(voltages)))
-    slope, voltage = (tuple(x) for x in zip(*each, strict=True))
+    """Runs under every combination of slopes, voltages and torques of a brake, where there is one."""
+    each = list(itertools.product(dict.fromkeys(slopes), dict.fromkeys(voltages), dict.fromkeys(torques)))
+    slope, voltage, torque = (tuple(x) for x in zip(*each, strict=True))
     own = (at.configuration,) if at is not None else ()
     return Run(
         ", ".join((name, *own)), (*(kinds or (name,)), *own), doing, setup, voltage, slope, (payload,) * len(each),
         tuple(c for c in (read or reach.measured) if c in reach.measured), 0 if at is None else at.index, sides,
         brake, math.inf if at is None else at.steepest, steepest, where=", ".join(own), motors=reach.motors,
+        torque=torque if reach.torques else (),
     )  # fmt: skip
 
 
@@ -256,6 +261,17 @@ def other_voltages(reach: Reach, used: tuple[float, ...]) -> tuple[float, ...]:
         levels = sorted([*levels, 0.5 * (low + high)])
         found.append(round_significant(0.5 * (low + high)))
     return tuple(sorted(set(found)))
+
+
+def other_torques(used: Sequence[float]) -> tuple[float, ...]:
+    """Three torques of a brake that a table lacks, in its widest gaps from none on, and the largest that it used."""
+    levels = sorted({0.0, *used})
+    found: list[float] = []
+    while len(found) < 3 and levels[-1] > 0:
+        low, high = max(itertools.pairwise(levels), key=lambda gap: round_significant(gap[1] - gap[0], 6))
+        levels = sorted([*levels, 0.5 * (low + high)])
+        found.append(round_significant(0.5 * (low + high)))
+    return tuple(sorted({*found, floor_significant(levels[-1]) if levels[-1] > 0 else 0.0}))
 
 
 def _travels(reach: Reach, used: Used) -> tuple[Run, ...]:
@@ -332,13 +348,19 @@ def _turns(reach: Reach, used: Used) -> tuple[Run, ...]:
         )
     )
     both = any(x < 0 for x in levels) and any(x > 0 for x in levels)
+    torques = other_torques(reach.torques)
+    way = -1.0 if levels[-1] > 0 else 1.0  # of a brake too, which is against the rotation
     found = [
         _runs(reach, others_of[reach.imposed], "run", kinds=("other voltages",), at=used,
               voltages=others),
         *([] if both else [
-            _runs(reach, "reverse", "other way", at=used,
-                  voltages=[-x if levels[-1] > 0 else x for x in (sizes[0], sizes[-1])])
+            _runs(reach, "reverse", "other way", at=used, voltages=[way * x for x in (sizes[0], sizes[-1])],
+                  torques=[0.0, *(way * x for x in torques[1:2])])
         ]),
+        *([
+            _runs(reach, "other torques", "run", at=used, voltages=[-way * x for x in (sizes[0], sizes[-1])],
+                  torques=[-way * x for x in torques])
+        ] if max(reach.torques, default=0.0) > 0 else []),
     ]  # fmt: skip
     return tuple(dataclasses.replace(r, imposed=reach.imposed) for r in found)
 
@@ -365,7 +387,7 @@ def possible(run: Run, does: np.ndarray) -> np.ndarray:
         does: whether the robot manages each run, shape (runs,).
     """
     kept = np.ones(len(does), bool)
-    axes = [np.asarray(x) for x in (run.slope, run.voltage, run.payload)]
+    axes = [np.asarray(x) for x in (run.slope, run.voltage, run.payload, run.torque) if len(x)]
     while kept.any() and not does[kept].all():
         levels = [(axis, level) for axis in axes for level in np.unique(axis[kept])]
         axis, level = max(levels, key=lambda at: float(np.mean(~does[kept & (at[0] == at[1])])))
@@ -382,8 +404,9 @@ def carried_out(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.n
         kept: by `possible`; temperature: of a winding after long running [°C]; speed: of the motor shaft [rad/s]; as
             foreseen, shape (runs,).
     """
-    voltage, slope, payload = (
-        tuple(v for v, k in zip(x, kept, strict=True) if k) for x in (run.voltage, run.slope, run.payload)
+    voltage, slope, payload, torque = (
+        tuple(v for v, k in zip(x, kept, strict=True) if k) if x else ()
+        for x in (run.voltage, run.slope, run.payload, run.torque)
     )
     watch: list[Watch] = []
     hottest, fastest, highest = float(temperature[kept].max()), float(np.abs(speed[kept]).max()), max(voltage)
@@ -399,4 +422,4 @@ def carried_out(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.n
         watch.append(Overspeed(fastest, limit, highest))
     if run.imposed == "voltage" and highest > reach.voltages[-1]:
         watch.append(Overvoltage(highest, reach.voltages[-1]))
-    return dataclasses.replace(run, voltage=voltage, slope=slope, payload=payload, watch=tuple(watch))
+    return dataclasses.replace(run, voltage=voltage, slope=slope, payload=payload, torque=torque, watch=tuple(watch))

@@ -279,11 +279,14 @@ class Headline:
         level: of the claims, a verdict; `open` where it depends on the noise whether anything is missing.
         claims: laws, mechanisms or places, each with those that data cannot tell from it.
         factors: on the noise.
+        shared: of each mechanism or place, how many of its members come first that hold at every noise; the others
+            cannot be told from these at some.
     """
 
     level: str
     claims: tuple[tuple[str, ...], ...]
     factors: tuple[float, ...]
+    shared: tuple[int, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)

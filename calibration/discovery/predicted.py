@@ -89,10 +89,13 @@ def batch(experiments: Sequence[Experiment], shown: tuple[str, ...]) -> Batch:
 def _conditions(run: Run) -> Conditions:
     # None would take the robot's own mass, which a batch with the others cannot.
     mass = UNLOADED if run.setup in setups.WEIGHTLESS else math.nan
+    torque = run.torque or None
     if run.imposed != "voltage":
         level = {run.imposed: run.voltage}
-        return Conditions(run.configuration, 0.0, run.slope, run.payload, total_mass=mass, **level)
-    return Conditions(run.configuration, run.voltage, run.slope, run.payload, total_mass=mass)
+        return Conditions(
+            run.configuration, 0.0, run.slope, run.payload, total_mass=mass, load_torque=torque, **level
+        )
+    return Conditions(run.configuration, run.voltage, run.slope, run.payload, total_mass=mass, load_torque=torque)
 
 
 def of_runs(function: Callable[..., T], robot: Robot, experiments: Batch, *own: Array) -> T:

@@ -68,6 +68,7 @@ class Reach:
             used, where these are imposed.
         has_ground: whether a ground carries it.
         duties: sizes of the driver's duty that the table used [-].
+        torques: sizes of a brake's torque that it used [N·m]; empty where it states none, so that there is no brake.
     """
 
     used: tuple[Used, ...]
@@ -88,6 +89,7 @@ class Reach:
     levels: tuple[float, ...] = ()
     has_ground: bool = True
     duties: tuple[float, ...] = ()
+    torques: tuple[float, ...] = ()
 
     @property
     def voltages(self) -> tuple[float, ...]:
@@ -136,6 +138,7 @@ def reach(robot: Robot, conditions: Conditions, measured: tuple[str, ...]) -> Re
         motor_speed, speed, geared, alone, motors, resistance, constant, motor.temperature_limit, robot.rig.imposed,
         _levels(np.asarray(getattr(conditions, robot.rig.imposed))) if conditions.voltage_follows else (),
         robot.has_ground, _levels(np.abs(np.asarray(conditions.duty))),
+        () if conditions.load_torque is None else _levels(np.abs(np.asarray(conditions.load_torque))),
     )  # fmt: skip
 
 

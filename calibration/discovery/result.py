@@ -743,6 +743,7 @@ def _effect(e: FoundEffect, support: NameSupport | None) -> dict[str, Any]:
 def _mechanism(m: Mechanism, curve: UnnamedDiscrepancy | None) -> dict[str, Any]:
     found = {n: getattr(m, n) for n in ("share", "gain", "again")} | {"se": m.se if np.isfinite(m.se) else None}
     listed = {n: list(getattr(m, n)) for n in ("families", "effects", "fails")}
+    listed["errors"] = {kind: se if np.isfinite(se) else None for kind, se in m.errors.items()}
     return {**listed, **found, "established": not m.fails, "course": "" if curve is None else words.course(curve)}
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial import legendre
 
-from calibration.data.columns import CURRENT, SPEED, Layout
+from calibration.data.columns import CURRENT, LOAD, SPEED, Layout
 from calibration.inference.linearization import Linearization
 from mmrjax import channels
 from mmrjax.balances import absent
@@ -180,6 +180,10 @@ class Scope:
         """All that straight travel of a robot has; None: of the packaged one."""
         return cls(balances_of(robot), axes_of(robot))
 
+    def over(self, columns: Mapping[str, np.ndarray]) -> Scope:
+        """The same with the torque of a brake among the conditions, of a table that states it."""
+        return dataclasses.replace(self, axes=(*self.axes, LOAD)) if LOAD in columns else self
+
 
 #: Signals of `effects.curve.WAYS`, by point; and a balance of the shafts.
 Ways = Mapping[str, np.ndarray]
@@ -207,7 +211,7 @@ def families(
         robot: whose channels and balances can be off; scope: None takes `Scope.of` it.
         ways: of each point, shape (rows,); None: all forward.
     """
-    scope = Scope.of(robot) if scope is None else scope
+    scope = (Scope.of(robot) if scope is None else scope).over(columns)
     balances = scope.balances
     ways = forward(len(weight)) if ways is None else ways
     unsigned = robot.rig.magnitudes if robot else ()
@@ -242,7 +246,8 @@ def surface(
     columns: Mapping[str, np.ndarray], weight: np.ndarray, scope: Scope, ways: Ways, place: str
 ) -> Float[np.ndarray, "points terms"]:
     """Polynomials in all conditions for each configuration; arguments as of `families`."""
-    of_column = {column: variable for variable, column in VARIABLES.items()} | {CURRENT: "current"}
+    of_column = {column: variable for variable, column in VARIABLES.items()}
+    of_column |= {CURRENT: "current", LOAD: "current"}  # whose sign is that of what drives the shafts too
     along = (in_travel(place, of_column[c], np.asarray(columns[c]), ways.__getitem__)[0] for c in scope.axes)
     spans = [scaled(x, weight) for x in along]
     powers = [p for p in itertools.product(range(DEGREE + 1), repeat=len(spans)) if sum(p) <= DEGREE]
@@ -298,7 +303,7 @@ def windows(
         robot, scope, ways: as of `families`.
     """
     counts = weight > 0
-    scope = Scope.of(robot) if scope is None else scope
+    scope = (Scope.of(robot) if scope is None else scope).over(columns)
     ways = forward(len(weight)) if ways is None else ways
     facing = {name: np.where(way < 0, -1.0, 1.0) for name, way in ways.items()}  # of what starts from rest, too
     offered: list[tuple[str, np.ndarray, np.ndarray]] = []  # axis, its values, which rows are inside

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.data.columns import CURRENT, SPEED
+from calibration.data.columns import CURRENT, LOAD, SPEED
 from calibration.data.courses import varies
 from calibration.data.runs import Runs
 from calibration.inference import held_out as refits
@@ -21,6 +21,7 @@ BLOCKS: dict[str, tuple[str, ...]] = {
     "speed": (SPEED,),
     "current": (CURRENT,),
     "payload": ("payload_kg",),
+    "load_torque": (LOAD,),
     "configuration": ("configuration",),
     "voltage_configuration": ("configuration", "supply_voltage_V"),
     "run": ("run_id",),
@@ -31,14 +32,16 @@ TURN = "turn"
 
 def in_words(by: str, joint: str = " and ") -> str:
     """What a block is named after, in words; `joint` joins two conditions."""
-    return by.replace("motor_speed", "motor speed").replace("_", joint)
+    for one in ("motor_speed", "load_torque"):
+        by = by.replace(one, one.replace("_", " "))
+    return by.replace("_", joint)
 
 
 #: Columns of blocks that are labels.
 NO_CONDITIONS = ("configuration", "run_id")
 #: Those whose values have no levels, or are measured.
-GRADED = (SPEED, CURRENT, "duty")
-#: Share of a value by which the next has to be larger to be of another level [-]: a speed or current that is
+GRADED = (SPEED, CURRENT, LOAD, "duty")
+#: Share of a value by which the next has to be larger to be of another level [-]: a speed, current or torque that is
 #: controlled is measured, and not twice the same. Blocks of a quantity that has no levels.
 APART, PARTS = 0.1, 4
 

@@ -15,6 +15,7 @@ from calibration.inference.conduct import conduct
 from calibration.inference.noise import Noise
 from calibration.inference.notes import Constant, Note, StiffSupply, Unmeasured
 from calibration.inference.ranges import check_ranges
+from calibration.inference.unused import no_load_gives, unused
 from mmrjax.errors import counted
 from mmrjax.robot import Robot
 from mmrjax.signals import SLIDES, STATUSES
@@ -31,6 +32,7 @@ def check(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[
     _configurations(runs, robot, names)
     _enough(runs, names, noise)
     said = [*runs.missing(), *_stuck(runs), *observers.kind(runs).check(runs, noise), *_constant_conditions(runs)]
+    said += [*unused(runs), *no_load_gives(runs)]
     return [*said, *check_ranges(runs, robot), *conduct(runs, robot)]
 
 

@@ -124,7 +124,8 @@ class Repeats(Note):
     Attributes:
         source: of the table; rows: numbers of two of them; column: of the readings; values: theirs [its unit].
         apart: by how much, in sds or as a share, as text.
-        unused: columns that differ between the two rows and are no conditions.
+        unused: columns that differ between the two rows and are no conditions; near: condition that the first of them
+            is most like, "" for none.
         more: groups of such rows beside this one.
     """
 
@@ -135,6 +136,32 @@ class Repeats(Note):
     apart: str
     unused: tuple[str, ...] = ()
     more: int = 0
+    near: str = ""
+
+
+class Unused(Note):
+    """Columns of numbers that vary from row to row and have no role.
+
+    Attributes:
+        source: of the table; columns: each with the column of this program that it is most like, "" for none.
+    """
+
+    source: str
+    columns: tuple[tuple[str, str], ...]
+
+
+class NoLoadGives(Note):
+    """Readings of the torque at the output that vary as no load on a shaft makes them vary.
+
+    Attributes:
+        source: of the table; column: of the channel; theirs: its name in the file.
+        share: of the variance of the readings that no load explains.
+    """
+
+    source: str
+    column: str
+    theirs: str
+    share: float
 
 
 class Turned(Note):

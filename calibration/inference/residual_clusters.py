@@ -38,7 +38,7 @@ DEGREE, SHARE = 2, 1 / 3
 #: Share of a column (sine of its angle) that conditions and parameters have to leave for it to be one of its own.
 OWN = 0.3
 #: Names of columns that say when a row was measured.
-_TIMES = re.compile(r"(^|_)(time|date|datetime|timestamp|stamp|epoch|clock)(_|$)", re.IGNORECASE)
+TIMES = re.compile(r"(^|_)(time|date|datetime|timestamp|stamp|epoch|clock)(_|$)", re.IGNORECASE)
 #: Share of the differences between levels from which a coarser column is said to make most of them [-].
 MOSTLY = 0.5
 
@@ -293,7 +293,7 @@ def _steps(cells: np.ndarray, words: np.ndarray, conditions: Sequence[np.ndarray
 
 def _is_time(name: str, cells: np.ndarray) -> bool:
     """Whether a column says when: by its name, by its words, or as numbers that only rise or only fall."""
-    if _TIMES.search(name):
+    if TIMES.search(name):
         return True
     if cells.dtype.kind == "f":
         steps = np.diff(cells)

@@ -36,6 +36,16 @@ def amounts(values: Sequence[float], unit: str) -> str:
     return f"{both([f'{v:g}' for v in sorted(set(values), key=abs)])} {unit}"
 
 
+#: Torque below which it is in mN·m [N·m].
+SMALL = 0.1
+
+
+def torques(values: Sequence[float]) -> str:
+    """«0, 0.2 and 0.4 N·m»; in mN·m where all are below `SMALL`."""
+    size, unit = (1e3, "mN·m") if max(map(abs, values)) < SMALL else (1.0, "N·m")
+    return amounts([menu.round_significant(size * v, 3) for v in values], unit)
+
+
 def slopes(angles: Sequence[float]) -> str:
     """«on the level and up 10 and 20 deg»."""
     words = ["on the level"] if any(s == 0 for s in angles) else []
@@ -100,13 +110,14 @@ def _weigh(act: menu.Act) -> str:
 
 
 def _run(run: menu.Run) -> str:
-    level = run.imposed != "voltage" and not any(run.slope)
+    level = (run.imposed != "voltage" or bool(run.torque)) and not any(run.slope)
     where = "" if run.setup in setups.WEIGHTLESS or level else f" {slopes(run.slope)}"
     read = both([channels.find(c).label for c in run.channels])
     turning = [menu.round_significant(v / RPM) for v in run.voltage]
     unit = {"voltage": "V", "motor_current": "A of each motor"}.get(run.imposed)
     at = amounts(turning, "rpm of the motor") if unit is None else amounts(run.voltage, unit)
-    text = f"{_doing(run)}{where} at {at}; read {read}"
+    against = f" against a brake of {torques(run.torque)}" if any(run.torque) else ""
+    text = f"{_doing(run)}{where} at {at}{against}; read {read}"
     return f"{text}. Watch {'; '.join(map(watch, run.watch))}" if run.watch else text
 
 
@@ -264,12 +275,17 @@ def _of_level(what: MoreRuns) -> dict[str, str]:
         "time": f"Record one {one} from a cold start for ten minutes, and again at once while all is warm",
     }
     if not within.has_ground:
-        words["current"] = f"{level} at one {one} with {_LOAD} that is raised in {what.runs} steps"
+        words["current"] = (
+            f"{level} at one {one} with {_brake(what)}" if any(within.torques) else words["speed_motor"]
+        )
     return words
 
 
-#: What loads a shaft, and a carriage.
-_LOAD = "a load (a brake on a shaft, a pull on a carriage)"
+def _brake(what: MoreRuns) -> str:
+    """`the brake's torque up to 0.8 N·m in steps of 0.05 N·m`, as the table varied it."""
+    most = max(what.within.torques)
+    size, unit = (1e3, "mN·m") if most < SMALL else (1.0, "N·m")
+    return f"the brake's torque{_up_to(size * most, what.runs, unit)}"
 
 
 def _of_shaft(what: MoreRuns) -> dict[str, str]:
@@ -279,5 +295,5 @@ def _of_shaft(what: MoreRuns) -> dict[str, str]:
         "voltage": f"Repeat with {_steps(what)}",
         "speed_motor": crawl,
         "speed": crawl,
-        "current": f"Repeat at {top:g} V with {_LOAD} that is raised in {what.runs} steps",
+        "current": f"Repeat at {top:g} V with {_brake(what)}" if any(what.within.torques) else crawl,
     }

@@ -88,7 +88,9 @@ def headline(found: notes.Headline) -> str:
     """What holds at every noise that was tried, in a sentence."""
     *first, last = [f"{f:g}" for f in found.factors]
     at = f"At {', '.join(first)} and {last} times the noise" if first else "At the stated noise"
-    claims = " and ".join(f"a {' or a '.join(c)}" for c in found.claims)
+    claims = " and ".join(
+        _claim(c[: n or len(c)], c[n:] if n else ()) for c, n in zip(found.claims, found.shared, strict=False)
+    )
     laws = " and ".join(" or ".join(c) for c in found.claims)
     held = {
         "none": "nothing is missing",
@@ -100,6 +102,12 @@ def headline(found: notes.Headline) -> str:
         "place": f"{claims or 'something'} is missing, and no more is established",
     }
     return f"{at} {held[found.level]}"
+
+
+def _claim(sure: Sequence[str], others: Sequence[str]) -> str:
+    """Members of a claim, and what some noises do not tell from them."""
+    apart = f" (not told at each noise from a {' or a '.join(others)})" if others else ""
+    return f"a {' or a '.join(sure)}{apart}"
 
 
 def _undescribed(said: notes.Summary) -> str:

@@ -56,11 +56,23 @@ def repeats(note: notes.Repeats) -> str:
     )
     if note.unused:
         many = len(note.unused) > 1
+        name = f'state [columns] {note.near} = "{note.unused[0]}"' if note.near else "name it under [columns]"
         return (
             f"{said}; {', '.join(note.unused)} {'vary' if many else 'varies'} there and {'are' if many else 'is'} "
-            "not used as a condition: name it under [columns], or give each level of a load a configuration"
+            f"not used as a condition: {name}, or give each level of a load a configuration"
         )
     return f"{said}; if one is wrong, remove it"
+
+
+def unused(note: notes.Unused) -> str:
+    """Columns that vary and have no role, and what each may be."""
+    names = [name for name, _ in note.columns]
+    vary, are = ("vary", "are") if len(names) > 1 else ("varies", "is")
+    said = [f"{note.source}: {', '.join(names)} {vary} from row to row and {are} not used"]
+    for name, near in note.columns:
+        if near:
+            said.append(f'if {name} is {near}, state [columns] {near} = "{name}" in the robot\'s file')
+    return "; ".join(said)
 
 
 def constant(note: notes.Constant) -> str:
@@ -127,6 +139,10 @@ SAID: dict[type, str | Callable[[Any], str]] = {
     notes.LargerNoise: "{channel}: {pairs} pairs of rows at the same conditions scatter {factor:.2g} times as much "
     "as the {source} noise says; its sd is taken {factor:.2g} times as large. Check the repeats, or state the noise "
     "with --noise",
+    notes.Unused: unused,
+    notes.NoLoadGives: "{source}, {theirs}: friction and a constant torque of a load leave {share:.0%} of its "
+    "variance unexplained; if a brake sets it, it is a condition: state [columns] load_torque_Nm = "
+    '"{theirs}" in the robot\'s file, and take output_torque out of its channels',
     notes.Turned: "{source}, {theirs}: off by {off:.2g} (rms) from what the file's numbers give, with the other sign "
     'by {turned:.2g}; if it is turned round, state [columns] {column} = {{column = "{theirs}", factor = -1}}',
     notes.StiffSupply: "{column} is {value:g} in every row: taken for a stiff supply; if it is no reading, remove "

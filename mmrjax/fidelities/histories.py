@@ -326,7 +326,8 @@ def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) 
             before, after = part.begin[MOTOR], end[MOTOR]
             nears = jnp.where(part.turn == 0, part.side * after < 0, part.turn < TURNS)
             rests, rest = part.turn == TURNS, end - after * along
-            to_rest = part.length * jnp.clip(before / (before - after), 0.0, 1.0)
+            lost = before - after  # nothing in a part of no length, of a step that begins at rest
+            to_rest = part.length * jnp.clip(before / jnp.where(lost == 0, 1.0, lost), 0.0, 1.0)
             return _Part(
                 jnp.where(nears | rests, part.turn + 1, TURNS + 2),
                 jnp.where(rests, rest, part.begin),

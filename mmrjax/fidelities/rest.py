@@ -47,6 +47,7 @@ def direction(robot: Robot, conditions: Conditions) -> Array:
     mass = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
     stall = robot.motor.torque_electromagnetic(voltage_at_rest(robot, conditions) / robot.motor.resistance)
     weight = chassis.torque_weight(mass * (1 / robot.sides), conditions.slope)
+    weight = weight if conditions.load_torque is None else weight + conditions.load_torque
     return jax.lax.stop_gradient(jnp.where(robot.gearbox.ratio * stall >= weight, 1.0, -1.0))
 
 

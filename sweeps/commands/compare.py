@@ -34,7 +34,8 @@ HISTORIES, OVER = "drive", {"time_s": "time [s]"}
 #: Conditions that are printed, and their headings.
 HEADINGS = {
     "supply_voltage_V": "U [V]", "motor_speed_rpm": "n [rpm]", "total_mass_kg": "M [kg]", "slope_deg": "slope [deg]",
-    "duty_left": "duty, left", "duty_right": "duty, right", "heading_deg": "heading [deg]",
+    "load_torque_Nm": "load torque [N·m]", "duty_left": "duty, left", "duty_right": "duty, right",
+    "heading_deg": "heading [deg]",
 }  # fmt: skip
 #: Group → channel → rows, rms_percent, max_percent, rms, unit (of the rms), r2, missing.
 Summary = dict[str, dict[str, dict[str, Any]]]

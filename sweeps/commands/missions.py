@@ -13,7 +13,7 @@ from rich.table import Table
 
 from calibration.data import profiles
 from calibration.data import runs as records
-from calibration.data.columns import SUPPLY
+from calibration.data.columns import LOAD, ON_SHAFT, SUPPLY
 from calibration.data.errors import BadConfiguration
 from calibration.data.profiles import ProfileTable
 from mmrjax import balances, channels, ground, missions, outputs
@@ -122,8 +122,11 @@ def _check_robot(robot: Robot) -> None:
 
 def _check_acting(robot: Robot, source: ProfileTable) -> None:
     """Refuse a profile that states what does not act on the robot's load."""
-    ground = ("slope_deg", "payload_kg", "surface")
-    imposed.check_acting(robot, (f"{source.source}, {column}" for column in ground if column in source.stated))
+    ground, shaft = (
+        [f"{source.source}, {column}" for column in columns if column in source.stated]
+        for columns in (("slope_deg", "payload_kg", "surface"), ON_SHAFT)
+    )
+    imposed.check_acting(robot, ground, shaft)
     if "speed" in source.modes and not robot.shows_travel:
         raise BadConfiguration(
             f"{source.source}, speed_mm_s: the robot's load is a shaft, of which no channel shows a travel; demand "
@@ -337,6 +340,7 @@ def _course(
         "source_voltage_V": signals.voltage_source,
         "motor_current_A": np.asarray(reading["motor_current"]),
         "slope_deg": np.degrees(signals.slope),
+        **({} if signals.load_torque is None else {LOAD: signals.load_torque}),
         "winding_temperature_C": winding if source.turns else np.asarray(reading["winding_temperature"]),
         "housing_temperature_C": housing,
         "energy_Wh": course.energy / JOULE_PER_WH,

@@ -11,6 +11,7 @@ from sweeps.console import say
 #: Kinds of rig, in words.
 KINDS = {
     "bench": "a motor with its gearbox that turns a shaft: brake, disk, worm, winch",
+    "dyno": "a motor against a brake whose torque is set and read",
     "pendulum": "a servo with an arm that gravity pulls",
     "servo": "a servo driven by PWM, whose angle is logged",
     "linear": "a carriage on a screw, a belt or a rope",

@@ -125,7 +125,8 @@ def _operating_points(
             table8 = {**table8, "slopes_deg": (0.0,)}
     axes = {key: getattr(config, key) or table8.get(key) for key in (*WHOLE, "motor_speeds_rpm")}
     for name in ranges:
-        imposed.check_acting(robot, [f"--vary {name}"] if name in axes_room.ON_GROUND else [])
+        ground, shaft = ([f"--vary {name}"] * (name in own) for own in (axes_room.ON_GROUND, axes_room.ON_SHAFT))
+        imposed.check_acting(robot, ground, shaft)
         if name in grid_room.AXIS and name != layout.imposed:
             raise BadConfiguration(
                 f"--vary {name}: the robot's file imposes the {words_of(layout.imposed)}; vary that"

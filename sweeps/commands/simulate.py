@@ -287,6 +287,7 @@ def print_runs(table: dict[str, np.ndarray], shown: Sequence[Channel]) -> None:
         "configuration": ("configuration", ""), "supply_voltage_V": ("supply voltage [V]", "g"),
         **({} if "supply_voltage_V" in table else {"motor_speed_rpm": ("motor speed [rpm]", ".1f")}),
         "total_mass_kg": ("total mass [kg]", "g"), "slope_deg": ("slope [deg]", "g"),
+        "load_torque_Nm": ("load torque [N·m]", "g"),
         "duty_left": ("duty, left", ".4g"), "duty_right": ("duty, right", ".4g"),
         "heading_deg": ("heading [deg]", "g"),
         **{c.column: (f"{c.label} [{c.unit}]", f".{c.resolution}f") for c in shown},

@@ -53,6 +53,7 @@ CONDITION_WORDS = {
     "supply_voltage_V": ("supply voltage", "V"),
     "payload_kg": ("payload", "kg"),
     "slope_deg": ("slope", "deg"),
+    "load_torque_Nm": ("load torque", "N·m"),
 }
 
 
@@ -63,7 +64,7 @@ ABREAST = 110
 def before_after(table: dict[str, np.ndarray], channels: Sequence[Channel], verdict: str) -> Figure:
     """Residual of every reading in sigmas, before and after; runs grouped by configuration and voltage."""
     own = imposed(table)
-    beside = [c for c in ("payload_kg", "slope_deg") if c in table]
+    beside = [c for c in ("payload_kg", "slope_deg", "load_torque_Nm") if c in table]
     order = np.lexsort((*(table[c] for c in beside), table[own], table["configuration"]))
     fig, grid = figure(len(channels), 1, 1.8 * len(channels), sharex=True)
     levels = np.unique(table[own]).size
@@ -94,7 +95,8 @@ def before_after(table: dict[str, np.ndarray], channels: Sequence[Channel], verd
                            rotation=90 if sum(len(word) + 2 for word in told) > ABREAST else 0)  # fmt: skip
     grid[-1, 0].grid(axis="x", visible=False)
     varied = own == "supply_voltage_V" or any(np.unique(table[c]).size > 1 for c in beside)
-    within = "by slope, then payload" if beside and varied else f"by {IMPOSED_WORDS[own].partition(' [')[0]}"
+    words = [CONDITION_WORDS[c][0] for c in reversed(beside)] if varied else []
+    within = f"by {', then '.join(words) or IMPOSED_WORDS[own].partition(' [')[0]}"
     grid[-1, 0].set_xlabel(f"runs, in each group {within}; band: ±2σ of the instruments")
     return fig
 

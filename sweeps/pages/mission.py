@@ -209,6 +209,6 @@ def _demand(found: Missions, k: int) -> str:
         shares = [(name, 0.01, "% duty") for name in ("duty", *PAIRS[0])] + [(name, 1.0, "V") for name in PAIRS[1]]
         spans = [span(source.values[name], one, unit) for name, one, unit in shares if name in source.values]
         said.append(" and ".join(spans) or "100 % duty")
-    units = {"voltage": "V", "slope_deg": "°", "payload": "kg", "current_other": "A"}
+    units = {"voltage": "V", "slope_deg": "°", "payload": "kg", "load_torque": "N·m", "current_other": "A"}
     said += [span(source.values[name], 1.0, unit) for name, unit in units.items() if name in source.values]
     return ", ".join([*said, *([source.surface[k]] if source.surface else [])])

@@ -106,6 +106,7 @@ CONDITIONS = {
     "total_mass_kg": ("M [kg]", "{:.1f}"),
     "payload_kg": ("payload [kg]", "{:g}"),
     "slope_deg": ("slope [°]", "{:g}"),
+    "load_torque_Nm": ("load torque [N·m]", "{:.4g}"),
     "duty_left": ("duty left", "{:.3g}"),
     "duty_right": ("duty right", "{:.3g}"),
     "heading_deg": ("heading from uphill [°]", "{:g}"),
@@ -134,6 +135,8 @@ def label(table: dict[str, np.ndarray], row: int) -> str:
         parts.append(f"{table['motor_current_A'][row]:g} A")
     if "payload_kg" in table:
         parts += [f"{table['payload_kg'][row]:g} kg", f"{table['slope_deg'][row]:g}°"]
+    if "load_torque_Nm" in table:
+        parts.append(f"{table['load_torque_Nm'][row]:.4g} N·m")
     if "duty_left" in table:
         parts.append(f"duties {table['duty_left'][row]:.3g} and {table['duty_right'][row]:.3g}")
     return ", ".join(parts)

@@ -25,6 +25,7 @@ _AXES = {
     "motor_speed_rpm": ("motor speed", " rpm"),
     "payload_kg": ("payload", " kg"),
     "slope_deg": ("slope", "°"),
+    "load_torque_Nm": ("load torque", " N·m"),
 }
 
 

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from mmrjax.conditions import Conditions
 
 CONFIGURATION, SURFACE = "configuration", "surface"
-#: Condition that is imposed, by `rig.IMPOSED`; those that act on a vehicle alone.
+#: Condition that is imposed, by `rig.IMPOSED`; those that act on a vehicle alone, and on a load on a shaft alone.
 AXIS = {name: name for name in IMPOSED}
-ON_GROUND = ("slope_deg", "payload", "total_mass", "adhesion")
+ON_GROUND, ON_SHAFT = ("slope_deg", "payload", "total_mass", "adhesion"), ("load_torque",)
 #: Most values of one axis: they are kept in memory, samples are not.
 LONGEST = 10_000_000
 #: Most points: beyond it their numbers leave 64 bits.
@@ -139,7 +139,8 @@ def _acting(names: set[str], robot: Robot, where: str, surface: str | None) -> N
             f"{AXIS[robot.rig.imposed]} instead"
         )
     ground = {*names, *([SURFACE] if surface is not None else [])} & {*ON_GROUND, SURFACE}
-    imposed.check_acting(robot, (f"{where}, {name}" for name in sorted(ground)))
+    shaft = [f"{where}, {name}" for name in ON_SHAFT if name in names]
+    imposed.check_acting(robot, (f"{where}, {name}" for name in sorted(ground)), shaft)
     if surface is not None and not robot.rig.scales_adhesion:
         raise BadConfiguration(
             f"{where}, conditions.surface: got {surface}; a rig's surfaces are configurations of its own "

@@ -27,6 +27,7 @@ def sweep(
     payloads: Axis = None,
     slopes_deg: Axis = None,
     surface: str | None = None,
+    load_torques: Axis = None,
     battery: bool = False,
     discharge: float = 0.0,
     model: str = "steady",
@@ -37,7 +38,7 @@ def sweep(
     Args:
         configurations: names, all by default; voltages [V], or for a rig that imposes it motor_speeds_rpm [rpm]
             or motor_currents_A [A].
-        payloads: [kg]; slopes_deg: [deg]; surface: of Table 5.
+        payloads: [kg]; slopes_deg: [deg]; surface: of Table 5; load_torques: of a load on a shaft [N·m].
         battery: whether the on-board battery feeds the motors; discharge: charge already taken from it [C].
         model, options: as for `simulate`.
 
@@ -53,7 +54,7 @@ def sweep(
         configurations=None if names is None else tuple(names),
         voltages_V=_axis(voltages), motor_speeds_rpm=_axis(motor_speeds_rpm),
         motor_currents_A=_axis(motor_currents_A), payloads_kg=_axis(payloads),
-        slopes_deg=_axis(slopes_deg), surface=surface,
+        slopes_deg=_axis(slopes_deg), surface=surface, load_torques_Nm=_axis(load_torques),
     )  # fmt: skip
     runs = grid(config, robot, battery)
     return simulate(robot, runs.conditions(robot, battery=float(battery), discharge=discharge), model, **options)

@@ -21,6 +21,7 @@ COLUMNS = {
     "voltage": ("supply_voltage_V", 1.0),
     "slope_deg": ("slope_deg", 1.0),
     "payload": ("payload_kg", 1.0),
+    "load_torque": ("load_torque_Nm", 1.0),
     "total_mass": ("total_mass_kg", 1.0),
     "motor_speed": ("motor_speed_rpm", channels.RPM),
     "motor_current": ("motor_current_A", 1.0),

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from calibration.data.columns import Layout
+from calibration.data.columns import LOAD, Layout
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.runs import Runs
 from mmrjax.robot import Robot
@@ -23,10 +23,10 @@ G = TypeVar("G", bound=GridPart)
 OPTIONS = {
     "voltages_V": "--voltages", "motor_speeds_rpm": "--motor-speeds",
     "motor_currents_A": "--motor-currents", "payloads_kg": "--payloads",
-    "slopes_deg": "--slopes", "surface": "--surface",
+    "slopes_deg": "--slopes", "surface": "--surface", "load_torques_Nm": "--load-torques",
 }  # fmt: skip
-#: Those that act on a vehicle alone.
-ON_GROUND = ("payloads_kg", "slopes_deg", "surface")
+#: Those that act on a vehicle alone, and on a load on a shaft alone.
+ON_GROUND, ON_SHAFT = ("payloads_kg", "slopes_deg", "surface"), ("load_torques_Nm",)
 #: Axis of what is imposed (`rig.IMPOSED`).
 AXIS = {"voltage": "voltages_V", "motor_speed": "motor_speeds_rpm", "motor_current": "motor_currents_A"}
 
@@ -73,7 +73,10 @@ def check(config: GridPart, robot: Robot) -> None:
     for key in AXIS.values():
         if key != AXIS[layout.imposed] and getattr(config, key) is not None:
             raise BadConfiguration(imposed.refused(robot, OPTIONS[key], OPTIONS[AXIS[layout.imposed]]))
-    imposed.check_acting(robot, (OPTIONS[key] for key in ON_GROUND if getattr(config, key) is not None))
+    ground, shaft = (
+        [OPTIONS[key] for key in keys if getattr(config, key) is not None] for keys in (ON_GROUND, ON_SHAFT)
+    )
+    imposed.check_acting(robot, ground, shaft)
     surface = config.surface
     if surface is not None and robot.rig.scales_adhesion and surface not in SURFACES:
         raise BadConfiguration(f"{OPTIONS['surface']}: got {surface!r}; {choices(surface, SURFACES)}")
@@ -93,8 +96,8 @@ def axes(config: GridPart, robot: Robot, battery: bool = False) -> dict[str, tup
         "configuration": configurations(config, robot),
         layout.imposed_column: (math.nan,) if battery else getattr(config, AXIS[layout.imposed]),
     }
-    ground = {"payload_kg": config.payloads_kg, "slope_deg": config.slopes_deg}
-    return found | {column: values for column, values in ground.items() if values}
+    loads = {LOAD: config.load_torques_Nm, "payload_kg": config.payloads_kg, "slope_deg": config.slopes_deg}
+    return found | {column: values for column, values in loads.items() if values}
 
 
 def grid(config: GridPart, robot: Robot, battery: bool = False) -> Runs:

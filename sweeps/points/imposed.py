@@ -12,7 +12,7 @@ from calibration.data.columns import Layout
 from calibration.data.errors import BadConfiguration
 from mmrjax.channels import RPM
 from mmrjax.conditions import OF_TURNS, sides_contradict
-from mmrjax.robot import Robot, cannot_turn
+from mmrjax.robot import NO_BRAKE, Robot, cannot_turn
 from mmrjax.tables import VOLTAGES_V
 from sweeps import capabilities
 
@@ -125,19 +125,18 @@ def refused(robot: Robot, option: str, instead: str) -> str:
     return f"{option}: the voltage is imposed on this robot, and its motors' speed follows; state {instead} [V]"
 
 
-def check_acting(robot: Robot, stated: Iterable[str]) -> None:
-    """Refuse conditions of the ground for a load that has none.
+def check_acting(robot: Robot, ground: Iterable[str] = (), shaft: Iterable[str] = ()) -> None:
+    """Refuse conditions of the ground for a load that has none, and those of a load on a shaft for a vehicle.
 
     Args:
-        stated: options or places that state one.
+        ground, shaft: options or places that state one.
 
     Raises:
         BadConfiguration: the first of them.
     """
-    for option in () if robot.has_ground else stated:
-        raise BadConfiguration(
-            f"{option}: the robot's load is a shaft, on which no slope, payload, mass or surface acts; leave it out"
-        )
+    for option in shaft if robot.has_ground else ground:
+        why = "the robot's load is a shaft, on which no slope, payload, mass or surface acts; leave it out"
+        raise BadConfiguration(f"{option}: {f'{NO_BRAKE}; leave it out' if robot.has_ground else why}")
 
 
 def check_battery(robot: Robot) -> None:

@@ -60,6 +60,7 @@ class Rig:
         p: true constants [SI]; stated: those of the file; ratio, supply [V], rated [A], torque [N·m], w_k [rad/s]: sizes.
         every: sampling step [s]; inputs: of each run at each row [SI], shape (runs, rows); delay: of the readings [s].
         sd: of each channel [unit of the column].
+        load_torque: of a brake at each row, held until the next [N·m], shape (runs, rows); None: none.
     """
 
     imposed: str
@@ -74,6 +75,7 @@ class Rig:
     inputs: np.ndarray
     delay: float
     sd: dict[str, float]
+    load_torque: np.ndarray | None = None
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -151,7 +153,9 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
     every = _side_by_side(terms or ())
     J_w, J_d, C, R, i = p["inertia"], p["rotor"], p["torque_constant"], p["resistance"], r.ratio
 
-    def signals(time, y, given, slope, way=None):
+    braked = np.zeros_like(inputs) if r.load_torque is None else np.tile(r.load_torque, (count, 1))
+
+    def signals(time, y, given, slope, brake, way=None):
         s = SimpleNamespace(time=time, C=C, fast=r.w_k, I=y[0], w=y[1], turn=y[2], b=y[3])
         if r.imposed == "motor_speed":
             s.w = given
@@ -161,7 +165,7 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
         def extra(balance):
             return laws.total(every, balance, s)
 
-        load = p["dry"] * s.d + p["damping"] * s.w_k + extra("track")
+        load = p["dry"] * s.d + p["damping"] * s.w_k + brake + extra("track")
         s.B = load
         s.B = load + extra("gearbox")
         idle = p["friction"] * s.d + p["viscous"] * s.w
@@ -182,8 +186,8 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
             s.dI = (given - s.I) / 2e-4
         return s
 
-    def rates(time, y, given, slope, way=None):
-        s = signals(time, y, given, slope, way)
+    def rates(time, y, given, slope, brake, way=None):
+        s = signals(time, y, given, slope, brake, way)
         b = (s.w_k - s.w_k * s.d * s.b) / YIELDS
         if r.imposed == "motor_speed":
             return np.stack([0 * s.w, 0 * s.w, s.w_k, b])
@@ -203,7 +207,7 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
             t = (row + n / per) * r.every
 
             def at(x: float, y: np.ndarray, what: Any = rates) -> Any:
-                return what(t + x * h, y, now + slope * (n + x) * h, slope)  # noqa: B023
+                return what(t + x * h, y, now + slope * (n + x) * h, slope, braked[:, row])  # noqa: B023
 
             if row * per + n in wanted:
                 s = at(0.0, y, signals) if lines else SimpleNamespace(I=y[0], w=y[1])
@@ -342,6 +346,8 @@ def case(r: Rig, name: str, sigmas: float, seed: int) -> Case:
         "time_s": np.tile(t, RUNS),
         column[r.imposed]: (r.inputs / (RPM if r.imposed == "motor_speed" else 1.0)).ravel(),
     }
+    if r.load_torque is not None:
+        table["load_torque_Nm"] = r.load_torque.ravel()
     for n in r.channels:
         head, _, unit = CHANNELS[n][0].rpartition("_")
         table[CHANNELS[n][0]] = np.array([typed(x, 9) for x in measured[n].ravel()])

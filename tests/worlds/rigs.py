@@ -291,7 +291,7 @@ def moved(name: str, value: float, by: float) -> float:
 @dataclasses.dataclass(frozen=True)
 class Conditions:
     """One array a column, shape (rows,), in the order of measuring: supply [V] and duty [-], or motor speed [rad/s];
-    slope [rad], payload [kg]; and the direction of travel, 1 or -1."""
+    slope [rad], payload [kg]; the direction of travel, 1 or -1; and torque of a brake on a shaft [N·m]."""
 
     supply: np.ndarray
     duty: np.ndarray
@@ -299,6 +299,7 @@ class Conditions:
     slope: np.ndarray
     payload: np.ndarray
     direction: np.ndarray
+    load_torque: np.ndarray
 
     def __len__(self) -> int:
         return len(self.supply)
@@ -335,7 +336,7 @@ def conditions(rng: np.random.Generator, r: Rig, p: Mapping[str, float]) -> Cond
     speed = np.round(0.9 * r.no_load / RPM * share, 1) * RPM * direction
     supply = np.round(r.supply * share, 2) * direction if r.imposed == "voltage" else r.supply * ones
     duty = np.round(share, 3) * direction if r.imposed == "duty" else ones
-    return Conditions(supply, duty, speed, np.radians(slope), payload, direction)
+    return Conditions(supply, duty, speed, np.radians(slope), payload, direction, 0 * ones)
 
 
 # --- the balances -----------------------------------------------------------------------------------
@@ -358,7 +359,7 @@ def solve(
     given = SimpleNamespace(
         sides=r.sides, supply=None if r.wide else c.supply, duty=np.ones(len(c)) if r.wide else c.duty, d=c.direction,
         motor_speed=c.motor_speed if r.wide else None, slope=c.slope, payload=c.payload, order=c.order,
-        mass=p["mass"] + c.payload if r.vehicle else None,
+        mass=p["mass"] + c.payload if r.vehicle else None, load_torque=c.load_torque,
     )  # fmt: skip
 
     def at(x: np.ndarray) -> SimpleNamespace:

@@ -177,7 +177,8 @@ def instant(
 
     Args:
         given: of each row: sides; supply [V] and duty, or motor_speed [rad/s] where that is imposed, else None;
-            direction d; slope [rad], payload [kg]; mass [kg] of what travels on the ground, None for a load on a shaft.
+            direction d; slope [rad], payload [kg]; mass [kg] of what travels on the ground, None for a load on a shaft,
+            which may have a load_torque [N·m] of a brake.
         p: constants, of the load without its configuration, a number or one a row; channels: whose readings are shown.
     """
 
@@ -214,7 +215,7 @@ def instant(
         s.slides = np.zeros(s.I.shape, bool)
         creep = 0.0
         friction = s.d * p["loss_coulomb"] + p["loss_viscous"] * s.w_k
-        s.pull = p.get("torque_constant", 0.0) * np.ones_like(s.I)
+        s.pull = (p.get("torque_constant", 0.0) + vars(given).get("load_torque", 0.0)) * np.ones_like(s.I)
     s.speed_left = s.V_teor - s.V - creep - extra("slip")
     s.B = friction + extra("track") + s.pull
     load = s.B + extra("gearbox")

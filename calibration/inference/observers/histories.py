@@ -91,9 +91,11 @@ EARLY, RESTING, RESTING_SD = 0.005, 0.2, 5.0
 #: Members of a search that one call of its program evaluates.
 TOGETHER = 2
 #: Fields of `Conditions` that may change within a run.
-CHANGING = ("voltage", "motor_current", "slope_deg", "payload", "adhesion", "total_mass", "duty", "open")
-#: Of these what is imposed.
-ON_LINES = ("voltage", "motor_current", "duty")
+CHANGING = (
+    "voltage", "motor_current", "slope_deg", "payload", "adhesion", "total_mass", "duty", "open", "load_torque",
+)  # fmt: skip
+#: Of these what is imposed, and a brake's torque, which is measured as it is.
+ON_LINES = ("voltage", "motor_current", "duty", "load_torque")
 #: A stretch of unchanged conditions so long may show steady travel [s].
 LASTING = 0.25
 #: Fewest steps from sample to sample of a run that is driven both ways as it passes through rest, where shafts and
@@ -477,26 +479,31 @@ class Histories(Observer):
         if not self.varying:
             return self.conditions
         rows = self.of_rows
+        braked = np.zeros(len(rows.voltage)) if rows.load_torque is None else _few(rows.load_torque)
         if rows.voltage_follows:
             own = "motor_current" if rows.motor_speed is None else "motor_speed"
             levels = _few(getattr(rows, own))
-            which = np.stack([rows.configuration, levels, rows.slope_deg, rows.payload], 1)
+            which = np.stack([rows.configuration, levels, rows.slope_deg, rows.payload, braked], 1)
             cases = np.unique(which[levels != 0], axis=0, return_index=True)[1]
             cases = np.flatnonzero(levels != 0)[cases] if len(cases) else np.arange(1)
             held = {} if rows.motor_speed is None else {"motor_acceleration": np.zeros_like(levels)}
+            held |= {} if rows.load_torque is None else {"load_torque": braked}
             steady = dataclasses.replace(rows, **{own: levels}, **held)
             return _some(steady, cases)
         applied = np.where(rows.open > 0.5, 0.0, rows.voltage * rows.duty)
         some = np.flatnonzero(applied != 0) if (applied != 0).any() else np.arange(1)
+        way = np.where(applied < 0, -1.0, 1.0)
+        braked = way * braked
         turned = dataclasses.replace(
             rows,
             voltage=_few(np.abs(applied)),
-            slope_deg=_few(np.where(applied < 0, -1.0, 1.0) * rows.slope_deg),
+            slope_deg=_few(way * rows.slope_deg),
             payload=_few(rows.payload),
+            load_torque=None if rows.load_torque is None else braked,
             duty=np.ones_like(rows.duty),
             open=np.zeros_like(rows.open),
         )
-        which = np.stack([turned.configuration, turned.voltage, turned.slope_deg, turned.payload], 1)[some]
+        which = np.stack([turned.configuration, turned.voltage, turned.slope_deg, turned.payload, braked], 1)[some]
         cases = some[np.unique(which, axis=0, return_index=True)[1]]
         return _some(turned, cases)
 

@@ -110,7 +110,8 @@ class SettledRuns(Observer):
     fewest: ClassVar[int] = 6
     sizes_padded: ClassVar[tuple[int, ...]] = (16, 24, 32, 48, 64, 96, 128, 192, 256)
     blocks: ClassVar[tuple[str, ...]] = (
-        "slope", "voltage_configuration", "voltage", "duty", "speed", "current", "payload", "configuration",
+        "slope", "voltage_configuration", "voltage", "duty", "speed", "current", "payload", "load_torque",
+        "configuration",
     )  # fmt: skip
     policy: ClassVar[SearchPolicy] = SearchPolicy()
     rows_tell: ClassVar[bool] = True
@@ -164,7 +165,8 @@ class SettledRuns(Observer):
                 known = f"{apart[at] / sd[at]:.0f} sd" if not noise.estimated[k] else f"{apart[at] / mean[at]:.0%}"
                 values = float(runs[column][first]), float(runs[column][second])
                 others = _unused(runs, first, second, column)
-                found.append(Repeats(runs.source, (first + 1, second + 1), column, values, known, others))
+                near = runs.layout.nearest(others[0], runs.columns) if others else ""
+                found.append(Repeats(runs.source, (first + 1, second + 1), column, values, known, others, near=near))
         if found and len(alike) == 1:
             raise BadData(f"{tables.repeats(found[0])}; no condition varies, so nothing can be fitted")
         return [dataclasses.replace(found[0], more=len(found) - 1)] if found else []

@@ -1,0 +1,70 @@
+"""Columns of a table that vary from row to row and are no conditions of its fit."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import nnls
+
+from calibration.data.columns import LOAD, SPEED
+from calibration.data.courses import applied
+from calibration.data.runs import Runs
+from calibration.inference.notes import NoLoadGives, Unused
+from calibration.inference.residual_clusters import TIMES
+from mmrjax import channels
+
+#: Share of a torque's variation that no load of a shaft explains from which a brake may set it, and share of its size
+#: that varies at least.
+BRAKED, VARIES = 0.5, 0.2
+#: Channel of the torque at the output.
+TORQUE = channels.find("output_torque")
+
+
+def unused(runs: Runs) -> tuple[Unused, ...]:
+    """A note on the columns of numbers that vary and have no role; row numbers and times are left out."""
+    found = [name for name, cells in runs.extras.items() if _varies(name, cells)]
+    return (
+        (Unused(runs.source, tuple((name, runs.layout.nearest(name, runs.columns)) for name in found)),)
+        if found
+        else ()
+    )
+
+
+def _varies(name: str, cells: np.ndarray) -> bool:
+    """True for a column of several numbers that neither counts the rows nor states when they were measured."""
+    if cells.dtype.kind != "f" or TIMES.search(name):
+        return False
+    levels = np.unique(cells[np.isfinite(cells)])
+    counts = len(levels) == len(cells) and bool((np.diff(levels) == 1).all())
+    return len(levels) > 1 and not counts
+
+
+def no_load_gives(runs: Runs) -> tuple[NoLoadGives, ...]:
+    """A note on a torque read at the output that varies as no load on a shaft makes it vary.
+
+    A load takes M_0 sign ω + K ω + M_c with M_0 and K of at least 0; where more than `BRAKED` of the variance of the
+    readings is left by the best of those, in each configuration, a brake sets the torque.
+    """
+    column = TORQUE.column
+    if runs.layout.has_ground or runs.has(LOAD) or not (runs.has(column) and TORQUE in runs.channels):
+        return ()
+    speed = next((runs[c] for c in (SPEED, "output_speed_rpm") if runs.has(c)), None)
+    if speed is None or runs.sampled:
+        return ()
+    total = left = 0.0
+    torque, way = runs[column], np.sign(applied(runs))
+    read = np.isfinite(torque) & np.isfinite(speed)
+    for name in np.unique(runs["configuration"]):
+        mine = read & (runs["configuration"] == name)
+        if mine.sum() >= 4:
+            y, w, d = torque[mine], np.abs(speed[mine]), way[mine]  # meters may show magnitude alone
+            left += min(_left(y, w, d), _left(np.abs(y), w, np.abs(d)))
+            total += float(np.sum((y - y.mean()) ** 2))
+    if left <= BRAKED * total or total < VARIES**2 * float(np.sum(torque[read] ** 2)):
+        return ()
+    return (NoLoadGives(runs.source, column, runs.headings.get(column, column), left / total),)
+
+
+def _left(torque: np.ndarray, speed: np.ndarray, way: np.ndarray) -> float:
+    """Sum of squares of a torque that the best load leaves, of sizes of a speed and the ways round."""
+    w, ones = speed / max(float(speed.max()), 1e-12), np.ones(len(speed))
+    return float(nnls(np.stack([way, way * w, ones, -ones], 1), torque)[1] ** 2)

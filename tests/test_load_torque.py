@@ -1,0 +1,288 @@
+"""Torque of a brake as a condition: against formulas, the same torque of the load, another implementation, differences."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_shaft import SPEEDS, bench, current_of
+from test_worlds_rigs import steady
+from worlds import logs, rigs
+
+import mmrjax as mm
+from calibration.data import robot_file
+from calibration.data import runs as records
+from calibration.data.errors import BadData
+from calibration.inference import bases, blocks
+from calibration.inference.observers import Histories, SettledRuns
+from mmrjax import balances
+from mmrjax.conditions import Conditions
+from mmrjax.errors import UsageError
+from mmrjax.fidelities.drive import drive_batch
+from mmrjax.fidelities.histories import grid, histories
+from mmrjax.fidelities.steady import steady_batch, steady_outputs
+from mmrjax.rig import Rig
+from mmrjax.signals import STATUSES, State
+
+VOLTS = np.array([24.0, 6.0, -12.0, 12.0])
+TORQUE = np.array([0.5, 0.1, -0.3, 0.0])  # of a brake: against the way that each turns
+
+
+def test_current_at_an_imposed_speed_follows_from_a_brake():
+    """In both directions, a torque that drives the motor among them; its derivative is that of the formula."""
+
+    def shown(torque):
+        conditions = Conditions(motor_speed=SPEEDS, load_torque=torque)
+        return steady_outputs(bench(), conditions, ("motor_current", "output_torque"))
+
+    torque = jnp.asarray([-0.1, 1.0, 0.3, 2.0])
+    found, slope = jax.jit(lambda x: jax.jvp(shown, (x,), (jnp.ones(4),)))(torque)
+    np.testing.assert_allclose(found["motor_current"], current_of(SPEEDS, np.asarray(torque)), rtol=1e-9)
+    np.testing.assert_allclose(
+        found["output_torque"], np.sign(SPEEDS) * 0.2 + 0.01 * SPEEDS / 16 + np.asarray(torque), rtol=1e-9
+    )
+    drives = np.array([False, True, False, False])
+    np.testing.assert_allclose(slope["motor_current"], np.where(drives, 0.8, 1 / 0.8) / 16 / 0.05, rtol=1e-9)
+
+
+@pytest.mark.parametrize("loose", [False, True])
+def test_a_brake_enters_as_a_constant_torque_of_the_load(loose):
+    """Every signal of an instant, of a shaft with and without backlash, under an arm's weight."""
+    rig, load = Rig(loose=loose), {"torque_gravity": 0.4, "backlash": 0.02 * loose}
+    state = State(1.0, 120.0, 7.0, 0.0, distance=0.3, gap=0.012 if loose else None)
+    moving = jax.jit(balances.moving)
+    braked = moving(bench(rig, **load), Conditions(load_torque=0.3), state)
+    stated = moving(bench(rig, torque_constant=0.3, **load), Conditions(), state)
+    free = moving(bench(rig, **load), Conditions(), state)
+    jax.tree.map(np.testing.assert_allclose, dataclasses.replace(braked, load_torque=None), stated)
+    assert float(braked.acceleration) < float(free.acceleration)
+
+
+def test_settled_rigs_with_a_brake_are_those_of_another_implementation():
+    for imposed in ("voltage", "motor_speed"):
+        w = rigs.world(np.random.default_rng([3, 1]), "bench", imposed)
+        size = 0.5 * rigs._nominal(w.constants, w.rig.supply)[0]
+        torque = size * np.random.default_rng(0).uniform(0, 1, len(w.conditions)) * w.conditions.direction
+        w = dataclasses.replace(w, conditions=dataclasses.replace(w.conditions, load_torque=torque))
+        found, _ = steady(w)
+        s, sound = rigs.solve(w.rig, w.conditions, w.constants)
+        free, _ = rigs.solve(w.rig, dataclasses.replace(w.conditions, load_torque=0 * torque), w.constants)
+        assert sound.all()
+        scale = np.abs(s.shown).max(1, keepdims=True)
+        np.testing.assert_allclose(found / scale, s.shown / scale, atol=1e-6)
+        assert (
+            np.abs(free.shown - s.shown).max(1) > 1e-2 * scale[:, 0]
+        ).any()  # a brake without effect would be seen
+
+
+def test_a_torque_that_changes_from_step_to_step_is_followed():
+    """A run from rest, which the torque begins to turn back before the current has risen."""
+    times = grid(np.linspace(0, 0.6, 13))
+    run = jax.jit(lambda x: histories(bench(), Conditions(voltage=24.0, load_torque=x), jnp.asarray(times)))
+    changes = run(0.3 + 0.2 * np.sin(8 * times)).speed_motor
+    end = float(run(np.full(len(times), 0.3)).speed_motor[-1])
+    assert np.isfinite(changes).all() and abs(float(changes[-1]) - end) > 1.0
+    assert 0.05 * end + 3.0 * current_of(end, 0.3) == pytest.approx(24.0, rel=1e-3)  # back-EMF and what torque takes
+
+
+def _steady(torque):
+    return steady_batch(bench(), Conditions(voltage=VOLTS, load_torque=torque))
+
+
+def _driven(torque):
+    return drive_batch(bench(), Conditions(voltage=VOLTS, load_torque=torque), jnp.asarray([0.0, 2.0, 4.0])).result
+
+
+@pytest.mark.slow
+def test_every_fidelity_settles_alike_under_a_brake():
+    at, run = _steady(TORQUE), _driven(TORQUE)
+    for name in ("motor_speed", "total_current", "output_torque"):
+        np.testing.assert_allclose(run.reading[name], at.reading[name], rtol=1e-6)
+    assert [STATUSES[s] for s in np.asarray(at.status)] == ["converged", "converged", "reverses", "converged"]
+    without = steady_batch(bench(), Conditions(voltage=VOLTS))
+    assert (np.abs(at.motor_speed)[:3] < np.abs(without.motor_speed)[:3]).all()  # it brakes either way
+    np.testing.assert_array_equal(at.motor_speed[3], without.motor_speed[3])
+    times = grid(np.linspace(0, 4.0, 9))
+    shown = jax.jit(histories)(bench(), Conditions(voltage=24.0, load_torque=0.5), jnp.asarray(times))
+    assert float(shown.speed_motor[-1]) == pytest.approx(float(at.motor_speed[0]), rel=1e-6)
+
+
+@pytest.mark.slow
+def test_derivatives_by_a_brake_are_differences():
+    """Of settled travel and of a run over time; of a history by the load's own torque, which is the same."""
+    for settles in (_steady, _driven):
+        by_torque = jax.jvp(lambda x: settles(x).motor_speed, (jnp.asarray(TORQUE),), (jnp.ones(4),))[1]  # noqa: B023
+        less, more = (settles(TORQUE + h).motor_speed for h in (-1e-4, 1e-4))
+        np.testing.assert_allclose(by_torque, (more - less) / 2e-4, rtol=1e-4)
+    times = jnp.asarray(grid(np.linspace(0, 0.6, 13)))
+
+    @jax.jit
+    def both(torque):
+        shown = lambda own: histories(bench(torque_constant=own), Conditions(load_torque=torque), times).speed_motor  # noqa: E731
+        return jax.jvp(shown, (0.0,), (1.0,))
+
+    torque = 0.3 + 0.2 * jnp.sin(8 * times)
+    less, more = (both(torque + h)[0] for h in (-1e-4, 1e-4))
+    np.testing.assert_allclose(both(torque)[1], (more - less) / 2e-4, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_a_log_with_a_brake_is_that_of_another_implementation(tmp_path):
+    from test_worlds_logs import shown
+
+    for imposed in ("voltage", "motor_speed"):
+        rig = logs.rig(np.random.default_rng([5, 1]), imposed)
+        steps = np.random.default_rng(2).uniform(0.0, 0.4 * rig.torque, (logs.RUNS, logs.ROWS // 4 + 1))
+        torque = np.round(np.repeat(steps, 4, 1)[:, : logs.ROWS], 6) * np.sign(rig.inputs)
+        rig = dataclasses.replace(rig, load_torque=torque)
+        case = logs.case(rig, "", 0.0, 1)
+        clean = logs.whitened(rig, logs.histories(rig, [rig.p])[0])
+        free = logs.whitened(rig, logs.histories(dataclasses.replace(rig, load_torque=None), [rig.p])[0])
+        mine = shown(tmp_path / imposed, case)[0]
+        assert np.sqrt(np.mean((mine - clean) ** 2)) < 0.3
+        assert np.sqrt(np.mean((free - clean) ** 2)) > 3.0
+
+
+def test_a_brake_on_a_vehicle_is_refused():
+    with pytest.raises(UsageError, match=r"load_torque: the robot is a vehicle.*slope_deg or payload"):
+        mm.simulate(mm.nominal(), mm.Conditions(load_torque=0.1))
+    profile = mm.profile.profile([0.0, 1.0], load_torque=0.1)
+    with pytest.raises(UsageError, match="load_torque: the robot is a vehicle"):
+        mm.simulate(mm.nominal(), mm.Conditions(), profile=profile)
+
+
+RIG = """
+base = "none"
+{head}
+[motor]
+resistance = 0.5
+torque_constant = 0.05
+friction_coulomb = 0.01
+[gearbox]
+ratio = 1
+efficiency_load = 1.0
+[brake]
+load = "shaft"
+inertia = 1e-4
+loss_coulomb = 0.0
+"""
+
+
+def read(tmp_path, lines, head=""):
+    (tmp_path / "rig.toml").write_text(RIG.format(head=head))
+    (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
+    robot = robot_file.read(tmp_path / "rig.toml")
+    return records.read(tmp_path / "runs.csv", robot=robot), robot
+
+
+@pytest.mark.parametrize(
+    ("column", "head", "factor"),
+    [
+        ("load_torque_Nm", "", 1.0),
+        ("load_torque_mNm", "", 1e-3),
+        ("load_torque_kNm", "", 1e3),
+        ("M_b", '[columns]\nload_torque_mNm = "M_b"', 1e-3),
+        ("M_b", '[columns]\nload_torque_Nm = {column = "M_b", factor = -0.1}', -0.1),
+    ],
+)
+def test_the_torque_of_a_row_is_read_in_its_unit(tmp_path, column, head, factor):
+    lines = [f"supply_voltage_V,motor_speed_rpm,{column}", "24,4000,0.2", "12,2000,0"]
+    runs, rig = read(tmp_path, lines, head)
+    np.testing.assert_allclose(runs.conditions(rig).load_torque, [0.2 * factor, 0.0])
+    assert "load_torque_Nm" in runs.axes
+
+
+@pytest.mark.parametrize(
+    ("cell", "said"),
+    [
+        ("", "runs.csv row 1, load_torque_Nm: got an empty cell; expected a number, -10000 to 10000"),
+        ("nan", "runs.csv row 1, load_torque_Nm: got nan; expected -10000 to 10000"),
+        ("inf", "runs.csv row 1, load_torque_Nm: got inf; expected -10000 to 10000"),
+        ("25000", "runs.csv row 1, load_torque_Nm: got 25000; is it in mNm? then name the column load_torque_mNm; "),
+        ("200 mNm", "write numbers alone, in Nm, or name the column load_torque_mNm"),
+    ],
+)
+def test_a_torque_that_is_none_is_refused(tmp_path, cell, said):
+    with pytest.raises(BadData) as error:
+        read(tmp_path, ["supply_voltage_V,motor_speed_rpm,load_torque_Nm", f"24,4000,{cell}"])
+    assert said in str(error.value)
+
+
+def test_columns_that_may_be_the_torque_are_asked_about(tmp_path):
+    with pytest.raises(BadData, match=r"unknown column load_torque; did you mean load_torque_Nm\?"):
+        read(tmp_path, ["supply_voltage_V,motor_speed_rpm,load_torque", "24,4000,0"])
+    with pytest.raises(BadData, match="load_torque_Nm and load_torque_mNm state the same"):
+        read(tmp_path, ["supply_voltage_V,motor_speed_rpm,load_torque_Nm,load_torque_mNm", "24,4000,0,0"])
+
+
+def test_a_table_of_a_vehicle_with_a_brake_is_refused(tmp_path):
+    head = "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,load_torque_mNm"
+    path = tmp_path / "runs.csv"
+    path.write_text(f"{head}\n6T2A,24,15,0,0,3,0\n6T2A,24,15,0,0,3,20\n")
+    with pytest.raises(BadData) as error:
+        records.read(path, robot=mm.nominal())
+    assert str(error.value) == (
+        "runs.csv row 2, load_torque_mNm: got 20; the robot is a vehicle, whose load is its ground, and a brake's torque "
+        "acts on a shaft; state slope_deg or payload_kg, or describe the load as a shaft"
+    )
+
+
+def test_a_torque_without_a_sign_is_said_to_drive_a_shaft_that_runs_backward(tmp_path):
+    lines = [
+        "supply_voltage_V,motor_speed_rpm,motor_current_A,load_torque_Nm",
+        "24,4000,4.2,0.2",
+        "-24,-4400,3.8,0.2",
+    ]
+    channels = 'channels = ["motor_speed", "motor_current"]'
+    runs, _ = read(tmp_path, lines, channels)
+    assert (
+        runs.pulled
+        and (
+            "runs.csv row 2, load_torque_Nm: got 0.2 where the shaft is driven backward: it turns the shaft on there; a "
+            "brake's torque is negative backward"
+        )
+        in runs.notes
+    )
+    lines[2] = "-24,-4000,-4.2,-0.2"
+    runs, _ = read(tmp_path, lines, channels)
+    assert not runs.pulled and not any("backward" in note for note in runs.notes)
+
+
+@pytest.mark.parametrize("between", ["held", "linear"])
+def test_a_log_holds_the_torque_of_every_sample(tmp_path, between):
+    time = np.arange(12) * 0.05
+    torque = np.round(0.1 + 0.05 * np.sin(20 * time), 4)
+    lines = ["time_s,supply_voltage_V,motor_speed_rpm,load_torque_Nm"]
+    lines += [f"{t:.2f},24,{1e4 * t:.6g},{m}" for t, m in zip(time, torque, strict=True)]
+    runs, rig = read(tmp_path, lines, f'between_rows = "{between}"')
+    observe = Histories.of(runs, rig)
+    held, times = np.asarray(observe.conditions.load_torque)[0], np.asarray(observe.times)[0]
+    middle = 0.5 * (times[1:] + times[:-1])
+    at = np.interp(middle, time, torque) if between == "linear" else torque[np.searchsorted(time, middle) - 1]
+    moving = np.diff(times) > 0
+    np.testing.assert_allclose(held[:-1][moving], at[moving])
+    assert observe.driven.load_torque.min() >= torque.min()
+
+
+def test_rows_are_held_out_by_levels_of_the_torque(tmp_path):
+    torque = [0.1, 0.1003, 0.2, 0.2004, 0.4, 0.4001]
+    lines = ["supply_voltage_V,motor_speed_rpm,load_torque_Nm", *(f"24,{4000 - 900 * m:.6g},{m}" for m in torque)]
+    runs, _ = read(tmp_path, lines)
+    found = blocks.distinct(runs, SettledRuns.blocks)
+    assert list(found) == ["load_torque"] and [int(m.sum()) for m in found["load_torque"].values()] == [2, 2, 2]
+    assert blocks.in_words("load_torque") == "load torque"
+
+
+def test_a_drift_that_goes_with_the_torque_is_none():
+    """Tables of a brake are sorted by its torque; their order then shows no drift of its own."""
+    columns = {
+        "configuration": np.full(18, "brake"), "order": np.arange(18.0), "supply_voltage_V": np.full(18, 24.0),
+        "total_current_A": np.linspace(0, 9, 18),
+    }  # fmt: skip
+    rig = bench()
+    for with_torque in (False, True):
+        known = columns | ({"load_torque_Nm": np.linspace(0, 0.5, 18)} if with_torque else {})
+        over = {variable for basis in bases.families(known, np.ones(18), rig) for _, variable in basis.names}
+        assert ("order" in over) != with_torque
