@@ -522,7 +522,7 @@ class DiscoveryResult:
     @property
     def standing(self) -> str:
         """Why names do not stand, or beside what they do, in words; "" where there is nothing to say."""
-        return words.reason(self.support)
+        return words.why(self)
 
     @property
     def notes(self) -> tuple[str, ...]:
