@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from mmrjax.effects.base import Effect, amplitude
+from mmrjax.effects.bristle import Bristle, breakaway_parameter
 from mmrjax.effects.periodic import Periodic, phase_parameter
 from mmrjax.one_sided import magnitude
 from mmrjax.params import Index, Scalar, parameter
@@ -348,7 +349,7 @@ class TorqueOffset(TrackEffect):
         return self.amplitude * jnp.ones_like(signals.speed_motor)
 
 
-class Presliding(TrackEffect):
+class Presliding(Bristle, TrackEffect):
     """ΔM_t = a (z - sign ω_k), θ_s z' = ω_k - |ω_k| z, z(0) = 0: of the dry loss a share a acts through bristles.
 
     Dry friction builds up over a small turn instead of at once, as contacts yield before they slide.
@@ -356,13 +357,11 @@ class Presliding(TrackEffect):
     Source: Dahl, A solid friction model (1968), with exponent 1; it is the first order of Canudas de Wit, Olsson,
     Åström and Lischinsky (1995) without their damping of the bristles. Settled z = sign ω_k: travel shows nothing
     of it, reversals do. The memory is z [-]. At a = M_t0 all of the dry friction is Dahl's. `stick_slip` is what the
-    contacts hold beyond M_t0 before they let go.
+    contacts hold beyond M_t0 before they let go; `bristle_load_loss` grows with the load.
     """
 
     driver = "direction"
     transient = True
-    memory_size = 1.0
-    memory_unit = "-"
 
     amplitude: Scalar = amplitude(
         unit="N·m",
@@ -371,21 +370,7 @@ class Presliding(TrackEffect):
         sd=0.1,
         source="a third of M_t0 of Table 3",
     )
-    angle_breakaway: Scalar = parameter(
-        0.02,
-        unit="rad",
-        meaning="turn of the pulley over which the contacts yield θ_s",
-        bounds=(1e-4, 2.0),
-        relative_sd=0.5,
-        source="1 mm of belt, a degree of a geared shaft",
-    )
-
-    def settled(self, robot: Robot, signals: Signals) -> Scalar:
-        return signals.direction
-
-    def rate(self, robot: Robot, signals: Signals) -> Scalar:
-        speed = signals.speed_wheel
-        return speed * (1 - signals.direction * signals.memory[self.name]) / self.angle_breakaway
+    angle_breakaway: Scalar = breakaway_parameter()
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * (self.recall(robot, signals) - signals.direction)

@@ -219,6 +219,8 @@ TRANSIENT: dict[str, Law] = {
     "battery_sag": Law("battery_sag", "supply", lambda s, q: s.q * s.battery, 0.2),
     "stick_slip": Law("stick_slip", "track", lambda s, q: s.z, 0.1),
     "presliding": Law("presliding", "track", lambda s, q: s.b - s.d, 0.1),
+    "bristle_load_loss": Law("bristle_load_loss", "gearbox", lambda s, q: abs(s.B) * s.b, 0.05),
+    "bristle_backdriving_loss": Law("bristle_backdriving_loss", "gearbox", lambda s, q: (abs(s.B) * s.b - s.B * s.b**2) / 2, 0.1),
     "angle_friction": Law("angle_friction", "track", lambda s, q: np.sin(s.turn + q["phase"]) * s.d, 0.05, _PHASE),
     "position_friction": Law("position_friction", "track", lambda s, q: s.turn * s.d, 0.01),
 }  # fmt: skip
@@ -382,6 +384,7 @@ LOGS: dict[str, Law] = {
     "directional_friction": _rig("directional_friction", _output(0.07), either=True),
     "directional_viscous": Law("directional_viscous", "track", lambda s, q: s.w_k * s.d, lambda r: 0.07 * r.torque / r.w_k, _no_shapes, either=True),
     "presliding": _rig("presliding", _output(0.1)),
+    "bristle_load_loss": _rig("bristle_load_loss", lambda r: 0.1),
     "angle_friction": _rig("angle_friction", _output(0.07), shapes=lambda r: _PHASE),
 }  # fmt: skip
 OUTSIDE_LOGS: dict[str, Law] = {
