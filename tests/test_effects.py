@@ -746,7 +746,7 @@ mass_error mass_offset rotating_inertia supply_sag battery_sag series_resistance
 thermal_drift coast_decay armature_inductance windage stribeck_motor iron_loss torque_constant_saturation cogging gear_load_loss
 gear_quadratic_loss stribeck_gear backdriving_loss bristle_load_loss bristle_backdriving_loss churning stribeck_track tension_friction centrifugal_tension
 bending_loss stick_slip directional_friction stribeck_exponent directional_viscous torque_offset presliding
-angle_friction position_friction speed_rolling adhesive_drag weight_transfer sinkage slope_bias grouser_polygon rolling_radius belt_creep nonlinear_slip speed_slip load_slip pulley_eccentricity
+angle_friction position_friction directional_stribeck speed_rolling adhesive_drag weight_transfer sinkage slope_bias grouser_polygon rolling_radius belt_creep nonlinear_slip speed_slip load_slip pulley_eccentricity
 vibration_slip ammeter_gain ammeter_offset encoder_scale speed_gain
 """.split()  # noqa: SIM905
 MODULES = [m.name for m in pkgutil.iter_modules(effects.__path__, "mmrjax.effects.")]
@@ -1173,6 +1173,14 @@ def test_settled_loss_through_a_bristle_is_that_of_the_load(name):
     assert at_speed.sum() > 300 and np.abs(found).max() > 0.01
 
 
+def test_stribeck_friction_by_direction_is_even_in_the_speed():
+    speed, way = np.asarray(STATES.speed_wheel), np.asarray(STATES.direction)
+    expected = 0.2 * np.exp(-np.abs(speed) / 5.0) * way**2
+    found = _term("directional_stribeck", amplitude=0.2, speed_fade=5.0)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert (found[speed > 1] > 0.01).any() and (found[speed < -1] > 0.01).any()
+
+
 def test_friction_along_the_travel_and_over_a_turn_turns_round_with_the_speed():
     for way in (1.0, -1.0):
         term, rate = _torque("position_friction", 2.5, speed_wheel=4.0 * way, direction=way)
@@ -1200,7 +1208,7 @@ def test_friction_by_the_position_begins_where_a_history_does():
 
 def test_library_declares_what_the_loop_asks_for():
     assert [e.name for e in ALL if e.needs_battery] == ["battery_sag"]
-    both_ways = ["directional_friction", "directional_viscous", "torque_offset"]
+    both_ways = ["directional_friction", "directional_viscous", "torque_offset", "directional_stribeck"]
     assert [e.name for e in ALL if e.needs_reverse] == both_ways
     assert {e.name: e.settles_to for e in ALL if e.settles_to} == {
         "thermal_drift": "winding_heating", "torque_offset": "directional_friction",

@@ -442,3 +442,40 @@ class PositionFriction(TrackEffect):
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * self.recall(robot, signals) * signals.direction
+
+
+class DirectionalStribeck(TrackEffect):
+    """ΔM_t = a exp(-|ω_k| / ω_s) (sign ω_k)²: an excess at a crawl of E + a forward and of E - a backward.
+
+    Friction that falls with speed, by more one way round than the other.
+
+    Source: Canudas de Wit, Olsson, Åström and Lischinsky, A new model for control of systems with friction, IEEE
+    Trans. Automatic Control 40 (1995): the curve g of the steady friction need not be the same both ways; here the
+    exponential of Tustin (1947). The mean E of both directions is `stribeck_track`: runs one way alone show their
+    sum. Far above ω_s it is absent, far below it is `directional_friction`; what grows with the speed is
+    `directional_viscous`. Runs both ways at a crawl tell the three apart.
+    """
+
+    driver = "direction"
+    odd_in_travel = True
+    needs_reverse = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="excess at a crawl forward beyond the mean of both directions",
+        bounds=(-0.5, 0.5),
+        sd=0.05,
+        source="half of what `stribeck_track` commonly is",
+    )
+    speed_fade: Scalar = parameter(
+        8.0,
+        unit="rad/s",
+        meaning="shaft speed ω_s over which the excess fades",
+        bounds=(0.5, 80.0),
+        relative_sd=0.5,
+        source="belt speeds of 0.1 to 0.5 m/s",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        excess = jnp.exp(-jnp.abs(signals.speed_wheel) / self.speed_fade)
+        return self.amplitude * excess * signals.direction**2
