@@ -295,6 +295,7 @@ _BOTH_WAYS: dict[str, Law] = {
     "backdriving_loss": Law("backdriving_loss", "gearbox", lambda s, q: np.maximum(-s.B * s.d, 0.0) * s.d, 0.1),
     "directional_friction": Law("directional_friction", "track", lambda s, q: s.d**2, 0.05, either=True),
     "directional_stribeck": Law("directional_stribeck", "track", lambda s, q: np.exp(-abs(s.w_k) / q["fade"]) * s.d**2, 0.05, _WK_S, either=True),
+    "coast_decay": Law("coast_decay", "electrical", lambda s, q: -(1 - abs(s.duty)) * s.C * s.w, 0.5),
 }  # fmt: skip
 
 
@@ -323,6 +324,7 @@ RIGS: dict[str, Law] = {
     "bending_loss": _rig("bending_loss", _output(0.06), shapes=lambda r: {"relaxation": (0.25 * r.w_k, 0.8 * r.w_k)}),
     "directional_friction": _rig("directional_friction", _output(0.05), lambda a: a.reverse),
     "directional_stribeck": _rig("directional_stribeck", _output(0.05), lambda a: a.reverse, _fade_output),
+    "coast_decay": _rig("coast_decay", lambda r: 0.2, lambda a: a.imposed == "duty"),
     "tension_friction": _rig("tension_friction", lambda r: 0.1, _sloped),
     "speed_rolling": _rig("speed_rolling", lambda r: 0.02 / r.V_teor**2, _vehicle),
     "adhesive_drag": _rig("adhesive_drag", lambda r: 0.02 * r.N / (r.V_teor / 1e-3) ** 0.6, _vehicle, lambda r: {"peel": (5e-4, 5e-3)}),
