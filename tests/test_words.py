@@ -83,6 +83,27 @@ SAMPLES = [
         "remove it",
     ),
     (
+        of_fit.NothingVaries("r.csv", 20, "supply_voltage_V"),
+        "r.csv: nothing varies in these 20 runs but noise, so nothing can be told from them; record runs at several values "
+        "of supply_voltage_V or of the load",
+    ),
+    (
+        of_fit.NothingVaries("r.csv", 20, "supply_voltage_V", ("a", "b")),
+        "r.csv: nothing varies in these 20 runs but noise, so nothing can be told from them; a, b vary and are not used: "
+        "name them under [columns] if they are conditions, or record runs at several values of supply_voltage_V or of "
+        "the load",
+    ),
+    (
+        of_fit.Copied("r.csv", "output_torque_Nm", "motor_current_A", 0.2, -0.5, False),
+        "r.csv, output_torque_Nm: in every row 0.2 - 0.5 times motor_current_A, to the last digit: it is computed from it "
+        "and no reading; remove it from channels and table, or read an instrument",
+    ),
+    (
+        of_fit.Copied("r.csv", "output_speed_rpm", "motor_speed_rpm", 0.0, 0.05, True),
+        "r.csv, output_speed_rpm: in every row 0.05 times motor_speed_rpm, to the last digit; if it is computed from it "
+        "and no reading, remove it, as its noise then counts twice",
+    ),
+    (
         of_fit.Turned("r.csv", "motor_current_A", "Iq", 8.04, 0.31),
         "r.csv, Iq: off by 8 (rms) from what the file's numbers give, with the other sign by 0.31; if it is turned "
         'round, state [columns] motor_current_A = {column = "Iq", factor = -1}',

@@ -13,12 +13,25 @@ from calibration.data.runs import Runs
 from calibration.data.thinning import thinned
 from calibration.inference import identifiability, observers, priors
 from calibration.inference import optimizers as fit
-from calibration.inference.notes import Notes, OffBy, Pair, Repeats, SlopesIn, StiffSupply, Turned
+from calibration.inference.notes import (
+    Copied,
+    Notes,
+    NothingVaries,
+    OffBy,
+    Pair,
+    Repeats,
+    SlopesIn,
+    StiffSupply,
+    Turned,
+)
 from calibration.inference.posterior import determined_together, of_coordinates
 from calibration.inference.preparation import prepare
 from mmrjax import fidelities
 from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
+
+#: What is to be looked at in a table before it is used.
+DOUBTS = (Copied, NothingVaries, OffBy, Repeats, SlopesIn, StiffSupply, Turned)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,9 +111,7 @@ def foresee(runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS
         for k, n in enumerate(names)
     )
     statuses = tuple(STATUSES[int(s)] for s in np.asarray(seen.status))
-    doubts = tuple(
-        note for note in ready.checked if isinstance(note, OffBy | Repeats | SlopesIn | StiffSupply | Turned)
-    )
+    doubts = tuple(note for note in ready.checked if isinstance(note, DOUBTS))
     priors_hold = [p.name for p in found if p.held]
     together = determined_together(of_coordinates(coordinates, np.asarray(z), about.covariance), priors_hold)
     return Foresight(found, statuses, known.source, tuple(about.correlated()), together, robot, doubts)

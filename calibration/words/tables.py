@@ -63,6 +63,29 @@ def repeats(note: notes.Repeats) -> str:
     return f"{said}; if one is wrong, remove it"
 
 
+def nothing_varies(note: notes.NothingVaries) -> str:
+    """Runs of one condition."""
+    many = len(note.unused) > 1
+    unused = f"{', '.join(note.unused)} {'vary' if many else 'varies'} and {'are' if many else 'is'} not used: name "
+    unused += (
+        f"{'them' if many else 'it'} under [columns] if {'they are conditions' if many else 'it is a condition'}, or "
+    )
+    return (
+        f"{note.source}: nothing varies in these {note.rows} runs but noise, so nothing can be told from them; "
+        f"{unused * bool(note.unused)}record runs at several values of {note.column} or of the load"
+    )
+
+
+def copied(note: notes.Copied) -> str:
+    """A channel that is a line of another."""
+    start = f"{note.intercept:.4g} {'+' if note.slope >= 0 else '-'} " if note.intercept else ""
+    slope = abs(note.slope) if note.intercept else note.slope
+    said = f"{note.source}, {note.column}: in every row {start}{slope:.4g} times {note.of}, to the last digit"
+    if note.tied:
+        return f"{said}; if it is computed from it and no reading, remove it, as its noise then counts twice"
+    return f"{said}: it is computed from it and no reading; remove it from channels and table, or read an instrument"
+
+
 def constant(note: notes.Constant) -> str:
     """A condition that does not vary."""
     here = f"{note.column} is {number(note.value)} in every row"
@@ -124,6 +147,8 @@ SAID: dict[type, str | Callable[[Any], str]] = {
     notes.Unmeasured: unmeasured,
     notes.Constant: constant,
     notes.Repeats: repeats,
+    notes.NothingVaries: nothing_varies,
+    notes.Copied: copied,
     notes.Turned: "{source}, {theirs}: off by {off:.2g} (rms) from what the file's numbers give, with the other sign "
     'by {turned:.2g}; if it is turned round, state [columns] {column} = {{column = "{theirs}", factor = -1}}',
     notes.StiffSupply: "{column} is {value:g} in every row: taken for a stiff supply; if it is no reading, remove "
