@@ -361,11 +361,12 @@ def _within_backlash(robot: Robot, chassis: Shaft, signals: Signals, gap: Scalar
     """Motor and load as two bodies, between which the flanks of the gear carry what they are pressed with [N·m]."""
     gear = robot.gearbox
     idle = gear.torque_idle(signals.speed_motor, signals.direction)
+    loss = chassis.torque_loss(signals.speed_output, signals.direction_travel) + added(robot, signals, "track")
+    signals = _fill(signals, torque_track_loss=loss)  # which effects of the gearbox go by
     own = added(robot, signals, "gearbox")
     inertia_added = added(robot, signals, "inertia")
     inertia_motor = robot.motor.inertia * gear.ratio**2
     mesh = chassis.torque_mesh(gap, signals.speed_wheel - signals.speed_output, inertia_motor)
-    loss = chassis.torque_loss(signals.speed_output, signals.direction_travel) + added(robot, signals, "track")
     efficiency = gear.efficiency_flow(mesh, signals.direction)
     drive = signals.torque_motor - idle
     net = gear.ratio * drive - mesh / efficiency - own
@@ -373,7 +374,6 @@ def _within_backlash(robot: Robot, chassis: Shaft, signals: Signals, gap: Scalar
     return _fill(
         signals,
         torque_idle=idle,
-        torque_track_loss=loss,
         torque_load=mesh + own,
         inertia_added=inertia_added,
         efficiency_load=efficiency,

@@ -11,14 +11,16 @@ from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration
 from calibration.inference.calibrate import calibrate
-from mmrjax import channels, params, robots
+from mmrjax import balances, channels, params, robots
 from mmrjax.conditions import Conditions
+from mmrjax.effects import ALL
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.histories import grid, histories
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.rig import Rig
 from mmrjax.robot import Configurations
 from mmrjax.shaft import Shaft
+from mmrjax.signals import Signals, State
 
 DRIVE = {
     "gearbox.ratio": 16.0, "gearbox.efficiency_load": 0.8, "motor.torque_constant": 0.05, "motor.resistance": 3.0,
@@ -47,6 +49,29 @@ def test_a_little_backlash_is_a_rigid_gear_once_things_have_settled():
     ends = np.searchsorted(TIMES, [0.49, 0.99, 1.49, 1.99])
     np.testing.assert_allclose(np.asarray(tight.speed_motor)[ends], np.asarray(rigid.speed_motor)[ends], rtol=2e-4)
     np.testing.assert_allclose(np.asarray(tight.current)[ends], np.asarray(rigid.current)[ends], rtol=2e-3)
+
+
+def test_effects_of_the_gearbox_go_by_the_load_within_the_backlash_too():
+    """By its dry and viscous loss and what it pulls with: 0.1 + 0.01 · 4 + 0.5 N·m and, where it drives, - 0.5."""
+    those = [e for e in ALL if e.balance == "gearbox"]
+    state = State(0.5, 64.0, 4.0, 0.0, {e.name: jnp.asarray(0.6) for e in those}, gap=jnp.asarray(0.015))
+
+    @jax.jit
+    def net(amplitudes, constant):
+        robot = params.replace(bench(0.02), {"bench.torque_constant": constant})
+        there = tuple(e(amplitude=a) for e, a in zip(those, amplitudes, strict=True))
+        return balances.moving(
+            dataclasses.replace(robot, effects=there), Conditions(0, voltage=6.0), state
+        ).torque_net
+
+    for constant, load in ((0.5, 0.64), (-0.5, -0.36)):
+        without = net(jnp.zeros(len(those)), constant)
+        at = Signals(torque_track_loss=jnp.asarray(load), traction=jnp.asarray(0.0), direction=jnp.asarray(1.0),
+                     speed_motor=jnp.asarray(64.0), memory=state.memory)  # fmt: skip
+        for k, effect in enumerate(those):
+            lost = float(without - net(jnp.zeros(len(those)).at[k].set(0.1), constant))
+            assert lost == pytest.approx(float(effect(amplitude=0.1).term(bench(0.02), at)), rel=1e-6), effect.name
+            assert lost != 0 or (effect.name == "backdriving_loss" and constant > 0)
 
 
 @pytest.mark.slow

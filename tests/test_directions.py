@@ -73,7 +73,12 @@ def test_runs_that_go_both_ways_are_known_by_what_drives_them_or_by_a_speed():
 def test_what_needs_runs_both_ways_is_looked_for_in_such_alone(kind):
     names = [{e.name for e in discover.visible(BY_NAME, robots.nominal(), kind, way)} for way in (True, False)]
     # A constant torque is directional friction in settled travel.
-    only = {"directional_friction", "directional_viscous", *(["torque_offset"] if kind is Histories else [])}
+    only = {
+        "directional_friction",
+        "directional_viscous",
+        "directional_stribeck",
+        *(["torque_offset"] if kind is Histories else []),
+    }
     assert names[0] - names[1] == only and names[1] < names[0]
 
 

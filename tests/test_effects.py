@@ -744,9 +744,9 @@ def test_law_rejects_mutant(law, mutant):
 ORDER = """
 mass_error mass_offset rotating_inertia supply_sag battery_sag series_resistance brush_drop winding_heating
 thermal_drift coast_decay armature_inductance windage stribeck_motor iron_loss torque_constant_saturation cogging gear_load_loss
-gear_quadratic_loss stribeck_gear backdriving_loss churning stribeck_track tension_friction centrifugal_tension
+gear_quadratic_loss stribeck_gear backdriving_loss bristle_load_loss bristle_backdriving_loss churning stribeck_track tension_friction centrifugal_tension
 bending_loss stick_slip directional_friction stribeck_exponent directional_viscous torque_offset presliding
-angle_friction position_friction speed_rolling adhesive_drag weight_transfer sinkage slope_bias grouser_polygon rolling_radius belt_creep nonlinear_slip speed_slip load_slip pulley_eccentricity
+angle_friction position_friction directional_stribeck speed_rolling adhesive_drag weight_transfer sinkage slope_bias grouser_polygon rolling_radius belt_creep nonlinear_slip speed_slip load_slip pulley_eccentricity
 vibration_slip ammeter_gain ammeter_offset encoder_scale speed_gain
 """.split()  # noqa: SIM905
 MODULES = [m.name for m in pkgutil.iter_modules(effects.__path__, "mmrjax.effects.")]
@@ -1145,6 +1145,42 @@ def test_presliding_is_dahls_friction_in_place_of_coulombs():
     assert (terms(settled, signals=dataclasses.replace(STATES, memory={})) == 0).all()
 
 
+@pytest.mark.parametrize(("bend", "way"), [(0.4, 1.0), (-0.9, 1.0), (0.7, -1.0)])
+def test_load_lost_through_a_bristle_is_its_mean_and_its_difference(bend, way):
+    """μ_avg |τ| z + μ_dif τ z² with μ_avg = a + b/2 and μ_dif = -b/2, whichever way the load acts."""
+    average, difference = 0.12, -0.05
+    amplitudes = {"bristle_load_loss": average + difference, "bristle_backdriving_loss": -2 * difference}
+    for load in (1.5, -1.5):
+        at = dict(torque_track_loss=jnp.asarray(load), traction=jnp.asarray(0.0), direction=jnp.asarray(way))
+        signals = [Signals(memory={n: jnp.asarray(bend)}, **at) for n in amplitudes]
+        found = [
+            fitted(BY_NAME[n], a).term(NOMINAL, s) for (n, a), s in zip(amplitudes.items(), signals, strict=True)
+        ]
+        assert float(sum(found)) == pytest.approx(average * abs(load) * bend + difference * load * bend**2)
+    rate = fitted(BY_NAME["bristle_load_loss"], 1.0).rate
+    at = Signals(
+        memory={"bristle_load_loss": jnp.asarray(bend)}, speed_wheel=jnp.asarray(4 * way), direction=jnp.asarray(way)
+    )
+    assert float(rate(NOMINAL, at)) == pytest.approx((4 * way - 4 * bend) / 0.02)
+
+
+@pytest.mark.parametrize("name", ["bristle_load_loss", "bristle_backdriving_loss"])
+def test_settled_loss_through_a_bristle_is_that_of_the_load(name):
+    settled = dataclasses.replace(STATES, memory={})
+    at_speed = np.abs(np.asarray(settled.direction)) == 1
+    found, known = (_term(n, settled, amplitude=0.1)[at_speed] for n in (name, BY_NAME[name].settles_to))
+    np.testing.assert_allclose(found, known, rtol=1e-12, atol=1e-15)
+    assert at_speed.sum() > 300 and np.abs(found).max() > 0.01
+
+
+def test_stribeck_friction_by_direction_is_even_in_the_speed():
+    speed, way = np.asarray(STATES.speed_wheel), np.asarray(STATES.direction)
+    expected = 0.2 * np.exp(-np.abs(speed) / 5.0) * way**2
+    found = _term("directional_stribeck", amplitude=0.2, speed_fade=5.0)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert (found[speed > 1] > 0.01).any() and (found[speed < -1] > 0.01).any()
+
+
 def test_friction_along_the_travel_and_over_a_turn_turns_round_with_the_speed():
     for way in (1.0, -1.0):
         term, rate = _torque("position_friction", 2.5, speed_wheel=4.0 * way, direction=way)
@@ -1172,10 +1208,11 @@ def test_friction_by_the_position_begins_where_a_history_does():
 
 def test_library_declares_what_the_loop_asks_for():
     assert [e.name for e in ALL if e.needs_battery] == ["battery_sag"]
-    both_ways = ["directional_friction", "directional_viscous", "torque_offset"]
+    both_ways = ["directional_friction", "directional_viscous", "torque_offset", "directional_stribeck"]
     assert [e.name for e in ALL if e.needs_reverse] == both_ways
     assert {e.name: e.settles_to for e in ALL if e.settles_to} == {
         "thermal_drift": "winding_heating", "torque_offset": "directional_friction",
+        "bristle_load_loss": "gear_load_loss", "bristle_backdriving_loss": "backdriving_loss",
     }  # fmt: skip
     assert [e.name for e in ALL if e.needs_duty] == ["coast_decay"]
     assert [e.name for e in ALL if e.odd_in_travel] == [*both_ways, "slope_bias"]

@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 from worlds import paper
 
 from mmrjax.gearbox import Gearbox
@@ -51,6 +52,15 @@ def test_gearbox_load_loss_takes_power_in_both_directions():
             out = float(gear.torque_output(transmitted, direction))
             power_in, power_out = transmitted * direction, out * direction / 48.0
             assert power_in > power_out  # what enters at the motor side exceeds what leaves
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_gearbox_without_torque_has_the_efficiency_of_a_load_about_to_grow(direction):
+    """Whichever sign rounding leaves: nothing but a torque that is transmitted sends power back."""
+    gear = Gearbox()
+    efficiency = [float(gear.efficiency_flow(torque, direction)) for torque in (0.0, 1e-15, -1e-15)]
+    np.testing.assert_allclose(efficiency, 0.74, rtol=1e-12)
+    np.testing.assert_allclose(float(gear.efficiency_flow(-1e-9 * direction, direction)), 1 / 0.74, rtol=1e-12)
 
 
 def test_gearbox_ratio_is_planetary_times_belt():

@@ -106,6 +106,27 @@ SAMPLES = [
         "its channels",
     ),
     (
+        of_fit.NothingVaries("r.csv", 20, "supply_voltage_V"),
+        "r.csv: nothing varies in these 20 runs but noise, so nothing can be told from them; record runs at several values "
+        "of supply_voltage_V or of the load",
+    ),
+    (
+        of_fit.NothingVaries("r.csv", 20, "supply_voltage_V", ("a", "b")),
+        "r.csv: nothing varies in these 20 runs but noise, so nothing can be told from them; a, b vary and are not used: "
+        "name them under [columns] if they are conditions, or record runs at several values of supply_voltage_V or of "
+        "the load",
+    ),
+    (
+        of_fit.Copied("r.csv", "output_torque_Nm", "motor_current_A", 0.2, -0.5, False),
+        "r.csv, output_torque_Nm: in every row 0.2 - 0.5 times motor_current_A, to the last digit: it is computed from it "
+        "and no reading; remove it from channels and table, or read an instrument",
+    ),
+    (
+        of_fit.Copied("r.csv", "output_speed_rpm", "motor_speed_rpm", 0.0, 0.05, True),
+        "r.csv, output_speed_rpm: in every row 0.05 times motor_speed_rpm, to the last digit; if it is computed from it "
+        "and no reading, remove it, as its noise then counts twice",
+    ),
+    (
         of_fit.Turned("r.csv", "motor_current_A", "Iq", 8.04, 0.31),
         "r.csv, Iq: off by 8 (rms) from what the file's numbers give, with the other sign by 0.31; if it is turned "
         'round, state [columns] motor_current_A = {column = "Iq", factor = -1}',
@@ -550,6 +571,35 @@ def test_a_mechanism_is_stated_with_what_it_explains_and_predicts():
         in said
     )
     assert loop.brief(Summary("mechanism", 0.001, place, mechanism=weak)) == "mechanism: slip"
+
+
+def test_a_mechanism_is_stated_with_its_window_and_why_no_name_stands():
+    """A discrepancy of some runs alone: its window stands in verdict and answer, and what leaves nothing comes first."""
+    here = SimpleNamespace(
+        place="slip", variable="order 30 to 44", alike=("slip",), variables_alike=("order 31 to 44",), by_duty=False,
+        family="slip that changes with order", window={"axis": "order", "low": 30.0, "high": 44.0},
+    )  # fmt: skip
+    mechanism = Mechanism((here.family,), (), 0.99, 0.8, 0.1, 1.0)
+    summary = Summary("mechanism", 0.001, here, mechanism=mechanism)
+    within = "order, in runs 30 to 44 (as well in runs 31 to 44)"
+    assert loop.statement(summary).startswith(
+        f"Missing: a slip that changes with {within}, established as a mechanism"
+    )
+    other = dataclasses.replace(mechanism, families=("slip that changes with load",))
+    assert "in runs" not in loop.statement(dataclasses.replace(summary, mechanism=other))
+    support = NameSupport(False, "none by itself", tests=(NameTest("a", 1.2, 3.41, (), 0.0),))
+    found = SimpleNamespace(
+        verdict="mechanism", summary=summary, effects=(), unnamed=here, support=support, after=SimpleNamespace(adequate=True)
+    )  # fmt: skip
+    assert (
+        loop.answer(found) == f"No: missing is a slip that changes with {within}. Its exact law is not established."
+    )
+    said = (
+        "one constant in the slip balance in runs 30 to 44 leaves nothing; a explains 1.2 σ, and chance reaches 3.4"
+    )
+    assert loop.why(found) == said
+    found.after.adequate = False
+    assert loop.why(found) == loop.reason(support)
 
 
 def test_every_doubt_about_a_mechanism_has_words():

@@ -10,6 +10,8 @@ import pytest
 from worlds import foreign as f
 from worlds import histories, laws, settled
 
+from mmrjax.effects import ALL
+
 LAWS = f.FOREIGN | f.FOREIGN_SERIES
 KNOWN = laws.LIBRARY | laws.VARIANTS | laws.OUTSIDE
 TABLE = settled.table8()
@@ -54,6 +56,12 @@ def test_count_and_names():
     assert balances >= {"supply", "electrical", "motor", "gearbox", "track", "ground", "slip"}
     assert set(f.DISSIPATIVE) <= set(f.FOREIGN)
     assert set(f.DISSIPATIVE_SERIES) <= set(f.FOREIGN_SERIES)
+
+
+def test_every_effect_of_the_library_is_written_once_more():
+    """`torque_offset` is `directional_friction` but at rest."""
+    known = {law.cls for those in (laws.LIBRARY, laws.TRANSIENT, laws.RIGS, laws.LOGS) for law in those.values()}
+    assert {e.name for e in ALL} - known == {"torque_offset"}
 
 
 @pytest.mark.parametrize("name", f.FOREIGN)

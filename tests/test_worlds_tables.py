@@ -89,9 +89,14 @@ def test_worlds_import_nothing_of_the_package():
 def test_library_is_of_every_effect_that_steady_runs_show():
     # battery_sag acts on the battery alone, coast_decay at a duty below 1; thermal_drift settles to winding_heating; forward directional_friction is
     # loss_coulomb, and up a slope no load drives a motor; forward a torque_offset is loss_coulomb too, and
-    # directional_viscous loss_viscous
-    forward = {"directional_friction", "torque_offset", "directional_viscous"}
-    other = {"battery_sag", "thermal_drift", "coast_decay", "backdriving_loss", *forward}
+    # directional_viscous loss_viscous, directional_stribeck stribeck_track
+    forward = {"directional_friction", "torque_offset", "directional_viscous", "directional_stribeck"}
+    other = {e.name for e in ALL if e.memory_size is not None} | {
+        "battery_sag",
+        "coast_decay",
+        "backdriving_loss",
+        *forward,
+    }
     shown = {e.name for e in ALL if not e.transient} - other
     assert set(laws.LIBRARY) == shown
     assert all(law.cls == name for name, law in laws.LIBRARY.items())

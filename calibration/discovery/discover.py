@@ -81,9 +81,19 @@ from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
-from calibration.inference.notes import FarFromPrior, HeldByPrior, NoiseOff, Note, Notes, OnlyTogether, Step
+from calibration.inference.notes import (
+    Copied,
+    FarFromPrior,
+    HeldByPrior,
+    NoiseOff,
+    Note,
+    Notes,
+    NothingVaries,
+    OnlyTogether,
+    Step,
+)
 from calibration.inference.residual_clusters import residual_clusters
-from calibration.words.notes import in_words
+from calibration.words.notes import in_words, sentence
 from mmrjax import channels, effects
 from mmrjax.effects import Effect
 from mmrjax.errors import counted
@@ -257,6 +267,9 @@ def prepared(
             f"{kind.fewest} are needed"
         )
     ready = preparation.prepare(distinct, robot, noise, stated)
+    for note in ready.checked:
+        if isinstance(note, NothingVaries) or (isinstance(note, Copied) and not note.tied):
+            raise BadData(sentence(note))
     at_first = (*ready.foreign, *ready.doubted)
     said: Notes = (*notes, *ready.former, *ready.checked, *ready.begins, *ready.weighed, *at_first)
     turned = scales.turned_in(distinct, ready.robot)

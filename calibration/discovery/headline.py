@@ -24,8 +24,8 @@ def headline(said: Summary, others: Sequence[tuple[float, Summary]] = ()) -> Hea
     if laws:
         alone = all(len(names) == 1 for names in laws) and not any(m.values for s in every for m in s.missing)
         return Headline("named" if alone else "class", laws, factors)
-    for level, of in (("mechanism", _mechanisms), ("place", _places)):
-        claims = [of(s) for s in every]
+    for level, claimed in (("mechanism", _mechanisms), ("place", _places)):
+        claims = [claimed(s) for s in every]
         if (found := _common(claims)) or level == "place":
             break
     return Headline(level, found, factors, tuple(_shared(claim, claims) for claim in found))

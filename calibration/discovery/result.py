@@ -522,7 +522,7 @@ class DiscoveryResult:
     @property
     def standing(self) -> str:
         """Why names do not stand, or beside what they do, in words; "" where there is nothing to say."""
-        return words.reason(self.support)
+        return words.why(self)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -743,8 +743,14 @@ def _effect(e: FoundEffect, support: NameSupport | None) -> dict[str, Any]:
 def _mechanism(m: Mechanism, curve: UnnamedDiscrepancy | None) -> dict[str, Any]:
     found = {n: getattr(m, n) for n in ("share", "gain", "again")} | {"se": m.se if np.isfinite(m.se) else None}
     listed = {n: list(getattr(m, n)) for n in ("families", "effects", "fails")}
-    listed["errors"] = {kind: se if np.isfinite(se) else None for kind, se in m.errors.items()}
-    return {**listed, **found, "established": not m.fails, "course": "" if curve is None else words.course(curve)}
+    errors = {kind: se if np.isfinite(se) else None for kind, se in m.errors.items()}
+    return {
+        **listed,
+        **found,
+        "errors": errors,
+        "established": not m.fails,
+        "course": "" if curve is None else words.course(curve),
+    }
 
 
 def _unnamed(d: UnnamedDiscrepancy) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from calibration.inference.conduct import conduct
 from calibration.inference.noise import Noise
 from calibration.inference.notes import Constant, Note, StiffSupply, Unmeasured
 from calibration.inference.ranges import check_ranges
+from calibration.inference.uninformative import copied, nothing_varies
 from calibration.inference.unused import no_load_gives, unused
 from mmrjax.errors import counted
 from mmrjax.robot import Robot
@@ -33,7 +34,15 @@ def check(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[
     _enough(runs, names, noise)
     said = [*runs.missing(), *_stuck(runs), *observers.kind(runs).check(runs, noise), *_constant_conditions(runs)]
     said += [*unused(runs), *no_load_gives(runs)]
-    return [*said, *check_ranges(runs, robot), *conduct(runs, robot)]
+    return [*said, *check_ranges(runs, robot), *_uninformative(runs, robot, noise), *conduct(runs, robot)]
+
+
+def _uninformative(runs: Runs, robot: Robot, noise: Noise) -> list[Note]:
+    """Notes on settled runs of one condition, and on channels that are computed from others."""
+    if runs.sampled or runs.turns:
+        return []
+    same = nothing_varies(runs, robot, noise)
+    return [same] if same is not None else [*copied(runs, robot)]
 
 
 def _configurations(runs: Runs, robot: Robot, names: Sequence[str]) -> None:

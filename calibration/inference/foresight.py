@@ -14,8 +14,11 @@ from calibration.data.thinning import thinned
 from calibration.inference import identifiability, observers, priors
 from calibration.inference import optimizers as fit
 from calibration.inference.notes import (
+    Copied,
+    LargerNoise,
     NoLoadGives,
     Notes,
+    NothingVaries,
     OffBy,
     Pair,
     Repeats,
@@ -29,6 +32,11 @@ from calibration.inference.preparation import prepare
 from mmrjax import fidelities
 from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
+
+#: What is to be looked at in a table before it is used.
+DOUBTS = (
+    Copied, LargerNoise, NoLoadGives, NothingVaries, OffBy, Repeats, SlopesIn, StiffSupply, Turned, Unused,
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,10 +77,6 @@ class Foresight:
     together: tuple[Pair, ...]
     robot: Robot
     doubts: Notes = ()
-
-
-#: Notes on a table that are said before any fit.
-DOUBTS = (NoLoadGives, OffBy, Repeats, SlopesIn, StiffSupply, Turned, Unused)
 
 
 def foresee(runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS) -> Foresight:

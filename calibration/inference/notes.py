@@ -164,6 +164,36 @@ class NoLoadGives(Note):
     share: float
 
 
+class NothingVaries(Note):
+    """Settled runs of which the robot foresees the same readings, within the noise of one.
+
+    Attributes:
+        source: of the table; rows: how many; column: of what is imposed.
+        unused: columns of numbers that vary and are no conditions.
+    """
+
+    source: str
+    rows: int
+    column: str
+    unused: tuple[str, ...] = ()
+
+
+class Copied(Note):
+    """A channel that is a line of another in every row.
+
+    Attributes:
+        source: of the table; column: its; of: that of the other; intercept, slope: of the line, in their units.
+        tied: True where the rig itself ties the two to one another, as a rigid gear its speeds.
+    """
+
+    source: str
+    column: str
+    of: str
+    intercept: float
+    slope: float
+    tied: bool
+
+
 class Turned(Note):
     """A channel whose readings fit the robot with the other sign.
 

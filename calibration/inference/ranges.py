@@ -23,6 +23,8 @@ REFUSED, SAID = 5.0, 2.0
 ALIKE = 1.3
 #: Shortest history whose later half shows about what steady travel does [s].
 UNDER_WAY = 0.25
+#: Factor beyond which another unit may explain torque and current of a rig whose friction nobody knows.
+FAR = 50.0
 #: Friction of a robot nobody has calibrated, as factors on what its file states.
 FRICTION = (0.1, 1.0, 4.0)
 #: Channels that show torque: what they show depends on friction, of which nothing is known of a rig from nothing.
@@ -70,10 +72,13 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
     said: list[Note] = []
     for k, (channel, factor) in enumerate(factors.items()):
         off = max(factor, 1 / factor)
-        if off <= SAID or (not robot.rig.inherits and channel.name in OF_TORQUE):
+        unknown = not robot.rig.inherits and channel.name in OF_TORQUE
+        if off <= (FAR if unknown else SAID):
             continue
         units = _units(channel, measured[:, k], possible[:, :, k], robot)
-        if not units and (kind.axis or _slips(robot, channel, factor)):  # what slides has speeds of its own
+        if not units and (
+            unknown or kind.axis or _slips(robot, channel, factor)
+        ):  # what slides has speeds of its own
             continue
         typical = _factor(measured[:, k], possible[1:2, :, k])
         found = OffBy(

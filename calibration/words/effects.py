@@ -79,4 +79,4 @@ def tests(effect: type[Effect]) -> Iterator[str]:
             )
             yield f"{text[0].upper()}{text[1:].rstrip(',')}, at several voltages"
     what = VARY.get(effect.driver, f"the {effect.driver}")  # one's own may go with anything
-    yield f"Vary {what}" + ("; from rest, over time" if effect.transient else "")
+    yield f"Vary {what}" + ("; from rest, over time" if effect.transient or effect.settles_to else "")

@@ -67,7 +67,9 @@ def _verdict(said: notes.Summary) -> str:
     if said.verdict in WITHOUT_NAME and where is not None:
         found = said.mechanism
         if said.verdict == "mechanism" and found is not None:
-            text = f"Missing: {_mechanism(found)} (family-wise p {p_value(p)}). No law of the library is established."
+            within = _within(where) if where.family in found.families else ""
+            text = f"Missing: {_mechanism(found, within)} (family-wise p {p_value(p)}). "
+            text += "No law of the library is established."
         else:
             text = _without_name(where, p, "is established" if said.missing else "explains it")
             text += f" No mechanism is established: {no_mechanism(found)}." if found is not None else ""
@@ -126,9 +128,9 @@ def _undescribed(said: notes.Summary) -> str:
     )
 
 
-def _mechanism(found: notes.Mechanism) -> str:
+def _mechanism(found: notes.Mechanism, within: str) -> str:
     """A mechanism with its evidence."""
-    return f"a {' or a '.join(found.families)}, established as a mechanism: it {evidence(found)}"
+    return f"a {' or a '.join(found.families)}{within}, established as a mechanism: it {evidence(found)}"
 
 
 def evidence(found: notes.Mechanism) -> str:
@@ -241,12 +243,21 @@ def _without_name(where: DiscrepancyLocation, p: float, no_effect: str) -> str:
     others = [bases.in_words(p).removesuffix(" balance") for p in where.alike if p != where.place]
     also = f" (or {', '.join(others)}, which act alike in these data)" if others else ""
     what = f": {where.family}" if where.variable in bases.VARIABLES else ""
-    well = [shown_over(v, where.by_duty).removeprefix("best shown ") for v in where.variables_alike]
-    over = shown_over(where.variable, where.by_duty) + (f" (as well {', '.join(well)})" if well else "")
     return (
-        f"Something is missing in the {bases.in_words(where.place)}{also}, {over}{what}; no effect of the library "
-        f"{no_effect} (family-wise p {p_value(p)})."
+        f"Something is missing in the {bases.in_words(where.place)}{also}, {_shown(where)}{what}; no effect of the "
+        f"library {no_effect} (family-wise p {p_value(p)})."
     )
+
+
+def _shown(where: DiscrepancyLocation) -> str:
+    """Where a discrepancy shows, and where it is as improbable."""
+    well = [shown_over(v, where.by_duty).removeprefix("best shown ") for v in where.variables_alike]
+    return shown_over(where.variable, where.by_duty) + (f" (as well {', '.join(well)})" if well else "")
+
+
+def _within(where: DiscrepancyLocation) -> str:
+    """The window of what happens for a while, after a comma; empty for other discrepancies."""
+    return "" if bases.window(where.variable) is None else f", {_shown(where)}"
 
 
 def shown_over(variable: str, by_duty: bool = False) -> str:
@@ -295,7 +306,9 @@ def answer(found: DiscoveryResult) -> str:
     sure, weak = ([e for e in found.effects if is_established(found, e) == want] for want in (True, False))
     lacks, stated = found.unnamed, found.summary.mechanism
     if found.verdict == "mechanism" and stated is not None:
-        over = f", which {course(lacks)}" if lacks is not None and course(lacks) else ""
+        over = ""
+        if lacks is not None:
+            over = f", which {course(lacks)}" if course(lacks) else _within(lacks)
         return f"No: missing is a {' or a '.join(stated.families)}{over}. Its exact law is not established."
     if lacks is not None and not weak:
         place = bases.in_words(lacks.channel or lacks.balance)
@@ -395,8 +408,8 @@ REASONS = {
     "": "",
     "implausible": "no effect of the library that explains it is of a plausible size",
     "larger": "{effects} would explain more, but not at a plausible size",
-    "better curve": "one smooth {curves} is the better explanation than {effects}",
-    "curve alone": "one smooth {curves} leaves nothing",
+    "better curve": "one {curves} is the better explanation than {effects}",
+    "curve alone": "one {curves} leaves nothing",
     "none by itself": "{lost}",
     "beside": "each by itself, at the fit of the others, explains more than chance would: {strengths}",
 }
@@ -412,6 +425,15 @@ def reason(support: notes.NameSupport | None) -> str:
         strengths=", ".join(map(_strength, support.tests)),
         lost="; ".join(f"{t.effect} {doubts(t)}" for t in support.tests if t.fails),
     )
+
+
+def why(found: DiscoveryResult) -> str:
+    """Why names do not stand, or beside what they do: a curve that leaves nothing comes first."""
+    said, lacks = reason(found.support), found.unnamed
+    if lacks is None or not found.after.adequate or (found.support is not None and found.support.curves):
+        return said
+    over = notes.CurveOver(lacks.place, (lacks.variable,))
+    return "; ".join([REASONS["curve alone"].format(curves=_curve(over)), *[said] * bool(said)])
 
 
 def _strength(test: notes.NameTest) -> str:
@@ -445,7 +467,9 @@ def doubts(test: notes.NameTest | None) -> str:
 
 
 def _curve(c: notes.CurveOver) -> str:
-    return f"{'curve' if len(c.variables) == 1 else 'surface'} in the {_over(c.place, *c.variables)}"
+    if bases.window(c.variables[0]) is not None:
+        return f"constant in the {bases.in_words(c.place)} {shown_over(c.variables[0])}"
+    return f"smooth {'curve' if len(c.variables) == 1 else 'surface'} in the {_over(c.place, *c.variables)}"
 
 
 def _over(place: str, *variables: str) -> str:

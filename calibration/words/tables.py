@@ -75,6 +75,29 @@ def unused(note: notes.Unused) -> str:
     return "; ".join(said)
 
 
+def nothing_varies(note: notes.NothingVaries) -> str:
+    """Runs of one condition."""
+    many = len(note.unused) > 1
+    unused = f"{', '.join(note.unused)} {'vary' if many else 'varies'} and {'are' if many else 'is'} not used: name "
+    unused += (
+        f"{'them' if many else 'it'} under [columns] if {'they are conditions' if many else 'it is a condition'}, or "
+    )
+    return (
+        f"{note.source}: nothing varies in these {note.rows} runs but noise, so nothing can be told from them; "
+        f"{unused * bool(note.unused)}record runs at several values of {note.column} or of the load"
+    )
+
+
+def copied(note: notes.Copied) -> str:
+    """A channel that is a line of another."""
+    start = f"{note.intercept:.4g} {'+' if note.slope >= 0 else '-'} " if note.intercept else ""
+    slope = abs(note.slope) if note.intercept else note.slope
+    said = f"{note.source}, {note.column}: in every row {start}{slope:.4g} times {note.of}, to the last digit"
+    if note.tied:
+        return f"{said}; if it is computed from it and no reading, remove it, as its noise then counts twice"
+    return f"{said}: it is computed from it and no reading; remove it from channels and table, or read an instrument"
+
+
 def constant(note: notes.Constant) -> str:
     """A condition that does not vary."""
     here = f"{note.column} is {number(note.value)} in every row"
@@ -143,6 +166,8 @@ SAID: dict[type, str | Callable[[Any], str]] = {
     notes.NoLoadGives: "{source}, {theirs}: friction and a constant torque of a load leave {share:.0%} of its "
     "variance unexplained; if a brake sets it, it is a condition: state [columns] load_torque_Nm = "
     '"{theirs}" in the robot\'s file, and take output_torque out of its channels',
+    notes.NothingVaries: nothing_varies,
+    notes.Copied: copied,
     notes.Turned: "{source}, {theirs}: off by {off:.2g} (rms) from what the file's numbers give, with the other sign "
     'by {turned:.2g}; if it is turned round, state [columns] {column} = {{column = "{theirs}", factor = -1}}',
     notes.StiffSupply: "{column} is {value:g} in every row: taken for a stiff supply; if it is no reading, remove "

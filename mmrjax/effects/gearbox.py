@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from mmrjax.effects.base import Effect, amplitude
+from mmrjax.effects.bristle import Bristle, breakaway_parameter
 from mmrjax.one_sided import at_least, magnitude
 from mmrjax.params import Scalar, parameter
 from mmrjax.robot import Robot
@@ -131,3 +132,61 @@ class BackdrivingLoss(GearboxEffect):
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         driving = at_least(0.0, -torque_output(robot, signals) * signals.direction)
         return self.amplitude * driving * signals.direction
+
+
+class BristleLoadLoss(Bristle, GearboxEffect):
+    """ΔM_r = a |M_load| z, θ_s z' = ω_k - |ω_k| z, z(0) = 0: a share of the load lost through a bristle.
+
+    Teeth that carry a load yield over a small turn before they slide, so that their loss builds up after a reversal.
+
+    Source: Duclusaud, Passault, Padois and Ly, Extended friction models for the physics simulation of servo actuators
+    (2024, arXiv:2410.08650): friction in proportion to the load, here through Dahl's bristle (1968). Settled
+    z = sign ω_k: it is then `gear_load_loss`, and reversals tell the two apart. With `bristle_backdriving_loss` of
+    amplitude b it is μ_avg |M_load| z + μ_dif M_load z² with μ_avg = a + b/2 and μ_dif = -b/2. Bent teeth give
+    energy back, so it is not a pure loss.
+    """
+
+    driver = "load"
+    settles_to = "gear_load_loss"
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="share of the output torque lost through the bristle",
+        bounds=(-0.2, 0.5),
+        sd=0.05,
+        source="as of `gear_load_loss`",
+    )
+    angle_breakaway: Scalar = breakaway_parameter()
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        load = magnitude(torque_output(robot, signals), signals.direction)
+        return self.amplitude * load * self.recall(robot, signals)
+
+
+class BristleBackdrivingLoss(Bristle, GearboxEffect):
+    """ΔM_r = a (|M_load| z - M_load z²) / 2, θ_s z' = ω_k - |ω_k| z, z(0) = 0.
+
+    Teeth that lose more of the load, or less, while it drives the motor, through the bristle of `bristle_load_loss`.
+
+    Source: Duclusaud, Passault, Padois and Ly (2024, arXiv:2410.08650), whose directional models give motor and load
+    a share of friction each; Dahl (1968). Settled z = sign ω_k: it is then `backdriving_loss`, 0 where the motor
+    drives the load and a |M_load| where the load drives the motor. Reversals under a load tell the two apart. See
+    `bristle_load_loss` for the sum of both.
+    """
+
+    driver = "load"
+    settles_to = "backdriving_loss"
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="share of the load's torque lost through the bristle while the load drives",
+        bounds=(-0.2, 1.0),
+        sd=0.1,
+        source="as of `backdriving_loss`",
+    )
+    angle_breakaway: Scalar = breakaway_parameter()
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        load, bend = torque_output(robot, signals), self.recall(robot, signals)
+        driving = magnitude(load, signals.direction) * bend - load * bend**2
+        return 0.5 * self.amplitude * driving

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from mmrjax.effects.base import Effect, amplitude
+from mmrjax.effects.bristle import Bristle, breakaway_parameter
 from mmrjax.effects.periodic import Periodic, phase_parameter
 from mmrjax.one_sided import magnitude
 from mmrjax.params import Index, Scalar, parameter
@@ -348,7 +349,7 @@ class TorqueOffset(TrackEffect):
         return self.amplitude * jnp.ones_like(signals.speed_motor)
 
 
-class Presliding(TrackEffect):
+class Presliding(Bristle, TrackEffect):
     """ΔM_t = a (z - sign ω_k), θ_s z' = ω_k - |ω_k| z, z(0) = 0: of the dry loss a share a acts through bristles.
 
     Dry friction builds up over a small turn instead of at once, as contacts yield before they slide.
@@ -356,13 +357,11 @@ class Presliding(TrackEffect):
     Source: Dahl, A solid friction model (1968), with exponent 1; it is the first order of Canudas de Wit, Olsson,
     Åström and Lischinsky (1995) without their damping of the bristles. Settled z = sign ω_k: travel shows nothing
     of it, reversals do. The memory is z [-]. At a = M_t0 all of the dry friction is Dahl's. `stick_slip` is what the
-    contacts hold beyond M_t0 before they let go.
+    contacts hold beyond M_t0 before they let go; `bristle_load_loss` grows with the load.
     """
 
     driver = "direction"
     transient = True
-    memory_size = 1.0
-    memory_unit = "-"
 
     amplitude: Scalar = amplitude(
         unit="N·m",
@@ -371,21 +370,7 @@ class Presliding(TrackEffect):
         sd=0.1,
         source="a third of M_t0 of Table 3",
     )
-    angle_breakaway: Scalar = parameter(
-        0.02,
-        unit="rad",
-        meaning="turn of the pulley over which the contacts yield θ_s",
-        bounds=(1e-4, 2.0),
-        relative_sd=0.5,
-        source="1 mm of belt, a degree of a geared shaft",
-    )
-
-    def settled(self, robot: Robot, signals: Signals) -> Scalar:
-        return signals.direction
-
-    def rate(self, robot: Robot, signals: Signals) -> Scalar:
-        speed = signals.speed_wheel
-        return speed * (1 - signals.direction * signals.memory[self.name]) / self.angle_breakaway
+    angle_breakaway: Scalar = breakaway_parameter()
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * (self.recall(robot, signals) - signals.direction)
@@ -457,3 +442,40 @@ class PositionFriction(TrackEffect):
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * self.recall(robot, signals) * signals.direction
+
+
+class DirectionalStribeck(TrackEffect):
+    """ΔM_t = a exp(-|ω_k| / ω_s) (sign ω_k)²: an excess at a crawl of E + a forward and of E - a backward.
+
+    Friction that falls with speed, by more one way round than the other.
+
+    Source: Canudas de Wit, Olsson, Åström and Lischinsky, A new model for control of systems with friction, IEEE
+    Trans. Automatic Control 40 (1995): the curve g of the steady friction need not be the same both ways; here the
+    exponential of Tustin (1947). The mean E of both directions is `stribeck_track`: runs one way alone show their
+    sum. Far above ω_s it is absent, far below it is `directional_friction`; what grows with the speed is
+    `directional_viscous`. Runs both ways at a crawl tell the three apart.
+    """
+
+    driver = "direction"
+    odd_in_travel = True
+    needs_reverse = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="excess at a crawl forward beyond the mean of both directions",
+        bounds=(-0.5, 0.5),
+        sd=0.05,
+        source="half of what `stribeck_track` commonly is",
+    )
+    speed_fade: Scalar = parameter(
+        8.0,
+        unit="rad/s",
+        meaning="shaft speed ω_s over which the excess fades",
+        bounds=(0.5, 80.0),
+        relative_sd=0.5,
+        source="belt speeds of 0.1 to 0.5 m/s",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        excess = jnp.exp(-jnp.abs(signals.speed_wheel) / self.speed_fade)
+        return self.amplitude * excess * signals.direction**2

@@ -129,7 +129,8 @@ def rates(
     D = p["ground.rolling_resistance"] * N * sign_V + extra("ground") + m * G * np.sin(c.slope)
     guide = p["track.guide_friction"] * p["track.guide_share"] * N * s.d
     B = p["track.loss_coulomb"] * s.d + p["track.loss_viscous"] * s.w_k + extra("track")
-    B = B + s.r * (guide + P) + extra("gearbox")
+    s.B = B = B + s.r * (guide + P)
+    B = B + extra("gearbox")
     A = M_d - p["gearbox.friction_coulomb"] * s.d - p["gearbox.friction_viscous"] * s.w
     J_w = p["inertia"] + extra("inertia")
     eta = teeth(A * J_w + s.i * J_d * B, s.d, eta_0)

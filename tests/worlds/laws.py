@@ -219,6 +219,8 @@ TRANSIENT: dict[str, Law] = {
     "battery_sag": Law("battery_sag", "supply", lambda s, q: s.q * s.battery, 0.2),
     "stick_slip": Law("stick_slip", "track", lambda s, q: s.z, 0.1),
     "presliding": Law("presliding", "track", lambda s, q: s.b - s.d, 0.1),
+    "bristle_load_loss": Law("bristle_load_loss", "gearbox", lambda s, q: abs(s.B) * s.b, 0.05),
+    "bristle_backdriving_loss": Law("bristle_backdriving_loss", "gearbox", lambda s, q: (abs(s.B) * s.b - s.B * s.b**2) / 2, 0.1),
     "angle_friction": Law("angle_friction", "track", lambda s, q: np.sin(s.turn + q["phase"]) * s.d, 0.05, _PHASE),
     "position_friction": Law("position_friction", "track", lambda s, q: s.turn * s.d, 0.01),
 }  # fmt: skip
@@ -292,7 +294,9 @@ def _no_shapes(r: SimpleNamespace) -> dict[str, tuple[float, float]]:
 _BOTH_WAYS: dict[str, Law] = {
     "backdriving_loss": Law("backdriving_loss", "gearbox", lambda s, q: np.maximum(-s.B * s.d, 0.0) * s.d, 0.1),
     "directional_friction": Law("directional_friction", "track", lambda s, q: s.d**2, 0.05, either=True),
-}
+    "directional_stribeck": Law("directional_stribeck", "track", lambda s, q: np.exp(-abs(s.w_k) / q["fade"]) * s.d**2, 0.05, _WK_S, either=True),
+    "coast_decay": Law("coast_decay", "electrical", lambda s, q: -(1 - abs(s.duty)) * s.C * s.w, 0.5),
+}  # fmt: skip
 
 
 def _rig(name: str, size: Any, needs: Callable[[Any], bool] = _always, shapes: Any = _no_shapes, **own: Any) -> Law:
@@ -319,6 +323,8 @@ RIGS: dict[str, Law] = {
     "stribeck_exponent": _rig("stribeck_exponent", _output(0.06), shapes=_fade_output, of=lambda s, q: np.exp(-((s.w_k / q["fade"]) ** 2)) * s.d),
     "bending_loss": _rig("bending_loss", _output(0.06), shapes=lambda r: {"relaxation": (0.25 * r.w_k, 0.8 * r.w_k)}),
     "directional_friction": _rig("directional_friction", _output(0.05), lambda a: a.reverse),
+    "directional_stribeck": _rig("directional_stribeck", _output(0.05), lambda a: a.reverse, _fade_output),
+    "coast_decay": _rig("coast_decay", lambda r: 0.2, lambda a: a.imposed == "duty"),
     "tension_friction": _rig("tension_friction", lambda r: 0.1, _sloped),
     "speed_rolling": _rig("speed_rolling", lambda r: 0.02 / r.V_teor**2, _vehicle),
     "adhesive_drag": _rig("adhesive_drag", lambda r: 0.02 * r.N / (r.V_teor / 1e-3) ** 0.6, _vehicle, lambda r: {"peel": (5e-4, 5e-3)}),
@@ -381,7 +387,10 @@ LOGS: dict[str, Law] = {
                            of=lambda s, q: np.exp(-abs(s.w_k) / (q["fade"] * s.fast)) * s.d),
     "directional_friction": _rig("directional_friction", _output(0.07), either=True),
     "directional_viscous": Law("directional_viscous", "track", lambda s, q: s.w_k * s.d, lambda r: 0.07 * r.torque / r.w_k, _no_shapes, either=True),
+    "directional_stribeck": _rig("directional_stribeck", _output(0.07), shapes=lambda r: {"fade": (0.1, 0.3)},
+                                 of=lambda s, q: np.exp(-abs(s.w_k) / (q["fade"] * s.fast)) * s.d**2),
     "presliding": _rig("presliding", _output(0.1)),
+    "bristle_load_loss": _rig("bristle_load_loss", lambda r: 0.1),
     "angle_friction": _rig("angle_friction", _output(0.07), shapes=lambda r: _PHASE),
 }  # fmt: skip
 OUTSIDE_LOGS: dict[str, Law] = {

@@ -1,0 +1,72 @@
+"""Tables of settled runs that tell nothing: of one condition, or with a channel that is computed from another."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from calibration.data.instruments import step_of
+from calibration.data.runs import Runs
+from calibration.inference.noise import Noise
+from calibration.inference.notes import Copied, NothingVaries
+from calibration.inference.operating import operating_readings
+from mmrjax.robot import Robot
+
+#: Fewest rows and different readings from which a line through all of them is no chance.
+ROWS, LEVELS = 8, 4
+#: Share of the range of a channel that rounding in a file leaves, and steps of a display in the range from which on
+#: a line through all readings is more than the display's rounding.
+ROUNDED, STEPS = 2e-6, 40.0
+#: Channels that a rig ties to one another: both may be read, and each tells what the other does.
+TIED = ({"motor_speed", "output_speed"}, {"total_current", "motor_current"})
+
+
+def nothing_varies(runs: Runs, robot: Robot, noise: Noise) -> NothingVaries | None:
+    """The note that the robot foresees the same readings in all rows, within the noise of one; None where a channel
+    differs by more, or where the robot of the file does not reach a row."""
+    if len(runs) < 2 or any(float(c.torque_gravity) > 0 for c in robot.configurations.members):
+        return None
+    foreseen = operating_readings(robot, runs.conditions(robot))
+    seen = np.isfinite(foreseen) & np.isfinite(runs.measured()) & np.isfinite(noise.sd)
+    if not seen.all():
+        return None
+    if (np.ptp(foreseen, 0) >= np.median(noise.sd, 0)).any():
+        return None
+    unused = [n for n, x in runs.extras.items() if np.issubdtype(x.dtype, np.number) and np.nanmax(x) > np.nanmin(x)]
+    return NothingVaries(runs.source, len(runs), runs.layout.imposed_column, tuple(unused))
+
+
+def copied(runs: Runs, robot: Robot) -> list[Copied]:
+    """The channels that are a line of another channel in every row, to the digits of the file."""
+    found, copies = list[Copied](), set[str]()
+    names = [c for c in runs.channels if runs.has(c.column)]
+    for one, other in itertools.combinations(names, 2):
+        if {one.name, other.name} & copies:
+            continue
+        x, y = np.asarray(runs[one.column], float), np.asarray(runs[other.column], float)
+        both = np.isfinite(x) & np.isfinite(y)
+        if (line := _line(x[both], y[both])) is not None:
+            copies.add(other.name)
+            tied = any({one.name, other.name} <= those for those in _tied(robot))
+            found.append(Copied(runs.source, other.column, one.column, *line, tied))
+    return found
+
+
+def _tied(robot: Robot) -> list[set[str]]:
+    """Sets of channels that the rig ties to one another."""
+    speeds, currents = TIED
+    return [speeds if robot.has_ground else {*speeds, "speed"}, currents]
+
+
+def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
+    """Intercept and slope of a line through all points, as far as their digits tell; None where there is none."""
+    if len(x) < ROWS or min(len(np.unique(x)), len(np.unique(y))) < LEVELS:
+        return None
+    slope, intercept = np.polyfit(x - x.mean(), y, 1)
+    intercept -= slope * x.mean()
+    rounding = step_of(y) + abs(slope) * step_of(x)
+    allowed = 0.75 * rounding + ROUNDED * (np.ptp(y) + np.max(np.abs(y)))
+    if np.ptp(y) < STEPS * rounding or np.max(np.abs(y - intercept - slope * x)) > allowed:
+        return None
+    return (0.0 if abs(intercept) <= 2 * allowed else float(intercept)), float(slope)

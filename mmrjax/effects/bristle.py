@@ -1,0 +1,42 @@
+"""Friction through a bristle, which bends before it slides: shared by the effects that a reversal shows."""
+
+from __future__ import annotations
+
+import equinox as eqx
+
+from mmrjax.effects.base import Effect
+from mmrjax.params import Scalar, parameter
+from mmrjax.robot import Robot
+from mmrjax.signals import Signals
+
+
+def breakaway_parameter() -> Scalar:
+    """The angle θ_s over which a bristle yields, a field of every effect with one."""
+    return parameter(
+        0.02,
+        unit="rad",
+        meaning="turn of the driven shaft over which the contacts yield θ_s",
+        bounds=(1e-4, 2.0),
+        relative_sd=0.5,
+        source="1 mm of belt, a degree of a geared shaft",
+    )
+
+
+class Bristle(Effect):
+    """A term of the bend z of a bristle at the driven shaft: θ_s z' = ω_k - |ω_k| z, z(0) = 0, settled z = sign ω_k.
+
+    Dahl, A solid friction model (1968), with exponent 1; the first order of Canudas de Wit, Olsson, Åström and
+    Lischinsky (1995) with a steady curve that does not depend on speed. The memory is z [-].
+    """
+
+    memory_size = 1.0
+    memory_unit = "-"
+
+    angle_breakaway: eqx.AbstractVar[Scalar]
+
+    def settled(self, robot: Robot, signals: Signals) -> Scalar:
+        return signals.direction
+
+    def rate(self, robot: Robot, signals: Signals) -> Scalar:
+        speed = signals.speed_wheel
+        return speed * (1 - signals.direction * signals.memory[self.name]) / self.angle_breakaway

@@ -1,0 +1,147 @@
+"""Tables that tell nothing: a sentence with what to check, and no claim of the loop."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from calibration.data import robot_file
+from calibration.data import runs as records
+from calibration.data.errors import BadData
+from calibration.discovery import discover
+from calibration.inference import noise, observers, ranges, uninformative
+from calibration.words.notes import sentence
+
+RIG = """
+base = "none"
+imposed = "motor_speed"
+channels = ["motor_current", "output_torque", "output_speed"]
+[motor]
+torque_constant = "0.04 ± 3 %"
+friction_coulomb = 0.002
+[gearbox]
+ratio = 20
+efficiency_load = "0.8 ± 5 %"
+[brake]
+load = "shaft"
+inertia = 0.004
+loss_coulomb = "0.3 ± 40 %"
+"""
+SPEED = np.linspace(300.0, 3000.0, 12)
+RNG = np.random.default_rng(5)
+CURRENT = 0.5 + SPEED / 6000 + 0.01 * RNG.standard_normal(12)
+TORQUE = 0.25 + SPEED / 12000 + 0.01 * RNG.standard_normal(12)
+OUTPUT = SPEED / 20 + 0.2 * RNG.standard_normal(12)
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    path = tmp_path_factory.mktemp("rig") / "rig.toml"
+    path.write_text(RIG, encoding="utf-8")
+    return robot_file.read(path)
+
+
+@pytest.fixture
+def foreseen(monkeypatch):
+    """The robot foresees what these functions of current and torque say, without a program."""
+
+    def says(readings):
+        for room in (ranges, uninformative):
+            monkeypatch.setattr(room, "operating_readings", lambda robot, conditions: readings)
+
+    return says
+
+
+def table(tmp_path, robot, current=CURRENT, torque=TORQUE, output=OUTPUT, speed=SPEED, **more):
+    columns = {"motor_speed_rpm": speed, "motor_current_A": current, "output_torque_Nm": torque,
+               "output_speed_rpm": output, **more}  # fmt: skip
+    lines = [",".join(columns), *(",".join(f"{x:.6g}" for x in row) for row in zip(*columns.values(), strict=True))]
+    path = tmp_path / "t.csv"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return records.read(path, robot=robot)
+
+
+def shown(runs):
+    """Readings as the robot would show them."""
+    return np.array(runs.measured())
+
+
+def test_independent_readings_are_no_copies(tmp_path, robot):
+    assert uninformative.copied(table(tmp_path, robot), robot) == []
+
+
+@pytest.mark.parametrize(
+    ("copy", "column", "said"),
+    [
+        (
+            {"torque": 0.64 * CURRENT},
+            "output_torque_Nm",
+            "0.64 times motor_current_A, to the last digit: it is computed",
+        ),
+        ({"torque": 3 - 2 * CURRENT}, "output_torque_Nm", "3 - 2 times motor_current_A"),
+        ({"torque": np.round(0.64 * CURRENT, 4)}, "output_torque_Nm", "0.64 times motor_current_A"),
+    ],
+)
+def test_a_channel_that_is_a_line_of_another_is_refused_by_the_loop(tmp_path, robot, foreseen, copy, column, said):
+    runs = table(tmp_path, robot, **copy)
+    (found,) = uninformative.copied(runs, robot)
+    assert (found.column, found.tied) == (column, False) and said in sentence(found)
+    foreseen(shown(runs))
+    with pytest.raises(BadData, match=rf"t\.csv, {column}: in every row .* remove it from channels and table"):
+        discover.prepared(runs, robot, replicates=192)
+
+
+@pytest.mark.parametrize(
+    "torque", [0.64 * CURRENT + 2e-4 * RNG.standard_normal(12), np.round(0.64 * CURRENT, 2), 0.64 * CURRENT**2]
+)
+def test_what_follows_another_within_noise_or_a_display_or_on_a_curve_is_no_copy(tmp_path, robot, torque):
+    assert uninformative.copied(table(tmp_path, robot, torque=torque), robot) == []
+
+
+def test_readings_that_a_rigid_gear_ties_are_said_and_not_refused(tmp_path, robot):
+    """The imposed speed is no channel; with the motor's as one, the output's may be of the same instrument."""
+    rig = dataclasses.replace(robot.rig, channels=("motor_speed", "output_speed"), imposed="voltage")
+    driven = dataclasses.replace(robot, rig=rig)
+    columns = {"supply_voltage_V": SPEED / 200, "motor_speed_rpm": SPEED, "output_speed_rpm": SPEED / 20}
+    path = tmp_path / "t.csv"
+    rows = (",".join(f"{x:.6g}" for x in row) for row in zip(*columns.values(), strict=True))
+    path.write_text("\n".join([",".join(columns), *rows]) + "\n", encoding="utf-8")
+    (found,) = uninformative.copied(records.read(path, robot=driven), driven)
+    assert found.tied and found.slope == pytest.approx(0.05) and "counts twice" in sentence(found)
+
+
+@pytest.mark.parametrize(("spread", "varies"), [(0.5, False), (3.0, True)])
+def test_runs_of_one_condition_are_refused_by_the_loop(tmp_path, robot, foreseen, spread, varies):
+    """Conditions that differ by less than shows in any channel are one."""
+    speed = 1000 + np.linspace(0, 1, 12)
+    runs = table(tmp_path, robot, 0.6 + 0.01 * RNG.standard_normal(12), 0.3 + 0.01 * RNG.standard_normal(12),
+                 50 + 0.1 * RNG.standard_normal(12), speed, wind_V=speed)  # fmt: skip
+    kind = observers.kind(runs)
+    known = noise.inferred(runs, kind.sizes(runs), "motor_current=0.01A,output_torque=0.01Nm,output_speed=1rpm")
+    middle = np.mean(shown(runs), 0)
+    foreseen(middle + spread * np.median(known.sd, 0) * np.linspace(-0.5, 0.5, 12)[:, None])
+    found = uninformative.nothing_varies(runs, robot, known)
+    assert (found is None) == varies
+    if not varies:
+        assert (found.rows, found.column, found.unused) == (12, "motor_speed_rpm", ("wind_V",))
+        with pytest.raises(
+            BadData, match=r"t\.csv: nothing varies in these 12 runs but noise, .* wind_V varies and is"
+        ):
+            discover.prepared(
+                runs, robot, noise="motor_current=0.01A,output_torque=0.01Nm,output_speed=1rpm", replicates=192
+            )
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1000.0, "mNm"), (10.0, "")])
+def test_a_torque_in_another_unit_is_refused_where_its_friction_is_not_known(tmp_path, robot, foreseen, factor, unit):
+    """Friction that nobody knows may be ten times another; a thousand times is a matter of units."""
+    runs = table(tmp_path, robot)
+    foreseen(shown(runs))
+    off = table(tmp_path, robot, torque=factor * TORQUE)
+    if unit:
+        with pytest.raises(
+            BadData, match=r"output_torque_Nm: readings are about 1000 times too large .* are they in mNm"
+        ):
+            ranges.check_ranges(off, robot)
+    else:
+        assert ranges.check_ranges(off, robot) == []
