@@ -18,20 +18,23 @@ ROWS, LEVELS = 8, 4
 #: Share of the range of a channel that rounding in a file leaves, and steps of a display in the range from which on
 #: a line through all readings is more than the display's rounding.
 ROUNDED, STEPS = 2e-6, 40.0
-#: Channels that a rig ties to one another: both may be read, and each tells what the other does.
-TIED = ({"motor_speed", "output_speed"}, {"total_current", "motor_current"})
+#: Range of readings that differ by their noise alone, in its sds: of a hundred rows 5 in the mean.
+RANGE = 8.0
+#: Channels that a rig ties to one another (the speed where nothing slips): each tells what the other does.
+TIED = ({"motor_speed", "output_speed", "speed"}, {"total_current", "motor_current"})
 
 
 def nothing_varies(runs: Runs, robot: Robot, noise: Noise) -> NothingVaries | None:
-    """The note that the robot foresees the same readings in all rows, within the noise of one; None where a channel
-    differs by more, or where the robot of the file does not reach a row."""
+    """The note that the robot foresees the same readings in all rows, within the noise of one, and that they are no
+    more apart than noise leaves them; None where a channel differs by more, or where the robot of the file does not reach a row."""
     if len(runs) < 2 or any(float(c.torque_gravity) > 0 for c in robot.configurations.members):
         return None
     foreseen = operating_readings(robot, runs.conditions(robot))
     seen = np.isfinite(foreseen) & np.isfinite(runs.measured()) & np.isfinite(noise.sd)
     if not seen.all():
         return None
-    if (np.ptp(foreseen, 0) >= np.median(noise.sd, 0)).any():
+    sd = np.median(noise.sd, 0)
+    if (np.ptp(foreseen, 0) >= sd).any() or (np.ptp(runs.measured(), 0) >= RANGE * sd).any():
         return None
     unused = [n for n, x in runs.extras.items() if np.issubdtype(x.dtype, np.number) and np.nanmax(x) > np.nanmin(x)]
     return NothingVaries(runs.source, len(runs), runs.layout.imposed_column, tuple(unused))
@@ -55,8 +58,7 @@ def copied(runs: Runs, robot: Robot) -> list[Copied]:
 
 def _tied(robot: Robot) -> list[set[str]]:
     """Sets of channels that the rig ties to one another."""
-    speeds, currents = TIED
-    return [speeds if robot.has_ground else {*speeds, "speed"}, currents]
+    return [those - {"speed"} if robot.has_ground else those for those in TIED]
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
