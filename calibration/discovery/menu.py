@@ -248,7 +248,7 @@ def other_voltages(reach: Reach, used: tuple[float, ...]) -> tuple[float, ...]:
 def other_torques(used: Sequence[float]) -> tuple[float, ...]:
     """Three torques of a brake that a table lacks, in its widest gaps from none on, and the largest that it used."""
     levels = sorted({0.0, *used})
-    found = []
+    found: list[float] = []
     while len(found) < 3 and levels[-1] > 0:
         low, high = max(itertools.pairwise(levels), key=lambda gap: round_significant(gap[1] - gap[0], 6))
         levels = sorted([*levels, 0.5 * (low + high)])
