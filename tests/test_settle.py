@@ -469,6 +469,23 @@ def test_levels_that_are_held_again_widen_sds_by_what_they_differ_by(tmp_path):
     assert all(s.sd["total_current"] > 0.9 * found.scatter["total_current"] for s in found.kept)
 
 
+def test_a_log_is_divided_where_the_torque_of_a_brake_changes(tmp_path):
+    """Levels of one voltage, read with noise, each twice: their readings are no scatter of repeats."""
+    levels = np.tile([0.0, 0.5, 1.0, 2.0], 2)
+    columns, torque = stairs(levels=(12.0,) * 8), np.repeat(levels, 200)
+    since = np.tile(np.arange(200), 8) / 100
+    columns["motor_speed_rpm"] += -300 * torque + 300 * np.repeat(np.diff(levels, prepend=0.0), 200) * np.exp(
+        -since / 0.05
+    )
+    columns["total_current_A"] += 0.4 * torque
+    columns["load_torque_Nm"] = torque + 0.005 * np.random.default_rng(1).standard_normal(len(torque))
+    found = settled(tmp_path, bench(tmp_path, columns))
+    table = found.table()
+    assert len(found.kept) == 8 and found.scatter["motor_speed"] < 1.0
+    np.testing.assert_allclose(table["load_torque_Nm"], levels, atol=2e-3)
+    np.testing.assert_allclose(table["motor_speed_rpm"], 2160 - 300 * levels, atol=2.0)
+
+
 def test_an_angle_shows_the_speed_of_its_shaft(tmp_path):
     columns = stairs()
     rate = columns.pop("motor_speed_rpm") / 10 * 6  # of the output, deg/s

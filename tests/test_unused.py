@@ -55,6 +55,7 @@ CHANNELS = 'channels = ["motor_current", "motor_speed"]'
         ("load_Nm", "load_torque_Nm"),
         ("Drehmoment_mNm", "load_torque_mNm"),  # the only condition in this unit
         ("room_C", ""),
+        ("hold_s", ""),  # no table of settled runs lacks a time
         ("room", ""),
     ],
 )

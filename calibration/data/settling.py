@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.data.columns import TIME
+from calibration.data.columns import LOAD, TIME
 from calibration.data.contradictions import GAP
 from calibration.data.courses import applied, differs
 from calibration.data.errors import BadData, number
@@ -245,7 +245,8 @@ def _divided(runs: Runs, shortest: float | None, drift: float, inertia: Mapping[
         far = np.flatnonzero(np.diff(runs["time_s"][rows]) > GAP * step)
         gaps += [int(rows[k]) for k in far]
         for part in np.split(rows, far + 1):
-            levels += _levels(runs, drives, part, shortest, drift, step)
+            for level in _levels(runs, drives, part, shortest, drift, step):
+                levels += _levels(runs, runs[LOAD], level, shortest, drift, step) if runs.has(LOAD) else [level]
     signals = _signals(runs, each, levels, half, drift)
     for signal in signals:
         _check_alive(runs, signal)
@@ -425,7 +426,8 @@ def _noise(x: np.ndarray) -> float:
 def _levels(
     runs: Runs, drives: np.ndarray, rows: np.ndarray, shortest: float, drift: float, step: float
 ) -> Iterator[np.ndarray]:
-    """Rows of a part without gaps, divided where a condition changes, or what is imposed by more than its noise."""
+    """Rows of a part without gaps, divided where a condition changes, or `drives` by more than its noise: what is
+    imposed, or the torque of a brake."""
     if not len(rows):
         return
     cuts = differs(rows, (runs[name] for name in EXACT if runs.has(name)))
@@ -665,8 +667,8 @@ def _scatter(runs: Runs, found: list[Stretch], signals: tuple[Signal, ...], larg
     alike = [c for c in EXACT if runs.has(c)]
     groups: list[list[Stretch]] = []
     where: tuple[object, ...] = ()
-    for s in sorted((s for s in found if not s.why), key=lambda s: s.imposed):
-        here = tuple(runs[c][s.rows[0]] for c in alike)
+    for s in sorted((s for s in found if not s.why), key=lambda s: (_braked(runs, s), s.imposed)):
+        here = (_braked(runs, s), *(runs[c][s.rows[0]] for c in alike))
         if groups and here == where and abs(s.imposed - groups[-1][0].imposed) <= 0.2 * FINE * largest:
             groups[-1].append(s)
         else:
@@ -686,6 +688,13 @@ def _scatter(runs: Runs, found: list[Stretch], signals: tuple[Signal, ...], larg
                 freedom += int(good.sum()) - 1
         scatter[name] = math.sqrt(max(excess, 0.0) / freedom) if freedom >= 3 else 0.0
     return scatter
+
+
+def _braked(runs: Runs, stretch: Stretch) -> int:
+    """Level of the brake's torque in a stretch, in steps of `DRIFT` of the largest; 0 without a brake."""
+    if not runs.has(LOAD) or not runs[LOAD].any():
+        return 0
+    return round(float(np.mean(runs[LOAD][stretch.rows])) / (DRIFT * float(np.max(np.abs(runs[LOAD])))))
 
 
 def _wider(stretch: Stretch, scatter: Mapping[str, float]) -> Stretch:
