@@ -152,6 +152,8 @@ class SettledRuns(Observer):
         columns = [c for c in ("configuration", *runs.axes, "surface") if runs.has(c)]
         measured, alike = runs.measured(), dict[tuple[str, ...], list[int]]()
         least, found = cls.least(runs), list[Repeats]()
+        shared = np.array([source == "series" for source in noise.source])
+        usual = np.array([c.sd_share for c in runs.channels])
         for row, key in enumerate(zip(*(runs[c].astype(str).tolist() for c in columns), strict=True)):
             alike.setdefault(key, []).append(row)
         for rows in map(np.array, alike.values()):
@@ -160,10 +162,13 @@ class SettledRuns(Observer):
             mean = np.maximum(np.abs(here[:, None] + here) / 2, least[rows])
             sd = np.hypot(sds[:, None], sds)
             allowed = np.where(noise.estimated, CONTRADICTION_SHARE * mean, CONTRADICTION * sd)
+            # Noise that is estimated by the scatter of these readings is no measure of it.
+            allowed = np.where(shared, np.minimum(allowed, CONTRADICTION * np.sqrt(2) * usual * mean), allowed)
             for at in np.argwhere(apart > allowed)[:1]:
                 (one, other, k), at = at.tolist(), tuple(at)
                 first, second, column = int(rows[one]), int(rows[other]), runs.channels[k].column
-                known = f"{apart[at] / sd[at]:.0f} sd" if not noise.estimated[k] else f"{apart[at] / mean[at]:.0%}"
+                in_sds = not (noise.estimated[k] or shared[k])
+                known = f"{apart[at] / sd[at]:.0f} sd" if in_sds else f"{apart[at] / mean[at]:.0%}"
                 values = float(runs[column][first]), float(runs[column][second])
                 others = _unused(runs, first, second, column)
                 found.append(Repeats(runs.source, (first + 1, second + 1), column, values, known, others))
