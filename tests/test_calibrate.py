@@ -247,6 +247,19 @@ def test_repeats_that_differ_are_said_and_no_error(measured):
         ]
 
 
+def test_repeats_are_not_measured_by_noise_that_is_their_own_scatter(measured):
+    """A current 12 % apart, of which noise estimated along series makes 3 sd: six of a usual ammeter's are 17 %."""
+    twice = measured.where(np.r_[0:20, 3])
+    for factor, said in ((1.12, []), (1.3, ["26%"])):
+        current = twice["total_current_A"].copy()
+        current[20] = factor * current[3]
+        other = changed(twice, total_current_A=current)
+        known = noise.from_table(other, SettledRuns.sizes(other), "current=6%,motor_speed=1%,speed=1%")
+        assert SettledRuns.check(other, known) == []
+        known = dataclasses.replace(known, source=("series", *known.source[1:]))
+        assert [note.apart for note in SettledRuns.check(other, known)] == said
+
+
 def test_a_column_that_varies_where_no_condition_does_is_named(measured):
     alike = measured.where(np.zeros(6, int))
     speeds = {"motor_speed_rpm": np.linspace(4000.0, 5000.0, 6)}

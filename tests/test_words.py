@@ -83,6 +83,11 @@ SAMPLES = [
         "configuration",
     ),
     (
+        of_fit.Repeats("r.csv", (1, 2), "motor_speed_rpm", (4500.0, 4300.0), "5%", (), 3),
+        "r.csv rows 1 and 2, motor_speed_rpm: the same conditions gave 4500 and 4300, 5% apart (and so 3 more); if one is "
+        "wrong, remove it, else find what changed between such rows that the table does not state",
+    ),
+    (
         of_fit.Repeats("r.csv", (1, 2), "motor_speed_rpm", (4500.0, 4300.0), "5%"),
         "r.csv rows 1 and 2, motor_speed_rpm: the same conditions gave 4500 and 4300, 5% apart; if one is wrong, "
         "remove it",

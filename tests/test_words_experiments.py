@@ -255,3 +255,13 @@ def test_a_temperature_that_nobody_stated_is_not_watched():
     stated, unknown = (more_runs("slip", "time", dataclasses.replace(ONE, hot=t)) for t in (125.0, 1e9))
     assert "(125 °C is allowed)" in words.instruction(stated)
     assert words.instruction(unknown).count("watch the winding's temperature;") == 1
+
+
+@pytest.mark.parametrize("reach", [ONE, BENCH, DRIVEN, BRAKED, HELD])
+@pytest.mark.parametrize(
+    "variable", ["voltage", "current", "speed_motor", "speed", "slope", "payload", "time", "order"]
+)
+def test_more_runs_are_said_of_a_table_that_varied_nothing(reach, variable):
+    """Where a speed is imposed the table has no voltage at all."""
+    used = tuple(dataclasses.replace(u, voltages=(0.0,), slopes=(0.0,), payloads=(0.0,)) for u in reach.used)
+    assert words.instruction(more_runs("track", variable, dataclasses.replace(reach, used=used))).startswith("Re")

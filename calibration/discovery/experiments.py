@@ -328,10 +328,9 @@ def more_runs(place: str, variable: str, within: Reach, by_duty: bool = False) -
     low, high = (volts[0], volts[-1]) if volts[-1] > volts[0] else (menu.round_significant(0.5 * volts[0]), volts[0])
     slope = max(u.steepest for u in within.used)
     payload = max(u.payloads[-1] for u in within.used)
-    step, angle, mass = (menu.step_of_settings(x, SERIES - 1) if x > 0 else 0.0 for x in (high - low, slope, payload))
+    step, angle, mass = (menu.step_of_settings(x, SERIES - 1) for x in (high - low, slope, payload))
     low, high, slope, payload = (
-        menu.last_setting(x, by) if by else x
-        for x, by in ((low, step), (high, step), (slope, angle), (payload, mass))
+        menu.last_setting(x, by) for x, by in ((low, step), (high, step), (slope, angle), (payload, mass))
     )
     low = low or step
     steps = step, angle, mass

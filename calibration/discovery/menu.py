@@ -123,14 +123,18 @@ ABOUT = 0.01
 
 
 def step_of_settings(span: float, count: int) -> float:
-    """The step of `STEPS` nearest, in proportion, to that of so many even steps over a span."""
+    """The step of `STEPS` nearest, in proportion, to that of so many even steps over a span; 0 for no span."""
+    if span <= 0:
+        return 0.0
     step = span / count
     power = 10.0 ** math.floor(math.log10(step))
     return round_significant(min((s * power for s in STEPS), key=lambda s: abs(math.log(s / step))))
 
 
 def last_setting(most: float, step: float) -> float:
-    """The largest multiple of a step that does not exceed about a number."""
+    """The largest multiple of a step that does not exceed about a number; the number itself without a step."""
+    if step == 0:
+        return most
     return float(f"{step * math.floor(most * (1 + ABOUT) / step + 1e-9):.6g}")
 
 

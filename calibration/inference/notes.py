@@ -165,7 +165,7 @@ class NoLoadGives(Note):
 
 
 class NothingVaries(Note):
-    """Settled runs of which the robot foresees the same readings, within the noise of one.
+    """The robot foresees the same readings in all settled runs, within the noise of one.
 
     Attributes:
         source: of the table; rows: how many; column: of what is imposed.

@@ -25,8 +25,8 @@ TIED = ({"motor_speed", "output_speed", "speed"}, {"total_current", "motor_curre
 
 
 def nothing_varies(runs: Runs, robot: Robot, noise: Noise) -> NothingVaries | None:
-    """The note that the robot foresees the same readings in all rows, within the noise of one, and that they are no
-    more apart than noise leaves them; None where a channel differs by more, or where the robot of the file does not reach a row."""
+    """The note that robot and readings are the same in all rows, within the noise; None where a channel differs by
+    more, or where the robot of the file does not reach a row."""
     if len(runs) < 2 or any(float(c.torque_gravity) > 0 for c in robot.configurations.members):
         return None
     foreseen = operating_readings(robot, runs.conditions(robot))

@@ -183,8 +183,10 @@ def more_runs(what: MoreRuns) -> str:
     happens = bases.window(what.variable)
     if happens is not None:
         return _again(happens)
-    by_kind = {} if what.within.has_ground else _of_shaft(what)
-    by_kind = _of_level(what) if what.within.imposed != "voltage" else by_kind
+    if what.within.imposed != "voltage":
+        by_kind = _of_level(what)
+    else:
+        by_kind = {} if what.within.has_ground else _of_shaft(what)
     last = f"Repeat with {what.variable.replace('_', ' ')} in even small steps from its least to its largest"
     return (_usual(what) | by_kind).get(what.variable, last)
 

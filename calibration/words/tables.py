@@ -61,7 +61,8 @@ def repeats(note: notes.Repeats) -> str:
             f"{said}; {', '.join(note.unused)} {'vary' if many else 'varies'} there and {'are' if many else 'is'} "
             f"not used as a condition: {name}, or give each level of a load a configuration"
         )
-    return f"{said}; if one is wrong, remove it"
+    wrong = f"{said}; if one is wrong, remove it"
+    return f"{wrong}, else find what changed between such rows that the table does not state" if note.more else wrong
 
 
 def unused(note: notes.Unused) -> str:

@@ -11,7 +11,7 @@ from mmrjax.signals import Signals
 
 
 def breakaway_parameter() -> Scalar:
-    """The angle θ_s over which a bristle yields, a field of every effect with one."""
+    """The angle θ_s over which a bristle yields: a field of every effect that has a bristle."""
     return parameter(
         0.02,
         unit="rad",

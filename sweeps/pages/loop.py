@@ -15,7 +15,7 @@ from calibration.discovery.result import DiscoveryResult
 from calibration.inference import blocks
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
 from calibration.inference.errors import root_mean_square
-from calibration.inference.notes import FarFromPrior
+from calibration.inference.notes import Copied, FarFromPrior, Repeats
 from calibration.words import fits
 from calibration.words import loop as words
 from calibration.words.notes import sentence
@@ -186,7 +186,7 @@ def summary(found: DiscoveryResult) -> list[dict[str, Any]]:
 def check_first(found: DiscoveryResult) -> list[str]:
     """What to look at before the robot is used: the reading that weighs most, parameters that moved too far, and what
     the table contradicts."""
-    far = [sentence(note) for note in found.remarks if isinstance(note, FarFromPrior)]
+    far = [sentence(note) for note in found.remarks if isinstance(note, FarFromPrior | Repeats | Copied)]
     against = [note for note in found.remarks if isinstance(note, str)]
     said = [words.largest_share(found), *far, *against[:1]]
     # a sentence begins with a capital, a parameter's name does not

@@ -52,6 +52,8 @@ CONTRADICTION = 6.0
 CONTRADICTION_SHARE = 0.25
 #: Searches side by side on a core: of a robot without effects, and with.
 MANY, FEW = 16, 4
+#: Least spread of a fitted speed or current, over its largest, for curves to be over it [-].
+VARIES = 0.05
 #: Share of the torque that motors make which the torque at the output is at least taken to be about [-].
 LOST = 0.1
 #: Balances to which the defect of a row is attributed, one for each equation that the channels close: what each is a
@@ -153,16 +155,21 @@ class SettledRuns(Observer):
         """Refuses a table of one condition whose readings differ; notes the repeats that differ most."""
         measured, alike = runs.measured(), same_conditions(runs)
         least, found = cls.least(runs), list[Repeats]()
+        shared = np.array([source == "series" for source in noise.source])
+        usual = np.array([c.sd_share for c in runs.channels])
         for rows in alike:
             here, sds = measured[rows], noise.sd[rows]
             apart = np.abs(here[:, None] - here)
             mean = np.maximum(np.abs(here[:, None] + here) / 2, least[rows])
             sd = np.hypot(sds[:, None], sds)
             allowed = np.where(noise.estimated, CONTRADICTION_SHARE * mean, CONTRADICTION * sd)
+            # Noise that is estimated by the scatter of these readings is no measure of it.
+            allowed = np.where(shared, np.minimum(allowed, CONTRADICTION * np.sqrt(2) * usual * mean), allowed)
             for at in np.argwhere(apart > allowed)[:1]:
                 (one, other, k), at = at.tolist(), tuple(at)
                 first, second, column = int(rows[one]), int(rows[other]), runs.channels[k].column
-                known = f"{apart[at] / sd[at]:.0f} sd" if not noise.estimated[k] else f"{apart[at] / mean[at]:.0%}"
+                in_sds = not (noise.estimated[k] or shared[k])
+                known = f"{apart[at] / sd[at]:.0f} sd" if in_sds else f"{apart[at] / mean[at]:.0%}"
                 values = float(runs[column][first]), float(runs[column][second])
                 others = _unused(runs, first, second, column)
                 near = runs.layout.nearest(others[0], runs.columns) if others else ""
@@ -359,7 +366,12 @@ def _unmeasured(
     if not wanted or observe.long:
         return {}
     fitted = {v: np.asarray(x, float) for v, x in zip(wanted, _signals(observe, robot, tuple(wanted)), strict=True)}
-    return {bases_room.VARIABLES[v]: x for v, x in fitted.items() if np.isfinite(x).all()}
+    return {bases_room.VARIABLES[v]: x for v, x in fitted.items() if np.isfinite(x).all() and _varies(np.abs(x))}
+
+
+def _varies(x: np.ndarray) -> bool:
+    """True if sizes differ by more than `VARIES` of the largest: a current that friction alone takes does not."""
+    return bool(np.ptp(x) > VARIES * np.max(x))
 
 
 @functools.partial(compiled, options=SELDOM)
