@@ -214,7 +214,6 @@ SPELLED = {
     ("calibration/discovery/menu.py", "TURNING, STANDING"),
     ("calibration/words/effects.py", "CHECKED_BY"),  # which act checks which instrument
     ("calibration/inference/bases.py", "VARIABLES"),
-    ("calibration/inference/uninformative.py", "TIED"),  # which a rig ties to one another
     ("calibration/inference/blocks.py", "BLOCKS"),  # what is imposed may be a channel's column
     ("calibration/inference/observers/settled_ends.py", "_sliding"),  # the two that show slip
     ("sweeps/pages/loop_figures.py", "VARIABLE_WORDS"),  # words of the same variables

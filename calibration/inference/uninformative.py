@@ -11,6 +11,7 @@ from calibration.data.runs import Runs
 from calibration.inference.noise import Noise
 from calibration.inference.notes import Copied, NothingVaries
 from calibration.inference.operating import operating_readings
+from mmrjax.channels import Channel
 from mmrjax.robot import Robot
 
 #: Fewest rows and different readings from which a line through all of them is no chance.
@@ -20,8 +21,6 @@ ROWS, LEVELS = 8, 4
 ROUNDED, STEPS = 2e-6, 40.0
 #: Range of readings that differ by their noise alone, in its sds: of a hundred rows 5 in the mean.
 RANGE = 8.0
-#: Channels that a rig ties to one another (the speed where nothing slips): each tells what the other does.
-TIED = ({"motor_speed", "output_speed", "speed"}, {"total_current", "motor_current"})
 
 
 def nothing_varies(runs: Runs, robot: Robot, noise: Noise) -> NothingVaries | None:
@@ -51,14 +50,14 @@ def copied(runs: Runs, robot: Robot) -> list[Copied]:
         both = np.isfinite(x) & np.isfinite(y)
         if (line := _line(x[both], y[both])) is not None:
             copies.add(other.name)
-            tied = any({one.name, other.name} <= those for those in _tied(robot))
-            found.append(Copied(runs.source, other.column, one.column, *line, tied))
+            found.append(Copied(runs.source, other.column, one.column, *line, _tied(one, other, robot)))
     return found
 
 
-def _tied(robot: Robot) -> list[set[str]]:
-    """Sets of channels that the rig ties to one another."""
-    return [those - {"speed"} if robot.has_ground else those for those in TIED]
+def _tied(one: Channel, other: Channel, robot: Robot) -> bool:
+    """True if the rig ties two channels to one another: readings of one unit, or speeds where nothing slips."""
+    same = (one.unit_si or one.unit) == (other.unit_si or other.unit)
+    return same or (not robot.has_ground and one.zero_at_rest and other.zero_at_rest)
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:

@@ -186,7 +186,7 @@ _SET_IN = {"speed_motor": ("rpm", math.pi / 30), "slope": ("°", math.pi / 180),
 def _level(variable: str, x: float) -> str:
     units = {"voltage": "V", "current": "A", "payload": "kg", "time": "s"}
     unit, factor = _SET_IN.get(variable, (units.get(variable, ""), 1.0))
-    return f"{x / factor:.3g} {unit}".rstrip()
+    return f"{float(f'{x / factor:.3g}'):g} {unit}".rstrip()
 
 
 def brief(said: notes.Summary) -> str:
