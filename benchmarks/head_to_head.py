@@ -51,7 +51,7 @@ PREDICTED = 0.9
 #: Share by which a competitor's error has to be lower to count as lower.
 TENTH = 0.1
 #: What `--quick` runs.
-QUICK = {"records": "rig-03", "methods": "refit,ridge"}
+QUICK = {"records": "rig-00", "methods": "refit,ridge"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,8 +94,7 @@ def lines(job: Job, begin: Any = lambda method: None) -> Iterable[tuple[str, dic
             record = public_records.record(job.record, Path(folder), job.public, job.cases, job.seed)
             posed = rivals.posed(record.robot, record.table, job.seed, job.replicates, record.case)
         except Exception as error:
-            words = str(error) if isinstance(error, public_records.NoRecord) else f"{type(error).__name__}: {error}"
-            yield from ((method, {"failed": words}) for method in job.methods)
+            yield from ((method, {"failed": _why(error)}) for method in job.methods)
             return
         base = time.perf_counter() - began
         for method in job.methods:
@@ -104,12 +103,16 @@ def lines(job: Job, begin: Any = lambda method: None) -> Iterable[tuple[str, dic
             try:
                 found = rivals.quietly(rivals.METHODS[method], posed)
             except Exception as error:
-                unable = isinstance(error, rivals.Unable)
-                yield method, {"failed": str(error) if unable else f"{type(error).__name__}: {error}"}
+                yield method, {"failed": _why(error)}
                 continue
             spent = time.perf_counter() - began
             seconds = found.seconds or (base if method == "refit" else spent)
             yield method, {"seconds": seconds, "truth": record.answer.kind, **measured(posed, found, record.answer)}
+
+
+def _why(error: Exception) -> str:
+    known = isinstance(error, public_records.NoRecord | rivals.Unable)
+    return str(error) if known else f"{type(error).__name__}: {error}"
 
 
 def measured(posed: Any, found: Any, answer: public_records.Answer) -> dict[str, Any]:
@@ -149,15 +152,23 @@ def run(jobs: Sequence[Job], count: int, within: float, keep: Any) -> None:
     """
     spawn = multiprocessing.get_context("spawn")
     waiting, at_work = list(jobs), dict[Connection, tuple[Any, Job, str, float]]()
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") and count > 1 else []
-    started = 0
+    cores: list[int | None] = sorted(os.sched_getaffinity(0))[:count] if count > 1 else []
+    cores += [None] * (count - len(cores))
+    taken: dict[Any, int | None] = {}
+
+    def over(line: Connection) -> None:
+        process = at_work.pop(line)[0]
+        process.join()
+        cores.append(taken.pop(process))
+
     while waiting or at_work:
         while waiting and len(at_work) < count:
             job, (mine, theirs) = waiting.pop(0), spawn.Pipe()
-            process = spawn.Process(target=work, args=(job, theirs, cores[started % len(cores)] if cores else None))
-            started += 1
+            core = cores.pop(0)
+            process = spawn.Process(target=work, args=(job, theirs, core), daemon=True)
             process.start()
             theirs.close()
+            taken[process] = core
             at_work[mine] = (process, job, "base", time.monotonic())
         soonest = min(began for *_, began in at_work.values()) + within - time.monotonic()
         for line in wait(list(at_work), timeout=max(soonest, 0.05)):
@@ -166,8 +177,7 @@ def run(jobs: Sequence[Job], count: int, within: float, keep: Any) -> None:
             try:
                 word, what = line.recv()
             except (EOFError, OSError):
-                process.join()
-                del at_work[line]
+                over(line)
                 waiting[:0] = ended(job, method, f"the process ended with {process.exitcode}", keep)
                 continue
             if word == "begin":
@@ -177,13 +187,11 @@ def run(jobs: Sequence[Job], count: int, within: float, keep: Any) -> None:
                 job = dataclasses.replace(job, methods=tuple(m for m in job.methods if m != what["method"]))
                 at_work[line] = (process, job, method, began)
             else:
-                process.join()
-                del at_work[line]
+                over(line)
         for line, (process, job, method, began) in list(at_work.items()):
             if time.monotonic() - began > within:
                 process.kill()
-                process.join()
-                del at_work[line]
+                over(line)
                 waiting[:0] = ended(job, method, f"no result in {within:g} s", keep)
 
 
@@ -210,6 +218,7 @@ class Compared:
     Attributes:
         record: its name; truth: kind of its answer; channels: names.
         percent: method → rms error of each channel [% of the measured rms].
+        partial: the same of a method that predicts too few of the rows, over its own; with their share.
         rows: rows that are compared, over the kinds of blocks; lines: method → line.
     """
 
@@ -217,6 +226,7 @@ class Compared:
     truth: str
     channels: tuple[str, ...]
     percent: dict[str, np.ndarray]
+    partial: dict[str, tuple[np.ndarray, float]]
     rows: int
     lines: dict[str, dict[str, Any]]
 
@@ -235,12 +245,11 @@ class Compared:
     def share(self) -> float:
         """Share of the way from the refit to the ceiling that our terms cover [-].
 
-        NaN where the ceiling is not lower than the refit by a tenth.
+        It is 1 where our terms are below the ceiling, NaN where neither is lower than the refit by a tenth.
         """
-        refit, ceiling = self.over_all("refit"), self.ceiling
-        return (
-            (refit - self.over_all("verdict")) / (refit - ceiling) if ceiling < (1 - TENTH) * refit else float("nan")
-        )
+        refit, ours = self.over_all("refit"), self.over_all("verdict")
+        lowest = float(np.fmin(self.ceiling, ours))
+        return (refit - ours) / (refit - lowest) if lowest < (1 - TENTH) * refit else float("nan")
 
     def better(self) -> list[str]:
         """Competitors whose error is lower than that of our terms by more than a tenth."""
@@ -261,12 +270,14 @@ def _compared(name: str, of: dict[str, dict[str, Any]]) -> Compared:
     truth = next((x["truth"] for x in of.values() if "truth" in x), "unknown")
     channels = next((tuple(x["channels"]) for x in of.values() if "channels" in x), ())
     if "refit" not in errors:
-        return Compared(name, truth, channels, {}, 0, of)
+        return Compared(name, truth, channels, {}, {}, 0, of)
     whole = np.isfinite(errors["refit"])
-    errors = {m: x for m, x in errors.items() if (np.isfinite(x) & whole).sum() >= PREDICTED * whole.sum()}
+    part = {m: float((np.isfinite(x) & whole).sum() / whole.sum()) for m, x in errors.items()}
+    partial = {m: (np.sqrt(np.nanmean(errors[m] ** 2, 0)), x) for m, x in part.items() if 0 < x < PREDICTED}
+    errors = {m: x for m, x in errors.items() if part[m] >= PREDICTED}
     same = np.all([np.isfinite(x) for x in errors.values()], 0)
     percent = {m: np.sqrt(np.nanmean(np.where(same, x, np.nan) ** 2, 0)) for m, x in errors.items()}
-    return Compared(name, truth, channels, percent, int(same.any(1).sum()), of)
+    return Compared(name, truth, channels, percent, partial, int(same.any(1).sum()), of)
 
 
 def _stacked(off: dict[str, list[list[float | None]]]) -> np.ndarray:
@@ -303,8 +314,8 @@ def figures(records: Sequence[Compared]) -> list[str]:
     out = [
         f"* records: {len(records)}, compared with our terms: {len(ours)}; "
         f"{sum('failed' in r.lines.get('verdict', {}) for r in records)} without a verdict",
-        "* our terms cover 80 % or more of the way from refit to ceiling (a mechanism of the library, ceiling lower "
-        f"than the refit by a tenth): {interval(len(good), len(known))}",
+        "* our terms cover 80 % or more of the way from refit to ceiling (a mechanism of the library, and either is "
+        f"lower than the refit by a tenth): {interval(len(good), len(known))}",
         "* a competitor's error is lower by more than a tenth: "
         + interval(sum(bool(r.better()) for r in ours), len(ours)),
     ]
@@ -325,9 +336,13 @@ def _cell(r: Compared, method: str) -> str:
         return ""
     if "failed" in line:
         return "" if method == "true" else line["failed"].replace("|", "/")[:60]
-    if method not in r.percent:
-        return "predicts too few rows" if line["off"] else "nothing to hold out"
-    return " / ".join(f"{x:.3g}" for x in r.percent[method])
+    if method in r.partial:
+        return f"({_percent(r.partial[method][0])}; {100 * r.partial[method][1]:.0f} % of the readings)"
+    return _percent(r.percent[method]) if method in r.percent else "nothing to hold out"
+
+
+def _percent(errors: np.ndarray) -> str:
+    return " / ".join(f"{x:.3g}" for x in errors)
 
 
 def _claim(line: dict[str, Any]) -> tuple[str, str]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import io
+import logging
 from types import SimpleNamespace
 from typing import Any
 
@@ -43,6 +44,7 @@ MODEL = """
     <general name="slope" joint="shaft"/>
     <general name="ground" joint="shaft"/>
     <general name="pull" joint="shaft"/>
+    <general name="brake" joint="shaft"/>
   </actuator>
   <sensor><jointvel name="speed" joint="shaft"/><actuatorfrc name="torque" actuator="motor"/></sensor>
 </mujoco>
@@ -55,7 +57,7 @@ class Sequence:
 
     Attributes:
         rows: of the table, in order; configuration: name; step: [s]; at: instants of the rows since the start [s].
-        control: of every step, shape (steps, 4); settled: True where each row is held until it is settled.
+        control: of every step, shape (steps, 5); settled: True where each row is held until it is settled.
         speed: of the output shaft at the start [rad/s].
     """
 
@@ -89,6 +91,7 @@ class Rig:
             every = [part(x, params, **options) for part in parts]
             return [r for residuals, _, _ in every for r in residuals], [], []
 
+        logging.getLogger("absl").setLevel(logging.ERROR)  # it warns of each start on a bound
         with contextlib.redirect_stdout(io.StringIO()):
             found, _ = sysid.optimize(free, residual, optimizer="mujoco", verbose=False)
         return np.asarray(found.as_vector())
@@ -154,7 +157,7 @@ class Rig:
         else:
             gain = bias = SERVO * max(c.damping, c.i**2 * c.eta * c.C**2)
         motor.gainprm[0], motor.biasprm[2] = gain, -bias
-        for name, value in (("slope", -c.radius), ("ground", -c.rubs), ("pull", -c.pull)):
+        for name, value in (("slope", -c.radius), ("ground", -c.rubs), ("pull", -c.pull), ("brake", -1.0)):
             spec.actuator(name).gainprm[0] = value
         joint.damping = np.array([[c.damping], [0], [0]])
         joint.frictionloss = c.friction
@@ -178,7 +181,8 @@ class Rig:
         shown = {
             "motor_speed": w, "output_speed": speed, "speed": c.radius * speed, "motor_current": current,
             "total_current": given.sides * current * duty, "motor_voltage": c.C * w + c.R * current,
-            "output_torque": c.load_dry * np.sign(speed) + c.load_viscous * speed + c.pull,
+            "output_torque": c.load_dry * np.sign(speed) + c.load_viscous * speed + c.pull
+            + given.load_torque[s.rows],
         }  # fmt: skip
         if given.mass is not None:
             weight = given.mass[s.rows] / given.sides * G
@@ -214,8 +218,8 @@ def rig(runs: Any, robot: Any, coordinates: Any) -> Rig:
     ratio = drive.known["gearbox.ratio"]
     sequences = []
     if runs.sampled:
-        if given.motor_speed is not None:
-            raise Unable("an imposed speed over time")
+        if given.motor_speed is not None or given.load_torque.any():
+            raise Unable("an imposed speed, or a brake, over time")
         for name in dict.fromkeys(runs.run_names.tolist()):
             sequences.append(_log(drive, runs.in_order(name), runs.whole.in_order(name)))
         return Rig(drive, tuple(sequences))
@@ -234,10 +238,10 @@ def rig(runs: Any, robot: Any, coordinates: Any) -> Rig:
 
 
 def _controls(given: SimpleNamespace, driven: np.ndarray) -> np.ndarray:
-    """Controls of every row: what is imposed, weight along and across the slope of one side [N], and one."""
+    """Controls of every row: what is imposed, weight along and across the slope of one side [N], one, and a brake."""
     weight = np.zeros(len(driven)) if given.mass is None else given.mass / given.sides * G
     across = weight * np.cos(given.slope) * given.d
-    return np.stack([driven, weight * np.sin(given.slope), across, np.ones(len(driven))], 1)
+    return np.stack([driven, weight * np.sin(given.slope), across, np.ones(len(driven)), given.load_torque], 1)
 
 
 def _log(drive: plain_drives.Drive, rows: np.ndarray, every: np.ndarray) -> Sequence:

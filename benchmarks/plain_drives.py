@@ -122,8 +122,8 @@ class Drive:
 
     def _followed(self, members: np.ndarray) -> np.ndarray:
         """Readings of logs with a voltage imposed, shape (members, rows, channels)."""
-        if self.given.motor_speed is not None:
-            raise Unable("an imposed speed over time")
+        if self.given.motor_speed is not None or self.given.load_torque.any():
+            raise Unable("an imposed speed, or a brake, over time")
         if set(c.name for c in self.runs.channels) - {
             "motor_speed",
             "output_speed",
@@ -238,9 +238,15 @@ class Shaft:
                 inertia = behind / i + i * J * passed
                 slope = (i * passed * (C * C * D / R + viscous) + damping / i) / inertia
                 force, rub = (i * passed * drive - pull) / inertia, (i * passed * dry + load) / inertia
-                ends = (force - rub * way) / np.maximum(slope, 1e-12)
+                slope = np.maximum(slope, 1e-9)
+                ends = (force - rub * way) / slope
                 new = ends + (w - ends) * np.exp(-slope * h)
-                new = np.where(((w != 0) & (new * way < 0)) | ((w == 0) & (np.abs(force) <= rub)), 0.0, new)
+                # One that reaches rest stays there, or turns round for what is left of the step.
+                stops = (w != 0) & (new * way < 0)
+                rest = np.where(stops, np.log1p(np.where(stops, -w / np.where(stops, ends, 1.0), 0.0)) / slope, 0.0)
+                onward = np.where(np.abs(force) > rub, (force - rub * np.sign(force)) / slope, 0.0)
+                new = np.where(stops, onward * -np.expm1(-slope * (h - rest)), new)
+                new = np.where((w == 0) & (np.abs(force) <= rub), 0.0, new)
                 then = (U - D * C * new) / R
                 steps_of.append((w, current, (new - w) / h, settles, then))
                 grid.append(grid[-1] + h)
@@ -312,12 +318,14 @@ def conditions_of(runs: Any, robot: Any) -> SimpleNamespace:
     payload = column(conditions.payload)
     mass = np.array(own)[which] + payload if conditions.total_mass is None else column(conditions.total_mass)
     driven = supply * duty if speed is None else speed
+    brake = getattr(conditions, "load_torque", None)
     most = float(np.max(np.abs(supply))) if speed is None else float(np.max(np.abs(speed)))
     return SimpleNamespace(
         configuration=which, sides=int(robot.sides), supply=None if speed is not None else supply,
         duty=np.ones(rows) if speed is not None else duty, motor_speed=speed,
         slope=np.radians(column(conditions.slope_deg)), payload=payload, mass=mass if vehicle else None,
-        d=np.where(driven < 0, -1.0, 1.0), order=np.arange(rows) / max(rows - 1, 1), most=most,
+        load_torque=column(0.0 if brake is None else brake), most=most,
+        d=np.where(driven < 0, -1.0, 1.0), order=np.arange(rows) / max(rows - 1, 1),
     )  # fmt: skip
 
 

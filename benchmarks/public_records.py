@@ -10,6 +10,7 @@ import csv
 import dataclasses
 import functools
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -147,6 +148,24 @@ static = "0.9 ± 30 %"
 """
 
 
+#: A brushless motor on a brake, 12 V through a duty.
+DYNO = """
+base = "none"
+channels = ["total_current", "motor_speed"]
+[motor]
+resistance = "0.067 ± 20 %"
+torque_constant = "0.0195 ± 20 %"
+friction_coulomb = "0.03 ± 100 %"
+[gearbox]
+ratio = 1
+efficiency_load = "1 ± 0"
+[brake]
+load = "shaft"
+inertia = 1e-4
+loss_coulomb = "0.1 ± 100 %"
+"""
+
+
 @dataclasses.dataclass(frozen=True)
 class Public:
     """A record of others: its file in the folder, the columns that are read, the robot's file and the answer."""
@@ -156,10 +175,18 @@ class Public:
     toml: str
     answer: Answer = Answer()
 
-    def write(self, public: Path, folder: Path) -> tuple[Path, Path]:
-        """The robot's file and the table, as a user would have them, in a folder."""
+    def rows(self, public: Path) -> list[dict[str, str]]:
+        """Rows of the record's file."""
         with (public / self.file).open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file, skipinitialspace=True))
+            return list(csv.DictReader(file, skipinitialspace=True))
+
+    def write(self, public: Path, folder: Path) -> tuple[Path, Path]:
+        """The robot's file and the table, as a user would have them, in a folder.
+
+        Raises:
+            NoRecord: a file without one of the columns.
+        """
+        rows = self.rows(public)
         missing = [c for c in self.columns if not rows or c not in rows[0]]
         if missing:
             raise NoRecord(f"{public / self.file}: no column {missing[0]}; give the record's file as published")
@@ -170,6 +197,16 @@ class Public:
             out.writeheader()
             out.writerows(rows)
         return robot, table
+
+
+class Braked(Public):
+    """A dyno whose brake's torque of each row is in the file of its robot, by the row's configuration."""
+
+    def rows(self, public: Path) -> list[dict[str, str]]:
+        """Rows of the record's file, with the torque of the brake."""
+        stated = tomllib.loads((public / self.file).with_suffix(".toml").read_text(encoding="utf-8"))
+        torque = {name: one["torque_constant"].split()[0] for name, one in stated.items() if name[:1] == "t"}
+        return [row | {"load_torque_Nm": torque[row["configuration"]]} for row in super().rows(public)]
 
 
 def _mouse(side: str, driver: str = "", answer: Answer = Answer()) -> Public:
@@ -185,6 +222,11 @@ PUBLIC: dict[str, Public] = {
     "micromouse-left-coasts": _mouse("left", '[driver]\ndecay = "fast"'),
     "micromouse-right-coasts": _mouse("right", '[driver]\ndecay = "fast"'),
     "car": Public("car/log_thin.csv", ("stamp_ns", "motor_throttle", "speed", "battery_voltage"), CAR),
+    "neo-dyno": Braked(
+        "neo_dyno/duty.csv",
+        ("supply_voltage_V", "duty", "load_torque_Nm", "motor_speed_rpm", "total_current_A"),
+        DYNO,
+    ),
     "drivetrain": Public("drivetrain/log.csv", ("run_id", "timestamp", "l_voltage", "l_velocity"), DRIVETRAIN),
 }
 

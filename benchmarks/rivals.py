@@ -92,6 +92,9 @@ def posed(robot: str, table: Any, seed: int, replicates: int, case: Any = None) 
 
     Args:
         robot: file, or name of a packaged robot; table: file of the runs; case: of a synthetic rig.
+
+    Raises:
+        Unable: a table with a column that nothing reads.
     """
     from campaign import ready
 
@@ -104,6 +107,8 @@ def posed(robot: str, table: Any, seed: int, replicates: int, case: Any = None) 
 
     rig = robot_file.load(robot)
     runs = records.read(table, robot=rig)
+    if runs.unknown:
+        raise Unable(f"column {runs.unknown[0]} of the record is not read")
     given = prepared(runs, rig, replicates=replicates, seed=seed)
     fitted = loop_baselines.base_of(given)
     space, rows = fitted.space, len(given.runs)
