@@ -5,8 +5,8 @@
     python benchmarks/head_to_head.py --table
 
 Records are the packaged table, public records of others, cases of a folder and synthetic rigs of `tests/worlds`.
-Methods are our refit and our verdict, SciPy's least squares on independent NumPy physics, MuJoCo's identification
-toolbox, PySINDy on the defects, and two regressions on what the refit leaves, the ceiling of what these channels
+Methods are our refit, our verdict, SciPy's least squares on independent NumPy physics, MuJoCo's identification
+toolbox and PySINDy on the defects. Two regressions on the refit's residuals are the ceiling of what these channels
 predict. Optional packages that are not installed leave a line that says so. `--packages FOLDER` looks for them there:
 
     pip install --target FOLDER --no-deps pysindy derivative scikit-learn joblib threadpoolctl narwhals \\
@@ -196,9 +196,9 @@ def run(jobs: Sequence[Job], count: int, within: float, keep: Any) -> None:
 
 
 def ended(job: Job, method: str, why: str, keep: Any) -> list[Job]:
-    """Keep the line of a method whose process ended, and return the job of those that are left.
+    """Keep the line of a method whose process ended, and return the job of the methods that are left.
 
-    None is left where that was the base of all.
+    Without a base no method is left.
     """
     over = job.methods if method == "base" else (method,)
     for name in over:
@@ -237,7 +237,7 @@ class Compared:
 
     @property
     def ceiling(self) -> float:
-        """The lower error of the two regressions [%]; NaN where neither is there."""
+        """The lower error of the two regressions [%]; NaN without either."""
         values = [self.over_all(m) for m in CEILING]
         return float(np.nanmin(values)) if np.isfinite(values).any() else float("nan")
 
@@ -314,8 +314,8 @@ def figures(records: Sequence[Compared]) -> list[str]:
     out = [
         f"* records: {len(records)}, compared with our terms: {len(ours)}; "
         f"{sum('failed' in r.lines.get('verdict', {}) for r in records)} without a verdict",
-        "* our terms cover 80 % or more of the way from refit to ceiling (a mechanism of the library, and either is "
-        f"lower than the refit by a tenth): {interval(len(good), len(known))}",
+        "* mechanisms of the library, refit a tenth above terms or ceiling: our terms cover 80 % of the way or more: "
+        f"{interval(len(good), len(known))}",
         "* a competitor's error is lower by more than a tenth: "
         + interval(sum(bool(r.better()) for r in ours), len(ours)),
     ]

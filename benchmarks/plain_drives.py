@@ -303,7 +303,7 @@ def first_speed(drive: Drive, row: int) -> float:
 
 
 def conditions_of(runs: Any, robot: Any) -> SimpleNamespace:
-    """What every row is measured under."""
+    """Conditions of every row."""
     conditions = runs.conditions(robot)
     rows = len(runs)
 

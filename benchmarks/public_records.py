@@ -25,11 +25,11 @@ TRIES = 20
 
 @dataclasses.dataclass(frozen=True)
 class Answer:
-    """What is known of the right verdict.
+    """The right verdict, as far as it is known.
 
     Attributes:
         kind: `clean`, `library`, `outside` or `unknown`, which is not judged.
-        names: effects of the library that are right, those that data without noise cannot tell apart included.
+        names: effects of the library that are right, with all that data without noise cannot tell from them.
         families: mechanisms that are right, as beginnings of `Effect.family()`.
     """
 
