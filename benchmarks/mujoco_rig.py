@@ -1,9 +1,9 @@
 """A drive as a model of MuJoCo, for its identification toolbox: a hinge that is the output shaft.
 
-Back-EMF is an actuator's bias, viscous losses the joint's damping, dry ones its frictionloss; weights are further
-actuators whose controls are known. MuJoCo has no gear that loses a share of its load either way and no slip of this
-kind: the efficiency is that of a motor that drives, and a vehicle rolls. Free constants are parameters of the toolbox
-in sds of their tolerances, within three of them.
+Back-EMF is an actuator's bias. In a log the winding's lag is a filter of the actuator's voltage. Viscous losses are
+the joint's damping, dry ones its frictionloss, weights further actuators whose controls are known. MuJoCo has no gear
+that loses a share of its load either way and no slip of this kind: the efficiency is that of a motor that drives, and
+a vehicle rolls. Free constants are parameters of the toolbox in sds of their tolerances, within three of them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from worlds.paper import G
 #: Sds of its tolerance within which a parameter is.
 BOUND = 3.0
 #: Steps for which each settled row is held, and their length [s]; longest step of a log [s].
-HOLD, STEP, LONGEST = 40, 1e-3, 0.005
+HOLD, STEP, LONGEST = 40, 1e-3, 0.001
 #: Gain of a servo that imposes a speed, over the damping of the shaft.
 SERVO = 1e6
 
@@ -36,11 +36,12 @@ MODEL = """
   <worldbody>
     <body name="shaft">
       <inertial pos="0 0 0" mass="1" diaginertia="1e-9 1e-9 1e-9"/>
-      <joint name="shaft" type="hinge" axis="0 1 0" armature="1" damping="1" frictionloss="1"/>
+      <joint name="shaft" type="hinge" axis="0 1 0" armature="1" damping="1" frictionloss="1"
+             solreffriction="{twice} 1" solimpfriction="0.9999 0.9999 0.001 0.5 2"/>
     </body>
   </worldbody>
   <actuator>
-    <general name="motor" joint="shaft" biastype="affine"/>
+    <general name="motor" joint="shaft" biastype="affine" dyntype="{lag}"/>
     <general name="slope" joint="shaft"/>
     <general name="ground" joint="shaft"/>
     <general name="pull" joint="shaft"/>
@@ -100,7 +101,7 @@ class Rig:
         """Readings of every row [SI], shape (rows, channels), at parameters [prior sds]."""
         shown = np.full((len(self.drive.runs), len(self.drive.runs.channels)), np.nan)
         for s in self.sequences:
-            spec = mujoco.MjSpec.from_string(MODEL.format(step=s.step))
+            spec = _spec(s)
             model = self._model(s, z, spec)
             rolled = sysid.sysid_rollout([model], [mujoco.MjData(model)], [_control(s)], [_begin(s, model)])
             shown[s.rows] = self._shown(s, z, np.asarray(rolled[0].sensordata.data))
@@ -108,7 +109,7 @@ class Rig:
 
     def _part(self, s: Sequence, measured: np.ndarray, sd: np.ndarray, counts: np.ndarray) -> Any:
         """The toolbox's residual function of a sequence."""
-        spec = mujoco.MjSpec.from_string(MODEL.format(step=s.step))
+        spec = _spec(s)
         model = spec.compile()
         silent = sysid.TimeSeries.from_names(_times(s), np.zeros((len(s.control), 2)), model)
         runs = sysid.ModelSequences("shaft", spec, "rows", _begin(s, model), _control(s), silent)
@@ -146,7 +147,7 @@ class Rig:
             load_viscous=own[f"{load}loss_viscous"], pull=0.0 if vehicle else own.get("torque_constant", 0.0),
             inertia=i * i * eta * own["motor.inertia"] + own["inertia"]
             + (own["mass"] / self.drive.given.sides * radius**2 if vehicle else 0.0),
-            late=own.get("rig.delay", 0.0),
+            late=own.get("rig.delay", 0.0), lag=own["motor.inductance"] / own["motor.resistance"],
         )  # fmt: skip
 
     def _model(self, s: Sequence, z: np.ndarray, spec: Any) -> Any:
@@ -157,6 +158,8 @@ class Rig:
         else:
             gain = bias = SERVO * max(c.damping, c.i**2 * c.eta * c.C**2)
         motor.gainprm[0], motor.biasprm[2] = gain, -bias
+        if not s.settled:
+            motor.dynprm[0] = max(c.lag, 1e-9)
         for name, value in (("slope", -c.radius), ("ground", -c.rubs), ("pull", -c.pull), ("brake", -1.0)):
             spec.actuator(name).gainprm[0] = value
         joint.damping = np.array([[c.damping], [0], [0]])
@@ -170,13 +173,11 @@ class Rig:
         if s.settled:
             at = HOLD * np.arange(1, len(s.rows) + 1) - 2  # the toolbox leaves the last step out
             speed, torque = sensors[at, 0], sensors[at, 1]
-            driven = s.control[at, 0]
         else:
             time = np.arange(len(sensors)) * s.step
             speed, torque = (np.interp(s.at - c.late, time, sensors[:, k]) for k in (0, 1))
-            driven = s.control[np.clip((s.at / s.step - 1e-6).astype(int), 0, len(s.control) - 1), 0]
         w = c.i * speed
-        current = torque / (c.i * c.eta * c.C) if given.motor_speed is not None else (driven - c.C * w) / c.R
+        current = torque / (c.i * c.eta * c.C)
         duty = given.duty[s.rows]
         shown = {
             "motor_speed": w, "output_speed": speed, "speed": c.radius * speed, "motor_current": current,
@@ -193,6 +194,12 @@ class Rig:
         return np.stack([np.abs(shown[n]) if n in unsigned else shown[n] for n in names], 1)
 
 
+def _spec(s: Sequence) -> Any:
+    return mujoco.MjSpec.from_string(
+        MODEL.format(step=s.step, twice=2 * s.step, lag="none" if s.settled else "filterexact")
+    )
+
+
 def _times(s: Sequence) -> np.ndarray:
     return s.step * np.arange(len(s.control))
 
@@ -202,7 +209,7 @@ def _control(s: Sequence) -> Any:
 
 
 def _begin(s: Sequence, model: Any) -> np.ndarray:
-    return np.asarray(sysid.create_initial_state(model, np.zeros(1), np.array([s.speed])))
+    return np.asarray(sysid.create_initial_state(model, np.zeros(1), np.array([s.speed]), np.zeros(model.na)))
 
 
 def rig(runs: Any, robot: Any, coordinates: Any) -> Rig:

@@ -116,6 +116,17 @@ class Drive:
         s, f = instant(x, given, p, terms, names), residual(x)
         sound = np.isfinite(f).all(0) & (np.abs(f).max(0) < 1e-7) & ~s.slides
         shown = np.where(sound, s.shown, np.nan)
+        if not wide:  # what friction holds is at rest, unless a weight could turn it back
+            held = (s.w * given.d <= 0) & (given.slope == 0) & (given.load_torque == 0) & (s.pull == 0)
+            volts = given.duty * given.supply
+            current = volts / p["motor.resistance"]
+            rest = {
+                "motor_current": current,
+                "total_current": given.sides * current * given.duty,
+                "motor_voltage": volts,
+            }
+            still = np.stack([rest.get(n, np.zeros_like(volts)) for n in names])
+            shown = np.where(held & ("output_torque" not in names), still, shown)
         return np.moveaxis(shown.reshape(len(names), count, rows), 0, 2)
 
     # --- logs -------------------------------------------------------------------------------------------
