@@ -356,8 +356,9 @@ def _claim(line: dict[str, Any]) -> tuple[str, str]:
 def _names(line: dict[str, Any]) -> str:
     if "level" not in line:
         return ""
-    wrong = ", wrong" if line["wrong"] else ""
-    return f"{len(line['claims'])} effects{wrong}"
+    names = [name for claim in line["claims"] for name in claim]
+    few = ", ".join(names) if len(names) <= 2 else f"{len(names)} effects"
+    return f"{few or 'none'}{', **wrong**' if line['wrong'] else ''}"
 
 
 def _seconds(r: Compared) -> str:
