@@ -175,14 +175,19 @@ def sindy(space, linear, scores) -> list[str]:
     return sorted(names)
 
 
-def sindy_refit(space, linear, scores) -> list[str]:
+def sindy_refit(space, linear, scores, sees=None) -> list[str]:
     """STLSQ on all three equations together, weighted by the readings' sds, the constants refitted beside it.
 
     Both sides are what a linear refit of the constants leaves of them (Frisch, Waugh and Lovell).
+
+    Args:
+        sees: mask of the residuals that count; None: all.
     """
     jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
     theta = np.zeros((len(residual), len(space.library)))
     theta[: linear.readings] = np.asarray(linear.signatures)[:, strongest(space, scores)]
+    if sees is not None:
+        jacobian, residual, theta = jacobian[sees], residual[sees], theta[sees]
     root = np.linalg.qr(jacobian)[0]
     left, target = theta - root @ (root.T @ theta), residual - root @ (root.T @ residual)
     seen = np.linalg.norm(left, axis=0) > UNSEEN * np.maximum(np.linalg.norm(theta, axis=0), 1e-12)
@@ -194,20 +199,24 @@ def sindy_refit(space, linear, scores) -> list[str]:
 # --- the campaign ---------------------------------------------------------------------------------------
 
 
-def work(task: Task) -> dict:
-    """A case made, and what each method names, in a worker."""
+def base_of(given):
+    """The base fit of what `discover.prepared` gives, as the loop begins: `candidates.BaseFit`."""
     from calibration.discovery.candidates import fit_base
     from calibration.discovery.discover import pose
 
+    space = pose(given.runs, given.robot, given.noise.sd, given.settings, given.stated, given.library)
+    return fit_base(space, given.settings, given.runs.source)
+
+
+def work(task: Task) -> dict:
+    """A case made, and what each method names, in a worker."""
     case = loop.attempt(task.kind, task.seed, narrow=True)
     if isinstance(case, str):
         return {"skipped": case}
     began = time.perf_counter()
     given = begun(case, task, loop.STATED)
-    runs, settings = given.runs, given.settings
-    space = pose(runs, given.robot, given.noise.sd, settings, given.stated)
-    fitted = fit_base(space, settings, runs.source)
-    space, ladder = fitted.space, Ladder(runs, fitted, settings)
+    fitted = base_of(given)
+    space, ladder = fitted.space, Ladder(given.runs, fitted, given.settings)
     linear, scores = ladder.look(ladder.base)
     named = {
         "aicc": stepwise(ladder, aicc), "bic": stepwise(ladder, bic),

@@ -52,6 +52,7 @@ SMALL = {
     "draw_mutants.py": "--number 1",
     "drive.py": "--batches 2 --repeats 1",
     "effects.py": "--check",
+    "head_to_head.py": "--quick --out lines.jsonl",
     "loop.py": _ONE,
     "loop_series.py": "--clean-wide 1 --replicates 20 --jobs 1 --out cases.jsonl",
     "missions.py": "--robots 10 --rounds 1",

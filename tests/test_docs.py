@@ -64,7 +64,8 @@ def test_twenty_questions_are_answered_somewhere():
 
 
 def test_figures_have_claim_machine_command_and_date():
-    lines = [line for line in (DOCS / "benchmarks.md").read_text("utf-8").splitlines() if line.startswith("| ")]
+    claims = (DOCS / "benchmarks.md").read_text("utf-8").partition("\n## ")[0]
+    lines = [line for line in claims.splitlines() if line.startswith("| ")]
     head, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
     assert head == ["claim", "figure", "goal", "machine", "command", "date"] and len(rows) >= 20
     for row in rows:
