@@ -19,6 +19,7 @@ from calibration.inference.observers import Histories, SettledRuns
 from mmrjax import balances
 from mmrjax.conditions import Conditions
 from mmrjax.errors import UsageError
+from mmrjax.fidelities import rest
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.histories import grid, histories
 from mmrjax.fidelities.steady import steady_batch, steady_outputs
@@ -59,6 +60,13 @@ def test_a_brake_enters_as_a_constant_torque_of_the_load(loose):
     free = moving(bench(rig, **load), Conditions(), state)
     jax.tree.map(np.testing.assert_allclose, dataclasses.replace(braked, load_torque=None), stated)
     assert float(braked.acceleration) < float(free.acceleration)
+
+
+def test_a_torque_above_what_stalls_the_motors_turns_them_back():
+    robot = bench()
+    for voltage, torque, way in ((24.0, 3.0, 1.0), (24.0, 7.0, -1.0), (0.0, 0.5, -1.0), (0.0, -0.5, 1.0)):
+        # 24 V / 3 ohm · 0.05 N·m/A · 16 = 6.4 N·m
+        assert float(rest.direction(robot, Conditions(voltage=voltage, load_torque=torque))) == way
 
 
 def test_settled_rigs_with_a_brake_are_those_of_another_implementation():
