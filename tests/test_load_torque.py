@@ -327,3 +327,25 @@ def test_a_profile_and_a_sweep_state_the_torque(tmp_path):
         mm.sweep(mm.nominal(), load_torques=[0.5])
     stated = of_grid(Sweep(load_torques_Nm=(0.0, 0.5), voltages_V=(12.0,), robot="rig.toml")).axes
     assert stated["load_torque"] == [0.0, 0.5]
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_a_dynos_table_gives_back_its_motor_and_nothing_is_missing(tmp_path):
+    """Of one voltage, from a file that is off by a tenth: R 0.5, k 0.05, M0 0.01."""
+    torque = np.arange(9) * 0.1
+    current = (torque + 0.01) / 0.05
+    speed = (24 - 0.5 * current) / 0.05 * 30 / np.pi
+    lines = ["supply_voltage_V,motor_speed_rpm,output_torque_Nm,motor_current_A"]
+    lines += [f"24,{n:.1f},{m:.1f},{i:.1f}" for n, m, i in zip(speed, torque, current, strict=True)]
+    head = 'channels = ["motor_current", "motor_speed"]\n[columns]\nload_torque_Nm = "output_torque_Nm"'
+    off = RIG.replace("= 0.5\n", '= "0.54 ± 10 %"\n').replace("= 0.05\n", '= "0.047 ± 10 %"\n')
+    off = off.replace("= 0.01\n", '= "0.02 ± 100 %"\n').replace("load = 1.0", 'load = "1 ± 0"')
+    (tmp_path / "rig.toml").write_text(off.format(head=head))
+    (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
+    rig = mm.read_robot(str(tmp_path / "rig.toml"))
+    found = mm.discover(mm.read_runs(str(tmp_path / "runs.csv"), robot=rig), rig)
+    assert found.verdict == "none"
+    motor = found.robot.motor
+    for name, value in {"resistance": 0.5, "torque_constant": 0.05, "friction_coulomb": 0.01}.items():
+        assert float(getattr(motor, name)) == pytest.approx(value, rel=0.01)
