@@ -11,19 +11,22 @@ from test_worlds_rigs import steady
 from worlds import logs, rigs
 
 import mmrjax as mm
-from calibration.data import robot_file
+from calibration.data import profiles, rig_facts, robot_file
 from calibration.data import runs as records
-from calibration.data.errors import BadData
+from calibration.data.errors import BadConfiguration, BadData
 from calibration.inference import bases, blocks
 from calibration.inference.observers import Histories, SettledRuns
 from mmrjax import balances
 from mmrjax.conditions import Conditions
 from mmrjax.errors import UsageError
+from mmrjax.fidelities import rest
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.histories import grid, histories
 from mmrjax.fidelities.steady import steady_batch, steady_outputs
 from mmrjax.rig import Rig
 from mmrjax.signals import STATUSES, State
+from sweeps.config import Sweep
+from sweeps.config_campaign import of_grid
 
 VOLTS = np.array([24.0, 6.0, -12.0, 12.0])
 TORQUE = np.array([0.5, 0.1, -0.3, 0.0])  # of a brake: against the way that each turns
@@ -57,6 +60,13 @@ def test_a_brake_enters_as_a_constant_torque_of_the_load(loose):
     free = moving(bench(rig, **load), Conditions(), state)
     jax.tree.map(np.testing.assert_allclose, dataclasses.replace(braked, load_torque=None), stated)
     assert float(braked.acceleration) < float(free.acceleration)
+
+
+def test_a_torque_above_what_stalls_the_motors_turns_them_back():
+    robot = bench()
+    for voltage, torque, way in ((24.0, 3.0, 1.0), (24.0, 7.0, -1.0), (0.0, 0.5, -1.0), (0.0, -0.5, 1.0)):
+        # 24 V / 3 ohm · 0.05 N·m/A · 16 = 6.4 N·m
+        assert float(rest.direction(robot, Conditions(voltage=voltage, load_torque=torque))) == way
 
 
 def test_settled_rigs_with_a_brake_are_those_of_another_implementation():
@@ -286,3 +296,56 @@ def test_a_drift_that_goes_with_the_torque_is_none():
         known = columns | ({"load_torque_Nm": np.linspace(0, 0.5, 18)} if with_torque else {})
         over = {variable for basis in bases.families(known, np.ones(18), rig) for _, variable in basis.names}
         assert ("order" in over) != with_torque
+
+
+def test_a_torque_in_another_unit_is_doubted(tmp_path):
+    """24 V and 0.5 ohm stall at 2.4 N·m; the same torques in mN·m are in order."""
+    rows = [f"24,{4565 - 1.91 * m},{m}" for m in (0, 100, 200, 300)]
+    for column, doubted in (("load_torque_Nm", True), ("load_torque_mNm", False)):
+        runs, rig = read(tmp_path, [f"supply_voltage_V,motor_speed_rpm,{column}", *rows])
+        said = rig_facts.doubtful_torque(runs, rig)
+        assert bool(said) == doubted and rig_facts.doubts(runs, rig) == ((said,) if doubted else ())
+        assert not doubted or said == (
+            "runs.csv row 2, load_torque_Nm: got 100 N·m, where the motors stall at 2.39 N·m; is it in mN·m? then state "
+            '[columns] load_torque_mNm = "load_torque_Nm"'
+        )
+
+
+def test_a_profile_and_a_sweep_state_the_torque(tmp_path):
+    (tmp_path / "p.csv").write_text("time_s,duty,load_torque_mNm\n0,1,0\n1,1,300\n2,,\n")
+    table = profiles.read(tmp_path / "p.csv")
+    np.testing.assert_allclose(table.values["load_torque"], [0.0, 0.3, 0.3])
+    assert table.stated == ("load_torque_Nm",)
+    (tmp_path / "bad.csv").write_text("time_s,duty,load_torque_Nm\n0,1,0\n1,1,\n2,1,0\n")
+    with pytest.raises(BadData, match=r"bad\.csv row 2, load_torque_Nm: got an empty cell; expected a number"):
+        profiles.read(tmp_path / "bad.csv")
+    made = mm.sweep(bench(), voltages=[12.0, 24.0], load_torques=[0.0, 0.5])
+    assert made.to_dict()["load_torque_Nm"].tolist() == [0.0, 0.5, 0.0, 0.5]
+    free, braked = np.asarray(made.motor_speed).reshape(2, 2).T
+    assert (braked < free).all() and "load torque" in str(made)
+    with pytest.raises(BadConfiguration, match="--load-torques: the robot is a vehicle"):
+        mm.sweep(mm.nominal(), load_torques=[0.5])
+    stated = of_grid(Sweep(load_torques_Nm=(0.0, 0.5), voltages_V=(12.0,), robot="rig.toml")).axes
+    assert stated["load_torque"] == [0.0, 0.5]
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_a_dynos_table_gives_back_its_motor_and_nothing_is_missing(tmp_path):
+    """Of one voltage, from a file that is off by a tenth: R 0.5, k 0.05, M0 0.01."""
+    torque = np.arange(9) * 0.1
+    current = (torque + 0.01) / 0.05
+    speed = (24 - 0.5 * current) / 0.05 * 30 / np.pi
+    lines = ["supply_voltage_V,motor_speed_rpm,output_torque_Nm,motor_current_A"]
+    lines += [f"24,{n:.1f},{m:.1f},{i:.1f}" for n, m, i in zip(speed, torque, current, strict=True)]
+    head = 'channels = ["motor_current", "motor_speed"]\n[columns]\nload_torque_Nm = "output_torque_Nm"'
+    off = RIG.replace("= 0.5\n", '= "0.54 ± 10 %"\n').replace("= 0.05\n", '= "0.047 ± 10 %"\n')
+    off = off.replace("= 0.01\n", '= "0.02 ± 100 %"\n').replace("load = 1.0", 'load = "1 ± 0"')
+    (tmp_path / "rig.toml").write_text(off.format(head=head))
+    (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
+    rig = mm.read_robot(str(tmp_path / "rig.toml"))
+    found = mm.discover(mm.read_runs(str(tmp_path / "runs.csv"), robot=rig), rig)
+    assert found.verdict == "none"
+    motor = found.robot.motor
+    for name, value in {"resistance": 0.5, "torque_constant": 0.05, "friction_coulomb": 0.01}.items():
+        assert float(getattr(motor, name)) == pytest.approx(value, rel=0.01)

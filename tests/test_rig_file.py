@@ -456,7 +456,7 @@ def test_rig_new_lists_the_kinds(mmrjax, tmp_path):
     code, _, err = mmrjax("rig", "new", "my-rig.toml", "--kind", "bensh")
     assert (
         code == 2
-        and "--kind: got bensh; did you mean bench? allowed: bench, pendulum, servo, linear, carriage, wheeled, tracked"
+        and "--kind: got bensh; did you mean bench? allowed: bench, dyno, pendulum, servo, linear, carriage, wheeled, tracked"
         in err
     )
     code, _, err = mmrjax("rig", "new", "nowhere/my-rig.toml")

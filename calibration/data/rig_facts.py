@@ -9,8 +9,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from calibration.data import rig_file
-from calibration.data.columns import CURRENT
-from calibration.data.courses import stretches
+from calibration.data.columns import CURRENT, LOAD
+from calibration.data.courses import applied, stretches
 from calibration.data.errors import rounded
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
@@ -226,9 +226,34 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
     )
 
 
+#: Multiple of the torque at stall beyond which a brake's is in another unit.
+BEYOND = 3.0
+
+
+def doubtful_torque(runs: Runs, robot: Robot) -> str:
+    """Why a brake's torque is in another unit: most of its rows are far above what stalls the motors; empty where
+    nothing shows that, or where the speed is imposed."""
+    of_current = robot.rig.imposed == "motor_current"
+    if not runs.has(LOAD) or not (of_current or (robot.rig.imposed == "voltage" and robot.knows(VOLTAGE))):
+        return ""
+    current = np.abs(applied(runs)) / (1.0 if of_current else float(robot.motor.resistance))
+    lost, made = (_torque(robot, x) for x in (0.0, 1.0))  # it rises with the current on a line
+    stall = np.maximum(lost + (made - lost) * current, 0.0)
+    braked = (runs[LOAD] != 0) & (current > 0)
+    beyond = braked & (np.abs(runs[LOAD]) > BEYOND * stall)
+    if not braked.any() or beyond.sum() <= braked.sum() / 2:
+        return ""
+    row, theirs = int(np.flatnonzero(beyond)[0]), runs.headings.get(LOAD, LOAD)
+    return (
+        f"{runs.source} row {row + 1}, {theirs}: got {rounded(runs[LOAD][row])} N·m, where the motors stall at "
+        f'{rounded(stall[row])} N·m; is it in mN·m? then state [columns] load_torque_mNm = "{theirs}"'
+    )
+
+
 def doubts(runs: Runs, robot: Robot) -> tuple[str, ...]:
-    """Why a table's time, or the current that it imposes, is in another unit, a sentence each."""
-    return tuple(filter(None, (doubtful_time(runs, robot), doubtful_current(runs, robot))))
+    """Why a table's time, the current that it imposes or a brake's torque is in another unit, a sentence each."""
+    every = doubtful_time(runs, robot), doubtful_current(runs, robot), doubtful_torque(runs, robot)
+    return tuple(filter(None, every))
 
 
 def time_constant(robot: Robot) -> float:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 def driven_on(columns: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray:
     """True for rows whose stated load torque turns the shafts the way in which they are driven, shape (rows,)."""
-    imposed = columns[layout.imposed_column]
+    imposed = columns[layout.imposed_column] * (columns.get("duty", 1.0) if layout.imposed == "voltage" else 1.0)
     return columns[LOAD] * imposed < 0 if LOAD in columns else np.zeros(len(imposed), bool)
 
 
