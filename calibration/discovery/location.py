@@ -12,6 +12,8 @@ from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
 from mmrjax.effects.base import EQUATION, THE_SIDE
 
+#: Balances in which the current stands for the load that the motors carry.
+OF_LOAD = ("motor", "gearbox", "track", "ground", "slip", "yaw")
 #: Spread of the supply voltage over that of the duty, each over its largest, below which the duty alone is set [-].
 SAGS = 0.3
 
@@ -69,7 +71,7 @@ class DiscrepancyLocation:
         happens = bases_room.window(self.variable)
         variable = self.variable if happens is None else happens.axis
         what = bases_room.in_words(self.place) if self.channel else EQUATION[self.balance]
-        drivers = {"speed_motor": "speed", "current": "current" if self.balance == "electrical" else "load"}
+        drivers = {"speed_motor": "speed", "current": "load" if self.balance in OF_LOAD else "current"}
         drivers |= {"payload": "load", "slope": "demand" if self.balance == "slip" else "slope"}
         drivers |= {"voltage": "duty"} if self.by_duty else {}
         drivers |= {"yaw_rate": "speed", "side": THE_SIDE}
