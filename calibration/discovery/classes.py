@@ -11,6 +11,7 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, fit_candidates, start
 from calibration.discovery.score_tests import ScoreTable
+from calibration.discovery.screening import ranked
 from calibration.discovery.search import without_each
 from calibration.discovery.settings import Settings
 from calibration.discovery.stated_values import Shift, shifts
@@ -57,6 +58,7 @@ def classes(
     best: Candidate,
     ladder: tuple[Candidate, ...],
     left: Diagnosis,
+    after: Diagnosis,
     settings: Settings,
 ) -> Classes:
     """For each effect of the best fit, the effects and the stated values that explain the data as well in its place.
@@ -65,7 +67,7 @@ def classes(
     `settings.form` of the sigmas, or `form_family` where it is of the same family.
 
     Args:
-        left: what the base leaves.
+        left: what the base leaves; after: what the best fit leaves.
     """
     cosine, names = cosines(space, left.scores), space.library.names
     fewer = [base] if len(best.effects) == 1 else without_each(space, best, settings, ladder)
@@ -79,7 +81,10 @@ def classes(
                 wanted.append((slot, names[j], active))
     known = {c.key: c for c in ladder}
     new = [active for _, _, active in wanted if frozenset(n for n in active if n) not in known]
-    fitted = fit_candidates(space, [(w, start(space, best, w, settings, left.scores)) for w in new], settings)
+    if space.bare.observe.long:
+        fitted = ranked(space, [(w, best, after) for w in new], settings)
+    else:
+        fitted = fit_candidates(space, [(w, start(space, best, w, settings, left.scores)) for w in new], settings)
     known |= {c.key: c for c in fitted}
     members, stated = [], []
     for slot, (name, gain) in enumerate(zip(best.effects, gains, strict=True)):

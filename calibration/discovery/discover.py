@@ -67,6 +67,7 @@ from calibration.discovery.result import (
     Sensitivity,
 )
 from calibration.discovery.score_tests import Statistics, bootstrap
+from calibration.discovery.screening import with_room
 from calibration.discovery.search import Search, diagnose, path, search
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings, settings_for
 from calibration.discovery.standing import standing
@@ -413,7 +414,10 @@ def trace(
     def tested(screened: Screening) -> tuple[Screening, Diagnosis]:
         weight = screened.base.space.weight
         null = None if known is None or np.any(known.screened.base.space.weight != weight) else known.left.test.null
-        return screened, diagnosis_of_base(screened, settings, sds.noise.freedom, null)
+        left, base = diagnosis_of_base(screened, settings, sds.noise.freedom, null), screened.base
+        room = () if known is None else known.screened.base.space.room
+        space = base.space.with_room(room) if room else with_room(base.space, base.candidate, left, settings)
+        return dataclasses.replace(screened, base=dataclasses.replace(base, space=space)), left
 
     def tried(screened: Screening, left: Diagnosis) -> tuple[Screening, Diagnosis, Search]:
         base = screened.base
@@ -423,6 +427,8 @@ def trace(
     for k in range(SCREENINGS):
         progress(Step("bootstrap", (settings.replicates,)))
         screened, left = keep(f"bootstrap {k}", functools.partial(tested, screened))
+        if k == 0:
+            keep("ranking", functools.partial(findings.ranking, screened.base.space, left, settings))
         if not left.test.rejected and screened.cluster is None:
             missed = undescribed(screened.base.space, runs, sds.noise, left.linear)
             word = "undescribed" if missed else "none"
@@ -460,7 +466,7 @@ def trace(
     searched = dataclasses.replace(searched, best=model[0], diagnosis=model[1])
     best, after = model
     progress(Step("alike", (best.effects,)))
-    alike = classes(space, base, best, searched.ladder, left, settings)
+    alike = classes(space, base, best, searched.ladder, left, after, settings)
     if not any(named):
         return stages(level, screened, left, sds, searched, alike, where, standing=stood, mechanism=found)
     compared: tuple[HeldOutAlternative, ...] = ()
@@ -612,8 +618,9 @@ def bases_at(runs: Runs, base: BaseFit) -> Bases:
     columns = dict(runs.where(index).columns)
     reading = np.where(np.isfinite(base.reading), base.reading, np.asarray(problem.data.measured))
     columns |= {c.column: reading[:, k] for k, c in enumerate(problem.channels)}
-    robot = problem.robot(jnp.asarray(base.candidate.z[: base.space.free]))
-    return problem.observe.bases(columns, base.space.included, robot)
+    z = base.candidate.z[: base.space.free]
+    observe = problem.observe.at_fit(problem, z)
+    return observe.bases(columns, base.space.included, problem.robot(jnp.asarray(z)))
 
 
 def diagnosis_of_base(

@@ -231,14 +231,13 @@ def predict(space: CandidateSpace, candidates: Mapping[str, Candidate], settings
     whole = priors.free_names(robot, robot.configurations.names)
     more = [n for n in whole if n not in space.coordinates.base.names]
     other = priors.coordinates(robot, more) if more else None
-    active = jnp.asarray([space.library.indices(c.active) for c in those])
+    equipped, indices = space.fitted_by(c.active for c in those)
+    active = jnp.asarray(indices)
     z = jnp.asarray(np.stack([c.z for c in those]))
     informed = jnp.stack([_informed(space, c) for c in those])
     within = reach_of(space, space.bare.robot(jnp.asarray(those[0].z[: space.free])))
     everything, shown = menu.menu(within), channels.names(space.bare.channels)
-    found, half = jax.device_get(
-        _predicted(space.equipped, other, predicted.batch(everything, shown), active, z, informed)
-    )
+    found, half = jax.device_get(_predicted(equipped, other, predicted.batch(everything, shown), active, z, informed))
     found, half = jax.tree.map(lambda x: np.asarray(x)[: len(names)], (found, half))
     experiments, kept = _possible(everything, found, within, settings)
     medians = np.median(np.asarray(space.equipped.data.sd), 0)

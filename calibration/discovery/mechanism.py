@@ -26,7 +26,7 @@ from calibration.discovery.standing import chosen_again
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import Bases
-from calibration.inference.held_out import held_out
+from calibration.inference.held_out import unseen
 
 #: Share of the largest rms change of a channel by a mechanism from which on it changes a reading [σ over σ].
 CHANGED = 0.5
@@ -172,7 +172,7 @@ def _gain_of_curve(
 ) -> Gain:
     """The same of the curve of what the base leaves."""
     curve, kinds = beside.curve, blocks_room.predictable(runs, space.bare)
-    told = {kind: held_out(curve.problem, curve.z, list(by.values())).reading for kind, by in kinds.items()}
+    told = {kind: unseen(curve.problem, curve.z, list(by.values())).reading for kind, by in kinds.items()}
     changed = _changed(space, runs, _reading(space, base), curve.reading)
     return _scored(space, runs, told).gain(_held_out(space, runs, base, predicted), changed, BLOCKS)
 

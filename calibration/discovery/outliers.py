@@ -65,8 +65,7 @@ def ahead(
         bootstrap(space.bare, nothing[: space.free], linear, space.library.scored, bases, 1, settings.seed)
 
     def fit() -> None:
-        if space.bare.observe.long:
-            space.equipped.observe.at(space.equipped, nothing, space.library.indices(none))
+        if space.bare.observe.long:  # whose programs have what is found to be missing, which is not known yet
             return
         looked.wait()  # needed last: what compiles beside the base fit shares two cores with it
         search_each(space.equipped, [nothing], [space.weight], [space.library.indices(none)])
@@ -163,8 +162,10 @@ def _screened(base: BaseFit, bases_at: Callable[[BaseFit], Bases], settings: Set
 
 def _look(base: BaseFit, bases_at: Callable[[BaseFit], Bases], settings: Settings) -> tuple[Bases, Diagnosed]:
     space, bases = base.space, bases_at(base)
-    z = jnp.asarray(base.candidate.z)
-    return bases, jax.device_get(diagnosed(space.problem(empty(settings)), z, space.library.scored, bases))
+    problem, z = space.problem(empty(settings)), base.candidate.z
+    if problem.observe.long:  # by the program that has fitted it
+        problem, z = space.bare, z[: space.free]
+    return bases, jax.device_get(diagnosed(problem, jnp.asarray(z), space.library.scored, bases))
 
 
 def _again(base: BaseFit, rows: np.ndarray, settings: Settings, where: str) -> BaseFit:

@@ -85,13 +85,13 @@ def _without_prior(
     None where that is beyond the parameter's bounds, or no optimum.
     """
     p, mean, start = space.free, value, np.array(at.z)
-    indices = space.library.indices(at.active)
+    equipped, (indices,) = space.fitted_by([at.active])
     for _ in range(ROUNDS):
         centre = np.zeros(len(start))
         centre[k] = mean
         start[k] = mean
-        data = dataclasses.replace(space.equipped.data, centre=jnp.asarray(centre))
-        problem = dataclasses.replace(space.equipped, data=data)
+        data = dataclasses.replace(equipped.data, centre=jnp.asarray(centre))
+        problem = dataclasses.replace(equipped, data=data)
         found, _ = search_each(problem, [start], [space.weight], [indices])
         best = jax.tree.map(lambda x: x[0], found)
         z = np.asarray(best.z)

@@ -1,0 +1,172 @@
+"""Screening by regression: fits of sets of effects on the equations of one fit made linear, where runs take long.
+
+A signature is the derivative of the readings by an amplitude. With the signatures at one fit known, a fit of any set
+of effects is a least-squares problem of a few unknowns (the inverse dynamic identification model of Gautier and
+Khalil 1990, of readings in place of torques). It ranks every effect in milliseconds. Simulation then confirms the
+first of them, since a signature tells nothing of how a run bends.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from calibration.discovery.active_set import CandidateSpace
+from calibration.discovery.adequacy import Diagnosis
+from calibration.discovery.candidates import Candidate, candidate, fit_candidates
+from calibration.discovery.score_tests import ScoreTable
+from calibration.discovery.settings import Settings
+from calibration.inference.linearization import Linearization
+from calibration.inference.optimizers import Optimum
+
+#: Sets that are fitted by simulation in a round: the first by regression and its nearest rivals, of which one is of
+#: another family.
+CONFIRMED = 3
+#: Further ones where simulation does not confirm the first.
+FURTHER = 3
+
+
+#: Largest amplitude at which a fit begins [prior sds of a fit].
+FAR = 1.5
+#: Effects for which the program of a log's fits is compiled at first.
+ROOM = 6
+
+
+@dataclasses.dataclass(frozen=True)
+class Confirmed:
+    """Sets of effects after a round of screening.
+
+    Attributes:
+        candidates: of every set, by simulation where it was made, else by regression.
+        asked: how many fits by simulation were set against their regression; otherwise: how many of these explained
+            less than the regression said, by more than `Settings.same`.
+    """
+
+    candidates: tuple[Candidate, ...]
+    asked: int = 0
+    otherwise: int = 0
+
+
+class Regression:
+    """Fits of sets of effects on the linearisation of a fit.
+
+    Args:
+        at: the fit; linear, scores: it linearised, and what each effect could explain of what it leaves.
+    """
+
+    def __init__(
+        self, space: CandidateSpace, at: Candidate, linear: Linearization, scores: ScoreTable, settings: Settings
+    ) -> None:
+        self.space, self.at, self.scores, self.settings = space, at, scores, settings
+        self.jacobian, self.residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
+        self.signatures = np.asarray(linear.signatures)
+
+    def __call__(self, active: tuple[str, ...]) -> Candidate:
+        """The candidate with these effects in the slots; new ones have the shape of their grid that scores best."""
+        p, s, at = self.space.free, self.settings.slots, self.at
+        size = self.jacobian.shape[1]  # residuals of the priors come last, in the order of the coordinates
+        slopes, residual, own = self.jacobian[:-size], self.residual[:-size].copy(), self.residual[-size:]
+        for old, name in enumerate(at.active):
+            if name and name not in active:  # at amplitude 0
+                residual -= slopes[:, p + old] * at.z[p + old]
+        z, columns, places = np.concatenate([at.z[:p], np.zeros(2 * s)]), [slopes[:, :p]], [*range(p)]
+        for slot, name in enumerate(active):
+            if not name:
+                continue
+            here = [p + slot, p + s + slot]
+            if name in at.active:
+                there = [p + at.active.index(name), p + s + at.active.index(name)]
+                columns.append(slopes[:, there])
+                z[here] = at.z[there]
+            else:
+                m = self.space.library.best_instance(name, np.asarray(self.scores.single))
+                columns.append(np.zeros((len(slopes), 2)))
+                columns[-1][: len(self.signatures), 0] = self.settings.width * self.signatures[:, m]
+                z[here[1]] = self.space.library.at[m]
+            places += here
+        whole = np.concatenate([np.concatenate(columns, 1), np.eye(len(places))])
+        left = np.concatenate([residual, own[:p], z[places[p:]]])
+        covariance = np.linalg.inv(whole.T @ whole)
+        step = -covariance @ (whole.T @ left)
+        z[places] += step
+        sd = np.ones(len(z))
+        sd[places] = np.sqrt(np.diag(covariance))
+        cost = np.asarray(0.5 * np.sum((left + whole @ step) ** 2))
+        found = Optimum(z, sd, covariance, cost, np.asarray(0.0), np.asarray(True), np.asarray(0))
+        return dataclasses.replace(candidate(self.space, active, found, self.settings), simulated=False)
+
+
+def confirmed(space: CandidateSpace, screened: Sequence[Candidate], settings: Settings) -> Confirmed:
+    """Simulate the first sets of a round that was screened by regression.
+
+    These are the plausible set that explains most, its nearest rival, the nearest of another family, and one that
+    explains more and is not of a plausible size. Where the best of them explains less than its regression said, by
+    more than `Settings.same`, the next by regression are tried too, as long as these promise more.
+    """
+    order = sorted((c for c in screened if np.isfinite(c.cost)), key=lambda c: c.cost)
+    first = _first(space, order)
+    found = dict[tuple[str, ...], Candidate]()
+
+    def simulate(those: Sequence[Candidate], more: Sequence[tuple[tuple[str, ...], np.ndarray]] = ()) -> None:
+        made = fit_candidates(space, [*((c.active, _begins(space, c)) for c in those), *more], settings)
+        for c in sorted(made, key=lambda c: -c.cost):  # of two fits of a set the lower one
+            found[c.active] = c
+
+    # The first from the prior mean too: what a model lacks may have led the search without it elsewhere.
+    at_mean = [(c.active, np.where(np.arange(len(c.z)) < space.free, 0.0, _begins(space, c))) for c in first[:1]]
+    simulate(first, at_mean)
+    said = {c.active: c for c in order}
+    less = lambda c: 2 * (c.cost - said[c.active].cost) > settings.same  # noqa: E731
+    for _ in range(FURTHER):
+        best = min(found.values(), key=lambda c: (not c.plausible, c.cost), default=None)
+        further = [c for c in order if c.active not in found and c.plausible]
+        if best is None or not less(best) or not further or further[0].cost >= best.cost:
+            break
+        simulate(further[:1])
+    every = tuple(found.get(c.active, c) for c in screened)
+    return Confirmed(every, len(found), sum(less(c) for c in found.values()))
+
+
+def _begins(space: CandidateSpace, screened: Candidate) -> np.ndarray:
+    """Where a simulation of a screened set begins: amplitudes no larger than a step of a search may be."""
+    z, p, slots = screened.z.copy(), space.free, len(screened.active)
+    z[p : p + slots] = np.clip(z[p : p + slots], -FAR, FAR)
+    return z
+
+
+def _first(space: CandidateSpace, order: Sequence[Candidate]) -> list[Candidate]:
+    """The sets that are simulated first, of those in the order of what they explain."""
+    families = lambda c: frozenset(space.library[n].family() for n in c.effects)  # noqa: E731
+    sound = [c for c in order if c.plausible]
+    if not sound:
+        return list(order[:1])
+    of_others = [c for c in sound if families(c) != families(sound[0])]
+    chosen = [sound[0], *of_others[:1], *sound[1:]]
+    chosen = list({c.active: c for c in chosen}.values())[:CONFIRMED]
+    return [*chosen, *(c for c in order[:1] if not c.plausible)]
+
+
+def ranked(
+    space: CandidateSpace, wanted: Sequence[tuple[tuple[str, ...], Candidate, Diagnosis]], settings: Settings
+) -> list[Candidate]:
+    """Sets of effects by regression, each beside another fit.
+
+    Args:
+        wanted: (active effects, the other fit, what that leaves).
+    """
+    known = {id(left): Regression(space, at, left.linear, left.scores, settings) for _, at, left in wanted}
+    return [known[id(left)](active) for active, _, left in wanted]
+
+
+def with_room(space: CandidateSpace, base: Candidate, left: Diagnosis, settings: Settings) -> CandidateSpace:
+    """The space whose fits have room for the effects that explain most of what the base leaves, the best of every
+    family before others; as it is where runs are not long."""
+    if not space.bare.observe.long:
+        return space
+    alone = [((name, *("",) * (settings.slots - 1)), base, left) for name in space.library.names]
+    order = sorted(ranked(space, alone, settings), key=lambda c: c.cost)
+    first = {space.library[c.active[0]].family(): c for c in reversed(order)}  # the best of each family
+    names = dict.fromkeys(c.active[0] for c in (*_first(space, order), *sorted(first.values(), key=lambda c: c.cost)))
+    return space.with_room(list(names)[:ROOM])
