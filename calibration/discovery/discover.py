@@ -99,6 +99,8 @@ EITHER_WAY = 0.05
 LATE = 4.0
 #: Share of rows set aside beyond which that is said first.
 MANY = 0.03
+#: Root of a score from which on it is likely that something is missing, before the bootstrap tells [σ].
+LIKELY = 4.0
 #: Prior sds beyond which a base parameter is worth a look.
 FAR = 3.0
 #: Is told what the loop does next.
@@ -243,6 +245,8 @@ def prepared(
     A campaign that wants verdicts alone goes on with `LoopInput.trace`, so that it takes the way that users take.
     """
     menu.check_forbidden(forbidden, robot)
+    if not robot.rig.inherits:
+        scales.nominal_ahead()
     runs = thinned(runs.of(robot), rows)
     distinct, numbers, notes = without_copies(runs)
     kind = observers.kind(distinct)
@@ -385,7 +389,8 @@ def trace(
     keep: Keep = kept.nothing,
 ) -> LoopStages:
     """The stages of the loop up to a verdict, in order; the noise is known. `later` is told the base
-    fit as soon as something is missing. What is kept of a stage holds what those before it found, which is one whole.
+    fit as soon as something is likely to be missing. What is kept of a stage holds what those before it found, which
+    is one whole.
 
     What replicates of a bootstrap show in units of their own sds hardly depends on these: where the stages of the
     same table with other sds are `known`, and the same rows count, their replicates serve.
@@ -414,10 +419,15 @@ def trace(
     def tested(screened: Screening) -> tuple[Screening, Diagnosis]:
         weight = screened.base.space.weight
         null = None if known is None or np.any(known.screened.base.space.weight != weight) else known.left.test.null
-        left, base = diagnosis_of_base(screened, settings, sds.noise.freedom, null), screened.base
         room = () if known is None else known.screened.base.space.room
-        space = base.space.with_room(room) if room else with_room(base.space, base.candidate, left, settings)
-        return dataclasses.replace(screened, base=dataclasses.replace(base, space=space)), left
+        base, (linear, scores, _) = screened.base, screened.diagnosed
+        space = base.space.with_room(room)
+        if not room:
+            space = with_room(base.space, base.candidate, linear, scores, settings)
+        screened = dataclasses.replace(screened, base=dataclasses.replace(base, space=space))
+        if np.max(np.abs(np.asarray(scores.single))) > LIKELY:
+            later(screened.base)
+        return screened, diagnosis_of_base(screened, settings, sds.noise.freedom, null)
 
     def tried(screened: Screening, left: Diagnosis) -> tuple[Screening, Diagnosis, Search]:
         base = screened.base
@@ -434,7 +444,6 @@ def trace(
             word = "undescribed" if missed else "none"
             return LoopStages(word, screened, left, sds, missed=missed, unused=unused(runs))
         progress(Step("effects"))
-        later(screened.base)
         screened, left, searched = keep(f"search {k}", functools.partial(tried, screened, left))
         after = searched.diagnosis
         if after is None or not after.test.rejected_with_margin:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import threading
 from collections.abc import Callable
 
 import jax
@@ -100,6 +101,11 @@ def library_for(robot: Robot, conditions: Conditions, library: Library, turned: 
     return sized
 
 
+def nominal_ahead() -> None:
+    """Compute what the nominal robot does on another core, for `library_for`."""
+    threading.Thread(target=_nominal, daemon=True).start()
+
+
 def turned_in(runs: Runs, robot: Robot) -> float:
     """Root mean square of the angles of the output that a table's channels show [rad]; NaN where none does."""
     measured = runs.measured()
@@ -136,9 +142,17 @@ def _signals(robot: Robot, conditions: Conditions) -> Signals:
     return jax.vmap(lambda c: operating_signals(robot, c))(conditions)
 
 
-@functools.cache
 def _nominal() -> tuple[Robot, Signals]:
-    """The nominal robot and its signals over Table 8."""
+    """The nominal robot and its signals over Table 8; who comes second waits for the first."""
+    with _COMPUTING:
+        return _over_table_8()
+
+
+_COMPUTING = threading.Lock()
+
+
+@functools.cache
+def _over_table_8() -> tuple[Robot, Signals]:
     robot = params.strong(robots.nominal())
     axes = np.meshgrid(robots.VOLTAGES_V, robots.SLOPES_DEG, robots.PAYLOADS_KG, (0, 1), indexing="ij")
     volts, slopes, payloads, which = (a.ravel() for a in axes)

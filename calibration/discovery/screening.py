@@ -15,7 +15,7 @@ import numpy as np
 
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
-from calibration.discovery.candidates import Candidate, candidate, fit_candidates
+from calibration.discovery.candidates import Candidate, candidate, empty, fit_candidates
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import Settings
 from calibration.inference.linearization import Linearization
@@ -102,8 +102,8 @@ def confirmed(space: CandidateSpace, screened: Sequence[Candidate], settings: Se
     """Simulate the first sets of a round that was screened by regression.
 
     These are the plausible set that explains most, its nearest rival, the nearest of another family, and one that
-    explains more and is not of a plausible size. Where the best of them explains less than its regression said, by
-    more than `Settings.same`, the next by regression are tried too, as long as these promise more.
+    explains more and is not of a plausible size. For each that explains less than its regression said, by more than
+    `Settings.same`, the simulation decides, and the next by regression is tried too.
     """
     order = sorted((c for c in screened if np.isfinite(c.cost)), key=lambda c: c.cost)
     first = _first(space, order)
@@ -119,10 +119,9 @@ def confirmed(space: CandidateSpace, screened: Sequence[Candidate], settings: Se
     simulate(first, at_mean)
     said = {c.active: c for c in order}
     less = lambda c: 2 * (c.cost - said[c.active].cost) > settings.same  # noqa: E731
-    for _ in range(FURTHER):
-        best = min(found.values(), key=lambda c: (not c.plausible, c.cost), default=None)
+    for tried in range(FURTHER):
         further = [c for c in order if c.active not in found and c.plausible]
-        if best is None or not less(best) or not further or further[0].cost >= best.cost:
+        if not further or sum(map(less, found.values())) <= tried:
             break
         simulate(further[:1])
     every = tuple(found.get(c.active, c) for c in screened)
@@ -160,13 +159,15 @@ def ranked(
     return [known[id(left)](active) for active, _, left in wanted]
 
 
-def with_room(space: CandidateSpace, base: Candidate, left: Diagnosis, settings: Settings) -> CandidateSpace:
+def with_room(
+    space: CandidateSpace, base: Candidate, linear: Linearization, scores: ScoreTable, settings: Settings
+) -> CandidateSpace:
     """The space whose fits have room for the effects that explain most of what the base leaves, the best of every
     family before others; as it is where runs are not long."""
     if not space.bare.observe.long:
         return space
-    alone = [((name, *("",) * (settings.slots - 1)), base, left) for name in space.library.names]
-    order = sorted(ranked(space, alone, settings), key=lambda c: c.cost)
+    beside = Regression(space, base, linear, scores, settings)
+    order = sorted((beside((name, *empty(settings)[1:])) for name in space.library.names), key=lambda c: c.cost)
     first = {space.library[c.active[0]].family(): c for c in reversed(order)}  # the best of each family
     names = dict.fromkeys(c.active[0] for c in (*_first(space, order), *sorted(first.values(), key=lambda c: c.cost)))
     return space.with_room(list(names)[:ROOM])

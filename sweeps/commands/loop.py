@@ -176,6 +176,8 @@ def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> Non
     if "ranking" in stages:
         for line in said_of.ranking(stages["ranking"]):
             tell(line)
+    if "base" not in stages:
+        return
     base = stages["base"][0].base
     robot = findings.proposed_robot(base.space, base.candidate)
     robot_file.write(robot, folder.partial / REFIT_FILE, note=f"{robot_name}, fitted; the loop has no verdict yet")
