@@ -142,17 +142,9 @@ def _signals(robot: Robot, conditions: Conditions) -> Signals:
     return jax.vmap(lambda c: operating_signals(robot, c))(conditions)
 
 
-def _nominal() -> tuple[Robot, Signals]:
-    """The nominal robot and its signals over Table 8; who comes second waits for the first."""
-    with _COMPUTING:
-        return _over_table_8()
-
-
-_COMPUTING = threading.Lock()
-
-
 @functools.cache
-def _over_table_8() -> tuple[Robot, Signals]:
+def _nominal() -> tuple[Robot, Signals]:
+    """The nominal robot and its signals over Table 8."""
     robot = params.strong(robots.nominal())
     axes = np.meshgrid(robots.VOLTAGES_V, robots.SLOPES_DEG, robots.PAYLOADS_KG, (0, 1), indexing="ij")
     volts, slopes, payloads, which = (a.ravel() for a in axes)

@@ -77,9 +77,9 @@ class Regression:
                 continue
             here = [p + slot, p + s + slot]
             if name in at.active:
-                there = [p + at.active.index(name), p + s + at.active.index(name)]
-                columns.append(slopes[:, there])
-                z[here] = at.z[there]
+                known = [p + at.active.index(name), p + s + at.active.index(name)]
+                columns.append(slopes[:, known])
+                z[here] = at.z[known]
             else:
                 m = self.space.library.best_instance(name, np.asarray(self.scores.single))
                 columns.append(np.zeros((len(slopes), 2)))

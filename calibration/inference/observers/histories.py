@@ -394,12 +394,13 @@ class Histories(Observer):
         entered = tuple(probe(b) for b in others if b not in {p.balance for p in probes})
         every, size = (*probes, *entered), len(probes)
         effects = tuple(_shaped_as_in(robot, e) for e in effects)
-        counts, places = [len(e.at) for e in effects], [p.balance for p in every]
-        of = np.array([places.index(b) if (b := e.effect.balance) in places else 0 for e in effects], int)
-        of = np.repeat(of, counts)
+        counts, places = np.array([len(e.at) for e in effects], int), [p.balance for p in every]
+        entering = np.array([places.index(b) if (b := e.effect.balance) in places else 0 for e in effects], int)
+        entering = np.repeat(entering, counts)
         enters = np.repeat([1.0 * (e.effect.balance in places) for e in effects], counts)
-        shown = [np.asarray([e.effect.channel == c for c in channels.names(robot.channels)], float) for e in effects]
-        at_sensor = np.repeat(np.reshape(shown, (len(effects), -1)), counts, 0).T
+        shown = channels.names(robot.channels)
+        at_sensor = np.array([[e.effect.channel == c for e in effects] for c in shown], float)
+        at_sensor = np.repeat(at_sensor, counts, 1) if effects else np.zeros((len(shown), 0))
         clock = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.knots]]
 
         def probed(amplitude: Array) -> Robot:
@@ -429,7 +430,7 @@ class Histories(Observer):
             def both(by_probes: Array, t: Array, term: Array) -> Array:
                 """Changes by defects of all knots and by every instance, by the change by each probe."""
                 knots = (by_probes[:, :size, None] * hat(t)).reshape(len(by_probes), -1)
-                return jnp.concatenate([knots, by_probes[:, of] * (enters * term)], 1)
+                return jnp.concatenate([knots, by_probes[:, entering] * (enters * term)], 1)
 
             def source(t: Array, y: Array, held: Conditions, way: Array) -> Array:
                 by_probes = jax.jacfwd(lambda a: rates(probed(a), held, y, way))(none)
@@ -448,7 +449,7 @@ class Histories(Observer):
 
             first, begins = at_first(robot, conditions)
             by_probes = jax.jacfwd(lambda a: at_first(probed(a), conditions)[1])(none)
-            begun = by_probes[:, of] * (enters * terms(clock[0], begins, first))
+            begun = by_probes[:, entering] * (enters * terms(clock[0], begins, first))
             unmoved = jnp.concatenate([jnp.zeros((len(begins), size * len(clock))), begun], 1)
             changed = respond(conditions, along, source, seen, unmoved)
             whole = jnp.concatenate([seen(clock[0], begins, unmoved, first)[None], changed])
@@ -1147,11 +1148,11 @@ def _shaped_as_in(robot: Robot, scored: ScoredEffect) -> ScoredEffect:
     return dataclasses.replace(scored, values=jnp.where(jnp.asarray(own.amplitude) == 0, scored.values, shape))
 
 
-def _each(scored: ScoredEffect, of: Callable[[Effect, Array], Array], given: Array) -> Array:
+def _each(scored: ScoredEffect, function: Callable[[Effect, Array], Array], given: Array) -> Array:
     """A function of an effect at every point of its shape's grid, and of what is given there, shape (grid,)."""
     if not scored.shape:
-        return of(scored.effect, given[0])[None]
-    at = lambda v, x: of(params.replace(scored.effect, {scored.shape: v}), x)  # noqa: E731
+        return function(scored.effect, given[0])[None]
+    at = lambda v, x: function(params.replace(scored.effect, {scored.shape: v}), x)  # noqa: E731
     return jax.vmap(at)(scored.values, given)
 
 
@@ -1204,8 +1205,8 @@ def _remembered(
         held, spans, passes = taken.held(constant), jnp.diff(here.clock), here.sides[0] != here.sides[1]
 
         def stage(memory: Array, span: Array, y: Array, way: Array) -> Array:
-            of = lambda m: speeds(y, held, way, m)  # noqa: E731
-            speed, slope = jax.jvp(of, (memory,), (jnp.ones_like(memory),))
+            law = lambda m: speeds(y, held, way, m)  # noqa: E731
+            speed, slope = jax.jvp(law, (memory,), (jnp.ones_like(memory),))
             return memory + span * speed / (1 - span * slope)
 
         first = stage(memory, spans[0], here.places[0], here.sides[0])
