@@ -181,6 +181,17 @@ def test_what_is_ranked_is_said_not_to_be_confirmed():
     assert words.ranking(nothing) == ["by regression: nothing is missing (family-wise p = 0.4)"]
 
 
+def test_what_is_found_before_the_verdict_is_said_to_be_untested(capsys):
+    found = SimpleNamespace(best=SimpleNamespace(effects=("churning",)))
+    library = {"churning": BY_NAME["churning"]()}
+    base = SimpleNamespace(base=SimpleNamespace(space=SimpleNamespace(library=library)))
+    folder = SimpleNamespace(keeps=lambda name: True, path="found")
+    command._say_kept({"ranking": RANKING, "search 0": (base, None, found)}, folder, "rig.toml")
+    said = capsys.readouterr().err
+    assert "so far, confirmed by simulation: a loss torque that changes with speed (churning);" in said
+    assert said.index("by regression") < said.index("so far")
+
+
 def test_a_budget_that_ends_after_the_screening_leaves_its_ranking(tmp_path, mmrjax, monkeypatch):
     rigs.case(rigs.world(np.random.default_rng(3), "bench", "voltage", rows=(16, 20))).write(tmp_path)
 

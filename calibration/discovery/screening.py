@@ -1,9 +1,9 @@
 """Screening by regression: fits of sets of effects on the equations of one fit made linear, where runs take long.
 
-A signature is the derivative of the readings by an amplitude. With the signatures at one fit known, a fit of any set
-of effects is a least-squares problem of a few unknowns (the inverse dynamic identification model of Gautier and
-Khalil 1990, of readings in place of torques). It ranks every effect in milliseconds. Simulation then confirms the
-first of them, since a signature tells nothing of how a run bends.
+A signature is the derivative of the readings by an amplitude. With the signatures at one fit, a fit of any set of
+effects is a least-squares problem of a few unknowns. (Gautier and Khalil 1990 do so with torques, their inverse
+dynamic identification model.) It ranks every effect in milliseconds. Simulation then confirms the first of them, since
+a signature does not show how a run bends.
 """
 
 from __future__ import annotations
@@ -30,8 +30,9 @@ FURTHER = 3
 
 #: Largest amplitude at which a fit begins [prior sds of a fit].
 FAR = 1.5
-#: Effects for which the program of a log's fits is compiled at first.
-ROOM = 6
+#: Effects for which the program of a log's fits is compiled at first, and how many of them are there since they act
+#: like the first.
+ROOM, NEAR = 8, 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,12 +163,16 @@ def ranked(
 def with_room(
     space: CandidateSpace, base: Candidate, linear: Linearization, scores: ScoreTable, settings: Settings
 ) -> CandidateSpace:
-    """The space whose fits have room for the effects that explain most of what the base leaves, the best of every
-    family before others; as it is where runs are not long."""
+    """The space with room in its fits for the effects that are simulated first, for others that act like the first of
+    them, and for the best of other families; as it is where runs are not long."""
     if not space.bare.observe.long:
         return space
-    beside = Regression(space, base, linear, scores, settings)
-    order = sorted((beside((name, *empty(settings)[1:])) for name in space.library.names), key=lambda c: c.cost)
-    first = {space.library[c.active[0]].family(): c for c in reversed(order)}  # the best of each family
-    names = dict.fromkeys(c.active[0] for c in (*_first(space, order), *sorted(first.values(), key=lambda c: c.cost)))
-    return space.with_room(list(names)[:ROOM])
+    beside, library = Regression(space, base, linear, scores, settings), space.library
+    order = sorted((beside((name, *empty(settings)[1:])) for name in library.names), key=lambda c: c.cost)
+    first = [c.active[0] for c in _first(space, order)]
+    cosine = np.abs(np.asarray(scores.cosine)[library.best_instance(first[0], np.asarray(scores.single))])
+    alike = library.largest(cosine)
+    near = [library.names[k] for k in np.argsort(-alike) if alike[k] > settings.alike]
+    best = {library[c.active[0]].family(): c for c in reversed(order)}  # of each family
+    others = [c.active[0] for c in sorted(best.values(), key=lambda c: c.cost)]
+    return space.with_room([*dict.fromkeys((*first, *near[:NEAR], *others))][:ROOM])

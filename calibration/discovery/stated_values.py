@@ -17,7 +17,6 @@ from calibration.discovery.candidates import Candidate, candidate
 from calibration.discovery.settings import Settings
 from calibration.inference.held_out import search_each
 from calibration.inference.linearization import Linearization
-from calibration.inference.optimizers import linearised
 
 #: Refits with a prior's mean where the last one ended, until it pulls no longer [prior sds].
 ROUNDS, PULL = 3, 0.3
@@ -62,8 +61,8 @@ def shifts(
         at: the fit; its effects stay; linear: the same, linearised, where that is known.
     """
     if linear is None:
-        problem = space.problem(at.active)
-        residual, jacobian, _ = linearised(problem, jnp.asarray(at.z), problem.data)
+        problem, (active,) = space.fitted_by([at.active])
+        residual, jacobian, _ = problem.observe.at(problem, at.z, active)
     else:
         residual, jacobian = linear.residual, linear.jacobian
     explained, values = scores(np.asarray(jacobian), np.asarray(residual))

@@ -228,6 +228,14 @@ def ranking(found: Ranking, most: int = 5) -> list[str]:
     return [f"{first}; effects by what each alone would explain:", *lines]
 
 
+def so_far(effects: Sequence[str], families: Sequence[str]) -> str:
+    """What a search has found whose verdict is not known yet."""
+    return (
+        f"so far, confirmed by simulation: {' and '.join(f'a {f}' for f in dict.fromkeys(families))} "
+        f"({' and '.join(effects)}); which claim stands is not tested yet"
+    )
+
+
 def _without_name(where: DiscrepancyLocation, p: float, no_effect: str) -> str:
     others = [bases.in_words(p).removesuffix(" balance") for p in where.alike if p != where.place]
     also = f" (or {', '.join(others)}, which act alike in these data)" if others else ""

@@ -176,6 +176,10 @@ def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> Non
     if "ranking" in stages:
         for line in said_of.ranking(stages["ranking"]):
             tell(line)
+    searches = [found for name, found in stages.items() if name.startswith("search")]
+    if searches and (best := searches[-1][2].best) is not None:
+        library = searches[-1][0].base.space.library
+        tell(said_of.so_far(best.effects, [library[n].family() for n in best.effects]))
     if "base" not in stages:
         return
     base = stages["base"][0].base

@@ -386,9 +386,9 @@ class Histories(Observer):
     ) -> tuple[Float[Array, "probes runs knots samples channels"], Float[Array, "runs samples channels instances"]]:
         """The same, and the change of the readings by each effect at every point of its shape's grid.
 
-        An effect enters one balance with one amplitude, so what it does to a run is what a defect of that balance
-        does that goes as its term along the run (as of settled runs). What it remembers follows from the run too. It
-        acts on the reading of a row between instants as on a line between them.
+        An effect enters one balance with one amplitude. So it changes a run as a defect of that balance does that has
+        the values of its term. What an effect remembers follows from the run too. Between two instants its change of
+        a reading is on a straight line.
         """
         others = dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor")
         entered = tuple(probe(b) for b in others if b not in {p.balance for p in probes})
