@@ -2,8 +2,8 @@
 
 A signature is the derivative of the readings by an amplitude. With the signatures at one fit, a fit of any set of
 effects is a least-squares problem of a few unknowns. (Gautier and Khalil 1990 do so with torques, their inverse
-dynamic identification model.) It ranks every effect in milliseconds. Simulation then confirms the first of them, since
-a signature does not show how a run bends.
+dynamic identification model.) It ranks every effect in milliseconds. Simulation then confirms the first of them,
+since a signature does not show how a run bends.
 """
 
 from __future__ import annotations
