@@ -206,10 +206,11 @@ class CandidateSpace:
         wanted = {*self.room, *(n for names in sets for n in names if n)} or {*self.library.names[:1]}
         chosen = [k for k, n in enumerate(self.library.names) if n in wanted]
         names, every = tuple(self.library.names[k] for k in chosen), self.coordinates
+        value, spread, sd, low, high = (x[np.asarray(chosen)] for x in every.scales)
         coordinates = dataclasses.replace(
             every,
             sd=every.sd[np.asarray(chosen)],
-            scales=tuple(x[np.asarray(chosen)] for x in every.scales),
+            scales=(value, spread, sd, low, high),
             names=names,
             shapes=tuple(every.shapes[k] for k in chosen),
         )

@@ -536,7 +536,8 @@ def choose(
     names += further[: settings.slots - len(names)]
     if not names:
         return None, searched, stood
-    known = [c for c in (proposed[0], best, *searched.ladder) if c.key == frozenset(names)]
+    every = (proposed[0], best, *(c for c in searched.ladder if c.simulated))
+    known = [c for c in every if c.key == frozenset(names)]
     if not known:
         active = filled(names, settings)
         begins = start(space, proposed[0], active, settings, left.scores)

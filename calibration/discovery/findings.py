@@ -188,7 +188,8 @@ def unnamed(
 def alternatives(
     space: CandidateSpace, best: Candidate, cost: float, ladder: Sequence[Candidate], settings: Settings
 ) -> tuple[tuple[Alternative, ...], tuple[Alternative, ...]]:
-    """Candidates that explain the data nearly as well as what is proposed; and those that would but for their size.
+    """Simulated candidates that explain the data nearly as well as what is proposed; and those that would but for
+    their size.
 
     One that only adds effects to what is proposed, or to another one of these, is left out where these explain next
     to nothing.
@@ -198,7 +199,7 @@ def alternatives(
     """
     near: tuple[list[Alternative], list[Alternative]] = ([], [])
     simpler = {best.key: cost} if best.key else {}
-    for c in sorted(ladder, key=lambda x: (len(x.effects), x.cost)):
+    for c in sorted((c for c in ladder if c.simulated), key=lambda x: (len(x.effects), x.cost)):
         rise = 2 * (c.cost - cost)
         if c.key in simpler or not c.effects or rise > settings.alternative:
             continue

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -95,7 +96,8 @@ class Regression:
         sd = np.ones(len(z))
         sd[places] = np.sqrt(np.diag(covariance))
         cost = np.asarray(0.5 * np.sum((left + whole @ step) ** 2))
-        found = Optimum(z, sd, covariance, cost, np.asarray(0.0), np.asarray(True), np.asarray(0))
+        parts: tuple[Any, ...] = (z, sd, covariance, cost, np.asarray(0.0), np.asarray(True), np.asarray(0))
+        found = Optimum(*parts)
         return dataclasses.replace(candidate(self.space, active, found, self.settings), simulated=False)
 
 

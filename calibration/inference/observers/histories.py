@@ -1218,7 +1218,10 @@ def _remembered(
     begin = at_first(robot, conditions)[1]
     angle = state_of(robot, begin).distance / robot.chassis(conditions.configuration).radius
     begun = jnp.concatenate(
-        [_each(e, lambda effect, _: effect.initial(robot, angle), jnp.zeros(len(e.at))) for e in mine]
+        [
+            _each(e, lambda effect, _: jnp.asarray(effect.initial(robot, angle), float), jnp.zeros(len(e.at)))
+            for e in mine
+        ]
     )
     stages = jax.lax.scan(after, begun, (along, steps))[1]
     nodes = jnp.concatenate([begun[None], stages.reshape(-1, len(begun))])
