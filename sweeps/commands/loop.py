@@ -90,7 +90,7 @@ def _loop(
         def keep(name: str, make: Callable[[], T]) -> T:
             found = stages[name] = folder.stage(name, make)
             if name == "ranking":
-                _show_ranking(found, folder, timed)
+                _show_ranking(stages[name], folder, timed)
             if name == "verdict":
                 timed(f"{said_of.verdict(stages[name])}; next, errors held out and other noises")
             return found
