@@ -105,28 +105,37 @@ def confirmed(space: CandidateSpace, screened: Sequence[Candidate], settings: Se
     """Simulate the first sets of a round that was screened by regression.
 
     These are the plausible set that explains most, its nearest rival, the nearest of another family, and one that
-    explains more and is not of a plausible size. For each that explains less than its regression said, by more than
-    `Settings.same`, the simulation decides, and the next by regression is tried too.
+    explains more and is not of a plausible size. Where the first explains less than its regression said, by more than
+    `Settings.same`, the simulation decides, and the next by regression is tried too: of those for which the program
+    has room, or which promise more.
     """
     order = sorted((c for c in screened if np.isfinite(c.cost)), key=lambda c: c.cost)
-    first = _first(space, order)
-    found = dict[tuple[str, ...], Candidate]()
-
-    def simulate(those: Sequence[Candidate], more: Sequence[tuple[tuple[str, ...], np.ndarray]] = ()) -> None:
-        made = fit_candidates(space, [*((c.active, _begins(space, c)) for c in those), *more], settings)
-        for c in sorted(made, key=lambda c: -c.cost):  # of two fits of a set the lower one
-            found[c.active] = c
-
-    # The first from the prior mean too: what a model lacks may have led the search without it elsewhere.
-    at_mean = [(c.active, np.where(np.arange(len(c.z)) < space.free, 0.0, _begins(space, c))) for c in first[:1]]
-    simulate(first, at_mean)
+    first, found = _first(space, order), dict[tuple[str, ...], Candidate]()
     said = {c.active: c for c in order}
-    less = lambda c: 2 * (c.cost - said[c.active].cost) > settings.same  # noqa: E731
-    for tried in range(FURTHER):
-        further = [c for c in order if c.active not in found and c.plausible]
-        if not further or sum(map(less, found.values())) <= tried:
+
+    def less(c: Candidate) -> bool:
+        return 2 * (c.cost - said[c.active].cost) > settings.same
+
+    def simulate(those: Sequence[Candidate]) -> None:
+        """From where the regression has them; what explains less there, and the first of all, from the prior mean
+        too: what a model lacks may have led the fit without it elsewhere."""
+        made = fit_candidates(space, [(c.active, _begins(space, c)) for c in those], settings)
+        found.update({c.active: c for c in made})
+        doubted = [c for c in those if less(found[c.active]) or c is first[0]]
+        at_mean = [np.where(np.arange(len(c.z)) < space.free, 0.0, _begins(space, c)) for c in doubted]
+        again = fit_candidates(space, [(c.active, z) for c, z in zip(doubted, at_mean, strict=True)], settings)
+        found.update({c.active: c for c in again if c.cost < found[c.active].cost})
+
+    simulate(first)
+    leader = first[0] if first else None
+    for _ in range(FURTHER):
+        best = min((c.cost for c in found.values() if c.plausible), default=np.inf)
+        rest = [c for c in order if c.active not in found and c.plausible]
+        further = [c for c in rest if c.cost < best or {*c.effects} <= {*space.room}]
+        if leader is None or not less(found[leader.active]) or not further:
             break
-        simulate(further[:1])
+        leader = further[0]
+        simulate([leader])
     every = tuple(found.get(c.active, c) for c in screened)
     return Confirmed(every, len(found), sum(less(c) for c in found.values()))
 
