@@ -109,7 +109,10 @@ def confirmed(space: CandidateSpace, screened: Sequence[Candidate], settings: Se
     `Settings.same`, the simulation decides, and the next by regression is tried too: of those for which the program
     has room, or which promise more.
     """
-    order = sorted((c for c in screened if np.isfinite(c.cost)), key=lambda c: c.cost)
+    fits = lambda c: {*c.effects} <= {*space.room}  # noqa: E731
+    # What the program has no room for takes another program, and has to promise that much more.
+    order = sorted(screened, key=lambda c: c.cost + (0.0 if fits(c) else settings.same / 2))
+    order = [c for c in order if np.isfinite(c.cost)]
     first, found = _first(space, order), dict[tuple[str, ...], Candidate]()
     said = {c.active: c for c in order}
 
@@ -131,7 +134,7 @@ def confirmed(space: CandidateSpace, screened: Sequence[Candidate], settings: Se
     for _ in range(FURTHER):
         best = min((c.cost for c in found.values() if c.plausible), default=np.inf)
         rest = [c for c in order if c.active not in found and c.plausible]
-        further = [c for c in rest if c.cost < best or {*c.effects} <= {*space.room}]
+        further = [c for c in rest if c.cost < best or fits(c)]
         if leader is None or not less(found[leader.active]) or not further:
             break
         leader = further[0]
