@@ -431,7 +431,9 @@ def trace(
 
     def tried(screened: Screening, left: Diagnosis) -> tuple[Screening, Diagnosis, Search]:
         base = screened.base
-        return screened, left, search(base.space, base.candidate, left, screened.bases, settings, progress)
+        found = search(base.space, base.candidate, left, screened.bases, settings, progress)
+        base = dataclasses.replace(base, space=base.space.with_room(found.room))
+        return dataclasses.replace(screened, base=base), left, found
 
     screened, sds = keep("base", begun)
     for k in range(SCREENINGS):

@@ -44,11 +44,13 @@ class Confirmed:
         candidates: of every set, by simulation where it was made, else by regression.
         asked: how many fits by simulation were set against their regression; otherwise: how many of these explained
             less than the regression said, by more than `Settings.same`.
+        room: names of the effects for which the program of these fits has room, see `CandidateSpace`.
     """
 
     candidates: tuple[Candidate, ...]
     asked: int = 0
     otherwise: int = 0
+    room: tuple[str, ...] = ()
 
 
 class Regression:
@@ -114,6 +116,7 @@ def confirmed(space: CandidateSpace, screened: Sequence[Candidate], settings: Se
     order = sorted(screened, key=lambda c: c.cost + (0.0 if fits(c) else settings.same / 2))
     order = [c for c in order if np.isfinite(c.cost)]
     first, found = _first(space, order), dict[tuple[str, ...], Candidate]()
+    space = space.with_room([*space.room, *(n for c in first for n in c.effects)])  # one program for all of them
     said = {c.active: c for c in order}
 
     def less(c: Candidate) -> bool:
@@ -140,7 +143,7 @@ def confirmed(space: CandidateSpace, screened: Sequence[Candidate], settings: Se
         leader = further[0]
         simulate([leader])
     every = tuple(found.get(c.active, c) for c in screened)
-    return Confirmed(every, len(found), sum(less(c) for c in found.values()))
+    return Confirmed(every, len(found), sum(less(c) for c in found.values()), space.room)
 
 
 def _begins(space: CandidateSpace, screened: Candidate) -> np.ndarray:

@@ -30,7 +30,7 @@ class Search:
         ladder: every candidate that was fitted.
         best: the one that is proposed, None where none is plausible; diagnosis: what it leaves.
         asked, otherwise: fits by simulation of what was screened by regression, and how many of these did not confirm
-            it, see `screening.Confirmed`.
+            it, see `screening.Confirmed`; room: for which effects the program of these fits has room.
     """
 
     ladder: tuple[Candidate, ...]
@@ -38,6 +38,7 @@ class Search:
     diagnosis: Diagnosis | None
     asked: int = 0
     otherwise: int = 0
+    room: tuple[str, ...] = ()
 
 
 def diagnose(
@@ -64,6 +65,7 @@ def search(
         base: the fit without effects; left: what it leaves.
     """
     rounds = [_singles(space, base, left, settings)]
+    space = space.with_room(rounds[0].room)
     ladder = list(rounds[0].candidates)
     null = np.asarray(left.test.null.single)
     best, diagnosis, seen = _best(ladder), None, None
@@ -76,7 +78,7 @@ def search(
             break
         progress(Step("more effects", (best.effects,)))
         rounds.append(_extend(space, best, diagnosis, base, left, settings))
-        more = list(rounds[-1].candidates)
+        more, space = list(rounds[-1].candidates), space.with_room(rounds[-1].room)
         best = _accepted(_best(more), ladder, settings)
         ladder += more
         if best is not None:
@@ -86,7 +88,7 @@ def search(
             if any(own_p(gain, null) > settings.family_wise_error for gain in gains):
                 best = None
     asked, otherwise = (sum(getattr(r, name) for r in rounds) for name in ("asked", "otherwise"))
-    return Search(tuple(ladder), seen, diagnosis, asked, otherwise)
+    return Search(tuple(ladder), seen, diagnosis, asked, otherwise, space.room)
 
 
 def path(found: Search) -> list[Candidate]:
