@@ -167,7 +167,8 @@ def test_a_refit_without_a_block_is_a_step_of_gauss_and_newton():
 RANKING = Ranking(
     True, 0.002, 9.0,
     (Ranked("churning", "loss torque that changes with speed", "N·m", 412.0, 0.0123, 0.0004),
-     Ranked("brush_drop", "voltage drop that changes with current", "V", 4.0, 0.1, 0.05)),
+     Ranked("brush_drop", "voltage drop that changes with current", "V", 4.0, 0.1, 0.05),
+     Ranked("bending_loss", "loss torque that changes with speed", "N·m", 430.0, -0.01, 0.001, True)),
 )  # fmt: skip
 
 
@@ -177,7 +178,7 @@ def test_what_is_ranked_is_said_not_to_be_confirmed():
     assert lines == [
         "  1. churning, a loss torque that changes with speed: lowers the misfit by 412 σ², "
         "amplitude 0.0123 ± 0.0004 N·m"
-    ]  # the other explains no more than chance
+    ]  # the others explain no more than chance, or would supply power
     nothing = dataclasses.replace(RANKING, missing=False, p_value=0.4)
     assert words.ranking(nothing) == ["by regression: nothing is missing (family-wise p = 0.4)"]
 
@@ -207,4 +208,4 @@ def test_a_budget_that_ends_after_the_screening_leaves_its_ranking(tmp_path, mmr
     assert "no verdict within 20 s\n" in err and "kept: ranking" in err
     left = json.loads((tmp_path / "found.partial" / "screening.json").read_text(encoding="utf-8"))
     assert left["schema"] == "mmrjax.screening/1" and left["confirmed"] is False
-    assert [e["name"] for e in left["effects"]] == ["churning", "brush_drop"]
+    assert [e["name"] for e in left["effects"]] == ["churning", "brush_drop", "bending_loss"]

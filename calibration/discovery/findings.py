@@ -331,8 +331,9 @@ def ranking(space: CandidateSpace, left: Diagnosis, settings: Settings) -> Ranki
         effect = space.library[s.name]
         sd = size_of(effect) / max(s.sigmas_per_prior_sd, 1e-300)
         unit = amplitude_of(effect).spec.unit
-        listed.append(Ranked(s.name, effect.family(), unit, s.score, s.amplitude, sd))
-    test = left.test
+        supplies = space.bare.observe.long and effect.dissipative and s.amplitude < 0  # as of `dissipation.supplying`
+        listed.append(Ranked(s.name, effect.family(), unit, s.score, s.amplitude, sd, supplies))
+    test, listed = left.test, sorted(listed, key=lambda e: e.supplies)
     return Ranking(test.rejected, test.p_value, test.threshold("single") ** 2, tuple(listed))
 
 

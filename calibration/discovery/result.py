@@ -237,6 +237,7 @@ class Ranked:
     Attributes:
         name: of the effect; family: what it is of, in words; unit: of its amplitude.
         score: what it alone would explain, no larger than plausible [σ²]; amplitude, sd: then [its unit].
+        supplies: whether it would supply power with such a sign, and so explains nothing.
     """
 
     name: str
@@ -245,6 +246,7 @@ class Ranked:
     score: float
     amplitude: float
     sd: float
+    supplies: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -254,7 +256,7 @@ class Ranking:
     Attributes:
         missing: whether anything is missing; p_value: of that test, family-wise.
         chance: score that the strongest effect reaches by chance alone [σ²].
-        effects: the strongest first.
+        effects: the strongest first, after them those that would supply power.
     """
 
     missing: bool

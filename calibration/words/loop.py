@@ -217,7 +217,7 @@ def ranking(found: Ranking, most: int = 5) -> list[str]:
     if not found.missing:
         return [f"by regression: nothing is missing (family-wise p = {found.p_value:.2g})"]
     first = f"by regression, not yet confirmed: something is missing (family-wise p {p_value(found.p_value)})"
-    beyond = [e for e in found.effects if e.score > found.chance][:most]
+    beyond = [e for e in found.effects if e.score > found.chance and not e.supplies][:most]
     if not beyond:
         return [f"{first}; no effect explains more than chance"]
     lines = [
