@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import os
-import threading
 from collections.abc import Callable, Hashable
 from typing import Any, ParamSpec, TypeVar
 
@@ -17,7 +16,7 @@ import equinox as eqx
 import jax
 
 from mmrjax import SOUND_AT_LEVEL_0
-from mmrjax.programs import Programs, structure_of
+from mmrjax.programs import TRACING, Programs, structure_of
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -32,9 +31,6 @@ def for_equations(x: T) -> T:
     return jax.tree.map(lambda leaf: leaf.for_equations() if _has_more(leaf) else leaf, x, is_leaf=_has_more)
 
 
-#: Held by the thread that traces: two threads that trace one function fill the same stores of JAX and Equinox, which
-#: then fail ("Store occupied").
-TRACING = threading.RLock()
 #: Options of XLA for programs over a few hundred points: compiled in three quarters of the time, no slower to run.
 SMALL = {"xla_cpu_use_fusion_emitters": False}
 #: The same with few optimizations, for runs over time: half of that time again, no slower to run (0.91 s for 1.06 an
@@ -49,25 +45,24 @@ def compiled(function: Callable[P, T], *, options: dict[str, Any] | None = None)
     """`eqx.filter_jit` of a function; one that returns a robot returns it as `for_equations` leaves it.
 
     Where a folder for them is stated its programs are kept there (`mmrjax.programs`). One thread traces at a time;
-    programs that were traced before run side by side.
+    programs that were traced before run side by side, and those that are kept are compiled side by side.
 
     Args:
         options: of XLA, by which programs that are kept are compiled: `SMALL`, `SELDOM` or None for its own.
     """
     inner, kept, traced = eqx.filter_jit(function), Programs(function, options), set[Hashable]()
 
-    def run(structure: Hashable | None, arguments: tuple[tuple, dict[str, Any]]) -> T:
-        program = kept.of_structure(structure, arguments)
-        return inner(*arguments[0], **arguments[1]) if program is None else program(arguments)
-
     @functools.wraps(function)
     def call(*args: P.args, **named: P.kwargs) -> T:
         arguments = for_equations((args, named))
         structure = structure_of(arguments)
+        program = kept.of_structure(structure, arguments)
+        if program is not None:
+            return program(arguments)
         if structure is not None and structure in traced:
-            return run(structure, arguments)
+            return inner(*arguments[0], **arguments[1])
         with TRACING:
-            found = run(structure, arguments)
+            found = inner(*arguments[0], **arguments[1])
         if structure is not None:
             traced.add(structure)
         return found

@@ -24,7 +24,7 @@ import zlib
 from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -44,6 +44,12 @@ _KNOWN |= {"builtins", "functools", "operator", "math", "collections", "copyreg"
 #: Settings of JAX and variables of the environment that say where and what is logged or kept, not what is computed.
 _ASIDE = ("jax_compilation_cache", "jax_persistent_cache", "jax_log", "jax_logging", "jax_dump")
 _HEEDED = ("XLA_", "EQX_")
+
+
+#: Held by the thread that traces: two threads that trace one function fill the same stores of JAX and Equinox, which
+#: then fail ("Store occupied").
+TRACING = threading.RLock()
+T = TypeVar("T")
 
 
 class Unnamed(Exception):
@@ -92,7 +98,6 @@ class Programs:
         """Of a function, by these options of the compiler."""
         self.function, self.options = function, options or {}
         self._found: dict[Any, Future[Program | None]] = {}
-        self._lock = threading.Lock()
 
     def of(self, arguments: tuple[tuple, dict[str, Any]]) -> Program | None:
         """The program for positional and named arguments; None where none may be kept."""
@@ -103,25 +108,34 @@ class Programs:
         folder = os.environ.get(VARIABLE, "")
         if structure is None or not folder or not _keeps() or not _private(folder):
             return None
-        with self._lock:
+        known = self._found.get(structure)
+        if known is not None:
+            return known.result()
+        # Whoever traces may wait for what another thread makes, which has to be past its own tracing by then.
+        with TRACING:
             first = structure not in self._found
             found = self._found.setdefault(structure, Future())
+            if first:
+                leaves, tree = jax.tree.flatten(arguments)
+                make = self._kept(structure, functools.partial(self._obtained, Path(folder), leaves, tree))
         if first:
-            leaves, tree = jax.tree.flatten(arguments)
-            try:
-                found.set_result(self._obtained(Path(folder), leaves, tree))
-            except BaseException as error:
-                found.set_exception(error)
-                with self._lock:
-                    del self._found[structure]
+            found.set_result(self._kept(structure, make))
         return found.result()
 
-    def _obtained(self, folder: Path, leaves: list[Any], tree: Any) -> Program | None:
-        """From the folder, or made and kept there."""
+    def _kept(self, structure: Hashable, make: Callable[[], T]) -> T:
+        """What is made; where that fails, it is forgotten, and those who wait for it are told."""
+        try:
+            return make()
+        except BaseException as error:
+            self._found.pop(structure).set_exception(error)
+            raise
+
+    def _obtained(self, folder: Path, leaves: list[Any], tree: Any) -> Callable[[], Program | None]:
+        """What gives it: from the folder, or compiled and kept there, once it is traced here."""
         try:
             name = _name(self.function, tree.unflatten([_shape(x) for x in leaves]))
         except (Unnamed, pickle.PicklingError, AttributeError, TypeError, RecursionError):
-            return None
+            return lambda: None
         place, known = folder / f"{name}.program", None
         with contextlib.suppress(Exception):  # an entry that cannot be read, for whatever reason, is made again
             known = pickle.loads(place.read_bytes())
@@ -130,24 +144,30 @@ class Programs:
             result, compiled = known
             executable = _loaded(folder, compiled, len(arrays), result)
             if executable is not None:
-                return Program(executable, result)
+                return functools.partial(Program, executable, result)
         result, lowered = self._lowered(leaves, tree)
         text = lowered.as_text()
         compiled = hashlib.sha256(f"{sorted(self.options.items())}{text}".encode()).hexdigest()
         executable = _loaded(folder, compiled, len(arrays), result)
-        if executable is None:
-            with _read_from_cache() as read:
-                executable = compile_by(lowered, self.options)
-            # One that JAX has read from its cache lacks functions when it is written again (XLA on a CPU), and one
-            # that calls back into Python holds addresses of this process.
-            if read or "callback" in text:
-                return Program(executable, result)
-            with contextlib.suppress(Exception):  # what cannot be written, for whatever reason, is not kept
-                written = serialize_executable.serialize(executable)[0]
-                _write(_executable(folder, compiled), zlib.compress(written, 1))
-        with contextlib.suppress(pickle.PicklingError, AttributeError, TypeError):
-            _write(place, pickle.dumps((result, compiled)))
-        return Program(executable, result)
+
+        def make() -> Program:
+            """Compiled beside what other threads trace and compile."""
+            found = executable
+            if found is None:
+                with _read_from_cache() as read:
+                    found = compile_by(lowered, self.options)
+                # One that JAX has read from its cache lacks functions when it is written again (XLA on a CPU), and
+                # one that calls back into Python holds addresses of this process.
+                if read or "callback" in text:
+                    return Program(found, result)
+                with contextlib.suppress(Exception):  # what cannot be written, for whatever reason, is not kept
+                    written = serialize_executable.serialize(found)[0]
+                    _write(_executable(folder, compiled), zlib.compress(written, 1))
+            with contextlib.suppress(pickle.PicklingError, AttributeError, TypeError):
+                _write(place, pickle.dumps((result, compiled)))
+            return Program(found, result)
+
+        return make
 
     def _lowered(self, leaves: list[Any], tree: Any) -> tuple[Any, Any]:
         """What the function returns of such arguments, and itself lowered for them."""

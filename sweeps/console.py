@@ -28,7 +28,7 @@ from calibration.data.writing import naming
 #: Widest line of text on a terminal.
 COLUMNS = 80
 #: Longest silence of a long computation, and of a command that begins [s].
-SILENCE, FIRST = 10.0, 1.0
+SILENCE, FIRST = 2.0, 1.0
 #: What results are printed to, as an error calls it.
 OUTPUT = "standard output"
 _WIDTH = None if sys.stdout.isatty() else 120  # a file has no width of its own
@@ -43,8 +43,16 @@ def say(what: Any) -> None:
 
 
 def tell(text: str) -> None:
-    """Print a line to stderr, where what is not the result goes."""
+    """Print a line to stderr, where what is not the result goes, in the place of one that is written again."""
+    again("")
     _err.print(wrapped(text) if sys.stderr.isatty() else text)
+
+
+def again(text: str) -> None:
+    """Write the last line of a terminal anew; a file, which keeps every line, gets none."""
+    if sys.stderr.isatty():
+        sys.stderr.write(f"\r\x1b[K{text[: COLUMNS - 1]}")
+        sys.stderr.flush()
 
 
 def wrapped(text: str) -> str:
@@ -71,12 +79,15 @@ def working(name: str) -> Iterator[None]:
 
 
 @contextmanager
-def pulse(tell: Callable[[str], None], doing: str, silence: float = SILENCE) -> Iterator[Callable[[str], None]]:
+def pulse(
+    tell: Callable[[str], None], doing: str, silence: float = SILENCE, again: Callable[[str], None] = again
+) -> Iterator[Callable[[str], None]]:
     """A function that says what goes on; where nothing has been said for a while, the latest is said again, with how
     long it has gone on and what was compiled meanwhile.
 
     Args:
         tell: says a line; doing: what goes on until the first; silence: the longest [s].
+        again: says how long something has gone on.
     """
     import jax
 
@@ -100,7 +111,7 @@ def pulse(tell: Callable[[str], None], doing: str, silence: float = SILENCE) -> 
             spoke.clear()
             if not heard and not over.is_set():
                 text, since, before = said[0]
-                tell(still(text, time.monotonic() - since, compiled - before))
+                again(still(text, time.monotonic() - since, compiled - before))
 
     jax.monitoring.register_event_duration_secs_listener(count)
     thread = threading.Thread(target=beat, daemon=True)

@@ -1,10 +1,14 @@
 """What a long computation says while it goes on."""
 
+import sys
 import time
 
 import jax
 import jax.numpy as jnp
+import pytest
 
+from calibration.inference.notes import Step
+from calibration.words import steps
 from calibration.words.steps import still
 from sweeps import console
 from sweeps.console import pulse
@@ -12,7 +16,7 @@ from sweeps.console import pulse
 
 def test_silence_is_broken_by_what_goes_on():
     said = []
-    with pulse(said.append, "reading", silence=0.2) as tell:
+    with pulse(said.append, "reading", silence=0.2, again=said.append) as tell:
         time.sleep(0.5)
         tell("fitting")
         jax.jit(lambda x: jnp.cosh(x) * 0.137)(jnp.ones(3))
@@ -35,6 +39,23 @@ def test_what_goes_on_is_said_with_what_was_compiled():
     assert still("fitting", 41.6, 0) == "still fitting (42 s)"
     assert still("fitting", 41.6, 1) == "still fitting (42 s, 1 program compiled)"
     assert still("fitting", 9.6, 12) == "still fitting (10 s, 12 programs compiled)"
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_terminal_writes_one_line_again_and_a_file_gets_none(monkeypatch, capsys, terminal):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
+    with pulse(console.tell, "reading", silence=0.05):
+        time.sleep(0.3)
+    err = capsys.readouterr().err
+    assert err.count("\r\x1b[Kstill") >= 2 * terminal and bool(err) == terminal, repr(err)
+
+
+def test_a_stage_of_the_loop_has_a_number_and_what_is_left():
+    text = steps.step(Step("bootstrap", (500,)))
+    assert text.startswith(f"2 of {steps.OF}, bootstrap of 500")
+    assert steps.expected(text, 45.0) == pytest.approx(55.0)  # 45 % are over when it begins
+    assert steps.expected("writing the report", 45.0) is steps.expected("1 of 7, fitting", 9.0) is None
+    assert set(steps.STAGES) <= set(steps.STEPS)
 
 
 def test_a_command_says_soon_that_it_works(monkeypatch, capsys):

@@ -410,7 +410,7 @@ SAMPLES = [
     ),
     (of_study.Tied(("a", "b")), "kept at their ratio to another input, and part of what it does: a, b"),
     (Step("evaluations", (12345, 1234.6)), "12,345 model evaluations so far, 1,235 a second"),
-    (Step("alike", (("a", "b"),)), "what else explains as much as a and b?"),
+    (Step("alike", (("a", "b"),)), "4 of 7, what else explains as much as a and b?"),
     (Step("round", (2, 3.25, 7, 1.26)), "round 2: objective 3.2500 after 7 steps, 1.3 min"),
 ]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import equinox as eqx
 import jax
@@ -146,13 +146,15 @@ class CandidateSpace:
     """All that can be fitted: the base, and the base with any effects of a library in a few slots.
 
     Attributes:
-        bare: problem of the base alone; equipped: of the base and the effects in the slots.
+        bare: problem of the base alone; equipped: of the base and the effects in the slots, whichever these are.
         library: the effects.
+        room: names of those that the program of a fit of histories has at least, see `fitted_by`.
     """
 
     bare: Problem
     equipped: Problem
     library: ScoredLibrary
+    room: tuple[str, ...] = ()
 
     @property
     def coordinates(self) -> ActiveSet:
@@ -188,17 +190,49 @@ class CandidateSpace:
 
         return dataclasses.replace(self, bare=with_weight(self.bare), equipped=with_weight(self.equipped))
 
+    def with_room(self, names: Sequence[str]) -> CandidateSpace:
+        """The same with these effects in the program of every fit of histories."""
+        return dataclasses.replace(self, room=tuple(n for n in self.library.names if n in names))
+
+    def fitted_by(self, sets: Iterable[Sequence[str]]) -> tuple[Problem, list[tuple[int, ...]]]:
+        """The problem by whose program sets of effects are fitted, and indices of each set in it.
+
+        That of settled runs has the whole library, and one program serves every set. A step of a fit of histories
+        takes longer with each effect, and so does compiling it: they have those of `room` and of the sets alone.
+        """
+        sets = [tuple(names) for names in sets]
+        if not self.bare.observe.long:
+            return self.equipped, [self.library.indices(names) for names in sets]
+        wanted = {*self.room, *(n for names in sets for n in names if n)} or {*self.library.names[:1]}
+        chosen = [k for k, n in enumerate(self.library.names) if n in wanted]
+        names, every = tuple(self.library.names[k] for k in chosen), self.coordinates
+        value, spread, sd, low, high = (x[np.asarray(chosen)] for x in every.scales)
+        coordinates = dataclasses.replace(
+            every,
+            sd=every.sd[np.asarray(chosen)],
+            scales=(value, spread, sd, low, high),
+            names=names,
+            shapes=tuple(every.shapes[k] for k in chosen),
+        )
+        robot = self.equipped.base
+        kept = {e.name for e in self.bare.base.effects} | wanted
+        robot = dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in kept))
+        index = {n: k for k, n in enumerate(names)} | {"": -1}
+        problem = dataclasses.replace(self.equipped, base=robot, coordinates=coordinates)
+        return problem, [tuple(index[n] for n in each) for each in sets]
+
     def fit_of(self, active: Sequence[str], z: np.ndarray) -> tuple[Problem, np.ndarray, tuple[int, ...] | None]:
         """Problem, coordinates and indices of the effects of a fit; of one without effects those of the base alone, a
         step of which costs a third and less."""
         if not any(active):
             return self.bare, np.asarray(z)[: self.free], None
-        return self.equipped, np.asarray(z), self.library.indices(active)
+        problem, (indices,) = self.fitted_by([active])
+        return problem, np.asarray(z), indices
 
     def problem(self, active: Sequence[str]) -> Problem:
         """The problem with these effects in the slots."""
-        coordinates = self.coordinates.with_effects(self.library.indices(active))
-        return dataclasses.replace(self.equipped, coordinates=coordinates)
+        problem, (indices,) = self.fitted_by([active])
+        return dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(indices))
 
 
 def candidate_space(

@@ -43,6 +43,7 @@ class Candidate:
         nearly: whether it is plausible, but for amplitudes up to `settings.stretched` times the largest.
         converged: whether the fit is an optimum.
         supplying: effects whose balance would supply power with them.
+        simulated: whether the fit is of the model; else of its equations made linear at another fit (`screening`).
     """
 
     active: tuple[str, ...]
@@ -55,6 +56,7 @@ class Candidate:
     nearly: bool
     converged: bool
     supplying: tuple[str, ...] = ()
+    simulated: bool = True
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -179,9 +181,9 @@ def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], setting
     """Fit every (active effects, start)."""
     if not proposals:
         return []
-    active = [space.library.indices(names) for names, _ in proposals]
+    problem, active = space.fitted_by(names for names, _ in proposals)
     starts = [z for _, z in proposals]
-    found, _ = search_each(space.equipped, starts, [space.weight] * len(proposals), active)
+    found, _ = search_each(problem, starts, [space.weight] * len(proposals), active)
     return [
         candidate(space, names, jax.tree.map(lambda x: x[k], found), settings)  # noqa: B023
         for k, (names, _) in enumerate(proposals)

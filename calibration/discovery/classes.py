@@ -11,12 +11,15 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, fit_candidates, start
 from calibration.discovery.score_tests import ScoreTable
+from calibration.discovery.screening import ranked
 from calibration.discovery.search import without_each
 from calibration.discovery.settings import Settings
 from calibration.discovery.stated_values import Shift, shifts
 
 #: Effects that are tried in the place of each one.
 TRIED = 16
+#: Rise of χ² by regression up to which a rival is simulated [σ²], and the same as a share of what an effect explains.
+NEAR, FAR = 50.0, 0.5
 #: Share of what an effect explains that the score of a shifted prior has to promise for it to be fitted.
 SURE = 0.7
 
@@ -57,6 +60,7 @@ def classes(
     best: Candidate,
     ladder: tuple[Candidate, ...],
     left: Diagnosis,
+    after: Diagnosis,
     settings: Settings,
 ) -> Classes:
     """For each effect of the best fit, the effects and the stated values that explain the data as well in its place.
@@ -65,7 +69,7 @@ def classes(
     `settings.form` of the sigmas, or `form_family` where it is of the same family.
 
     Args:
-        left: what the base leaves.
+        left: what the base leaves; after: what the best fit leaves.
     """
     cosine, names = cosines(space, left.scores), space.library.names
     fewer = [base] if len(best.effects) == 1 else without_each(space, best, settings, ladder)
@@ -77,10 +81,18 @@ def classes(
             if cosine[k, j] > settings.alike and names[j] not in best.effects:
                 active = tuple(names[j] if s == slot else n for s, n in enumerate(best.active))
                 wanted.append((slot, names[j], active))
-    known = {c.key: c for c in ladder}
+    known = {c.key: c for c in ladder if c.simulated}
     new = [active for _, _, active in wanted if frozenset(n for n in active if n) not in known]
-    fitted = fit_candidates(space, [(w, start(space, best, w, settings, left.scores)) for w in new], settings)
-    known |= {c.key: c for c in fitted}
+    fitted = []
+    if space.bare.observe.long:
+        fitted = ranked(space, [(w, best, after) for w in new], settings)
+        known |= {c.key: c for c in fitted}
+        # What may be of the class is simulated where the program of the fits has room for it.
+        new = [c.active for c in fitted if 2 * (c.cost - best.cost) < max(NEAR, FAR * max(gains))]
+        new = [active for active in new if {n for n in active if n} <= {*space.room, *best.effects}]
+    wanted_fits = [(w, start(space, best, w, settings, left.scores)) for w in new]
+    fitted += fit_candidates(space, wanted_fits, settings)
+    known |= {c.key: c for c in fitted if c.simulated}
     members, stated = [], []
     for slot, (name, gain) in enumerate(zip(best.effects, gains, strict=True)):
         same = [name]
@@ -98,9 +110,10 @@ def classes(
         linear = left.linear if len(best.effects) == 1 else None
         found = shifts(space, fewer[slot], SURE * gain, settings, linear)
         stated.append(tuple(s for s in found if 2 * (s.fit.cost - best.cost) <= within[settings.form]))
-    return Classes(
-        tuple(members), tuple(stated), tuple(families(space, same) for same in members), (*ladder, *fitted)
-    )
+    by_regression = [c for c in (*ladder, *fitted) if not c.simulated and c.key not in known]
+    latest = {c.key: c for c in by_regression} | {k: c for k, c in known.items() if not c.simulated}
+    whole = (*latest.values(), *(c for c in (*ladder, *fitted) if c.simulated))
+    return Classes(tuple(members), tuple(stated), tuple(families(space, same) for same in members), whole)
 
 
 def families(space: CandidateSpace, members: Sequence[str]) -> tuple[str, ...]:

@@ -69,6 +69,7 @@ from calibration.discovery.result import (
     Sensitivity,
 )
 from calibration.discovery.score_tests import Statistics, bootstrap
+from calibration.discovery.screening import with_room
 from calibration.discovery.search import Search, diagnose, path, search
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings, settings_for
 from calibration.discovery.standing import standing
@@ -114,6 +115,8 @@ MANY = 0.03
 LEVEL = 0.02
 #: Error of a refit over that of the robot as stated above which it is said [-].
 WORSE = 1.1
+#: Root of a score from which on it is likely that something is missing, before the bootstrap tells [σ].
+LIKELY = 4.0
 #: Prior sds beyond which a base parameter is worth a look.
 FAR = 3.0
 #: Is told what the loop does next.
@@ -258,6 +261,8 @@ def prepared(
     A campaign that wants verdicts alone goes on with `LoopInput.trace`, so that it takes the way that users take.
     """
     menu.check_forbidden(forbidden, robot)
+    if not robot.rig.inherits:
+        scales.nominal_ahead()
     runs = thinned(runs.of(robot), rows)
     distinct, numbers, notes = without_copies(runs)
     kind = observers.kind(distinct)
@@ -403,7 +408,8 @@ def trace(
     keep: Keep = kept.nothing,
 ) -> LoopStages:
     """The stages of the loop up to a verdict, in order; the noise is known. `later` is told the base
-    fit as soon as something is missing. What is kept of a stage holds what those before it found, which is one whole.
+    fit as soon as something is likely to be missing. What is kept of a stage holds what those before it found, which
+    is one whole.
 
     What replicates of a bootstrap show in units of their own sds hardly depends on these: where the stages of the
     same table with other sds are `known`, and the same rows count, their replicates serve.
@@ -432,22 +438,33 @@ def trace(
     def tested(screened: Screening) -> tuple[Screening, Diagnosis]:
         weight = screened.base.space.weight
         null = None if known is None or np.any(known.screened.base.space.weight != weight) else known.left.test.null
+        room = () if known is None else known.screened.base.space.room
+        base, (linear, scores, _) = screened.base, screened.diagnosed
+        space = base.space.with_room(room)
+        if not room:
+            space = with_room(base.space, base.candidate, linear, scores, settings)
+        screened = dataclasses.replace(screened, base=dataclasses.replace(base, space=space))
+        if np.max(np.abs(np.asarray(scores.single))) > LIKELY:
+            later(screened.base)
         return screened, diagnosis_of_base(screened, settings, sds.noise.freedom, null)
 
     def tried(screened: Screening, left: Diagnosis) -> tuple[Screening, Diagnosis, Search]:
         base = screened.base
-        return screened, left, search(base.space, base.candidate, left, screened.bases, settings, progress)
+        found = search(base.space, base.candidate, left, screened.bases, settings, progress)
+        base = dataclasses.replace(base, space=base.space.with_room(found.room))
+        return dataclasses.replace(screened, base=base), left, found
 
     screened, sds = keep("base", begun)
     for k in range(SCREENINGS):
         progress(Step("bootstrap", (settings.replicates,)))
         screened, left = keep(f"bootstrap {k}", functools.partial(tested, screened))
+        if k == 0:
+            keep("ranking", functools.partial(findings.ranking, screened.base.space, left, settings))
         if not left.test.rejected and screened.cluster is None:
             missed = undescribed(screened.base.space, runs, sds.noise, left.linear)
             word = "undescribed" if missed else "none"
             return LoopStages(word, screened, left, sds, missed=missed, unused=unused(runs))
         progress(Step("effects"))
-        later(screened.base)
         screened, left, searched = keep(f"search {k}", functools.partial(tried, screened, left))
         after = searched.diagnosis
         if after is None or not after.test.rejected_with_margin:
@@ -479,7 +496,7 @@ def trace(
     searched = dataclasses.replace(searched, best=model[0], diagnosis=model[1])
     best, after = model
     progress(Step("alike", (best.effects,)))
-    alike = classes(space, base, best, searched.ladder, left, settings)
+    alike = classes(space, base, best, searched.ladder, left, after, settings)
     if not any(named):
         return stages(level, screened, left, sds, searched, alike, where, standing=stood, mechanism=found)
     compared: tuple[HeldOutAlternative, ...] = ()
@@ -540,7 +557,8 @@ def choose(
     names += further[: settings.slots - len(names)]
     if not names:
         return None, searched, stood
-    known = [c for c in (proposed[0], best, *searched.ladder) if c.key == frozenset(names)]
+    every = (proposed[0], best, *(c for c in searched.ladder if c.simulated))
+    known = [c for c in every if c.key == frozenset(names)]
     if not known:
         active = filled(names, settings)
         begins = start(space, proposed[0], active, settings, left.scores)
@@ -631,8 +649,9 @@ def bases_at(runs: Runs, base: BaseFit) -> Bases:
     columns = dict(runs.where(index).columns)
     reading = np.where(np.isfinite(base.reading), base.reading, np.asarray(problem.data.measured))
     columns |= {c.column: reading[:, k] for k, c in enumerate(problem.channels)}
-    robot = problem.robot(jnp.asarray(base.candidate.z[: base.space.free]))
-    return problem.observe.bases(columns, base.space.included, robot)
+    z = base.candidate.z[: base.space.free]
+    observe = problem.observe.at_fit(problem, z)
+    return observe.bases(columns, base.space.included, problem.robot(jnp.asarray(z)))
 
 
 def diagnosis_of_base(

@@ -35,8 +35,8 @@ def supplying(space: CandidateSpace, active: Sequence[str], amplitude: np.ndarra
         active: name of the effect in each slot; amplitude: of each; z: coordinates of the fit.
     """
     negative = [n for n, a in zip(active, amplitude, strict=True) if n and a <= 0 and space.library[n].dissipative]
-    if not negative:
-        return ()
+    if not negative or space.bare.observe.long:
+        return tuple(negative)
     power = _taken(space.bare.observe, space.problem(active).robot(jnp.asarray(z)))
     if power is None:
         return tuple(negative)

@@ -42,7 +42,7 @@ from calibration.discovery.reach import Reach, reach_of
 from calibration.discovery.settings import Settings
 from calibration.inference import bases, priors
 from calibration.inference.normal_equations import half_solved
-from calibration.inference.optimizers import informing, linearised
+from calibration.inference.optimizers import informing
 from calibration.inference.problem import Problem
 from mmrjax import channels
 from mmrjax.compiling import SELDOM, compiled
@@ -214,9 +214,8 @@ def _predicted(
     return jax.vmap(one)(which, z, informed)
 
 
-def _informed(space: CandidateSpace, at: Candidate) -> Array:
-    problem = space.problem(at.active)
-    return linearised(problem, jnp.asarray(at.z), problem.data)[1][informing(problem.data)]
+def _informed(problem: Problem, at: Candidate, active: tuple[int, ...]) -> Array:
+    return problem.observe.at(problem, at.z, active)[1][informing(problem.data)]
 
 
 def predict(space: CandidateSpace, candidates: Mapping[str, Candidate], settings: Settings) -> PredictedReadings:
@@ -231,14 +230,13 @@ def predict(space: CandidateSpace, candidates: Mapping[str, Candidate], settings
     whole = priors.free_names(robot, robot.configurations.names)
     more = [n for n in whole if n not in space.coordinates.base.names]
     other = priors.coordinates(robot, more) if more else None
-    active = jnp.asarray([space.library.indices(c.active) for c in those])
+    equipped, indices = space.fitted_by(c.active for c in those)
+    active = jnp.asarray(indices)
     z = jnp.asarray(np.stack([c.z for c in those]))
-    informed = jnp.stack([_informed(space, c) for c in those])
+    informed = jnp.stack([_informed(equipped, c, mine) for c, mine in zip(those, indices, strict=True)])
     within = reach_of(space, space.bare.robot(jnp.asarray(those[0].z[: space.free])))
     everything, shown = menu.menu(within), channels.names(space.bare.channels)
-    found, half = jax.device_get(
-        _predicted(space.equipped, other, predicted.batch(everything, shown), active, z, informed)
-    )
+    found, half = jax.device_get(_predicted(equipped, other, predicted.batch(everything, shown), active, z, informed))
     found, half = jax.tree.map(lambda x: np.asarray(x)[: len(names)], (found, half))
     experiments, kept = _possible(everything, found, within, settings)
     medians = np.median(np.asarray(space.equipped.data.sd), 0)

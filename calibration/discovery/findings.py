@@ -12,7 +12,7 @@ import numpy as np
 
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
-from calibration.discovery.adequacy import AdequacyTest
+from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import Classes
 from calibration.discovery.discrepancy import Discrepancy
@@ -35,7 +35,9 @@ from calibration.discovery.result import (
     KindOfEvidence,
     Member,
     NextExperiment,
+    Ranked,
     RankedExperiment,
+    Ranking,
     ReadingsOfRows,
     StatedValue,
     UnnamedDiscrepancy,
@@ -48,7 +50,7 @@ from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
 from calibration.inference import priors
 from calibration.inference.errors import channel_errors
-from calibration.inference.held_out import held_out
+from calibration.inference.held_out import unseen
 from calibration.inference.identifiability import held_by_prior
 from calibration.inference.linearization import Linearization, amplitude_of, shape_of, shape_scales, shaped
 from calibration.inference.problem import Observation, Problem
@@ -186,7 +188,8 @@ def unnamed(
 def alternatives(
     space: CandidateSpace, best: Candidate, cost: float, ladder: Sequence[Candidate], settings: Settings
 ) -> tuple[tuple[Alternative, ...], tuple[Alternative, ...]]:
-    """Candidates that explain the data nearly as well as what is proposed; and those that would but for their size.
+    """Simulated candidates that explain the data nearly as well as what is proposed; and those that would but for
+    their size.
 
     One that only adds effects to what is proposed, or to another one of these, is left out where these explain next
     to nothing.
@@ -196,7 +199,7 @@ def alternatives(
     """
     near: tuple[list[Alternative], list[Alternative]] = ([], [])
     simpler = {best.key: cost} if best.key else {}
-    for c in sorted(ladder, key=lambda x: (len(x.effects), x.cost)):
+    for c in sorted((c for c in ladder if c.simulated), key=lambda x: (len(x.effects), x.cost)):
         rise = 2 * (c.cost - cost)
         if c.key in simpler or not c.effects or rise > settings.alternative:
             continue
@@ -321,6 +324,19 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
     return tuple(sorted(listed, key=lambda s: (-round(s.score, 9), s.name)))
 
 
+def ranking(space: CandidateSpace, left: Diagnosis, settings: Settings) -> Ranking:
+    """The library by what each effect alone would explain of what the base leaves."""
+    listed = []
+    for s in effect_scores(space, left.scores, settings):
+        effect = space.library[s.name]
+        sd = size_of(effect) / max(s.sigmas_per_prior_sd, 1e-300)
+        unit = amplitude_of(effect).spec.unit
+        supplies = space.bare.observe.long and effect.dissipative and s.amplitude < 0  # as of `dissipation.supplying`
+        listed.append(Ranked(s.name, effect.family(), unit, s.score, s.amplitude, sd, supplies))
+    test, listed = left.test, sorted(listed, key=lambda e: e.supplies)
+    return Ranking(test.rejected, test.p_value, test.threshold("single") ** 2, tuple(listed))
+
+
 def _plausible_score(
     space: CandidateSpace, effect: Effect, scores: ScoreTable, settings: Settings
 ) -> tuple[float, float]:
@@ -383,16 +399,16 @@ def readings(
         lost = fitted.problem.observe.unreachable(np.asarray(found.status))[:rows, None]
         return np.where(lost, np.nan, np.asarray(found.reading)[:rows])
 
-    def unseen(fitted: Fitted, masks: list[np.ndarray]) -> np.ndarray:
-        return held_out(fitted.problem, fitted.z, masks, fitted.active).reading
+    def left_out(fitted: Fitted, masks: list[np.ndarray]) -> np.ndarray:
+        return unseen(fitted.problem, fitted.z, masks, fitted.active).reading
 
     held, labels = {}, {}
     for kind, by in blocks_room.predictable(runs, before.problem).items():
         masks = list(by.values())
-        first = unseen(before, masks) if known_before is None else known_before[kind]
+        first = left_out(before, masks) if known_before is None else known_before[kind]
         later = first
         if after is not None:
-            later = unseen(after, masks) if known_after is None else known_after[kind]
+            later = left_out(after, masks) if known_after is None else known_after[kind]
         held[kind], labels[kind] = (first, later), tuple(by)
     stated, fitted = seen(dataclasses.replace(before, z=np.zeros_like(before.z))), seen(before)
     later = fitted if after is None else seen(after)

@@ -15,7 +15,7 @@ from calibration.data.runs import Runs
 from calibration.discovery import prediction
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
-from calibration.discovery.candidates import Candidate
+from calibration.discovery.candidates import Candidate, fit_candidates
 from calibration.discovery.discrepancy import CurveBeside
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.notes import AGAIN, HALF, Mechanism
@@ -26,7 +26,7 @@ from calibration.discovery.standing import chosen_again
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import Bases
-from calibration.inference.held_out import held_out
+from calibration.inference.held_out import unseen
 
 #: Share of the largest rms change of a channel by a mechanism from which on it changes a reading [σ over σ].
 CHANGED = 0.5
@@ -54,6 +54,7 @@ def mechanism(
         left: what the base leaves; ladder: candidates that were fitted; beside: the curve of what the base leaves.
         predicted: what fits predict of data held out, where it is known.
     """
+    ladder = first_simulated(space, base, ladder, settings)
     best, own = _of_one_family(space, ladder), _families_of(beside.where)
     if space.bare.observe.long:  # whose curves take long to fit
         by_curve = beside.where.explained - OF_CURVE
@@ -92,6 +93,22 @@ def mechanism(
         if not found[-1].fails:
             return found[-1]
     return found[0] if found else None
+
+
+def first_simulated(
+    space: CandidateSpace, base: Candidate, ladder: Sequence[Candidate], settings: Settings
+) -> list[Candidate]:
+    """The candidates, where of each family that may explain most the best one is a simulation and no regression."""
+    found = list(ladder)
+    while True:
+        best = _of_one_family(space, found).values()
+        lowest = min((c.cost for c in best), default=0.0)
+        within = max(settings.same, settings.form**2 * 2 * (base.cost - lowest))
+        near = [c for c in best if not c.simulated and 2 * (c.cost - lowest) <= within]
+        if not near:
+            return found
+        made = fit_candidates(space, [(c.active, c.z) for c in near], settings)
+        found = [*(c for c in found if not any(c is x for x in near)), *made]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -203,7 +220,7 @@ def _gain_of_curve(
     """The same of the curve of what the base leaves, over the range of its variable that its fit has seen: a curve
     says nothing beyond."""
     curve, kinds = beside.curve, blocks_room.predictable(runs, space.bare)
-    told = {kind: held_out(curve.problem, curve.z, list(by.values())).reading for kind, by in kinds.items()}
+    told = {kind: unseen(curve.problem, curve.z, list(by.values())).reading for kind, by in kinds.items()}
     changed = _changed(space, runs, _reading(space, base), curve.reading)
     score = _scored(space, runs, told)
     seen = {kind: _seen(space, beside, list(by.values())) for kind, by in kinds.items()}

@@ -49,8 +49,9 @@ def ahead(
     space: CandidateSpace, bases_at: Callable[[BaseFit], Bases], settings: Settings
 ) -> Iterator[Callable[[BaseFit], None]]:
     """Beside what is done meanwhile, a first look at the prior's mean, a replicate of a bootstrap there and a fit
-    with room for effects, on other cores: what every later one needs is then compiled. So are experiments foreseen,
-    by a call of what this gives, with the base fit. What they find is not read."""
+    with room for effects, on other cores: what every later one needs is then compiled. A call of what this gives,
+    with the base fit, has experiments foreseen too, or where runs are long what fits with room for effects take. What
+    they find is not read."""
     nothing, none = np.zeros(len(space.coordinates)), empty(settings)
     mean = Candidate(none, nothing, nothing, np.inf, nothing, nothing, False, False, False)
     start = BaseFit(mean, np.full(np.shape(space.bare.data.measured), np.nan), space, ())
@@ -65,14 +66,19 @@ def ahead(
         bootstrap(space.bare, nothing[: space.free], linear, space.library.scored, bases, 1, settings.seed)
 
     def fit() -> None:
-        if space.bare.observe.long:
-            space.equipped.observe.at(space.equipped, nothing, space.library.indices(none))
+        if space.bare.observe.long:  # whose programs have what is found to be missing, which is not known yet
             return
         looked.wait()  # needed last: what compiles beside the base fit shares two cores with it
         search_each(space.equipped, [nothing], [space.weight], [space.library.indices(none)])
 
+    def make_room(base: BaseFit) -> None:
+        problem, z = base.space.problem(none), jnp.asarray(nothing)
+        problem.observe.linearise(problem, z, problem.data, base.space.library.scored)
+
     def foresee(base: BaseFit) -> None:
-        if space.bare.observe.menu and not space.bare.observe.long:
+        if space.bare.observe.long:
+            jobs.append(others.submit(make_room, base))
+        elif space.bare.observe.menu:
             jobs.append(others.submit(predict, base.space, {"": base.candidate}, settings))
 
     with concurrent.futures.ThreadPoolExecutor(2) as others:
@@ -163,8 +169,10 @@ def _screened(base: BaseFit, bases_at: Callable[[BaseFit], Bases], settings: Set
 
 def _look(base: BaseFit, bases_at: Callable[[BaseFit], Bases], settings: Settings) -> tuple[Bases, Diagnosed]:
     space, bases = base.space, bases_at(base)
-    z = jnp.asarray(base.candidate.z)
-    return bases, jax.device_get(diagnosed(space.problem(empty(settings)), z, space.library.scored, bases))
+    problem, z = space.problem(empty(settings)), base.candidate.z
+    if problem.observe.long:  # by the program that has fitted it
+        problem, z = space.bare, z[: space.free]
+    return bases, jax.device_get(diagnosed(problem, jnp.asarray(z), space.library.scored, bases))
 
 
 def _again(base: BaseFit, rows: np.ndarray, settings: Settings, where: str) -> BaseFit:

@@ -16,7 +16,7 @@ from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate
 from calibration.inference import blocks as blocks_room
-from calibration.inference.held_out import held_out
+from calibration.inference.held_out import unseen
 
 #: Degrees of freedom of Student's t that a reading is scored by: one that is far off does not decide alone.
 FREEDOM = 4.0
@@ -136,7 +136,7 @@ def score_of(space: CandidateSpace, runs: Runs, candidate: Candidate) -> HeldOut
     data, rows, kinds = space.equipped.data, len(runs), blocks_room.predictable(runs, space.bare)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
     problem, z, active = space.fit_of(candidate.active, candidate.z)
-    reading = {kind: held_out(problem, z, list(by.values()), active).reading for kind, by in kinds.items()}
+    reading = {kind: unseen(problem, z, list(by.values()), active).reading for kind, by in kinds.items()}
     return dataclasses.replace(scored(reading, measured, sd, counts, kinds), reading=reading)
 
 

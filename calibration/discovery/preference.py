@@ -18,7 +18,7 @@ from calibration.discovery.search import Search, diagnose
 from calibration.discovery.settings import HELD_OUT, Settings
 from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import Bases
-from calibration.inference.held_out import held_out
+from calibration.inference.held_out import unseen
 
 #: Share of itself by which held-out errors have to differ to be told apart; less is not seen in two digits.
 TOLD = 0.01
@@ -64,7 +64,7 @@ def compared(space: CandidateSpace, runs: Runs, best: Candidate, alike: Classes)
 
     def sigma(c: Candidate, masks: list[np.ndarray]) -> np.ndarray:
         problem, z, active = space.fit_of(c.active, c.z)
-        reading = held_out(problem, z, masks, active).reading
+        reading = unseen(problem, z, masks, active).reading
         return np.where(counts, (reading - measured) / sd, np.nan)
 
     errors = [{kind: sigma(c, list(by.values())) for kind, by in kinds.items()} for c in others]
@@ -126,6 +126,8 @@ def prefer_by_held_out(
         leader = fitted[frozenset(table[k].effects)]
         if leader is best:
             break
+        if not leader.simulated:
+            (leader,) = fit_candidates(space, [(leader.active, leader.z)], settings)
         diagnosis = diagnose(space, leader, bases, before.test.null, settings)
         sound = before.test.rejected_with_margin or not diagnosis.test.rejected_with_margin
         if sound:

@@ -231,6 +231,41 @@ class EffectScore:
 
 
 @dataclasses.dataclass(frozen=True)
+class Ranked:
+    """An effect by regression alone: all else is fitted again on the equations of the base fit made linear.
+
+    Attributes:
+        name: of the effect; family: what it is of, in words; unit: of its amplitude.
+        score: what it alone would explain, no larger than plausible [σ²]; amplitude, sd: then [its unit].
+        supplies: whether it would supply power with such a sign, and so explains nothing.
+    """
+
+    name: str
+    family: str
+    unit: str
+    score: float
+    amplitude: float
+    sd: float
+    supplies: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Ranking:
+    """What regression says of the library before any set of effects is fitted: nothing of it is confirmed.
+
+    Attributes:
+        missing: whether anything is missing; p_value: of that test, family-wise.
+        chance: score that the strongest effect reaches by chance alone [σ²].
+        effects: the strongest first, after them those that would supply power.
+    """
+
+    missing: bool
+    p_value: float
+    chance: float
+    effects: tuple[Ranked, ...]
+
+
+@dataclasses.dataclass(frozen=True)
 class KindOfEvidence:
     """The strongest statistic of one kind, what it has to exceed, its share among bootstrap tables, and those."""
 

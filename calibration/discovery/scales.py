@@ -13,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import threading
 from collections.abc import Callable
 
 import jax
@@ -98,6 +99,11 @@ def library_for(robot: Robot, conditions: Conditions, library: Library, turned: 
             continue
         sized[name] = _sized(kind, (robot, _placed(mine, kind, turned)), (nominal, _placed(theirs, kind)))
     return sized
+
+
+def nominal_ahead() -> None:
+    """Compute what the nominal robot does on another core, for `library_for`."""
+    threading.Thread(target=_nominal, daemon=True).start()
 
 
 def turned_in(runs: Runs, robot: Robot) -> float:

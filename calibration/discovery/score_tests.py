@@ -190,8 +190,10 @@ def diagnosed(
         near: of a fit nearby, whose signatures and defects serve for this one where runs are long: a curve moves the
             residual, and hardly what an effect would add.
     """
-    if near is None or not problem.observe.long:
+    if not problem.observe.long:
         linear = _linearised(problem, z, effects)
+    elif near is None:  # by programs of its own
+        linear = problem.observe.linearise(problem, z, problem.data, effects)
     else:
         residual, jacobian, _ = problem.observe.at(problem, z)
         linear = dataclasses.replace(near, residual=residual, jacobian=jacobian)

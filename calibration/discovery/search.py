@@ -13,6 +13,7 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate, filled, fit_beside, fit_candidates, start
 from calibration.discovery.score_tests import ScoreTable, Statistics, diagnosed
+from calibration.discovery.screening import Confirmed, confirmed, ranked
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import Bases
 from calibration.inference.notes import Step
@@ -28,11 +29,16 @@ class Search:
     Attributes:
         ladder: every candidate that was fitted.
         best: the one that is proposed, None where none is plausible; diagnosis: what it leaves.
+        asked, otherwise: fits by simulation of what was screened by regression, and how many of these did not confirm
+            it, see `screening.Confirmed`; room: for which effects the program of these fits has room.
     """
 
     ladder: tuple[Candidate, ...]
     best: Candidate | None
     diagnosis: Diagnosis | None
+    asked: int = 0
+    otherwise: int = 0
+    room: tuple[str, ...] = ()
 
 
 def diagnose(
@@ -58,7 +64,9 @@ def search(
     Args:
         base: the fit without effects; left: what it leaves.
     """
-    ladder = _singles(space, base, left.scores, settings)
+    rounds = [_singles(space, base, left, settings)]
+    space = space.with_room(rounds[0].room)
+    ladder = list(rounds[0].candidates)
     null = np.asarray(left.test.null.single)
     best, diagnosis, seen = _best(ladder), None, None
     if best is not None and own_p(2 * (base.cost - best.cost), null) > settings.family_wise_error:
@@ -69,7 +77,8 @@ def search(
         if not diagnosis.test.rejected_with_margin or len(best.effects) == _most(space, settings):
             break
         progress(Step("more effects", (best.effects,)))
-        more = _extend(space, best, diagnosis.scores, base, left.scores, settings)
+        rounds.append(_extend(space, best, diagnosis, base, left, settings))
+        more, space = list(rounds[-1].candidates), space.with_room(rounds[-1].room)
         best = _accepted(_best(more), ladder, settings)
         ladder += more
         if best is not None:
@@ -78,7 +87,8 @@ def search(
             gains = [2 * (c.cost - best.cost) for c in fewer]
             if any(own_p(gain, null) > settings.family_wise_error for gain in gains):
                 best = None
-    return Search(tuple(ladder), seen, diagnosis)
+    asked, otherwise = (sum(getattr(r, name) for r in rounds) for name in ("asked", "otherwise"))
+    return Search(tuple(ladder), seen, diagnosis, asked, otherwise, space.room)
 
 
 def path(found: Search) -> list[Candidate]:
@@ -109,7 +119,7 @@ def without_each(
         ladder: fits that are known, of which none is made again.
     """
     fewer = [tuple("" if s == slot else n for s, n in enumerate(best.active)) for slot in range(len(best.effects))]
-    known = {c.active: c for c in ladder}
+    known = {c.active: c for c in ladder if c.simulated}
     new = fit_candidates(space, [(w, start(space, best, w, settings)) for w in fewer if w not in known], settings)
     known |= {c.active: c for c in new}
     return [known[w] for w in fewer]
@@ -127,9 +137,22 @@ def _ranked(space: CandidateSpace, scores: ScoreTable, without: Sequence[str] = 
     return [space.library.names[k] for k in np.argsort(-strength)]
 
 
-def _singles(space: CandidateSpace, base: Candidate, scores: ScoreTable, settings: Settings) -> list[Candidate]:
-    wanted = [filled([name], settings) for name in _ranked(space, scores)[: _batch(space)]]
-    return fit_beside(space, [(w, base, scores) for w in wanted], settings)
+def _singles(space: CandidateSpace, base: Candidate, left: Diagnosis, settings: Settings) -> Confirmed:
+    """Single effects: those that score highest, or where a run takes long all of them by regression."""
+    names = _ranked(space, left.scores)
+    if not space.bare.observe.long:
+        names = names[: _batch(space)]
+    return _tried(space, [(filled([name], settings), base, left) for name in names], settings)
+
+
+def _tried(
+    space: CandidateSpace, wanted: Sequence[tuple[tuple[str, ...], Candidate, Diagnosis]], settings: Settings
+) -> Confirmed:
+    """Sets of effects, each beside another fit and what that leaves: fitted, or screened by regression first where a
+    run takes long."""
+    if not space.bare.observe.long:
+        return Confirmed(tuple(fit_beside(space, [(w, at, by.scores) for w, at, by in wanted], settings)))
+    return confirmed(space, ranked(space, wanted, settings), settings)
 
 
 def _batch(space: CandidateSpace) -> int:
@@ -139,20 +162,20 @@ def _batch(space: CandidateSpace) -> int:
 def _extend(
     space: CandidateSpace,
     best: Candidate,
-    scores: ScoreTable,
+    left_by_best: Diagnosis,
     base: Candidate,
-    scores_base: ScoreTable,
+    left: Diagnosis,
     settings: Settings,
-) -> list[Candidate]:
+) -> Confirmed:
     """One effect more beside the best, and pairs from the base."""
-    names = _ranked(space, scores, best.effects)[: _batch(space)]
-    sources = {filled([*best.effects, name], settings): (best, scores) for name in names}
+    names = _ranked(space, left_by_best.scores, best.effects)[: _batch(space)]
+    sources = {filled([*best.effects, name], settings): (best, left_by_best) for name in names}
     if len(best.effects) == 1:
-        for pair in _pairs(space, scores_base):
+        for pair in _pairs(space, left.scores):
             one, other = filled(pair, settings), filled(pair[::-1], settings)
             if one not in sources and other not in sources:
-                sources[one] = (base, scores_base)
-    return fit_beside(space, [(w, at, by) for w, (at, by) in sources.items()], settings)
+                sources[one] = (base, left)
+    return _tried(space, [(w, at, by) for w, (at, by) in sources.items()], settings)
 
 
 def _pairs(space: CandidateSpace, scores: ScoreTable) -> list[tuple[str, str]]:
@@ -170,7 +193,7 @@ def _pairs(space: CandidateSpace, scores: ScoreTable) -> list[tuple[str, str]]:
 
 
 def _best(candidates: Sequence[Candidate]) -> Candidate | None:
-    sound = [c for c in candidates if c.plausible and np.isfinite(c.cost)]
+    sound = [c for c in candidates if c.plausible and c.simulated and np.isfinite(c.cost)]
     return min(sound, key=lambda c: c.cost) if sound else None
 
 

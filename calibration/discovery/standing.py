@@ -95,7 +95,8 @@ def _ruled_out(
 ) -> list[Candidate]:
     """Candidates that are the better explanation by their evidence and ruled out by their size alone, best first."""
     names = evidence_of_names(space, base, best, settings)
-    ruled_out = [c for c in ladder if not c.plausible and np.isfinite(c.cost) and len(c.effects) <= len(best.effects)]
+    fits = [c for c in ladder if c.simulated and np.isfinite(c.cost) and len(c.effects) <= len(best.effects)]
+    ruled_out = [c for c in fits if not c.plausible]
     evidence = {c.active: evidence_of_names(space, base, c, settings) for c in ruled_out}
     better = [c for c in ruled_out if evidence[c.active] > names + settings.preferred]
     return sorted(better, key=lambda c: -evidence[c.active])

@@ -17,7 +17,6 @@ from calibration.discovery.candidates import Candidate, candidate
 from calibration.discovery.settings import Settings
 from calibration.inference.held_out import search_each
 from calibration.inference.linearization import Linearization
-from calibration.inference.optimizers import linearised
 
 #: Refits with a prior's mean where the last one ended, until it pulls no longer [prior sds].
 ROUNDS, PULL = 3, 0.3
@@ -62,8 +61,8 @@ def shifts(
         at: the fit; its effects stay; linear: the same, linearised, where that is known.
     """
     if linear is None:
-        problem = space.problem(at.active)
-        residual, jacobian, _ = linearised(problem, jnp.asarray(at.z), problem.data)
+        problem, (active,) = space.fitted_by([at.active])
+        residual, jacobian, _ = problem.observe.at(problem, at.z, active)
     else:
         residual, jacobian = linear.residual, linear.jacobian
     explained, values = scores(np.asarray(jacobian), np.asarray(residual))
@@ -85,13 +84,13 @@ def _without_prior(
     None where that is beyond the parameter's bounds, or no optimum.
     """
     p, mean, start = space.free, value, np.array(at.z)
-    indices = space.library.indices(at.active)
+    equipped, (indices,) = space.fitted_by([at.active])
     for _ in range(ROUNDS):
         centre = np.zeros(len(start))
         centre[k] = mean
         start[k] = mean
-        data = dataclasses.replace(space.equipped.data, centre=jnp.asarray(centre))
-        problem = dataclasses.replace(space.equipped, data=data)
+        data = dataclasses.replace(equipped.data, centre=jnp.asarray(centre))
+        problem = dataclasses.replace(equipped, data=data)
         found, _ = search_each(problem, [start], [space.weight], [indices])
         best = jax.tree.map(lambda x: x[0], found)
         z = np.asarray(best.z)

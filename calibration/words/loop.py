@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         Errors,
         Estimate,
         FoundEffect,
+        Ranking,
         Resolved,
         Sensitivity,
         StatedValue,
@@ -237,6 +238,30 @@ def verdict(stages: LoopStages) -> str:
     """The verdict as soon as it is known: `verdict: class, series_resistance or supply_sag`."""
     sure = [" or ".join(members) for members in stages.members] or [f"a {family}" for family in stages.families]
     return f"verdict: {', '.join((stages.verdict, *sure))}"
+
+
+def ranking(found: Ranking, most: int = 5) -> list[str]:
+    """What regression says of the library, a line each: whether anything is missing, and the strongest effects."""
+    if not found.missing:
+        return [f"by regression: nothing is missing (family-wise p = {found.p_value:.2g})"]
+    first = f"by regression, not yet confirmed: something is missing (family-wise p {p_value(found.p_value)})"
+    beyond = [e for e in found.effects if e.score > found.chance and not e.supplies][:most]
+    if not beyond:
+        return [f"{first}; no effect explains more than chance"]
+    lines = [
+        f"  {k}. {e.name}, a {e.family}: lowers the misfit by {e.score:.3g} σ², "
+        f"amplitude {e.amplitude:.3g} ± {e.sd:.2g} {e.unit}".rstrip(" -")
+        for k, e in enumerate(beyond, 1)
+    ]
+    return [f"{first}; effects by what each alone would explain:", *lines]
+
+
+def so_far(effects: Sequence[str], families: Sequence[str]) -> str:
+    """What a search has found whose verdict is not known yet."""
+    return (
+        f"so far, confirmed by simulation: {' and '.join(f'a {f}' for f in dict.fromkeys(families))} "
+        f"({' and '.join(effects)}); which claim stands is not tested yet"
+    )
 
 
 def _without_name(where: DiscrepancyLocation, p: float, no_effect: str) -> str:

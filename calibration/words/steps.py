@@ -40,10 +40,32 @@ STEPS = {
 }
 
 
+#: Stage of the loop that a step belongs to, from 1 on, and how many there are.
+STAGES = {
+    **{"base": 1, "sds": 1, "bootstrap": 2, "effects": 3, "more effects": 3, "alone": 3},
+    **{"held out": 4, "mechanism": 4, "alike": 4, "shape": 5, "errors": 5, "next": 6, "factors": 7, "others": 7},
+}
+OF = max(STAGES.values())
+#: Share of a loop's time that is over when a stage begins: of logs with nothing kept, a guess for others.
+OVER = {2: 0.45, 3: 0.5, 4: 0.7, 5: 0.75, 6: 0.8, 7: 0.9}
+
+
 def step(now: Step) -> str:
-    """A step in a sentence."""
+    """A step in a sentence, a stage of the loop with its number."""
     about = (" and ".join(x) if isinstance(x, tuple) else x for x in now.about)
-    return STEPS[now.name].format(*about)
+    text = STEPS[now.name].format(*about)
+    return f"{STAGES[now.name]} of {OF}, {text}" if now.name in STAGES else text
+
+
+def expected(text: str, seconds: float) -> float | None:
+    """Time that a loop is expected to take yet, by what the stages before took [s]; None where that is not known.
+
+    Args:
+        text: what is said of a stage that begins; seconds: since the loop began.
+    """
+    stage, _, rest = text.partition(f" of {OF}, ")
+    over = OVER.get(int(stage)) if rest and stage.isdigit() else None
+    return None if over is None else seconds * (1 - over) / over
 
 
 def still(doing: str, seconds: float, compiled: int) -> str:

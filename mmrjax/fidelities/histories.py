@@ -154,7 +154,7 @@ class Lag(eqx.Module):
     decay: Float[Array, ""]
 
 
-class _Step(eqx.Module):
+class Step(eqx.Module):
     """A step of a run; or all of them, fields of shape (steps, ...).
 
     Attributes:
@@ -190,7 +190,7 @@ class _Step(eqx.Module):
         return jax.vmap(rate)(at, each)
 
 
-def _steps(conditions: Conditions, times: Float[Array, " times"]) -> tuple[_Step, Conditions]:
+def steps_of(conditions: Conditions, times: Float[Array, " times"]) -> tuple[Step, Conditions]:
     """Every step of a run, and what of its conditions does not change."""
     changing, constant = _in_time(conditions)
     now = jax.tree.map(lambda x: x[:-1], changing)
@@ -203,10 +203,10 @@ def _steps(conditions: Conditions, times: Float[Array, " times"]) -> tuple[_Step
     rests = conditions.begin is None
     begun = jnp.where((jump == 0) & rests, 0.0, 1.0).astype(times.dtype)
     since = times[:-1] - times[jump]
-    return _Step(jnp.diff(times), since, begun, before if conditions.motor_speed is None else None, now), constant
+    return Step(jnp.diff(times), since, begun, before if conditions.motor_speed is None else None, now), constant
 
 
-def _lag(rate: Float[Array, " rates"], step: _Step) -> Lag:
+def _lag(rate: Float[Array, " rates"], step: Step) -> Lag:
     """Of a step, by the rates at its start: what is left by then of the lag after the last jump."""
     if not len(rate):
         return _decaying(jnp.zeros(()), jnp.zeros(()), step.length)
@@ -226,14 +226,12 @@ def _decaying(begin: Array, decay: Array, h: Array) -> Lag:
     return Lag(begin, means, begin * jnp.exp(-decay * h), decay)
 
 
-def _windings(
-    robot: Robot, constant: Conditions, step: _Step, y: Float[Array, " unknowns"]
-) -> Float[Array, " rates"]:
+def _windings(robot: Robot, constant: Conditions, step: Step, y: Float[Array, " unknowns"]) -> Float[Array, " rates"]:
     """What the lag of a step follows from."""
     return step.rates_at_start(constant, lambda y, held: winding(robot, held, y), y)
 
 
-def _lag_of(robot: Robot, constant: Conditions, step: _Step, y: Float[Array, " unknowns"]) -> Lag:
+def _lag_of(robot: Robot, constant: Conditions, step: Step, y: Float[Array, " unknowns"]) -> Lag:
     return _lag(_windings(robot, constant, step, y), step)
 
 
@@ -304,11 +302,11 @@ def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) 
 
     Args: as of `histories`.
     """
-    steps, constant = _steps(conditions, times)
+    steps, constant = steps_of(conditions, times)
     of_first, first_state = at_first(robot, conditions)
     edge, along = _edge(robot, of_first)
 
-    def taken(y: Array, step: _Step) -> tuple[Array, States]:
+    def taken(y: Array, step: Step) -> tuple[Array, States]:
         held, lag = step.held(constant), _lag_of(robot, constant, step, y)
         law = functools.partial(rates, robot, held)
 
@@ -364,7 +362,7 @@ def followed(
     Args: as of `histories`; known: its states, where they are.
     """
     run = states(robot, conditions, times) if known is None else known
-    steps, constant = _steps(conditions, times)
+    steps, constant = steps_of(conditions, times)
     first_state = at_first(robot, conditions)[1]
     begins = jnp.concatenate([first_state[None], run.ends[:-1]])
     # A step to rest and from it: Euler's implicit ones.
@@ -449,9 +447,9 @@ def respond(
 
     Sources of a block's steps are computed side by side; one after another is left only a product a step.
     """
-    steps, constant = _steps(conditions, jnp.append(along.clock[:, 0], along.clock[-1, 2]))
+    steps, constant = steps_of(conditions, jnp.append(along.clock[:, 0], along.clock[-1, 2]))
 
-    def added(along: Followed, step: _Step) -> Array:
+    def added(along: Followed, step: Step) -> Array:
         """By the sources of a step, at its end."""
         held = step.held(constant)
         both = jax.vmap(lambda t, y, way: source(t, y, held, way))(along.clock[1:], along.places, along.sides)
@@ -582,7 +580,7 @@ def within(
     Args: as of `histories`; at: steps that are wanted, by the index of the instant that each begins at.
     """
     ys = _nodes(robot, conditions, times, known)
-    steps, constant = _steps(conditions, times)
+    steps, constant = steps_of(conditions, times)
     then = jax.tree.map(lambda x: x[1:], _in_time(conditions)[0])
     each = ys[:-1], ys[1:], steps, then
     if at is not None:
@@ -591,7 +589,7 @@ def within(
     def shown(conditions: Conditions, y: Array) -> Signals:
         return moving(robot, conditions, state_of(robot, y))
 
-    def one(y: Array, after: Array, step: _Step, then: Conditions) -> Within:
+    def one(y: Array, after: Array, step: Step, then: Conditions) -> Within:
         held = step.held(constant)
         if step.before is None:  # what is imposed is on a line itself
             first = shown(held, y)

@@ -19,11 +19,12 @@ from calibration.discovery import findings
 from calibration.discovery.discover import discover
 from calibration.discovery.kept import OutOfTime
 from calibration.discovery.resolve import check_resolvable, resolve
-from calibration.discovery.result import REFIT_FILE, DiscoveryResult
+from calibration.discovery.result import REFIT_FILE, DiscoveryResult, Ranking
 from calibration.discovery.settings import fewest_replicates
 from calibration.inference import blocks, observers, priors
 from calibration.inference.errors import OF_SIZE
 from calibration.words import loop as said_of
+from calibration.words.steps import expected
 from sweeps import config as configuration
 from sweeps.console import pulse, say, tell
 from sweeps.inputs import load_robot, read_runs
@@ -32,6 +33,8 @@ from sweeps.skeleton import leave, page
 from sweeps.store import SOLVER_FAILED, RunFolder, open_folder
 
 T = TypeVar("T")
+#: File of what regression says before anything is confirmed, and its schema.
+SCREENING_FILE, SCREENING = "screening.json", "mmrjax.screening/1"
 
 
 def loop(
@@ -73,7 +76,9 @@ def _loop(
         return None if within is None else max(within - (time.monotonic() - began), 0.0)
 
     def timed(text: str) -> None:
-        tell(f"{time.monotonic() - began:4.0f} s  {text}")
+        used = time.monotonic() - began
+        more = expected(text, used)
+        tell(f"{used:4.0f} s  {text}{'' if more is None else f' (about {more:.0f} s more)'}")
 
     with open_folder("loop", config, robot, out, force, runs) as folder, pulse(timed, "preparing the table") as heard:
 
@@ -84,6 +89,8 @@ def _loop(
 
         def keep(name: str, make: Callable[[], T]) -> T:
             found = stages[name] = folder.stage(name, make)
+            if name == "ranking":
+                _show_ranking(stages[name], folder, timed)
             if name == "verdict":
                 timed(f"{said_of.verdict(stages[name])}; next, errors held out and other noises")
             return found
@@ -143,6 +150,16 @@ def _alarm(seconds: float | None, wanted: Callable[[], bool]) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
+def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None]) -> None:
+    """Say what regression makes of the library, and leave it in the run folder: the first answer."""
+    first, *lines = said_of.ranking(found)
+    timed(first)
+    for line in lines:
+        tell(line)
+    content = {"schema": SCREENING, "confirmed": False, **dataclasses.asdict(found)}
+    folder.write_json(SCREENING_FILE, content)
+
+
 def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> None:
     """Say which stages are kept, and leave the robot of the base fit where there is one but no verdict."""
     if not stages:
@@ -155,6 +172,15 @@ def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> Non
     if "verdict" in stages:
         traced = stages["verdict"]
         tell(f"{said_of.verdict(traced)}; errors held out and other noises are outstanding")
+        return
+    if "ranking" in stages:
+        for line in said_of.ranking(stages["ranking"]):
+            tell(line)
+    searches = [found for name, found in stages.items() if name.startswith("search")]
+    if searches and (best := searches[-1][2].best) is not None:
+        library = searches[-1][0].base.space.library
+        tell(said_of.so_far(best.effects, [library[n].family() for n in best.effects]))
+    if "base" not in stages:
         return
     base = stages["base"][0].base
     robot = findings.proposed_robot(base.space, base.candidate)

@@ -210,6 +210,10 @@ class Observer(eqx.Module):
     def linearise(self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]) -> Linearization:
         """Residuals, Jacobian and signatures at z."""
 
+    def at_fit(self, problem: Problem, z: Numbers) -> Observer:
+        """The same with what a fit of a problem has found out about its runs."""
+        return self
+
     def draws(self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray) -> Any:
         """What replicates of the bootstrap begin with, leading axis the keys: the keys, or fits of tables drawn.
 

@@ -13,7 +13,7 @@ import operator
 import re
 import threading
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
@@ -41,7 +41,6 @@ from calibration.inference.optimizers import (
     Evaluate,
     Numbers,
     Optimum,
-    computed,
     counted,
     linearised,
     linearised_signed,
@@ -52,7 +51,7 @@ from calibration.inference.priors import DELAY
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax import balances, channels, fidelities, params
 from mmrjax.channels import Channel
-from mmrjax.compiling import OVER_TIME, compiled
+from mmrjax.compiling import OVER_TIME, SELDOM, compiled
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import WAYS
@@ -64,12 +63,14 @@ from mmrjax.fidelities.histories import (
     START,
     STEPS,
     Followed,
+    Step,
     Within,
     at_first,
     followed,
     grid,
     histories,
     respond,
+    steps_of,
     within,
 )
 from mmrjax.params import Scalar
@@ -380,26 +381,62 @@ class Histories(Observer):
     ) -> Float[Array, "probes runs knots samples channels"]:
         """Change of the readings by a defect of each probe's balance [its unit] that is 1 at a knot of a run and
         falls linearly to 0 at the next ones; an effect `probe` is its amplitude in its balance."""
+        return self.changes(robot, probes, ())[0]
+
+    def changes(
+        self, robot: Robot, probes: tuple[Effect, ...], effects: tuple[ScoredEffect, ...]
+    ) -> tuple[Float[Array, "probes runs knots samples channels"], Float[Array, "runs samples channels instances"]]:
+        """The same, and the change of the readings by each effect at every point of its shape's grid.
+
+        An effect enters one balance with one amplitude. So it changes a run as a defect of that balance does that has
+        the values of its term. What an effect remembers follows from the run too. Between two instants its change of
+        a reading is on a straight line.
+        """
+        others = dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor")
+        entered = tuple(probe(b) for b in others if b not in {p.balance for p in probes})
+        every, size = (*probes, *entered), len(probes)
+        effects = tuple(_shaped_as_in(robot, e) for e in effects)
+        counts, places = np.array([len(e.at) for e in effects], int), [p.balance for p in every]
+        entering = np.array([places.index(b) if (b := e.effect.balance) in places else 0 for e in effects], int)
+        entering = np.repeat(entering, counts)
+        enters = np.repeat([1.0 * (e.effect.balance in places) for e in effects], counts)
+        shown = channels.names(robot.channels)
+        at_sensor = np.array([[e.effect.channel == c for e in effects] for c in shown], float)
+        at_sensor = np.repeat(at_sensor, counts, 1) if effects else np.zeros((len(shown), 0))
         clock = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.knots]]
 
-        def one(conditions: Conditions, clock: Array, instants: Array, along: Followed) -> Array:
-            def probed(amplitude: Array) -> Robot:
-                put = tuple(eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(probes, amplitude, strict=True))
-                return dataclasses.replace(robot, effects=(*robot.effects, *put))
+        def probed(amplitude: Array) -> Robot:
+            put = tuple(eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(every, amplitude, strict=True))
+            return dataclasses.replace(robot, effects=(*robot.effects, *put))
 
-            none = jnp.zeros(len(probes))
+        none = jnp.zeros(len(every))
+
+        def one(
+            conditions: Conditions, clock: Array, instants: Array, along: Followed, times: Array, time: Array
+        ) -> tuple[Array, Array]:
             # A run that ended early repeats its last knot; only the first of them is one.
             real = jnp.concatenate([jnp.ones(1), (jnp.diff(clock) > 0).astype(clock.dtype)])
             before = jnp.concatenate([clock[:1], clock[:-1]])
             after = jnp.concatenate([clock[1:], clock[-1:] + 1.0])
+            remembered = _remembered(robot, conditions, along, effects)
 
             def hat(t: Array) -> Array:
                 rising = ((t - before) / jnp.maximum(clock - before, 1e-12)).at[0].set(1.0)
                 falling = jnp.where(after > clock, (after - t) / jnp.where(after > clock, after - clock, 1.0), 1.0)
                 return real * jnp.clip(jnp.minimum(rising, falling), 0.0, 1.0)
 
+            def terms(t: Array, y: Array, held: Conditions, way: Array | None = None) -> Array:
+                signals = moving(robot, held, state_of(robot, y), way)
+                return _terms(robot, signals, effects, remembered(t))
+
+            def both(by_probes: Array, t: Array, term: Array) -> Array:
+                """Changes by defects of all knots and by every instance, by the change by each probe."""
+                knots = (by_probes[:, :size, None] * hat(t)).reshape(len(by_probes), -1)
+                return jnp.concatenate([knots, by_probes[:, entering] * (enters * term)], 1)
+
             def source(t: Array, y: Array, held: Conditions, way: Array) -> Array:
-                return jax.jacfwd(lambda a: rates(probed(a), held, y, way))(none)[:, :, None] * hat(t)
+                by_probes = jax.jacfwd(lambda a: rates(probed(a), held, y, way))(none)
+                return both(by_probes, t, terms(t, y, held, way))
 
             def seen(t: Array, y: Array, dy: Array, held: Conditions) -> Array:
                 """By the state, and at once: the current follows from torque where the speed is imposed."""
@@ -408,21 +445,32 @@ class Histories(Observer):
                     return _reading(robot, moving(probed(amplitude), held, state_of(robot, y)))
 
                 by_state, at_once = jax.jacfwd(reading, (0, 1))(y, none)
-                return jnp.tensordot(by_state, dy, 1) + at_once[:, :, None] * hat(t)
+                term = terms(t, y, held)
+                shows = jnp.concatenate([jnp.zeros((len(by_state), size * len(clock))), at_sensor * term], 1)
+                return by_state @ dy + both(at_once, t, term) + shows
 
             first, begins = at_first(robot, conditions)
-            unmoved = jnp.zeros((len(begins), len(probes), len(clock)))
+            by_probes = jax.jacfwd(lambda a: at_first(probed(a), conditions)[1])(none)
+            begun = by_probes[:, entering] * (enters * terms(clock[0], begins, first))
+            unmoved = jnp.concatenate([jnp.zeros((len(begins), size * len(clock))), begun], 1)
             changed = respond(conditions, along, source, seen, unmoved)
-            still = seen(clock[0], begins, unmoved, first)
-            whole = jnp.concatenate([still[None], changed])
-            return jnp.moveaxis(whole[instants], (0, 1), (2, 3))  # probes, knots, samples, channels
+            whole = jnp.concatenate([seen(clock[0], begins, unmoved, first)[None], changed])
+            knots = whole[instants, :, : size * len(clock)].reshape(len(instants), -1, size, len(clock))
+            mine = whole[:, :, size * len(clock) :]
+            if self.delayed:
+                step, share = robot.rig.before(times, time)
+                by_effects = mine[step] + share[:, None, None] * (mine[step + 1] - mine[step])
+            else:
+                by_effects = mine[instants]
+            return knots.transpose(2, 3, 0, 1), by_effects
 
-        instants = self.instant[jnp.where(self.rows_of < 0, 0, self.rows_of)]
+        rows = jnp.where(self.rows_of < 0, 0, self.rows_of)
         known = self.following(robot).known
         assert known is not None
         # One run after another: each is wide by its knots, and large.
-        found = jax.lax.map(lambda of_run: one(*of_run), (self.conditions, clock, instants, known))
-        return jnp.moveaxis(found, 0, 1)
+        given = self.conditions, clock, self.instant[rows], known, self.times, self.time[rows]
+        knots, by_effects = jax.lax.map(lambda of_run: one(*of_run), given)
+        return jnp.moveaxis(knots, 0, 1), by_effects
 
     def following(self, robot: Robot) -> Histories:
         """The same for a robot whose runs are then known."""
@@ -556,70 +604,38 @@ class Histories(Observer):
     def linearise(
         self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]
     ) -> HistoriesLinearization:
-        """As the protocol says. Effects that keep a memory act by the whole past of a run, so a signature is the
-        derivative of the run by the amplitude. All effects are in one run, once for each point of the shapes'
-        grids; those that are there already keep their shape. What else is asked of the fit is by a run of the same
-        robot, so that one program follows all of them."""
-        have = {e.name for e in problem.base.effects}
-        added = tuple(e.absent for e in effects if e.effect.name not in have)
-        whole = dataclasses.replace(problem.base, effects=(*problem.base.effects, *added))
-        problem = dataclasses.replace(problem, base=whole)
-        robot = problem.robot(z)
-        sds = jnp.stack([jnp.asarray(e.effect.amplitude) for e in effects])
-
-        def at(point: Array, x: Array) -> Robot:
-            """At coordinates, with more of each effect; those that are not there have their shapes at a point of the
-            grid."""
-            robot, more, put = problem.robot(x[: z.size]), x[z.size :], {}
-            value = {p.name: p.value for p in params.walk(robot)}
-            for k, e in enumerate(effects):
-                amplitude = f"effects.{e.effect.name}.amplitude"
-                put[amplitude] = value[amplitude] + more[k] * sds[k]
-                if e.shape:
-                    shape = f"effects.{e.effect.name}.{e.shape}"
-                    wanted = e.values[jnp.minimum(point, len(e.values) - 1)]
-                    put[shape] = jnp.where(value[amplitude] == 0, wanted, value[shape])
-            return params.replace(robot, put)
-
-        wide, points = jnp.concatenate([z, jnp.zeros(len(effects))]), max(len(e.at) for e in effects)
-
-        @jax.jit  # traced once for both that ask
-        def runs_at(point: Array) -> Followed | None:
-            return self.following(at(point, wide)).known
-
-        def along(_: Followed, point: Array) -> tuple[Followed | None, tuple[Array, Array]]:
-            known = runs_at(point)
-            posed = dataclasses.replace(problem, observe=dataclasses.replace(self, known=known))
-            return known, posed.linearised(lambda x: at(point, x), wide, data)[:2]
-
-        # Runs of many steps are large: kept are those at the first point, the last that is looked at.
-        one = jax.eval_shape(runs_at, jnp.asarray(0))
-        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), one)
-        first, (r, slopes) = jax.lax.scan(along, nothing, jnp.arange(points), reverse=True)
-        size, shown = z.size, data.measured.size
-        parts = [slopes[j, :shown, size + k] for k, e in enumerate(effects) for j in range(len(e.at))]
-        residual = jnp.concatenate([r[0], z - data.centre])
-        jacobian = jnp.concatenate([slopes[0, :, :size], jnp.eye(size)])
-        residual, jacobian = counted(*computed(residual, jacobian, data), penalties(data))
-        known = dataclasses.replace(self, known=first)
-        defects = known.defective(robot, tuple(probe(b) for b in PROBED))
-        scale = data.weight / data.sd
-        defects = jnp.where(self.rows_of[:, None, :, None] < 0, 0.0, defects * scale[self.rows_of][:, None])
-        runs = known.whole(robot)
+        """As the protocol says; residuals and Jacobian by the program of the searches, and what defects and effects
+        change (`changes`) along the run that it has followed."""
+        problem = dataclasses.replace(problem, data=data)
+        which = getattr(problem.coordinates, "active", None)
+        twice = lambda x: jnp.stack([jnp.asarray(x)] * TOGETHER)  # noqa: E731
+        members = twice(z), twice(data.weight), None if which is None else twice(which)
+        r, jacobian, _, known = jax.tree.map(lambda x: x[0], _evaluate(problem, *members))
+        residual, jacobian = counted(r, jacobian, penalties(data))
+        robot, observe = problem.robot(jnp.asarray(z)), dataclasses.replace(self, known=known)
+        signatures, defects, signals, angle = _responses(observe, robot, effects, data.weight / data.sd)
         return HistoriesLinearization(
             residual,
             jacobian,
-            finite(jnp.stack(parts, 1)),
-            finite(defects),
-            scale,
-            self.at_rows(runs),
+            signatures,
+            defects,
+            data.weight / data.sd,
+            signals,
             self.rows_of,
             self.knots,
             self.time,
-            self.angle(runs),
+            angle,
             channels=channels.names(problem.channels),
             magnitudes=robot.rig.magnitudes,
         )
+
+    def at_fit(self, problem: Problem, z: Numbers) -> Histories:
+        """The same with its runs known as they are at coordinates z, by the program of the searches."""
+        which = getattr(problem.coordinates, "active", None)
+        twice = lambda x: np.stack([np.asarray(x)] * TOGETHER)  # noqa: E731
+        members = twice(z), twice(problem.data.weight), None if which is None else twice(which)
+        known = _evaluate(problem, *members)[3]
+        return dataclasses.replace(self, known=jax.tree.map(lambda x: x[0], known))
 
     def replicate(
         self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Array
@@ -1082,7 +1098,7 @@ def _evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Ev
     def some(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
         filled = np.resize(np.arange(len(members)), TOGETHER)
         own = None if active is None else np.asarray(active)[members[filled]]
-        return jax.device_get(_evaluate(problem, z[filled], weights[members[filled]], own))
+        return jax.device_get(_evaluate(problem, z[filled], weights[members[filled]], own)[:3])
 
     def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
         parts = [(z[k : k + TOGETHER], members[k : k + TOGETHER]) for k in range(0, len(members), TOGETHER)]
@@ -1097,11 +1113,134 @@ def _evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Ev
 @functools.partial(compiled, options=OVER_TIME)
 def _evaluate(
     problem: Problem, z: Numbers, weights: Numbers, active: Numbers | None
-) -> tuple[Array, Array, Observation]:
-    def one(z: Array, weight: Array, which: Array | None) -> tuple[Array, Array, Observation]:
+) -> tuple[Array, Array, Observation, Followed]:
+    """Of members of a search what `linearised_signed` returns, and their runs."""
+
+    def one(z: Array, weight: Array, which: Array | None) -> tuple[Array, Array, Observation, Followed]:
         here = problem
         if which is not None:
             here = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(which))
-        return linearised_signed(here, z, dataclasses.replace(problem.data, weight=weight))
+        observe: Histories = problem.observe.following(here.robot(z))  # type: ignore[attr-defined]
+        here = dataclasses.replace(here, observe=observe)
+        assert observe.known is not None
+        return *linearised_signed(here, z, dataclasses.replace(problem.data, weight=weight)), observe.known
 
     return jax.vmap(one)(z, weights, active)
+
+
+@functools.partial(compiled, options=SELDOM)
+def _responses(
+    observe: Histories, robot: Robot, effects: tuple[ScoredEffect, ...], scale: Array
+) -> tuple[Array, Array, Signals, Array]:
+    """Signatures and defects as of `HistoriesLinearization`, signals of every row, and the angle there.
+
+    Args:
+        observe: whose runs are known; scale: of readings [1/SI], shape (rows, channels).
+    """
+    defects, by_effects = observe.changes(robot, tuple(probe(b) for b in PROBED), effects)
+    rows_of, rows = observe.rows_of, len(scale)
+    defects = jnp.where(rows_of[:, None, :, None] < 0, 0.0, defects * scale[rows_of][:, None])
+    signatures = _by_row(by_effects, rows_of, rows) * scale[..., None]
+    runs = observe.whole(robot)
+    by_reading = signatures.reshape(scale.size, -1)
+    return finite(by_reading), finite(defects), observe.at_rows(runs), observe.angle(runs)
+
+
+def _shaped_as_in(robot: Robot, scored: ScoredEffect) -> ScoredEffect:
+    """An effect with its grid; with the shape that it has in a robot in which it is present."""
+    own = next((e for e in robot.effects if e.name == scored.effect.name), None)
+    if own is None or not scored.shape:
+        return scored
+    shape = getattr(own, scored.shape)
+    return dataclasses.replace(scored, values=jnp.where(jnp.asarray(own.amplitude) == 0, scored.values, shape))
+
+
+def _each(scored: ScoredEffect, function: Callable[[Effect, Array], Array], given: Array) -> Array:
+    """A function of an effect at every point of its shape's grid, and of what is given there, shape (grid,)."""
+    if not scored.shape:
+        return function(scored.effect, given[0])[None]
+    at = lambda v, x: function(params.replace(scored.effect, {scored.shape: v}), x)  # noqa: E731
+    return jax.vmap(at)(scored.values, given)
+
+
+def _terms(robot: Robot, signals: Signals, effects: tuple[ScoredEffect, ...], memory: list[Array]) -> Array:
+    """Terms of effects in their balances at an instant, shape (instances,).
+
+    Args:
+        memory: of every effect at each point of its grid, any number where it has none.
+    """
+
+    def term(effect: Effect, remembered: Array) -> Array:
+        alone = dataclasses.replace(robot, effects=(effect,))
+        with_memory = dataclasses.replace(signals, memory={**signals.memory, effect.name: remembered})
+        return jnp.asarray(balances.added(alone, with_memory, effect.balance, effect.channel), float)
+
+    found = [_each(e, term, m) for e, m in zip(effects, memory, strict=True)]
+    return jnp.concatenate(found) if found else jnp.zeros(0)
+
+
+def _remembered(
+    robot: Robot, conditions: Conditions, along: Followed, effects: tuple[ScoredEffect, ...]
+) -> Callable[[Array], list[Array]]:
+    """What effects remember along a run that is known, each at every point of its grid, as a function of time.
+
+    By the stages of the run (`histories.followed`); a rate is linear in what it is a rate of, or nearly so.
+    """
+    mine = [e for e in effects if e.effect.memory_size is not None]
+    counts = np.cumsum([len(e.at) for e in mine])
+    nothing = [jnp.zeros(len(e.at)) for e in effects]
+    if not mine:
+        return lambda t: nothing
+
+    def split(memory: Array) -> list[Array]:
+        return jnp.split(memory, counts[:-1])
+
+    def speeds(y: Array, held: Conditions, way: Array, memory: Array) -> Array:
+        signals = moving(robot, held, state_of(robot, y), way)
+
+        def rate(effect: Effect, remembered: Array) -> Array:
+            known = dataclasses.replace(signals, memory={**signals.memory, effect.name: remembered})
+            return jnp.asarray(effect.rate(robot, known), float)
+
+        return jnp.concatenate([_each(e, rate, m) for e, m in zip(mine, split(memory), strict=True)])
+
+    times = jnp.append(along.clock[:, 0], along.clock[-1, 2])
+    steps, constant = steps_of(conditions, times)
+
+    def after(memory: Array, step: tuple[Followed, Step]) -> tuple[Array, Array]:
+        here, taken = step
+        held, spans, passes = taken.held(constant), jnp.diff(here.clock), here.sides[0] != here.sides[1]
+
+        def stage(memory: Array, span: Array, y: Array, way: Array) -> Array:
+            law = lambda m: speeds(y, held, way, m)  # noqa: E731
+            speed, slope = jax.jvp(law, (memory,), (jnp.ones_like(memory),))
+            return memory + span * speed / (1 - span * slope)
+
+        first = stage(memory, spans[0], here.places[0], here.sides[0])
+        ahead = jnp.where(passes, 1.0, spans[1] / jnp.where(spans[0] > 0, spans[0], 1.0))
+        span = jnp.where(passes, spans[1], spans[0])
+        last = stage(memory + ahead * (first - memory), span, here.places[1], here.sides[1])
+        return last, jnp.stack([first, last])
+
+    begin = at_first(robot, conditions)[1]
+    angle = state_of(robot, begin).distance / robot.chassis(conditions.configuration).radius
+    begun = jnp.concatenate(
+        [
+            _each(e, lambda effect, _: jnp.asarray(effect.initial(robot, angle), float), jnp.zeros(len(e.at)))
+            for e in mine
+        ]
+    )
+    stages = jax.lax.scan(after, begun, (along, steps))[1]
+    nodes = jnp.concatenate([begun[None], stages.reshape(-1, len(begun))])
+    clock = jnp.append(along.clock[0, 0], along.clock[:, 1:].ravel())
+
+    def at_time(t: Array) -> list[Array]:
+        k = jnp.clip(jnp.searchsorted(clock, t, side="right") - 1, 0, len(clock) - 2)
+        length = clock[k + 1] - clock[k]
+        share = jnp.clip(jnp.where(length > 0, (t - clock[k]) / jnp.where(length > 0, length, 1.0), 0.0), 0.0, 1.0)
+        found = iter(split(nodes[k] + share * (nodes[k + 1] - nodes[k])))
+        return [
+            zero if e.effect.memory_size is None else next(found) for e, zero in zip(effects, nothing, strict=True)
+        ]
+
+    return at_time

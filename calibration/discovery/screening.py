@@ -1,0 +1,195 @@
+"""Screening by regression: fits of sets of effects on the equations of one fit made linear, where runs take long.
+
+A signature is the derivative of the readings by an amplitude. With the signatures at one fit, a fit of any set of
+effects is a least-squares problem of a few unknowns. (Gautier and Khalil 1990 do so with torques, their inverse
+dynamic identification model.) It ranks every effect in milliseconds. Simulation then confirms the first of them,
+since a signature does not show how a run bends.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from calibration.discovery.active_set import CandidateSpace
+from calibration.discovery.adequacy import Diagnosis
+from calibration.discovery.candidates import Candidate, candidate, empty, fit_candidates
+from calibration.discovery.score_tests import ScoreTable
+from calibration.discovery.settings import Settings
+from calibration.inference.linearization import Linearization
+from calibration.inference.optimizers import Optimum
+
+#: Sets that are fitted by simulation in a round: the first by regression and its nearest rivals, of which one is of
+#: another family.
+CONFIRMED = 3
+#: Further ones where simulation does not confirm the first.
+FURTHER = 3
+
+
+#: Largest amplitude at which a fit begins [prior sds of a fit].
+FAR = 1.5
+#: Effects for which the program of a log's fits is compiled at first, and how many of them are there since they act
+#: like the first.
+ROOM, NEAR = 8, 5
+
+
+@dataclasses.dataclass(frozen=True)
+class Confirmed:
+    """Sets of effects after a round of screening.
+
+    Attributes:
+        candidates: of every set, by simulation where it was made, else by regression.
+        asked: how many fits by simulation were set against their regression; otherwise: how many of these explained
+            less than the regression said, by more than `Settings.same`.
+        room: names of the effects for which the program of these fits has room, see `CandidateSpace`.
+    """
+
+    candidates: tuple[Candidate, ...]
+    asked: int = 0
+    otherwise: int = 0
+    room: tuple[str, ...] = ()
+
+
+class Regression:
+    """Fits of sets of effects on the linearisation of a fit.
+
+    Args:
+        at: the fit; linear, scores: it linearised, and what each effect could explain of what it leaves.
+    """
+
+    def __init__(
+        self, space: CandidateSpace, at: Candidate, linear: Linearization, scores: ScoreTable, settings: Settings
+    ) -> None:
+        self.space, self.at, self.scores, self.settings = space, at, scores, settings
+        self.jacobian, self.residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
+        self.signatures = np.asarray(linear.signatures)
+
+    def __call__(self, active: tuple[str, ...]) -> Candidate:
+        """The candidate with these effects in the slots; new ones have the shape of their grid that scores best."""
+        p, s, at = self.space.free, self.settings.slots, self.at
+        size = self.jacobian.shape[1]  # residuals of the priors come last, in the order of the coordinates
+        slopes, residual, own = self.jacobian[:-size], self.residual[:-size].copy(), self.residual[-size:]
+        for old, name in enumerate(at.active):
+            if name and name not in active:  # at amplitude 0
+                residual -= slopes[:, p + old] * at.z[p + old]
+        z, columns, places = np.concatenate([at.z[:p], np.zeros(2 * s)]), [slopes[:, :p]], [*range(p)]
+        for slot, name in enumerate(active):
+            if not name:
+                continue
+            here = [p + slot, p + s + slot]
+            if name in at.active:
+                known = [p + at.active.index(name), p + s + at.active.index(name)]
+                columns.append(slopes[:, known])
+                z[here] = at.z[known]
+            else:
+                m = self.space.library.best_instance(name, np.asarray(self.scores.single))
+                columns.append(np.zeros((len(slopes), 2)))
+                columns[-1][: len(self.signatures), 0] = self.settings.width * self.signatures[:, m]
+                z[here[1]] = self.space.library.at[m]
+            places += here
+        whole = np.concatenate([np.concatenate(columns, 1), np.eye(len(places))])
+        left = np.concatenate([residual, own[:p], z[places[p:]]])
+        covariance = np.linalg.inv(whole.T @ whole)
+        step = -covariance @ (whole.T @ left)
+        z[places] += step
+        sd = np.ones(len(z))
+        sd[places] = np.sqrt(np.diag(covariance))
+        cost = np.asarray(0.5 * np.sum((left + whole @ step) ** 2))
+        parts: tuple[Any, ...] = (z, sd, covariance, cost, np.asarray(0.0), np.asarray(True), np.asarray(0))
+        found = Optimum(*parts)
+        return dataclasses.replace(candidate(self.space, active, found, self.settings), simulated=False)
+
+
+def confirmed(space: CandidateSpace, screened: Sequence[Candidate], settings: Settings) -> Confirmed:
+    """Simulate the first sets of a round that was screened by regression.
+
+    These are the plausible set that explains most, its nearest rival, the nearest of another family, and one that
+    explains more and is not of a plausible size. Where the first explains less than its regression said, by more than
+    `Settings.same`, the simulation decides, and the next by regression is tried too: of those for which the program
+    has room, or which promise more.
+    """
+    fits = lambda c: {*c.effects} <= {*space.room}  # noqa: E731
+    # What the program has no room for takes another program, and has to promise that much more.
+    order = sorted(screened, key=lambda c: c.cost + (0.0 if fits(c) else settings.same / 2))
+    order = [c for c in order if np.isfinite(c.cost)]
+    first, found = _first(space, order), dict[tuple[str, ...], Candidate]()
+    space = space.with_room([*space.room, *(n for c in first for n in c.effects)])  # one program for all of them
+    said = {c.active: c for c in order}
+
+    def less(c: Candidate) -> bool:
+        return 2 * (c.cost - said[c.active].cost) > settings.same
+
+    def simulate(those: Sequence[Candidate]) -> None:
+        """From where the regression has them; what explains less there, and the first of all, from the prior mean
+        too: what a model lacks may have led the fit without it elsewhere."""
+        made = fit_candidates(space, [(c.active, _begins(space, c)) for c in those], settings)
+        found.update({c.active: c for c in made})
+        doubted = [c for c in those if less(found[c.active]) or c is first[0]]
+        at_mean = [np.where(np.arange(len(c.z)) < space.free, 0.0, _begins(space, c)) for c in doubted]
+        again = fit_candidates(space, [(c.active, z) for c, z in zip(doubted, at_mean, strict=True)], settings)
+        found.update({c.active: c for c in again if c.cost < found[c.active].cost})
+
+    simulate(first)
+    leader = first[0] if first else None
+    for _ in range(FURTHER):
+        best = min((c.cost for c in found.values() if c.plausible), default=np.inf)
+        rest = [c for c in order if c.active not in found and c.plausible]
+        further = [c for c in rest if c.cost < best or fits(c)]
+        if leader is None or not less(found[leader.active]) or not further:
+            break
+        leader = further[0]
+        simulate([leader])
+    every = tuple(found.get(c.active, c) for c in screened)
+    return Confirmed(every, len(found), sum(less(c) for c in found.values()), space.room)
+
+
+def _begins(space: CandidateSpace, screened: Candidate) -> np.ndarray:
+    """Where a simulation of a screened set begins: amplitudes no larger than a step of a search may be."""
+    z, p, slots = screened.z.copy(), space.free, len(screened.active)
+    z[p : p + slots] = np.clip(z[p : p + slots], -FAR, FAR)
+    return z
+
+
+def _first(space: CandidateSpace, order: Sequence[Candidate]) -> list[Candidate]:
+    """The sets that are simulated first, of those in the order of what they explain."""
+    families = lambda c: frozenset(space.library[n].family() for n in c.effects)  # noqa: E731
+    sound = [c for c in order if c.plausible]
+    if not sound:
+        return list(order[:1])
+    of_others = [c for c in sound if families(c) != families(sound[0])]
+    chosen = [sound[0], *of_others[:1], *sound[1:]]
+    chosen = list({c.active: c for c in chosen}.values())[:CONFIRMED]
+    return [*chosen, *(c for c in order[:1] if not c.plausible)]
+
+
+def ranked(
+    space: CandidateSpace, wanted: Sequence[tuple[tuple[str, ...], Candidate, Diagnosis]], settings: Settings
+) -> list[Candidate]:
+    """Sets of effects by regression, each beside another fit.
+
+    Args:
+        wanted: (active effects, the other fit, what that leaves).
+    """
+    known = {id(left): Regression(space, at, left.linear, left.scores, settings) for _, at, left in wanted}
+    return [known[id(left)](active) for active, _, left in wanted]
+
+
+def with_room(
+    space: CandidateSpace, base: Candidate, linear: Linearization, scores: ScoreTable, settings: Settings
+) -> CandidateSpace:
+    """The space with room in its fits for the effects that are simulated first, for others that act like the first of
+    them, and for the best of other families; as it is where runs are not long."""
+    if not space.bare.observe.long:
+        return space
+    beside, library = Regression(space, base, linear, scores, settings), space.library
+    order = sorted((beside((name, *empty(settings)[1:])) for name in library.names), key=lambda c: c.cost)
+    first = [c.active[0] for c in _first(space, order)]
+    cosine = np.abs(np.asarray(scores.cosine)[library.best_instance(first[0], np.asarray(scores.single))])
+    alike = library.largest(cosine)
+    near = [library.names[k] for k in np.argsort(-alike) if alike[k] > settings.alike]
+    best = {library[c.active[0]].family(): c for c in reversed(order)}  # of each family
+    others = [c.active[0] for c in sorted(best.values(), key=lambda c: c.cost)]
+    return space.with_room([*dict.fromkeys((*first, *near[:NEAR], *others))][:ROOM])

@@ -1,0 +1,211 @@
+"""Sets of effects are ranked by regression where runs take long, and simulation confirms the first of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import Analyst, table
+from worlds import histories, rigs
+
+from calibration.discovery import screening
+from calibration.discovery.candidates import Candidate, filled
+from calibration.discovery.result import Ranked, Ranking
+from calibration.discovery.score_tests import ScoreTable
+from calibration.discovery.settings import settings_for
+from calibration.inference.held_out import unseen
+from calibration.inference.observers import Histories
+from calibration.words import loop as words
+from mmrjax.effects import BY_NAME
+from sweeps.commands import loop as command
+
+NAMES = ("churning", "stribeck_track", "series_resistance", "brush_drop")
+ANALYST = Analyst(dataclasses.replace(settings_for(Histories, 300), slots=2), {n: BY_NAME[n] for n in NAMES})
+
+
+@pytest.fixture(scope="module")
+def space():
+    """What can be fitted to two starts; nothing is."""
+    runs = table(histories.narrow((), 0.0, 1, duration=0.4, every=0.02))
+    return ANALYST.space(runs.where(np.isin(runs["run_id"], ["start0", "start3"])))
+
+
+def test_the_program_of_a_log_has_the_effects_that_are_asked_for_and_those_of_its_room(space):
+    problem, indices = space.with_room(["churning"]).fitted_by([("brush_drop", ""), ("", "churning")])
+    names = problem.coordinates.names
+    assert set(names) == {"churning", "brush_drop"} == {e.name for e in problem.base.effects}
+    assert [tuple(names[k] if k >= 0 else "" for k in each) for each in indices] == [
+        ("brush_drop", ""), ("", "churning"),
+    ]  # fmt: skip
+    z = np.linspace(-0.4, 0.5, len(space.coordinates))
+    mine = problem.coordinates.with_effects(indices[0]).robot(problem.base, jnp.asarray(z))
+    every = space.coordinates.with_effects(space.library.indices(("brush_drop", "")))
+    whole = every.robot(space.equipped.base, jnp.asarray(z))
+    (one,) = (e for e in mine.effects if e.name == "brush_drop")
+    (other,) = (e for e in whole.effects if e.name == "brush_drop")
+    assert float(one.amplitude) == float(other.amplitude) != 0
+    assert float(mine.motor.resistance) == float(whole.motor.resistance)
+
+
+def linear_world(space, seed=3):
+    """A linearisation of the space's base in which every reading is linear, and what its effects explain there."""
+    rng, p, rows = np.random.default_rng(seed), space.free, 40
+    jacobian = np.concatenate([rng.standard_normal((rows, p)), np.zeros((rows, p)), np.eye(p)])
+    signatures = rng.standard_normal((rows, len(space.library.of)))
+    m = space.library.best_instance("churning", np.where(space.library.of == 0, 2.0, 1.0))
+    residual = np.concatenate([0.1 * rng.standard_normal(rows), np.zeros(rows), np.zeros(p)])
+    residual[:rows] -= 2.0 * signatures[:, m]  # an amplitude of 2 prior sds takes it away
+    single = np.where(np.arange(len(space.library.of)) == m, 9.0, 1.0)
+    none = jnp.zeros(0)
+    scores = ScoreTable(single, none, none, none, none, none, none, none, none)
+    at = Candidate(("", ""), np.zeros(p + 4), np.ones(p + 4), 0.5 * float(residual @ residual), np.zeros(2),
+                   np.zeros(2), True, True, True)  # fmt: skip
+    linear = SimpleNamespace(jacobian=jacobian, residual=residual, signatures=signatures)
+    return screening.Regression(space, at, linear, scores, ANALYST.settings), at, linear, m
+
+
+def test_a_regression_is_the_least_squares_fit_of_base_amplitudes_and_their_priors(space):
+    beside, at, linear, m = linear_world(space)
+    found, width, p = beside(("churning", "")), ANALYST.settings.width, space.free
+    columns = np.concatenate([linear.jacobian[:40], width * linear.signatures[:, [m]]], 1)
+    whole, left = np.concatenate([columns, np.eye(p + 1)]), np.concatenate([linear.residual[:40], np.zeros(p + 1)])
+    step, *_ = np.linalg.lstsq(whole, -left, rcond=None)
+    np.testing.assert_allclose(found.z[:p], step[:p], atol=1e-9)
+    assert found.z[p] == pytest.approx(step[p], rel=1e-9) and abs(found.amplitude[0] - 2.0) < 0.2
+    shape = space.library.at[m]
+    assert found.cost == pytest.approx(0.5 * np.sum((left + whole @ step) ** 2) + 0.5 * shape**2, rel=1e-9)
+    assert not found.simulated and found.cost < 0.1 * at.cost
+
+
+def test_a_regression_takes_an_effect_of_the_other_fit_away(space):
+    """From a fit with an effect that is all there is back to nothing."""
+    beside, at, linear, m = linear_world(space)
+    p, width = space.free, ANALYST.settings.width
+    wide = np.zeros((80 + p + 4, p + 4))
+    wide[:80, :p] = linear.jacobian[:80]
+    wide[:40, p] = width * linear.signatures[:, m]
+    wide[80:] = np.eye(p + 4)
+    there = np.zeros(p + 4)
+    there[p] = 2.0 / width
+    residual = np.concatenate([linear.residual[:80], np.zeros(p + 4)]) + wide @ there
+    fitted = dataclasses.replace(at, active=("churning", ""), z=there, cost=0.5 * float(residual @ residual))
+    after = SimpleNamespace(jacobian=wide, residual=residual, signatures=linear.signatures)
+    back = screening.Regression(space, fitted, after, beside.scores, ANALYST.settings)(("", ""))
+    assert back.cost == pytest.approx(beside(("", "")).cost, rel=1e-9)
+    np.testing.assert_allclose(back.z, beside(("", "")).z, atol=1e-9)
+
+
+def ranked_sets(space, **explained):
+    """Screened single effects that explain so much [σ²], of 1000."""
+    at = np.zeros(space.free + 4)
+    return [
+        Candidate(filled([n], ANALYST.settings), at, at, 500 - x / 2, np.zeros(2), np.zeros(2), True, True, True,
+                  simulated=False)
+        for n, x in explained.items()
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("simulated", "asked", "otherwise"),
+    [
+        ({"churning": 900, "series_resistance": 500, "stribeck_track": 895}, 3, 0),
+        ({"churning": 300, "series_resistance": 500, "stribeck_track": 400, "brush_drop": 700}, 4, 2),
+    ],
+)
+def test_simulation_confirms_the_first_and_its_rivals_or_another_is_tried(
+    space, monkeypatch, simulated, asked, otherwise
+):
+    tried = []
+
+    def fit(space, proposals, settings):
+        tried.extend(names[0] for names, _ in proposals)
+        return [
+            dataclasses.replace(c, simulated=True)
+            for names, _ in proposals
+            for c in ranked_sets(space, **{names[0]: simulated[names[0]]})
+        ]
+
+    monkeypatch.setattr(screening, "fit_candidates", fit)
+    screened = ranked_sets(space, churning=900, stribeck_track=890, series_resistance=500, brush_drop=480)
+    found = screening.confirmed(space.with_room(NAMES), screened, ANALYST.settings)
+    assert (found.asked, found.otherwise) == (asked, otherwise)
+    assert [c.simulated for c in found.candidates].count(True) == asked
+    assert tried[:4] == ["churning", "series_resistance", "stribeck_track", "churning"]  # from the prior mean too
+    assert tried.count("series_resistance") == 1 and tried.count("stribeck_track") == (1 if otherwise == 0 else 2)
+    best = min((c for c in found.candidates if c.simulated), key=lambda c: c.cost)
+    assert best.effects == (("churning",) if otherwise == 0 else ("brush_drop",))
+
+
+def test_a_refit_without_a_block_is_a_step_of_gauss_and_newton():
+    rng, rows = np.random.default_rng(5), 12
+    slopes, truth = rng.standard_normal((rows, 2, 3)), np.array([0.3, -0.2, 0.5])
+    sd, measured = np.full((rows, 2), 0.1), slopes @ truth + 0.1 * rng.standard_normal((rows, 2))
+
+    def at(problem, z, active):
+        residual = np.concatenate([((slopes @ z - measured) / sd).ravel(), np.zeros(rows), z])
+        jacobian = np.concatenate([(slopes / sd[..., None]).reshape(-1, 3), np.zeros((rows, 3)), np.eye(3)])
+        return residual, jacobian, SimpleNamespace(reading=slopes @ z, status=np.zeros(rows, int))
+
+    observe = SimpleNamespace(long=True, at=at, unreachable=lambda status: status > 0)
+    data = SimpleNamespace(weight=np.ones((rows, 2)), sd=sd)
+    block = np.arange(rows) < 4
+    found = unseen(SimpleNamespace(observe=observe, data=data), np.zeros(3), [block])
+    kept = np.concatenate([(slopes[~block] / sd[~block][..., None]).reshape(-1, 3), np.eye(3)])
+    wanted = np.concatenate([(measured[~block] / sd[~block]).ravel(), np.zeros(3)])
+    z = np.linalg.lstsq(kept, wanted, rcond=None)[0]
+    np.testing.assert_allclose(found.z[0], z, rtol=1e-9)
+    np.testing.assert_allclose(found.reading[block], slopes[block] @ z, rtol=1e-9)
+    assert np.isnan(found.reading[~block]).all() and list(found.block) == [0] * 4 + [-1] * 8
+
+
+# --- the first answer -------------------------------------------------------------------------------------
+
+RANKING = Ranking(
+    True, 0.002, 9.0,
+    (Ranked("churning", "loss torque that changes with speed", "N·m", 412.0, 0.0123, 0.0004),
+     Ranked("brush_drop", "voltage drop that changes with current", "V", 4.0, 0.1, 0.05),
+     Ranked("bending_loss", "loss torque that changes with speed", "N·m", 430.0, -0.01, 0.001, True)),
+)  # fmt: skip
+
+
+def test_what_is_ranked_is_said_not_to_be_confirmed():
+    first, *lines = words.ranking(RANKING)
+    assert "by regression, not yet confirmed: something is missing" in first
+    assert lines == [
+        "  1. churning, a loss torque that changes with speed: lowers the misfit by 412 σ², "
+        "amplitude 0.0123 ± 0.0004 N·m"
+    ]  # the others explain no more than chance, or would supply power
+    nothing = dataclasses.replace(RANKING, missing=False, p_value=0.4)
+    assert words.ranking(nothing) == ["by regression: nothing is missing (family-wise p = 0.4)"]
+
+
+def test_what_is_found_before_the_verdict_is_said_to_be_untested(capsys):
+    found = SimpleNamespace(best=SimpleNamespace(effects=("churning",)))
+    library = {"churning": BY_NAME["churning"]()}
+    base = SimpleNamespace(base=SimpleNamespace(space=SimpleNamespace(library=library)))
+    folder = SimpleNamespace(keeps=lambda name: True, path="found")
+    command._say_kept({"ranking": RANKING, "search 0": (base, None, found)}, folder, "rig.toml")
+    said = capsys.readouterr().err
+    assert "so far, confirmed by simulation: a loss torque that changes with speed (churning);" in said
+    assert said.index("by regression") < said.index("so far")
+
+
+def test_a_budget_that_ends_after_the_screening_leaves_its_ranking(tmp_path, mmrjax, monkeypatch):
+    rigs.case(rigs.world(np.random.default_rng(3), "bench", "voltage", rows=(16, 20))).write(tmp_path)
+
+    def screened(*_, keep, **__):
+        keep("ranking", lambda: RANKING)
+        raise command.OutOfTime
+
+    monkeypatch.setattr(command, "discover", screened)
+    options = ("--robot", "rig.toml", "--no-report", "--out", "found", "--within", "20s")
+    code, _, err = mmrjax("loop", "table.csv", *options)
+    assert code == 3 and err.count("  1. churning, a loss torque that changes with speed") == 2  # at once, and last
+    assert "no verdict within 20 s\n" in err and "kept: ranking" in err
+    left = json.loads((tmp_path / "found.partial" / "screening.json").read_text(encoding="utf-8"))
+    assert left["schema"] == "mmrjax.screening/1" and left["confirmed"] is False
+    assert [e["name"] for e in left["effects"]] == ["churning", "brush_drop", "bending_loss"]
