@@ -49,7 +49,7 @@ def found(monkeypatch):
     library = {n: SimpleNamespace(family=lambda f=f: f) for n, f in FAMILIES.items()}
     space = SimpleNamespace(
         weight=np.ones((ROWS, 1)), library=library, included=np.ones(ROWS, bool),
-        bare=SimpleNamespace(observe=SimpleNamespace(long=False, blocks=("speed",))),
+        bare=SimpleNamespace(observe=SimpleNamespace(long=False, blocks=("speed",), noise_misfit=lambda off, counts: counts.sum())),
     )  # fmt: skip
     score = HeldOutScore({}, {})
     monkeypatch.setattr(room.blocks_room, "predictable", lambda *_: {})
@@ -88,7 +88,8 @@ def test_two_laws_of_one_mechanism_are_one(found):
 
 
 def test_share_of_the_excess_is_no_more_than_all_where_noise_is_stated_too_large():
-    space, base = SimpleNamespace(weight=np.ones((ROWS, 1))), fitted(explains=0.0)
+    bare = SimpleNamespace(observe=SimpleNamespace(noise_misfit=lambda off, counts: counts.sum()))
+    space, base = SimpleNamespace(weight=np.ones((ROWS, 1)), bare=bare), fitted(explains=0.0)
     assert room.share_of_excess(space, base, 985.0) == pytest.approx(0.5)
     assert room.share_of_excess(space, dataclasses.replace(base, cost=ROWS / 2), 20.0) == 1.0
 

@@ -209,3 +209,18 @@ def test_a_budget_that_ends_after_the_screening_leaves_its_ranking(tmp_path, mmr
     left = json.loads((tmp_path / "found.partial" / "screening.json").read_text(encoding="utf-8"))
     assert left["schema"] == "mmrjax.screening/1" and left["confirmed"] is False
     assert [e["name"] for e in left["effects"]] == ["churning", "brush_drop", "bending_loss"]
+
+
+def test_noise_stated_too_small_is_no_excess_of_a_log():
+    """Half of the true sds: three quarters of χ² are noise, whatever slow misfit there is beside."""
+    rng, count = np.random.default_rng(0), 400
+    rows_of = np.concatenate([np.arange(count), np.full(100, -1)]).reshape(1, -1)
+    slow = 6 * np.sin(np.linspace(0, 9, count))[:, None]
+    counts = np.ones((count, 1), bool)
+
+    def misfit(sd):
+        observe = SimpleNamespace(rows_of=rows_of)
+        return Histories.noise_misfit(observe, lambda: slow + sd * rng.standard_normal((count, 1)), counts)
+
+    assert misfit(2.0) == pytest.approx(4 * count, rel=0.15)
+    assert misfit(0.5) == count

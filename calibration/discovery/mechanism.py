@@ -147,13 +147,14 @@ def _explained(
 
 
 def share_of_excess(space: CandidateSpace, base: Candidate, explained: float) -> float:
-    """Share of the excess misfit that so much is [-]: of χ² of the base, priors included, less its expectation, the
-    number of readings. No more than all: with noise that is stated too large there is less excess than that.
+    """Share of the excess misfit that so much is [-]: of χ² of the base, priors included, less what noise leaves
+    (`Observer.noise_misfit`). No more than all: with noise that is stated too large there is less excess than that.
 
     Args:
         explained: fall of χ² [σ²].
     """
-    excess = 2 * base.cost - float(np.sum(space.weight > 0))
+    counts = np.asarray(space.weight > 0)
+    excess = 2 * base.cost - space.bare.observe.noise_misfit(lambda: _whitened(space, base), counts)
     return float(explained / max(excess, explained, 1e-300))
 
 
@@ -267,6 +268,13 @@ def _scored(space: CandidateSpace, runs: Runs, reading: dict[str, np.ndarray]) -
 def _reading(space: CandidateSpace, candidate: Candidate) -> np.ndarray:
     problem, z, active = space.fit_of(candidate.active, candidate.z)
     return np.asarray(problem.observe.observed(problem, z, active).reading)
+
+
+def _whitened(space: CandidateSpace, candidate: Candidate) -> np.ndarray:
+    """Residuals of a candidate in sds, 0 for readings that do not count; shape (rows, channels)."""
+    data = space.equipped.data
+    off = (_reading(space, candidate) - np.asarray(data.measured)) / np.asarray(data.sd)
+    return np.where(np.asarray(space.weight) > 0, np.nan_to_num(off), 0.0)
 
 
 def _changed(space: CandidateSpace, runs: Runs, before: np.ndarray, after: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
@@ -203,6 +203,14 @@ class Observer(eqx.Module):
     @abc.abstractmethod
     def runs_counting(self, included: np.ndarray) -> int:
         """How many runs count, of rows that do."""
+
+    def noise_misfit(self, off: Callable[[], np.ndarray], counts: Bool[np.ndarray, "rows channels"]) -> float:
+        """χ² that noise alone leaves: of settled runs, whose rows tell nothing of one another, one for each reading.
+
+        Args:
+            off: returns the whitened residuals of a fit, shape (rows, channels); counts: True for readings that do.
+        """
+        return float(counts.sum())
 
     # --- of fits
 

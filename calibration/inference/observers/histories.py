@@ -91,6 +91,8 @@ DELAYS, SCANNED = (256, 2048), 32
 EARLY, RESTING, RESTING_SD = 0.005, 0.2, 5.0
 #: Members of a search that one call of its program evaluates.
 TOGETHER = 2
+#: Differences between neighbouring residuals, over their median, beyond which they are jumps and no noise [-].
+JUMP = 7.0
 #: Fields of `Conditions` that may change within a run.
 CHANGING = (
     "voltage", "motor_current", "slope_deg", "payload", "adhesion", "total_mass", "duty", "open", "load_torque",
@@ -600,6 +602,19 @@ class Histories(Observer):
 
     def runs_counting(self, included: np.ndarray) -> int:
         return self.rows_of.shape[0]
+
+    def noise_misfit(self, off: Callable[[], np.ndarray], counts: np.ndarray) -> float:
+        """As the protocol says, and more where the differences between neighbouring samples, in which what a model
+        lacks nearly cancels, show that the noise is larger than its sds (von Neumann, Ann. Math. Stat. 12 (1941))."""
+        residual, rows, total = off(), np.asarray(self.rows_of), 0.0
+        first, second = rows[:, :-1].ravel(), rows[:, 1:].ravel()
+        within = (first >= 0) & (second >= 0)
+        for k in range(residual.shape[1]):
+            both = within & counts[first, k] & counts[second, k]
+            apart = np.abs(residual[second[both], k] - residual[first[both], k])
+            usual = apart[apart <= JUMP * np.median(apart)] if len(apart) else np.zeros(1)
+            total += counts[:, k].sum() * max(1.0, float(np.mean(usual**2)) / 2)
+        return float(total)
 
     def linearise(
         self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]
