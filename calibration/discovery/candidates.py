@@ -118,13 +118,15 @@ class BaseFit:
     unusable: tuple[int, ...]
 
 
-def fit_base(space: CandidateSpace, settings: Settings, where: str) -> BaseFit:
+def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candidate | None = None) -> BaseFit:
     """The base fitted alone, from the prior mean and from draws of the prior; the best that was found.
 
     Rows that it cannot reach at all are kept out, and it is fitted again.
 
     Args:
         where: opens the message.
+        near: a fit of the same runs with other weights or sds; where runs are long it is begun there and at the prior
+            mean alone.
 
     Raises:
         BadData: too few rows are left.
@@ -133,7 +135,7 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str) -> BaseFit:
     unusable = tuple(map(int, np.flatnonzero(lost)))
     space = space.without(lost) if unusable else space
     while True:
-        found, seen = _base_searches(space, settings)
+        found, seen = _base_searches(space, settings, near)
         # The first of those that end in one place: which of them is the lowest is rounding's choice.
         cost = np.where(np.isfinite(found.cost), found.cost, np.inf)
         k = int(np.argmax(cost <= np.min(cost) + ALIKE))
@@ -166,10 +168,13 @@ def _beyond_adhesion(space: CandidateSpace) -> np.ndarray:
     return (np.asarray(seen.status) == SLIDES) & space.included
 
 
-def _base_searches(space: CandidateSpace, settings: Settings) -> tuple[Optimum, Observation]:
+def _base_searches(space: CandidateSpace, settings: Settings, near: Candidate | None) -> tuple[Optimum, Observation]:
     """Where searches of the base end, from the starts that its data propose, and what it says there."""
     observe = space.bare.observe
-    starts = observe.starts(space.bare, np.random.default_rng(settings.seed), observe.policy.searches)
+    if near is not None and observe.long:
+        starts = np.stack([near.z[: space.free], np.zeros(space.free)])
+    else:
+        starts = observe.starts(space.bare, np.random.default_rng(settings.seed), observe.policy.searches)
     weights = np.repeat(space.weight[None], len(starts), 0)
     return jax.device_get(observe.search(space.bare, jnp.asarray(starts), jnp.asarray(weights), rivals=True))
 

@@ -418,21 +418,21 @@ def trace(
     stages go through again with such as the residuals show.
     """
 
-    def look(noise: Noise) -> Screening:
+    def look(noise: Noise, near: Candidate | None = None) -> Screening:
         space = pose(runs, robot, noise.sd, settings, stated, library)
         progress(Step("base"))
         at = functools.partial(bases_at, runs)
-        return screen(fit_base(space, settings, runs.source), at, runs, settings)
+        return screen(fit_base(space, settings, runs.source, near), at, runs, settings)
 
     def begun() -> tuple[Screening, Sds]:
-        screened = look(noise)
+        screened = look(noise, None if known is None else known.screened.base.candidate)
         residuals = residuals_of(screened, runs)
         factors = {} if screened.cluster is not None else common_factors(residuals)
         sds = Sds(noise, factors, tuple(noise_remarks(residuals, noise.word)))
         if factors:
             progress(Step("sds"))
             sds = dataclasses.replace(sds, noise=noise.scaled(factors))
-            screened = look(sds.noise)
+            screened = look(sds.noise, screened.base.candidate)
         return screened, sds
 
     def tested(screened: Screening) -> tuple[Screening, Diagnosis]:

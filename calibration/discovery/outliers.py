@@ -176,7 +176,7 @@ def _look(base: BaseFit, bases_at: Callable[[BaseFit], Bases], settings: Setting
 
 
 def _again(base: BaseFit, rows: np.ndarray, settings: Settings, where: str) -> BaseFit:
-    again = fit_base(base.space.without(rows), settings, where)
+    again = fit_base(base.space.without(rows), settings, where, base.candidate)
     return dataclasses.replace(again, unusable=tuple(sorted({*base.unusable, *again.unusable})))
 
 
