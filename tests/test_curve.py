@@ -129,8 +129,7 @@ def test_curves_act_in_drive_and_at_zero_change_nothing():
 @EACH
 def test_curve_of_a_run_in_mirror_image_is_the_mirror_image(effect):
     made = params.replace(effect(), {**{n: jnp.asarray(v) for n, v in SHAPE.items()}, "amplitude": jnp.asarray(0.3)})
-    flipped = {f.name: -getattr(laws.STATES, f.name) for f in dataclasses.fields(Signals) if f.name not in laws.EVEN}
-    there = laws.terms(made, signals=dataclasses.replace(laws.STATES, **flipped))
+    there = laws.terms(made, signals=laws.mirrored(laws.STATES))
     np.testing.assert_allclose(there, -laws.terms(made), rtol=1e-12, atol=1e-15)
 
 
@@ -139,9 +138,7 @@ def test_a_curve_of_what_shows_magnitudes_is_the_same_in_mirror_image():
     made = params.replace(UNNAMED["curve_motor_current_current"](), {n: jnp.asarray(v) for n, v in SHAPE.items()})
     made = params.replace(made, {"amplitude": jnp.asarray(0.3)})
     robot = laws.metered(signed=False)
-    flipped = {f.name: -getattr(laws.STATES, f.name) for f in dataclasses.fields(Signals) if f.name not in laws.EVEN}
-    turned = dataclasses.replace(laws.STATES, **flipped)
-    each = [laws.terms(made, robot, s) for s in (laws.STATES, turned)]
+    each = [laws.terms(made, robot, s) for s in (laws.STATES, laws.mirrored(laws.STATES))]
     np.testing.assert_allclose(*each, rtol=1e-12, atol=1e-15)
     robot = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, channels=("motor_current", "speed")))
     columns = {"order": np.tile(np.arange(9.0), 2), "supply_voltage_V": np.repeat([12.0, -12.0], 9)}

@@ -401,16 +401,21 @@ EVEN = (
 )
 
 
+def mirrored(signals: Signals) -> Signals:
+    """Signals of a run in mirror image; what is not followed stays so."""
+    odd = (f.name for f in dataclasses.fields(Signals) if f.name not in EVEN)
+    return dataclasses.replace(signals, **{n: -getattr(signals, n) for n in odd if getattr(signals, n) is not None})
+
+
 def law_travel(effect: type[Effect]) -> None:
     """In a run in mirror image a term is the mirror image, and in that of one `odd_in_travel` what it was."""
     if effect.balance not in CONJUGATE or issubclass(effect, Periodic):
         return  # masses and readings have no direction; a phase has its own
     start = fitted(effect, size(effect))
     there = dataclasses.replace(STATES, memory={})
-    turned = {f.name: -getattr(there, f.name) for f in dataclasses.fields(Signals) if f.name not in EVEN}
     sign = 1 if effect.odd_in_travel else -1
-    mirrored = terms(start, signals=dataclasses.replace(there, **turned))
-    np.testing.assert_allclose(mirrored, sign * terms(start, signals=there), rtol=1e-12, atol=1e-15)
+    turned = terms(start, signals=mirrored(there))
+    np.testing.assert_allclose(turned, sign * terms(start, signals=there), rtol=1e-12, atol=1e-15)
 
 
 LAWS = (
@@ -847,8 +852,9 @@ def test_import_circles_are_found():
 
 def test_units_of_signals_are_all_known():
     fields = {f.name for f in dataclasses.fields(Signals)}
-    # Each memory states its own unit, an index has none, and no temperature is followed where effects are tried.
-    assert {*UNIT_OF, "memory", "configuration", "temperature"} == fields
+    # Each memory states its own unit, an index has none, and where effects are tried no temperature is followed and no
+    # brake takes a torque.
+    assert {*UNIT_OF, "memory", "configuration", "temperature", "load_torque"} == fields
 
 
 def test_units_of_parameters_and_balances_are_all_known(free):

@@ -141,6 +141,7 @@ def test_command_ends_well_and_says_what_it_found(done):
     names = {p.name for p in (done.folder / "found").iterdir()}
     assert names == {
         "config.resolved.toml", "figures", "fitted.toml", "manifest.json", "posterior.nc", "report.html", "result.json", "robot.toml", "rows.csv",
+        "screening.json",
     }  # fmt: skip
 
 

@@ -70,7 +70,7 @@ class Written:
 # --- every effect ---------------------------------------------------------------------------------------
 
 #: Effects that settled runs forward on an external supply show; a robot may have the others all the same.
-SEEN = tuple(e.name for e in ALL if SettledRuns.shows(e) and not e.needs_reverse)
+SEEN = tuple(e.name for e in ALL if SettledRuns.shows(e) and not e.needs_reverse and not e.needs_duty)
 UNSEEN = tuple(e.name for e in ALL if e.name not in SEEN)
 
 

@@ -114,11 +114,11 @@ def test_what_candidates_predict_is_kept_and_not_fitted_again(monkeypatch, runs)
 
     fitted = []
 
-    def held_out(problem, z, masks, active):
+    def unseen(problem, z, masks, active):
         fitted.append(z[0])
         return SimpleNamespace(reading=np.full((12, 2), -1.0))
 
-    monkeypatch.setattr(findings, "held_out", held_out)
+    monkeypatch.setattr(findings, "unseen", unseen)
     problem = SimpleNamespace(
         base=None,
         coordinates=NONE_FREE,
