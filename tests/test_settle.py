@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import re
@@ -16,6 +17,8 @@ from worlds.settled import write_table
 from calibration.data import contradictions, rig_facts, robot_file, settling
 from calibration.data import runs as records
 from calibration.data.errors import BadData
+from calibration.inference import checks, observers
+from calibration.inference import noise as noises
 from calibration.inference.foresight import Foresight
 from calibration.words import settle as words
 from sweeps.commands import rig_check
@@ -206,7 +209,7 @@ BAD = {
         ),
         r"motor_speed_rpm: shows -1001 rpm at 6 V; expected the sign of what is imposed; give duty the sign",
     ),
-    "nothing imposed": (lambda c: c | {"supply_voltage_V": np.zeros(600)}, r"no settled stretch: idle"),
+    "nothing imposed": (lambda c: c | {"supply_voltage_V": np.zeros(600)}, r"rows 1 to 600, no settled stretch: supply_voltage_V: nothing drives the motors; log rows"),
     "never settles": (
         lambda c: (
             stairs((12.0,), 600) | {"motor_speed_rpm": 300 + 200 * c["time_s"]}
@@ -602,3 +605,44 @@ def test_a_channel_that_is_read_in_few_rows_has_the_means_of_these_or_none(tmp_p
     assert [s.mean["motor_speed"] for s in found.kept] == pytest.approx(
         [speed[s.rows].mean() for s in found.kept], rel=0.01
     )
+
+
+@pytest.mark.parametrize(("case", "said"), [
+    ("even", ""),
+    ("uneven rows", ""),
+    ("missing rows", r"^log\.csv row 401, time_s: 90 s after the row before it, where 0\.01 s is usual; a fit holds"),
+    ("a clock that jitters", r"^log\.csv rows 1 to 600, time_s: the clock jitters by 0\.00\d+ s about even rows; .* 0\.01 s apart"),
+])  # fmt: skip
+def test_gaps_and_a_clock_that_jitters_are_said_with_rows_and_remedy(tmp_path, case, said):
+    rng, columns = np.random.default_rng(12), stairs()
+    off = {
+        "even": np.zeros(600),
+        "uneven rows": np.cumsum(rng.uniform(-0.005, 0.005, 600)),
+        "missing rows": np.where(np.arange(600) < 400, 0.0, 89.99),
+        "a clock that jitters": rng.uniform(-0.0049, 0.0049, 600),
+    }[case]
+    columns["time_s"] = columns["time_s"] + off - off[0]
+    robot = bench(tmp_path, columns)
+    (found,) = rig_facts.doubts(records.read(tmp_path / "log.csv", robot=robot), robot) or ("",)
+    assert re.search(said, found) and bool(found) == bool(said)
+
+
+@pytest.mark.parametrize(("volts", "noise", "said"), [
+    (0.0, None, r"rows 1 to 600, supply_voltage_V: nothing drives the motors and nothing moves; expected rows"),
+    (0.5, None, r"rows 1 to 600, motor_speed_rpm: readings are noise about zero \(\d\.\d rpm\), so nothing moves; .* --noise"),
+    (0.5, "motor_speed=3rpm", ""),
+    (12.0, None, ""),
+])  # fmt: skip
+def test_a_log_in_which_nothing_moves_is_refused_unless_a_shaft_is_locked(tmp_path, volts, noise, said):
+    columns = stairs((volts,) * 3)
+    columns["motor_speed_rpm"] = (
+        3 * np.random.default_rng(13).standard_normal(600) + (volts == 12) * columns["motor_speed_rpm"]
+    )
+    robot = bench(tmp_path, columns)
+    runs = records.read(tmp_path / "log.csv", robot=robot)
+    refused = pytest.raises(BadData, match=said) if said else contextlib.nullcontext()
+    with refused:
+        checks._nothing_moves(runs, noises.from_table(runs, observers.kind(runs).sizes(runs), noise))
+    if volts == 0.5:  # nor is it a settled run
+        with pytest.raises(BadData, match="no settled stretch: nothing moves beyond its noise"):
+            settled(tmp_path, robot)

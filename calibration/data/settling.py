@@ -524,7 +524,10 @@ def _settled(
     moving = [
         s for s in signals if s.channel.zero_at_rest and s.channel.name in means and s.channel.name not in OF_YAW
     ]
-    if moving and all(abs(means[s.channel.name]) < STILL * s.largest for s in moving):
+    least = {
+        s.channel.name: max(STILL * s.largest, SDS * sds[s.channel.name]) for s in moving if s.channel.name in sds
+    }
+    if moving and all(abs(means[s.channel.name]) < least[s.channel.name] for s in moving):
         return out("rest")
     acting = inertia.get(str(runs["configuration"][rows[0]]))
     if acting is not None and acting.speed in drifts and (not acting.current or acting.current in means):
@@ -834,4 +837,13 @@ def _nothing(found: Settled, loop: str) -> str:
             f"{source}: no settled stretch: no channel has enough readings ({each} of the rows); each level needs at "
             f"least {FEWEST}; {direct}log them more often"
         )
-    return f"{source}: no settled stretch: {', '.join(dict.fromkeys(whys))}; see {rows}, the longest"
+    imposed = found.runs.layout.imposed_column
+    others = {
+        "idle": f"{imposed}: nothing drives the motors; log rows in which they are driven, or name the column that "
+        "drives them under [columns] in the rig's file",
+        "rest": "nothing moves beyond its noise at any level; drive it further",
+        "stuck": f"{longest.channel} shows one number for long: saturated or frozen; mend it or its range",
+        "glitches": f"{longest.channel} has many readings far from the others; mend it, or log its mean",
+        "undriven": "the driver brakes or coasts in every row; log rows in which it drives the motors",
+    }
+    return f"{source} {rows}, no settled stretch: {others[why]}"
