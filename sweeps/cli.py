@@ -307,9 +307,10 @@ def calibrate(
 ) -> int:
     """Find friction coefficients from measured runs, with their uncertainty, by gradients through the model.
 
-    Writes robot.toml, which every command takes with --robot, and result.json. With --model drive or track the search
-    begins at the optimum of steady; track takes minutes. Intervals are linear then, unless --profiles. With the
-    running gear free (--model track --free running_gear.guide_recess,...) a population is searched first.
+    Writes robot.toml, which every command takes with --robot, and result.json. A log over time is fitted by drive,
+    settled runs by steady unless --model says otherwise; with drive or track the search of settled runs begins at the
+    optimum of steady, and track takes minutes. Intervals are linear then, unless --profiles. With the running gear
+    free (--model track --free running_gear.guide_recess,...) a population is searched first.
     """
     from sweeps.commands import calibrate as room
 
@@ -522,7 +523,8 @@ def _prepared(resolved: Any, no_cache: bool = False) -> Any:
     XLA's CPU executor (jax 0.10.2); with one thread none of twelve did (docs/benchmarks.md). Whoever sets
     XLA_FLAGS, be it to nothing, is heeded.
     """
-    one_thread = hasattr(resolved, "model") and fidelities.facts(resolved.model).one_thread
+    model = getattr(resolved, "model", None)  # None: of a calibration, whose data decide
+    one_thread = model is not None and fidelities.facts(model).one_thread
     options = (f"xla_cpu_small_while_loop_byte_threshold={WHOLE}",) * isinstance(resolved, config.Loop)
     _start_jax(no_cache, ("--xla_cpu_multi_thread_eigen=false",) * one_thread, options)
     return resolved

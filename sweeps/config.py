@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from calibration.data.columns import BRAKED, CONDITIONS, LOAD, ROWS, SIDES
@@ -76,9 +76,14 @@ class ModelPart(Part):
     @field_validator("model")
     @classmethod
     def _known(cls, model: str) -> str:
-        if model not in fidelities.TABLE:
-            raise PydanticCustomError("unknown", f"input should be {_either(map(repr, fidelities.TABLE))}")
-        return model
+        return _fidelity(model)
+
+
+def _fidelity(model: str) -> str:
+    """The name of a fidelity, refused where there is no such one."""
+    if model not in fidelities.TABLE:
+        raise PydanticCustomError("unknown", f"input should be {_either(map(repr, fidelities.TABLE))}")
+    return model
 
 
 def _either(names: Iterable[str]) -> str:
@@ -530,9 +535,12 @@ class Reproduce(RobotPart, ModelPart):
     model: str = about(fidelities.NAMES[0], "steady, or track for Figs. 23-27 too")
 
 
-class Calibrate(RobotPart, ModelPart, InferencePart, OutputPart):
+class Calibrate(RobotPart, InferencePart, OutputPart):
     """A calibration beside its data; None leaves what has it to the fidelity and the data."""
 
+    model: Annotated[str, AfterValidator(_fidelity)] | None = about(
+        None, f"Fidelity: {', '.join(fidelities.NAMES)}", usual="drive for a log over time, else steady"
+    )
     free: tuple[str, ...] = about(
         (), "Parameters to free, comma-separated; default is the default set, motor.* a group"
     )

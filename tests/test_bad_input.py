@@ -113,11 +113,7 @@ def made(case, histories):
 @pytest.mark.parametrize("case", REFUSED)
 def test_refused_with_4_and_one_sentence(case, command, histories, tmp_path):
     written(tmp_path / "runs.csv", made(case, histories))
-    answer = mmrjax(
-        tmp_path, command, "runs.csv", "--out", "x", *(["--model", "drive"] if command == "calibrate" else [])
-    )
-    if command == "calibrate" and case == "every reading equal":
-        answer = mmrjax(tmp_path, command, "runs.csv", "--out", "x")
+    answer = mmrjax(tmp_path, command, "runs.csv", "--out", "x")
     assert answer.code == 4 and REFUSED[case] in answer.err
     assert len(answer.err.strip().splitlines()) == 1 and not (tmp_path / "x").exists()
 

@@ -284,11 +284,11 @@ def test_thousands_of_rows_are_compared_at_once(measured):
 
 def test_samples_of_one_run_with_two_configurations_are_refused(measured):
     with pytest.raises(BadData, match=r"configuration: run \(no run_id\) has several values"):
-        quick(changed(measured, time_s=np.arange(20.0)), model="drive")
+        quick(changed(measured, time_s=np.arange(20.0)))
 
 
 @pytest.mark.slow
-def test_histories_need_drive(measured):
+def test_histories_are_not_fitted_by_steady(measured):
     with pytest.raises(
         BadConfiguration, match="--model steady: measured holds time histories; they need --model drive"
     ):
@@ -296,7 +296,7 @@ def test_histories_need_drive(measured):
         quick(changed(measured, time_s=np.arange(20.0), configuration=np.full(20, "6T2A"),
                       supply_voltage_V=np.full(20, 15.0), slope_deg=np.zeros(20), total_mass_kg=np.full(20, 13.1),
                       payload_kg=np.zeros(20), motor_speed_rpm=measured["motor_speed_rpm"] * later,
-                      speed_mm_s=measured["speed_mm_s"] * later))  # fmt: skip
+                      speed_mm_s=measured["speed_mm_s"] * later), model="steady")  # fmt: skip
 
 
 def test_unknown_fidelity_lists_the_choices(measured):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibration.data.posterior import LOG, NORMAL, Posterior
-from calibration.inference.posterior import determined_together
+from calibration.inference.posterior import determined_together, undetermined
 from calibration.words.fits import determined
 
 
@@ -45,4 +45,5 @@ def test_a_pair_that_priors_hold_or_that_hardly_trades_is_none():
     assert determined_together(posterior(0.94, (LOG, LOG))) == ()
     assert determined_together(posterior(0.99, (LOG, LOG)), held=("a", "b")) == ()
     (pair,) = determined_together(posterior(0.99, (LOG, LOG)), held=("a",))  # b is known by the prior of a
-    assert determined("a", True, (pair,)) == "no" and determined("b", False, (pair,)) == "only with a"
+    assert determined("a", True, (pair,)) == "only with b" and determined("b", False, (pair,)) == "only with a"
+    assert determined("c", True, (pair,)) == "no" and undetermined(("a", "c"), (pair,)) == ("c",)

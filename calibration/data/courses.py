@@ -49,11 +49,11 @@ def changing(runs: Runs) -> tuple[str, ...]:
 def applied(runs: Runs) -> np.ndarray:
     """Voltage that the driver gives the motors in every row, in turns the size of the larger one, 0 where they brake
     or coast [V], or the speed [rpm] or current [A] imposed on them; shape (rows,)."""
+    if runs.turns:
+        return np.abs(runs.of_sides).max(0)
     if runs.layout.imposed_column != SUPPLY:
         return runs[runs.layout.imposed_column]
     voltage = runs["supply_voltage_V"] * (runs["duty"] if runs.has("duty") else 1.0)
-    if runs.turns:
-        voltage = np.abs(runs.of_sides).max(0)
     return np.where(runs["mode"] == "voltage", voltage, 0.0) if runs.has("mode") else voltage
 
 

@@ -16,6 +16,7 @@ from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from mmrjax import params
 from mmrjax.channels import RPM, VOLTAGE
+from mmrjax.errors import counted
 from mmrjax.robot import Robot
 from mmrjax.shaft import Shaft
 from mmrjax.signals import GRAVITY
@@ -226,6 +227,63 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
     )
 
 
+#: Multiple of the usual time between rows beyond which rows may be missing.
+LONG = 100.0
+
+
+def gap(runs: Runs) -> str:
+    """Sentence on the longest time between two rows of a run, if rows may be missing there; empty otherwise."""
+    if not runs.sampled:
+        return ""
+    worst, told = 0.0, ""
+    for name in np.unique(runs.run_names):
+        rows = runs.in_order(name)
+        steps = np.diff(runs["time_s"][rows])
+        usual = float(np.median(steps)) if len(steps) else 0.0
+        long = steps > LONG * usual
+        if not (usual > 0 and long.any() and steps.max() > worst):
+            continue
+        k, worst = int(np.argmax(steps)), float(steps.max())
+        more = f" (and {counted(int(long.sum()) - 1, 'other row')} after a gap)" if long.sum() > 1 else ""
+        told = (
+            f"{runs.source} row {rows[k + 1] + 1}, time_s: {rounded(worst)} s after the row before it, where "
+            f"{rounded(usual)} s is usual{more}; a fit holds what is imposed for that time; if rows are missing, "
+            "give the rows from there on another run_id"
+        )
+    return told
+
+
+#: Of the times between rows: spread over the usual one, and correlation of one with the next, from which on a clock
+#: jitters; fewest rows.
+UNEVEN, TURNS_BACK, ROWS_OF_CLOCK = 0.1, -0.3, 50
+
+
+def jitter(runs: Runs) -> str:
+    """Sentence on a clock that jitters about even rows; empty otherwise.
+
+    If rows are even and the clock's errors independent, the times between rows correlate with the next by -1/2. If
+    the rows themselves are uneven, these times are independent and correlate by 0.
+    """
+    if not runs.sampled:
+        return ""
+    for name in np.unique(runs.run_names):
+        rows = runs.in_order(name)
+        steps = np.diff(runs["time_s"][rows])
+        usual = float(np.median(steps)) if len(steps) > ROWS_OF_CLOCK else 0.0
+        off = np.clip(steps - usual, -usual, usual)
+        spread = float(np.std(off))
+        if usual <= 0 or spread <= UNEVEN * usual or (steps > LONG * usual).any():
+            continue
+        if float(np.mean(off[1:] * off[:-1])) < TURNS_BACK * spread**2:
+            run = f" of run {name}" if name else ""
+            return (
+                f"{runs.source} rows {rows[0] + 1} to {rows[-1] + 1}, time_s: the clock{run} jitters by "
+                f"{rounded(spread / 2**0.5)} s about even rows; a fit takes its times as they are; give even "
+                f"ones, {rounded(float(np.mean(steps)))} s apart"
+            )
+    return ""
+
+
 #: Multiple of the torque at stall beyond which a brake's is in another unit.
 BEYOND = 3.0
 
@@ -251,8 +309,14 @@ def doubtful_torque(runs: Runs, robot: Robot) -> str:
 
 
 def doubts(runs: Runs, robot: Robot) -> tuple[str, ...]:
-    """Why a table's time, the current that it imposes or a brake's torque is in another unit, a sentence each."""
-    every = doubtful_time(runs, robot), doubtful_current(runs, robot), doubtful_torque(runs, robot)
+    """Sentences on times with a gap, and on time, an imposed current or a brake's torque in another unit."""
+    every = (
+        gap(runs),
+        jitter(runs),
+        doubtful_time(runs, robot),
+        doubtful_current(runs, robot),
+        doubtful_torque(runs, robot),
+    )
     return tuple(filter(None, every))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.data.columns import LOAD, TIME
+from calibration.data.columns import LOAD, SPEED, TIME
 from calibration.data.contradictions import GAP
 from calibration.data.courses import applied, differs
 from calibration.data.errors import BadData, number
@@ -48,11 +49,13 @@ STUCK, CHANCE = 20, 0.2
 FAR = 6.0
 #: Share of glitches in a stretch up to which the other readings have a mean; samples beside which a reading is held.
 MOST_GLITCHES, BESIDE = 0.25, (21, 101)
+#: Channels that a robot that travels straight reads as zero.
+OF_YAW = ("yaw_rate", "lateral_speed")
 #: Conditions whose every change ends a stretch.
 EXACT = ("configuration", "surface", "mode", "slope_deg", "payload_kg", "total_mass_kg")
 #: Why samples are left out.
 REASONS = (
-    "changes", "short", "settling", "accelerates", "idle", "rest", "stuck", "glitches", "undriven",
+    "changes", "short", "settling", "accelerates", "idle", "rest", "stuck", "glitches", "unread", "undriven",
 )  # fmt: skip
 
 
@@ -74,6 +77,11 @@ class Signal:
     step: float
     largest: float
     glitches: np.ndarray
+
+    @functools.cached_property
+    def filled(self) -> float:
+        """Share of the log's rows that have a reading; below 1 where instruments log at different rates."""
+        return float(np.isfinite(self.shown).mean())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,7 +170,7 @@ class Settled:
         read = {c.column for s in self.signals for c in (s.channel,)} | {"time_s", "order", "run_id"}
         read |= {c.sd_column for c in channels.EVERY} | {angle for angle, _, _ in RATES}
         for name, column in means.items():
-            if name in read or (name == "mode"):
+            if name in read or name == "mode" or (name == SPEED and self.runs.turns):
                 continue
             if column.dtype.kind == "f":
                 found[name] = np.array([_digits(_plain(column[s.rows])) for s in kept])
@@ -170,6 +178,8 @@ class Settled:
                 found[name] = np.array([str(column[s.rows[0]]) for s in kept])
         for signal in self.signals:
             name = signal.channel.name
+            if not any(math.isfinite(s.mean[name]) for s in kept):
+                continue
             found[signal.channel.column] = np.array([_digits(s.mean[name]) for s in kept])
             found[signal.channel.sd_column] = np.array([_digits(s.sd[name], 3) for s in kept])
         found["run_id"] = np.array([f"{s.run or 'log'} {s.begin:.6g}-{s.end:.6g} s" for s in kept])
@@ -188,6 +198,7 @@ def settle(
     drift: float = DRIFT,
     inertia: Mapping[str, Inertia] | None = None,
     rolling: Mapping[str, Mapping[str, float]] | None = None,
+    loop: str = "mmrjax loop LOG --robot RIG",
 ) -> Settled:
     """The settled runs of a log.
 
@@ -201,6 +212,7 @@ def settle(
         shortest: stretch [s]; None: 0.3 s, and at least 20 samples.
         drift: largest change of a mean within a stretch, as a share of it.
         inertia: by configuration; a stretch whose acceleration takes more than `drift` of its current is left out.
+        loop: command that fits the log as it is, for messages.
         rolling: by configuration, what channels show while the motors turn by 1 rad/s, by name [unit of the column].
 
     Raises:
@@ -209,7 +221,7 @@ def settle(
     """
     result = _divided(runs, shortest, drift, inertia)
     if not result.kept:
-        raise BadData(_nothing(result))
+        raise BadData(_nothing(result, loop))
     _check_signs(result)  # by sds of their own: repeats whose signs differ widen them
     _check_units(result, rolling or {})
     return dataclasses.replace(result, stretches=tuple(_wider(s, result.scatter) for s in result.stretches))
@@ -217,8 +229,6 @@ def settle(
 
 def doubtful_sign(runs: Runs) -> str:
     """Why the sign of a channel of a log is wrong, by what settles in it; empty where nothing shows that it is."""
-    if runs.turns:
-        return ""
     try:
         result = _divided(runs, None, DRIFT, None)
     except BadData:  # what no stretch can be found in
@@ -241,12 +251,15 @@ def _divided(runs: Runs, shortest: float | None, drift: float, inertia: Mapping[
     drives = applied(runs)
     gaps: list[int] = []
     levels: list[np.ndarray] = []
+    divided_by = (*(runs.of_sides if runs.turns else (drives,)), *([runs[LOAD]] if runs.has(LOAD) else []))
     for rows in each:
         far = np.flatnonzero(np.diff(runs["time_s"][rows]) > GAP * step)
         gaps += [int(rows[k]) for k in far]
         for part in np.split(rows, far + 1):
-            for level in _levels(runs, drives, part, shortest, drift, step):
-                levels += _levels(runs, runs[LOAD], level, shortest, drift, step) if runs.has(LOAD) else [level]
+            found_in = [part]
+            for driver in divided_by:
+                found_in = [x for level in found_in for x in _levels(runs, driver, level, shortest, drift, step)]
+            levels += found_in
     signals = _signals(runs, each, levels, half, drift)
     for signal in signals:
         _check_alive(runs, signal)
@@ -506,8 +519,15 @@ def _settled(
             return out("settling", name, to_come)
         left_over = max(left_over, to_come)
         means[name], sds[name], drifts[name] = mean, sd, change
-    moving = [s for s in signals if s.channel.zero_at_rest and s.channel.name in means]
-    if moving and all(abs(means[s.channel.name]) < STILL * s.largest for s in moving):
+    if not means:
+        return out("unread")
+    moving = [
+        s for s in signals if s.channel.zero_at_rest and s.channel.name in means and s.channel.name not in OF_YAW
+    ]
+    least = {
+        s.channel.name: max(STILL * s.largest, SDS * sds[s.channel.name]) for s in moving if s.channel.name in sds
+    }
+    if moving and all(abs(means[s.channel.name]) < least[s.channel.name] for s in moving):
         return out("rest")
     acting = inertia.get(str(runs["configuration"][rows[0]]))
     if acting is not None and acting.speed in drifts and (not acting.current or acting.current in means):
@@ -638,7 +658,7 @@ def _mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[float, fl
     """Mean of a channel over a stretch, sd of that mean, and its change from end to end by a straight line."""
     shown = signal.shown[rows]
     finite = np.isfinite(shown)
-    if finite.sum() < max(FEWEST, 0.5 * len(rows)):
+    if finite.sum() < max(FEWEST, 0.5 * signal.filled * len(rows)):
         return math.nan, math.nan, math.nan
     t, x = time[finite] - time[finite].mean(), shown[finite]
     if len(signal.angle):
@@ -667,8 +687,8 @@ def _scatter(runs: Runs, found: list[Stretch], signals: tuple[Signal, ...], larg
     alike = [c for c in EXACT if runs.has(c)]
     groups: list[list[Stretch]] = []
     where: tuple[object, ...] = ()
-    for s in sorted((s for s in found if not s.why), key=lambda s: (_braked(runs, s), s.imposed)):
-        here = (_braked(runs, s), *(runs[c][s.rows[0]] for c in alike))
+    for s in sorted((s for s in found if not s.why), key=lambda s: (_held(runs, s), s.imposed)):
+        here = (_held(runs, s), *(runs[c][s.rows[0]] for c in alike))
         if groups and here == where and abs(s.imposed - groups[-1][0].imposed) <= 0.2 * FINE * largest:
             groups[-1].append(s)
         else:
@@ -690,11 +710,13 @@ def _scatter(runs: Runs, found: list[Stretch], signals: tuple[Signal, ...], larg
     return scatter
 
 
-def _braked(runs: Runs, stretch: Stretch) -> int:
-    """Level of the brake's torque in a stretch, in steps of `DRIFT` of the largest; 0 without a brake."""
-    if not runs.has(LOAD) or not runs[LOAD].any():
-        return 0
-    return round(float(np.mean(runs[LOAD][stretch.rows])) / (DRIFT * float(np.max(np.abs(runs[LOAD])))))
+def _held(runs: Runs, stretch: Stretch) -> tuple[int, ...]:
+    """Levels in a stretch of the brake's torque, and in a turn of what drives each side, in steps of `DRIFT` of the
+    largest."""
+    signals = (*(runs.of_sides if runs.turns else ()), *([runs[LOAD]] if runs.has(LOAD) else []))
+    return tuple(
+        round(float(np.mean(x[stretch.rows])) / (DRIFT * float(np.max(np.abs(x))))) if x.any() else 0 for x in signals
+    )
 
 
 def _wider(stretch: Stretch, scatter: Mapping[str, float]) -> Stretch:
@@ -781,8 +803,9 @@ def _read(runs: Runs, channel: str) -> bool:
     return runs.has(channels.find(channel).column)
 
 
-def _nothing(found: Settled) -> str:
-    """That a log has no settled stretch, why mostly, and what to do."""
+def _nothing(found: Settled, loop: str) -> str:
+    """Says that a log has no settled stretch, why mostly, and what to do; `loop` is the command that takes it."""
+    direct = "" if found.runs.turns else f"give the log to the loop as it is, {loop}, or "
     source, longest = found.runs.source, max(found.stretches, key=lambda s: s.lasts)
     whys = [s.why for s in found.stretches]
     why = max(dict.fromkeys(whys), key=lambda w: sum(s.lasts for s in found.stretches if s.why == w))
@@ -790,22 +813,37 @@ def _nothing(found: Settled) -> str:
     if why in ("changes", "short"):
         step = longest.lasts / max(len(longest.rows) - 1, 1)
         held, asked = f"for {longest.lasts:.3g} s", f"{found.shortest:.3g} s are asked for"
-        cure = "hold each level longer, state --shortest"
+        cure = "hold each level longer or state --shortest"
         if len(longest.rows) < FEWEST or found.shortest > longest.lasts >= LEAST:  # it is the samples that are few
             needed = max(FEWEST, round(found.shortest / step) if step > 0 else FEWEST)
             held, asked = f"for {counted(len(longest.rows), 'sample')}", f"{needed} are needed"
             cure = (
-                "log faster or hold each level longer (--shortest states the time, of at least "
-                f"{FEWEST} samples), remove time_s if each row is a settled run already"
+                "log faster, hold each level longer (--shortest states the time, of at least "
+                f"{FEWEST} samples), or remove time_s if each row is a settled run already"
             )
         return (
-            f"{source}: no settled stretch: what is imposed holds {held} at most ({rows}), and {asked}; {cure}, or "
-            "give the log to loop as it is (time histories)"
+            f"{source}: no settled stretch: what is imposed holds {held} at most ({rows}), and {asked}; "
+            f"{direct}{cure}"
         )
     if why in ("settling", "accelerates"):
         return (
             f"{source}: never settles: at the end of its longest level ({rows}) {longest.channel or 'a channel'} "
-            f"still changes by {100 * longest.size:.2g} % ({100 * found.drift:g} % are allowed); hold each level "
-            "longer, state --drift, or give the log to loop as it is (time histories)"
+            f"still changes by {100 * longest.size:.2g} % ({100 * found.drift:g} % are allowed); {direct}hold each "
+            "level longer or state --drift"
         )
-    return f"{source}: no settled stretch: {', '.join(dict.fromkeys(whys))}; see {rows}, the longest"
+    if why == "unread":
+        each = " and ".join(f"{s.channel.column} in {100 * s.filled:.2g} %" for s in found.signals)
+        return (
+            f"{source}: no settled stretch: no channel has enough readings ({each} of the rows); each level needs at "
+            f"least {FEWEST}; {direct}log them more often"
+        )
+    imposed = found.runs.layout.imposed_column
+    others = {
+        "idle": f"{imposed}: nothing drives the motors; log rows in which they are driven, or name the column that "
+        "drives them under [columns] in the rig's file",
+        "rest": "nothing moves beyond its noise at any level; drive it further",
+        "stuck": f"{longest.channel} shows one number for long: saturated or frozen; mend it or its range",
+        "glitches": f"{longest.channel} has many readings far from the others; mend it, or log its mean",
+        "undriven": "the driver brakes or coasts in every row; log rows in which it drives the motors",
+    }
+    return f"{source} {rows}, no settled stretch: {others[why]}"

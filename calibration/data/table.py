@@ -119,8 +119,14 @@ class Runs:
 
     def turns_round(self, channel: Channel) -> bool:
         """Whether a channel's readings have the sign of what drives the motors: a speed's do, and a current's where
-        nothing else drives them; a bridge that turns the voltage turns the supply's current back."""
-        if not channel.directed or channel.name == "motor_voltage" or self.layout.magnitude(channel.name):
+        nothing else drives them; a bridge that turns the voltage turns the supply's current back. In a turn each side
+        has its own sign, and the yaw rate that of their difference (`sides.check`)."""
+        if (
+            self.turns
+            or not channel.directed
+            or channel.name == "motor_voltage"
+            or self.layout.magnitude(channel.name)
+        ):
             return False
         back = self.has("duty") and channel.name == "total_current"
         return channel.zero_at_rest or not (self.pulled or back)

@@ -46,6 +46,8 @@ from mmrjax.signals import FLAGS, STATUSES
 
 #: Members of a generation where parameters are free that `steady` does not read.
 POPULATION = 256
+#: Fidelity of time histories where none is stated.
+OF_HISTORIES = "drive"
 #: Parameters that the resolved running gear gives another meaning: beginnings after their configuration.
 FRICTION = "ground.friction."
 
@@ -58,7 +60,7 @@ def calibrate(
     fix: Sequence[str] = (),
     stated: Mapping[str, tuple[float, float]] | None = None,
     noise: str | None = None,
-    model: str = "steady",
+    model: str | None = None,
     starts: int | None = None,
     population: int | None = None,
     generations: int | None = None,
@@ -76,7 +78,7 @@ def calibrate(
         robot: its values are the prior means; a mass that the table states takes the place of its own.
         free, fix: parameter names, see `priors.choose`; stated: priors in place of the fields', (mean, sd) [SI].
         noise: as `noise.parse`; None takes the file's sd columns, or estimates.
-        model: name of a fidelity.
+        model: name of a fidelity; None takes `drive` for time histories and `steady` for settled runs.
         starts: the prior mean and `starts - 1` draws from the prior; for settled rows with a rollout the optimum of
             `steady` and draws from its posterior.
         population: members of each generation of a search without gradients, with which that of a rollout begins;
@@ -100,7 +102,8 @@ def calibrate(
         )
     runs = thinned(runs.of(robot), rows)
     observe = observers.kind(runs)
-    facts = observers.facts(model)
+    fidelity = model or (OF_HISTORIES if observe.axis else fidelities.NAMES[0])
+    facts = observers.facts(fidelity)
     effort = facts.effort
     starts = (observe.searches or effort.starts) if starts is None else starts
     profiles = effort.profiles and observe.profiled if profiles is None else profiles
@@ -119,15 +122,17 @@ def calibrate(
         present = {robot.configurations.names[k] for k in runs.configurations(robot)}
         default = priors.default_names(present, robot, computed=facts.computes, turns=runs.turns)
         owned = priors.stated_names(robot, present, () if observe.axis else priors.OVER_TIME)
-        held = {*default, *fidelities.unread(model, owned, runs.turns)}
+        held = {*default, *fidelities.unread(fidelity, owned, runs.turns)}
         default = (*default, *(n for n in owned if n not in held and not n.endswith(facts.computes)))
         default = (*default, *priors.delays(robot, observe.free()[0]))
         names = priors.choose(robot, default, *words)
-        if unread := fidelities.unread(model, names, runs.turns):
+        if unread := fidelities.unread(fidelity, names, runs.turns):
             if fidelities.OF_TURNS in unread[0]:
                 raise BadConfiguration(f"--free {unread[0]}: these runs are straight, which do not show it")
             reads = ", ".join(other for other in fidelities.NAMES if not fidelities.unread(other, unread, runs.turns))
-            raise BadConfiguration(f"--free {unread[0]}: --model {model} does not read it; allowed: --model {reads}")
+            raise BadConfiguration(
+                f"--free {unread[0]}: --model {fidelity} does not read it; allowed: --model {reads}"
+            )
         return names
 
     ready = prepare(runs, robot, noise, stated, assume=False, choose=chosen)
@@ -143,7 +148,7 @@ def calibrate(
     notes: list[Note | str] = [*ready.foreign, *ready.doubted, *ready.checked, *ready.weighed]
     notes += [PriorOfProduct(name, mean, sd, priors.GUIDED) for name, (mean, sd) in of_product.items()]
     notes += ready.begins
-    posed = observers.pose(runs, base, coordinates, known.sd, model)
+    posed = observers.pose(runs, base, coordinates, known.sd, fidelity)
 
     if population is None:
         population = POPULATION if fidelities.unread("steady", names, runs.turns) else 0
@@ -199,7 +204,7 @@ def calibrate(
         robot=fitted,
         source=runs.source,
         channels=runs.channels,
-        model=model,
+        model=fidelity,
         seed=seed,
         parameters=estimates.parameters(posed, base, z, about, profile, beside, sources, seen_over),
         tied=estimates.tied(posed),

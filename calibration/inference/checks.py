@@ -32,9 +32,40 @@ def check(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[
     """
     _configurations(runs, robot, names)
     _enough(runs, names, noise)
+    _nothing_moves(runs, noise)
     said = [*runs.missing(), *_stuck(runs), *observers.kind(runs).check(runs, noise), *_constant_conditions(runs)]
     said += [*unused(runs), *no_load_gives(runs)]
     return [*said, *check_ranges(runs, robot), *_uninformative(runs, robot, noise), *conduct(runs, robot)]
+
+
+#: Scatter of a speed over that of its changes from row to row, up to which it is noise alone.
+WHITE = 1.5
+
+
+def _nothing_moves(runs: Runs, noise: Noise) -> None:
+    """Refuse a log whose speeds are noise alone; a locked shaft is one that is driven and whose noise is stated."""
+    speeds = [(k, c) for k, c in enumerate(runs.channels) if c.zero_at_rest and runs.has(c.column)]
+    if not runs.sampled or runs.turns or not speeds:
+        return
+    driven = bool(applied(runs).any())
+    for k, channel in speeds:
+        shown = runs[channel.column][np.isfinite(runs[channel.column])]
+        scatter = float(np.std(np.diff(shown))) / 2**0.5 if len(shown) > 2 else 0.0
+        if np.std(shown) > WHITE * scatter or abs(np.mean(shown)) > WHITE * scatter:
+            return
+        if driven and scatter <= WHITE * float(np.nanmax(noise.sd[:, k])) / channel.factor:
+            return
+    imposed, (_, channel) = runs.layout.imposed_column, speeds[0]
+    size, name, unit = number(float(f"{scatter:.2g}")), channel.name, channel.unit
+    if driven:
+        raise BadData(
+            f"{runs.source} rows 1 to {len(runs)}, {channel.column}: readings are noise about zero ({size} {unit}), "
+            f"so nothing moves; log it while it moves, or of a locked shaft state --noise {name}={size}{unit}"
+        )
+    raise BadData(
+        f"{runs.source} rows 1 to {len(runs)}, {imposed}: nothing drives the motors and nothing moves; expected rows "
+        "in which they are driven; if another column drives them, name it under [columns] in the rig's file"
+    )
 
 
 def _uninformative(runs: Runs, robot: Robot, noise: Noise) -> list[Note]:

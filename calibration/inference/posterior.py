@@ -40,7 +40,7 @@ def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tup
 
     Args:
         held: names of parameters that their priors hold; a pair of two of these is left out. With one of them,
-            the other is known as well as that prior alone.
+            the other is known as well as that prior, and the data determine their combination alone.
     """
     sd = np.sqrt(np.diag(posterior.covariance))
     value = posterior.at(posterior.mean)
@@ -58,3 +58,9 @@ def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tup
         form = "linear" if not even else "ratio" if correlation > 0 else "product"
         found.append(Pair(one, other, correlation, form, float(weight)))
     return tuple(sorted(found, key=lambda pair: -abs(pair.correlation)))
+
+
+def undetermined(held: Collection[str], pairs: Collection[Pair]) -> tuple[str, ...]:
+    """Names that priors hold, without those of a pair: of these the data determine a combination."""
+    paired = {name for pair in pairs for name in (pair.one, pair.other)}
+    return tuple(name for name in held if name not in paired)

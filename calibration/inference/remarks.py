@@ -72,7 +72,7 @@ def _statuses(found: CalibrationResult) -> Iterator[Note]:
 
 def _parameters(found: CalibrationResult) -> Iterator[Note]:
     far = {name for name, p in found.parameters.items() if abs(p.shift) > FAR}  # which is said of them instead
-    if held := tuple(name for name in found.held_by_prior if name not in far):
+    if held := tuple(name for name in found.undetermined if name not in far):
         yield HeldByPrior(held)
     if pairs := found.together:
         yield OnlyTogether(pairs)

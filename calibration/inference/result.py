@@ -17,7 +17,7 @@ from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.multistart import Starts
 from calibration.inference.notes import HeldByPrior, Notes, Pair
 from calibration.inference.population import Searched
-from calibration.inference.posterior import determined_together
+from calibration.inference.posterior import determined_together, undetermined
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.words import fits as words
 from calibration.words.notes import sentence, sentences
@@ -328,6 +328,11 @@ class CalibrationResult:
         """Pairs of parameters of which these data determine a combination alone."""
         return determined_together(self.posterior, self.held_by_prior)
 
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Names of the parameters that only their priors determine, without those of a pair in `together`."""
+        return undetermined(self.held_by_prior, self.together)
+
     def determined(self, name: str) -> str:
         """`yes`, `no`, or with which parameters together these data determine one."""
         return words.determined(name, self.parameters[name].held_by_prior, self.together)
@@ -374,7 +379,9 @@ class CalibrationResult:
                 "schema": SCHEMA,
                 "model": self.model,
                 "rows": len(self),
-                "parameters": {name: p.to_json() for name, p in self.parameters.items()},
+                "parameters": {
+                    name: {**p.to_json(), "determined": self.determined(name)} for name, p in self.parameters.items()
+                },
                 "tied": {name: f"{tie.ratio:.4g} x {tie.leader}" for name, tie in self.tied.items()},
                 "noise": _by_name(self.noise),
                 "percent_of": OF_SIZE,
@@ -444,7 +451,7 @@ class CalibrationResult:
 
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        held = [sentence(HeldByPrior(self.held_by_prior))] if self.held_by_prior else []
+        held = [sentence(HeldByPrior(self.undetermined))] if self.undetermined else []
         note = "\n".join([words.header(self, robot_name), *held])
         robot_file.write(self.robot, folder / "robot.toml", note=note)
         writing.write_json(folder / "result.json", self.to_json())

@@ -74,9 +74,9 @@ def pair(two: notes.Pair) -> dict[str, Any]:
 
 
 def determined(name: str, held: bool, pairs: Sequence[notes.Pair]) -> str:
-    """Whether data determine a parameter: `yes`, `no`, `only with motor.resistance`."""
+    """Answer whether data determine a parameter: `yes`, `no`, or `only with motor.resistance` for both of a pair."""
     others = [p.other if p.one == name else p.one for p in pairs if name in (p.one, p.other)]
-    return "no" if held else f"only with {', '.join(others)}" if others else "yes"
+    return f"only with {', '.join(others)}" if others else "no" if held else "yes"
 
 
 def only_together(note: notes.OnlyTogether) -> str:

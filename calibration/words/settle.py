@@ -7,9 +7,11 @@ from collections.abc import Iterable
 from calibration.data.settling import RATES, Settled, Stretch
 from mmrjax.errors import counted
 
+#: Reasons that are none where the log itself is fitted, and what to do then.
+OF_LEVELS = ("changes", "short", "settling", "accelerates")
 #: Of each of `settling.REASONS`: what is so, and what to do where it is much.
 WHY = {
-    "changes": ("the imposed quantity changes all the time", "hold it, or give loop the log as it is"),
+    "changes": ("the imposed quantity changes all the time", "hold it at each level for a while"),
     "short": ("the level is held too briefly", "hold it longer, or state --shortest"),
     "settling": ("still changes at the end of its level", "hold the level longer, or state --drift"),
     "accelerates": ("still accelerates at the end of its level", "hold the level longer, or state --drift"),
@@ -17,6 +19,7 @@ WHY = {
     "rest": ("does not move", "nothing: friction holds it there; time histories use it"),
     "stuck": ("shows one number for long: saturated or frozen", "mend the instrument or its range"),
     "glitches": ("has many readings far from the others", "mend the instrument, or log its mean if it shows pulses"),
+    "unread": ("no channel has enough readings", "log more of them, or remove the rows without"),
     "undriven": ("the driver brakes or coasts", "nothing: time histories use it"),
 }
 
@@ -27,15 +30,20 @@ def reason(stretch: Stretch) -> str:
     return what + (f" ({100 * stretch.size:.2g} %)" if stretch.size else "")
 
 
-def left_out(stretches: Iterable[Stretch]) -> list[tuple[str, int, int, str, str]]:
-    """Of each reason: it, stretches, samples, rows of the longest one, what to do."""
+def left_out(stretches: Iterable[Stretch], few: bool = False) -> list[tuple[str, int, int, str, str]]:
+    """Reasons, each with its stretches, samples, rows of the longest one, and what to do.
+
+    Args:
+        few: the log itself is to be fitted, as it has too few settled runs.
+    """
     found = []
     every = [s for s in stretches if s.why]
     for why in dict.fromkeys(s.why for s in every):
         mine = [s for s in every if s.why == why]
         longest = max(mine, key=lambda s: len(s.rows))
         rows = f"{longest.rows[0] + 1}-{longest.rows[-1] + 1}"
-        found.append((reason(longest), len(mine), sum(len(s.rows) for s in mine), rows, WHY[why][1]))
+        cure = "nothing: the log as it is has them" if few and why in OF_LEVELS else WHY[why][1]
+        found.append((reason(longest), len(mine), sum(len(s.rows) for s in mine), rows, cure))
     return found
 
 
@@ -47,6 +55,22 @@ def statement(found: Settled) -> str:
     return (
         f"{counted(len(kept), 'settled run')}{ways}, from {rows} of {len(found.runs)} samples "
         f"(each at least {found.shortest:.3g} s long, its means steady to {100 * found.drift:g} %)."
+    )
+
+
+def too_few(found: Settled, fewest: int, loop: str) -> str:
+    """Sentence for a log with too few settled runs: fit the log itself; empty where it has enough.
+
+    Args:
+        fewest: rows that the loop asks for; loop: command that fits the log as it is.
+    """
+    if len(found.kept) >= fewest:
+        return ""
+    if found.runs.turns:  # over time a turn is simulated, and not fitted
+        return f"The loop asks for {fewest} settled runs: hold more levels of both sides, or hold them longer."
+    return (
+        f"The loop asks for {fewest} settled runs, so give it the log as it is: {loop}; calibrate in place of loop "
+        "fits the parameters alone."
     )
 
 
@@ -67,12 +91,8 @@ def glitches(found: Settled) -> list[str]:
     return said
 
 
-def remarks(found: Settled, fewest: int) -> list[str]:
-    """What should be looked at, a sentence each.
-
-    Args:
-        fewest: rows that the loop asks for.
-    """
+def remarks(found: Settled) -> list[str]:
+    """Sentences on what should be looked at."""
     said = []
     if found.gaps:
         rows = ", ".join(str(k + 1) for k in found.gaps[:5]) + (", ..." if len(found.gaps) > 5 else "")
@@ -91,6 +111,4 @@ def remarks(found: Settled, fewest: int) -> list[str]:
             f"{signal.channel.column}: levels that were held several times differ by "
             f"{wide[signal.channel.name]:.2g} {signal.channel.unit} beyond their noise; the sds include it"
         )
-    if len(found.kept) < fewest:
-        said.append(f"the loop asks for {fewest} settled runs; hold more levels, or give the log to loop as it is")
     return said

@@ -18,7 +18,8 @@ from calibration.data.rig_file import FREE
 from calibration.data.runs import Runs
 from calibration.data.writing import finite
 from calibration.inference import foresight, identifiability, priors
-from calibration.inference.foresight import Foresight
+from calibration.inference.foresight import Determined, Foresight
+from calibration.inference.posterior import undetermined
 from calibration.words import fits
 from calibration.words.notes import sentences
 from mmrjax import channels
@@ -184,14 +185,19 @@ class RigCheck:
         """What the table can determine, in a sentence."""
         if self.foresight is None:
             return "Without data: give a table to see what it can determine."
-        held = [p.name for p in self.foresight.parameters if p.held]
         pairs = self.foresight.together
+        held = undetermined([p.name for p in self.foresight.parameters if p.held], pairs)
         traded = {name for pair in pairs for name in (pair.one, pair.other)}
         told = [p.name for p in self.foresight.parameters if not p.held and p.name not in traded]
         told += [fits.combination(p) for p in pairs]
         parts = [f"These data determine {', '.join(told)}" if told else "These data determine no parameter"]
         parts += [f"{', '.join(held)} would not be determined by these runs"] * bool(held)
         return "; ".join(parts) + "."
+
+    def determined(self, parameter: Determined) -> str:
+        """`yes`, `no`, or with which parameters together the table determines one."""
+        assert self.foresight is not None
+        return fits.determined(parameter.name, parameter.held, self.foresight.together)
 
     def to_json(self) -> dict[str, Any]:
         """The whole, for machines."""
@@ -205,7 +211,9 @@ class RigCheck:
                 "columns": self.columns(),
                 "unused": self.unused(),
                 "status": {str(n): int(c) for n, c in zip(names, counts, strict=True)},
-                "parameters": [dataclasses.asdict(p) for p in self.foresight.parameters],
+                "parameters": [
+                    {**dataclasses.asdict(p), "determined": self.determined(p)} for p in self.foresight.parameters
+                ],
                 "alike": [list(pair) for pair in self.foresight.alike],
                 "together": [fits.pair(pair) for pair in self.foresight.together],
             }
@@ -358,8 +366,8 @@ def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
     title = "\nwhat these data can determine (posterior sd over prior sd, at the numbers of the file)"
     shown = _table(title, "parameter", "value>r", "prior ±>r", "unit", "posterior/prior>r", "")
     for p in sorted(seen.parameters, key=lambda p: p.share):
-        said = fits.determined(p.name, p.held, seen.together)
-        shown.add_row(p.name, f"{p.value:.4g}", f"{p.prior_sd:.2g}", p.unit, f"{p.share:.2f}", said)
+        row = (p.name, f"{p.value:.4g}", f"{p.prior_sd:.2g}", p.unit, f"{p.share:.2f}", found.determined(p))
+        shown.add_row(*row)
     say(shown)
     say(f"not determined: above {identifiability.HELD:g}")
     for one, other, size in seen.alike:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -31,18 +32,25 @@ def settle(config: configuration.Settle, source: str, out: Path | None, force: b
     """Find what of a log has settled, and leave a run folder with the table; returns the exit code, 0."""
     robot = load_robot(config).robot
     runs = read_runs(source, robot, measured=True, series=True)
+    loop = shlex.join(["mmrjax", "loop", source, "--robot", config.robot])
     found = settling.settle(
-        runs, shortest=config.shortest_s, drift=config.drift, inertia=inertia(robot), rolling=rolling(robot)
+        runs,
+        shortest=config.shortest_s,
+        drift=config.drift,
+        inertia=inertia(robot),
+        rolling=rolling(robot),
+        loop=loop,
     )
+    few = words.too_few(found, SettledRuns.fewest, loop)
     with open_folder("settle", config, robot, out, force, runs) as folder:
         robot_file.write(robot, folder.partial / "robot.toml", note=f"the rig of this log, from {config.robot}")
         folder.write_table("settled.csv", found.table())
         folder.write_table("stretches.csv", stretches(found))
-        folder.write_json("result.json", to_json(found))
-        print_settled(found)
+        folder.write_json("result.json", to_json(found, few))
+        print_settled(found, few)
         for sentence in sentences(ranges.turned_signs(found.settled_runs(), robot)):
             say(f"- {sentence}")
-        shown = page("settle", found)
+        shown = page("settle", found, few=few)
         return leave(folder, config, {"seed": None, "settled": len(found.kept)}, page=shown, runs=runs)
 
 
@@ -112,9 +120,9 @@ def stretches(found: Settled) -> dict[str, np.ndarray]:
     return table
 
 
-def to_json(found: Settled) -> dict[str, Any]:
-    """`result.json`."""
-    left = words.left_out(found.stretches)
+def to_json(found: Settled, few: str = "") -> dict[str, Any]:
+    """`result.json`; `few` is the sentence of `words.too_few`."""
+    left = words.left_out(found.stretches, bool(few))
     return {
         "schema": "mmrjax.settle/1",
         "statement": words.statement(found),
@@ -128,14 +136,16 @@ def to_json(found: Settled) -> dict[str, Any]:
             s.channel.name: sum(k.glitches.get(s.channel.name, 0) for k in found.kept) for s in found.signals
         },
         "left_out": [dict(zip(("why", "stretches", "samples", "rows", "do"), row, strict=True)) for row in left],
-        "notes": words.remarks(found, SettledRuns.fewest),
+        "notes": [*filter(None, [few]), *words.remarks(found)],
     }
 
 
-def print_settled(found: Settled) -> None:
-    """What was found and what was left out, for a person."""
+def print_settled(found: Settled, few: str = "") -> None:
+    """Print what was found, the log's own command where that is too few, and what was left out."""
     say(words.statement(found))
-    left = words.left_out(found.stretches)
+    if few:
+        say(few)
+    left = words.left_out(found.stretches, bool(few))
     if left:
         shown = Table(title="left out", title_justify="left", box=None, pad_edge=False)
         for heading in ("why", "stretches", "samples", "rows, as", "what to do"):
@@ -143,5 +153,5 @@ def print_settled(found: Settled) -> None:
         for row in left:
             shown.add_row(*map(str, row))
         say(shown)
-    for sentence in words.remarks(found, SettledRuns.fewest):
+    for sentence in words.remarks(found):
         say(f"- {sentence}")

@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 
 from calibration.data.courses import applied
 from calibration.data.settling import Settled
-from calibration.inference.observers import SettledRuns
 from calibration.words import settle as words
 from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, figure
 from sweeps.pages.page import ROWS, Album, render
@@ -25,8 +24,12 @@ IMPOSED = {
 POINTS = 3000
 
 
-def write(folder: Path, found: Settled) -> Path:
-    """Write `report.html` and `figures/` for what of a log has settled; returns the path of the page."""
+def write(folder: Path, found: Settled, *, few: str = "") -> Path:
+    """Write `report.html` and `figures/` for what of a log has settled; returns the path of the page.
+
+    Args:
+        few: sentence of `words.too_few`.
+    """
     album = Album(folder)
     album.add("log", lambda: over_log(found))
     return render(
@@ -37,8 +40,9 @@ def write(folder: Path, found: Settled) -> Path:
         of_channels=tuple(s.channel for s in found.signals),
         title=f"Settled runs of {Path(found.runs.source).name}",
         statement=words.statement(found),
-        notes=words.remarks(found, SettledRuns.fewest),
-        left=words.left_out(found.stretches),
+        few=few,
+        notes=words.remarks(found),
+        left=words.left_out(found.stretches, bool(few)),
         imposed="{} [{}]".format(*IMPOSED[found.runs.layout.imposed]),
         settled=_rows(found),
         count=len(found.kept),
