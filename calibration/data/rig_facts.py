@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from calibration.data import rig_file
-from calibration.data.columns import CURRENT, LOAD, SUPPLY
+from calibration.data.columns import CURRENT, LOAD, SPEED, SUPPLY
 from calibration.data.courses import applied, stretches
 from calibration.data.errors import rounded
 from calibration.data.robot_file import RobotFile
@@ -295,7 +295,7 @@ def saturated(runs: Runs) -> str:
     Rows of small voltage give U = R I + k ω by least squares. In rows of a larger voltage, current and speed show one
     voltage all the time if the driver limits it.
     """
-    current, speed = ("motor_current_A" if runs.has("duty") else "total_current_A"), "motor_speed_rpm"
+    current, speed = (CURRENT if runs.has("duty") else "total_current_A"), SPEED
     if runs.layout.imposed != "voltage" or not (runs.sampled and runs.has(current) and runs.has(speed)) or runs.turns:
         return ""
     if any(runs.layout.magnitude(c.name) for c in runs.channels if c.column in (current, speed)):
@@ -317,9 +317,9 @@ def saturated(runs: Runs) -> str:
     row = int(np.flatnonzero(beyond)[0])
     column = "duty" if runs.has("duty") else runs.headings.get(SUPPLY, SUPPLY)
     return (
-        f"{runs.source} row {row + 1}, {column}: commands {rounded(given[row])} V, and so in {beyond.sum()} of "
-        f"{len(runs)} rows, where current and speed show {rounded(limit)} V at most; the driver limits it: give the "
-        f"voltage that it applies, or limit the column to {rounded(limit)} V"
+        f"{runs.source} row {row + 1}, {column}: commands {rounded(given[row])} V, where current and speed show "
+        f"{rounded(limit)} V at most, and so in {100 * np.mean(beyond):.2g} % of the log; the driver limits it: give "
+        f"the voltage that it applies, or limit the column to {rounded(limit)} V"
     )
 
 
