@@ -646,3 +646,25 @@ def test_a_log_in_which_nothing_moves_is_refused_unless_a_shaft_is_locked(tmp_pa
     if volts == 0.5:  # nor is it a settled run
         with pytest.raises(BadData, match="no settled stretch: nothing moves beyond its noise"):
             settled(tmp_path, robot)
+
+
+@pytest.mark.parametrize("limit", [12.0, 100.0])
+def test_a_command_beyond_what_the_driver_gives_is_said_with_its_limit(tmp_path, limit):
+    time, rng = np.arange(1200) / 100, np.random.default_rng(14)
+    command = np.round(36 * np.sin(2.2 * time) * np.sin(0.9 * time), 3)
+    volts, speed = np.clip(command, -limit, limit), np.zeros(1200)  # of 0.05 N·m/A and 1 ohm, in rad/s
+    for k in range(1, 1200):
+        speed[k] = speed[k - 1] + 0.01 * (volts[k - 1] / 0.05 - speed[k - 1]) / 0.2
+    columns = {
+        "time_s": time,
+        "supply_voltage_V": command,
+        "total_current_A": volts - 0.05 * speed + 0.05 * rng.standard_normal(1200),
+        "motor_speed_rpm": speed * 30 / np.pi + 3 * rng.standard_normal(1200),
+    }
+    robot = bench(tmp_path, columns)
+    found = rig_facts.saturated(records.read(tmp_path / "log.csv", robot=robot))
+    if limit > 36:
+        assert found == ""
+        return
+    row, shown = re.search(r"row (\d+), supply_voltage_V: commands .* show ([\d.]+) V at most", found).groups()
+    assert abs(command[int(row) - 1]) > limit and float(shown) == pytest.approx(limit, rel=0.05)

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from calibration.data import rig_file
-from calibration.data.columns import CURRENT, LOAD
+from calibration.data.columns import CURRENT, LOAD, SPEED, SUPPLY
 from calibration.data.courses import applied, stretches
 from calibration.data.errors import rounded
 from calibration.data.robot_file import RobotFile
@@ -248,7 +248,7 @@ def gap(runs: Runs) -> str:
         told = (
             f"{runs.source} row {rows[k + 1] + 1}, time_s: {rounded(worst)} s after the row before it, where "
             f"{rounded(usual)} s is usual{more}; a fit holds what is imposed for that time; if rows are missing, "
-            "give the rows from there on another run_id"
+            'give the rows from there on another run_id, with start = "measured" in the rig\'s file'
         )
     return told
 
@@ -284,6 +284,45 @@ def jitter(runs: Runs) -> str:
     return ""
 
 
+#: Share of the largest voltage up to which rows show resistance and back-EMF, and fewest of them; the misfit up to
+#: which they do, over their voltage; the share of a larger voltage that its rows have to show.
+INNER, ROWS_INNER, FITS, REACHES = 0.25, 30, 0.2, 0.8
+
+
+def saturated(runs: Runs) -> str:
+    """Sentence on a voltage in a log that the driver does not reach; empty where nothing shows that.
+
+    Rows of small voltage give U = R I + k ω by least squares. In rows of a larger voltage, current and speed show one
+    voltage all the time if the driver limits it.
+    """
+    current, speed = (CURRENT if runs.has("duty") else "total_current_A"), SPEED
+    if runs.layout.imposed != "voltage" or not (runs.sampled and runs.has(current) and runs.has(speed)) or runs.turns:
+        return ""
+    if any(runs.layout.magnitude(c.name) for c in runs.channels if c.column in (current, speed)):
+        return ""
+    given, shown = applied(runs), np.stack([runs[current], runs[speed]], 1)
+    read = np.isfinite(shown).all(1)
+    inner = read & (given != 0) & (np.abs(given) <= INNER * float(np.max(np.abs(given))))
+    if inner.sum() < ROWS_INNER:
+        return ""
+    seen = shown @ np.linalg.lstsq(shown[inner], given[inner], rcond=None)[0]
+    if np.std(seen[inner] - given[inner]) > FITS * np.std(given[inner]):
+        return ""
+    top = read & (np.abs(given) >= np.quantile(np.abs(given[read]), 0.9))
+    limit = float(np.median(np.abs(seen[top])))
+    beyond = read & (np.abs(given) > limit / REACHES)
+    # Where what they show rises on, something else is wrong.
+    if beyond.sum() < ROWS_INNER or np.std(np.abs(seen[beyond])) > FITS * limit:
+        return ""
+    row = int(np.flatnonzero(beyond)[0])
+    column = "duty" if runs.has("duty") else runs.headings.get(SUPPLY, SUPPLY)
+    return (
+        f"{runs.source} row {row + 1}, {column}: commands {rounded(given[row])} V, where current and speed show "
+        f"{rounded(limit)} V at most, and so in {100 * np.mean(beyond):.2g} % of the log; the driver limits it: give "
+        f"the voltage that it applies, or limit the column to {rounded(limit)} V"
+    )
+
+
 #: Multiple of the torque at stall beyond which a brake's is in another unit.
 BEYOND = 3.0
 
@@ -313,6 +352,7 @@ def doubts(runs: Runs, robot: Robot) -> tuple[str, ...]:
     every = (
         gap(runs),
         jitter(runs),
+        saturated(runs),
         doubtful_time(runs, robot),
         doubtful_current(runs, robot),
         doubtful_torque(runs, robot),

@@ -43,7 +43,7 @@ WHITE = 1.5
 
 
 def _nothing_moves(runs: Runs, noise: Noise) -> None:
-    """Refuse a log whose speeds are noise alone; a locked shaft is one that is driven and whose noise is stated."""
+    """Refuse a log whose speeds are noise alone, except a locked shaft: it is driven, and its noise is stated."""
     speeds = [(k, c) for k, c in enumerate(runs.channels) if c.zero_at_rest and runs.has(c.column)]
     if not runs.sampled or runs.turns or not speeds:
         return
