@@ -985,7 +985,7 @@ def remarks(found: DiscoveryResult) -> Notes:
             said.append(KeptOut(rows, why))
     far = {name: abs(p.shift_after) for name, p in found.base_shift.items() if abs(p.shift_after) > FAR}
     said += [FarFromPrior(name, x, "loop") for name, x in far.items()]
-    held = tuple(name for name in found.held_by_prior if name not in far)
+    held = tuple(name for name in undetermined(found.held_by_prior, found.together) if name not in far)
     said += [HeldByPrior(held)] * bool(held)
     said += [OnlyTogether(found.together)] * bool(found.together)
     said += [NotPredictable(found.held_out_unpredictable)] * bool(found.held_out_unpredictable)
