@@ -93,6 +93,7 @@ from calibration.inference.notes import (
     OnlyTogether,
     Step,
 )
+from calibration.inference.posterior import undetermined
 from calibration.inference.residual_clusters import residual_clusters
 from calibration.words.notes import in_words, sentence
 from mmrjax import channels, effects
