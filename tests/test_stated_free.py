@@ -114,7 +114,7 @@ def test_what_lies_far_from_its_prior_is_not_said_to_be_held_by_it():
     parameter = lambda shift: SimpleNamespace(shift=shift, at_bound="")  # noqa: E731
     found = SimpleNamespace(
         parameters={"near": parameter(0.5), "far": parameter(-6.5)}, held_by_prior=("near", "far"), searched=None,
-        together=(),
+        together=(), undetermined=("near", "far"),
     )  # fmt: skip
     said = list(remarks._parameters(found))
     assert [n.names for n in said if isinstance(n, HeldByPrior)] == [("near",)]
