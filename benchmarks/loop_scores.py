@@ -182,7 +182,7 @@ def same_mechanism(family: str, truth: dict, loosely: bool = False) -> bool:
         drivers, enters = {own.driver}, own.family().partition(" that ")[0]
     else:
         drivers = set(DRIVERS[truth["name"]])
-        shown = {"range_switch": "total_current", "lost_counts": "motor_speed"}.get(truth["name"], truth["balance"])
+        shown = truth.get("channel") or truth["balance"]
         enters = WORDS.get(shown, f"reading of {shown.replace('_', ' ')}")
     if loosely:
         drivers |= {v for same in SAME_DRIVER if same & drivers for v in same}

@@ -55,6 +55,12 @@ def test_a_mechanism_is_right_where_its_equation_and_its_driver_are(found, right
     assert scores.mechanism_wrong(found | {"truth": []}) == bool(scores.established_families(found))
 
 
+def test_a_law_of_an_instrument_is_a_reading_of_its_channel():
+    truth = {"class": "", "name": "range_switch", "balance": "sensor", "channel": "total_current"}
+    assert scores.same_mechanism("reading of total current that changes with current", truth)
+    assert not scores.same_mechanism("reading of speed that changes with current", truth)
+
+
 def test_what_acts_alike_counts_apart():
     truth = {"class": "", "name": "guide_binding", "balance": "track"}
     assert not scores.same_mechanism("resistance to travel that changes with slope", truth)
