@@ -90,8 +90,8 @@ def test_two_laws_of_one_mechanism_are_one(found):
 def test_share_of_the_excess_is_no_more_than_all_where_noise_is_stated_too_large():
     bare = SimpleNamespace(observe=SimpleNamespace(noise_misfit=lambda off, counts: counts.sum()))
     space, base = SimpleNamespace(weight=np.ones((ROWS, 1)), bare=bare), fitted(explains=0.0)
-    assert room.share_of_excess(space, base, 985.0) == pytest.approx(0.5)
-    assert room.share_of_excess(space, dataclasses.replace(base, cost=ROWS / 2), 20.0) == 1.0
+    assert room.share_of_excess(room.excess_misfit(space, base), 985.0) == pytest.approx(0.5)
+    assert room.share_of_excess(room.excess_misfit(space, dataclasses.replace(base, cost=ROWS / 2)), 20.0) == 1.0
 
 
 def test_mechanisms_that_explain_as_much_are_both_listed(found):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from test_load_torque import RIG as IDEAL
 
 from calibration.data import robot_file
 from calibration.data import runs as records
@@ -13,21 +14,7 @@ from calibration.inference.observers import SettledRuns
 from calibration.inference.unused import no_load_gives, unused
 from calibration.words.notes import sentences
 
-RIG = """
-base = "none"
-{head}
-[motor]
-resistance = 0.5
-torque_constant = 0.05
-friction_coulomb = 0.01
-[gearbox]
-ratio = 1
-efficiency_load = 1.0
-[brake]
-load = "shaft"
-inertia = 1e-4
-loss_coulomb = 0.1
-"""
+RIG = IDEAL.replace("loss_coulomb = 0.0", "loss_coulomb = 0.1")
 #: Of an ideal motor at 24 V, R 0.5, k 0.05, M0 0.01: torque of a brake [N·m], speed [rpm], current [A].
 TORQUE = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 0.5])
 CURRENT = (TORQUE + 0.01) / 0.05

@@ -231,14 +231,17 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
 LONG = 100.0
 
 
+def _times_between(runs: Runs) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Name of each run of a log, its rows in the order of time, and the times between these [s]."""
+    for name in np.unique(runs.run_names) if runs.sampled else ():
+        rows = runs.in_order(name)
+        yield name, rows, np.diff(runs["time_s"][rows])
+
+
 def gap(runs: Runs) -> str:
     """Sentence on the longest time between two rows of a run, if rows may be missing there; empty otherwise."""
-    if not runs.sampled:
-        return ""
     worst, told = 0.0, ""
-    for name in np.unique(runs.run_names):
-        rows = runs.in_order(name)
-        steps = np.diff(runs["time_s"][rows])
+    for _, rows, steps in _times_between(runs):
         usual = float(np.median(steps)) if len(steps) else 0.0
         long = steps > LONG * usual
         if not (usual > 0 and long.any() and steps.max() > worst):
@@ -264,11 +267,7 @@ def jitter(runs: Runs) -> str:
     If rows are even and the clock's errors independent, the times between rows correlate with the next by -1/2. If
     the rows themselves are uneven, these times are independent and correlate by 0.
     """
-    if not runs.sampled:
-        return ""
-    for name in np.unique(runs.run_names):
-        rows = runs.in_order(name)
-        steps = np.diff(runs["time_s"][rows])
+    for name, rows, steps in _times_between(runs):
         usual = float(np.median(steps)) if len(steps) > ROWS_OF_CLOCK else 0.0
         off = np.clip(steps - usual, -usual, usual)
         spread = float(np.std(off))

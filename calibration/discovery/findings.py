@@ -19,7 +19,7 @@ from calibration.discovery.discrepancy import Discrepancy
 from calibration.discovery.experiments import Proposal
 from calibration.discovery.hidden import Hidden
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.mechanism import share_of_excess
+from calibration.discovery.mechanism import excess_misfit, share_of_excess
 from calibration.discovery.notes import RuledOut
 from calibration.discovery.projection import Defect, defect
 from calibration.discovery.result import (
@@ -82,7 +82,7 @@ def found_effects(
         test: of the base fit, whose bootstrap gives the p-values.
     """
     gains = _without_each(space, base, best, found.ladder, settings)
-    null = np.asarray(test.null.single)
+    null, excess = np.asarray(test.null.single), excess_misfit(space, base)
     listed = []
     for slot, members in enumerate(found.members):
         effect = space.library[members[0]]
@@ -100,7 +100,7 @@ def found_effects(
                 parameters=_parameters(space, best, slot, settings),
                 p_value=own_p(gains[slot], null),
                 score=float(gains[slot]),
-                share=share_of_excess(space, base, float(gains[slot])),
+                share=share_of_excess(excess, float(gains[slot])),
             )
         )
     return tuple(listed)

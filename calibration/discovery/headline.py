@@ -20,15 +20,15 @@ def headline(said: Summary, others: Sequence[tuple[float, Summary]] = ()) -> Hea
         return Headline("open", (), factors)
     if _silent(said):
         return Headline(said.verdict, (), factors)
-    laws = _common([[m.names for m in s.missing if m.established] for s in every])
+    laws, _ = _common([[m.names for m in s.missing if m.established] for s in every])
     if laws:
         alone = all(len(names) == 1 for names in laws) and not any(m.values for s in every for m in s.missing)
         return Headline("named" if alone else "class", laws, factors)
-    for level, claimed in (("mechanism", _mechanisms), ("place", _places)):
-        claims = [claimed(s) for s in every]
-        if (found := _common(claims)) or level == "place":
-            break
-    return Headline(level, found, factors, tuple(_shared(claim, claims) for claim in found))
+    mechanisms, shared = _common([_mechanisms(s) for s in every])
+    if mechanisms:
+        return Headline("mechanism", mechanisms, factors, shared)
+    places, shared = _common([_places(s) for s in every])
+    return Headline("place", places, factors, shared)
 
 
 def _silent(said: Summary) -> str:
@@ -50,20 +50,17 @@ def _places(said: Summary) -> list[tuple[str, ...]]:
     return [tuple(dict.fromkeys(f.partition(" that ")[0] for f in those)) for those in families]
 
 
-def _common(claims: Sequence[Sequence[tuple[str, ...]]]) -> tuple[tuple[str, ...], ...]:
+def _common(claims: Sequence[Sequence[tuple[str, ...]]]) -> tuple[tuple[tuple[str, ...], ...], tuple[int, ...]]:
     """Claims of the first that share a member with one of each of the others: the members that all of them list come
-    first, then what some cannot tell from these. A claim that another one contains is left out."""
-    found: list[tuple[str, ...]] = []
+    first, then what some cannot tell from these; and how many are shared. A claim that another contains is left out."""
+    found: dict[tuple[str, ...], int] = {}
     for claim in claims[0]:
         alike = [[other for other in those if set(other) & set(claim)] for those in claims[1:]]
         if all(alike):
             every = dict.fromkeys([*claim, *(n for those in alike for other in those for n in other)])
-            shared = [n for n in every if n in claim and all(any(n in o for o in those) for those in alike)]
-            found.append((*shared, *(n for n in every if n not in shared)))
-    kept = [c for k, c in enumerate(found) if not any(set(c) <= set(o) for o in (*found[:k],))]
-    return tuple(c for c in kept if not any(set(c) < set(o) for o in kept))
-
-
-def _shared(claim: tuple[str, ...], claims: Sequence[Sequence[tuple[str, ...]]]) -> int:
-    """Number of the leading members of a claim that every verdict lists."""
-    return sum(all(any(n in other for other in those) for those in claims) for n in claim)
+            shared = [n for n in claim if all(any(n in o for o in those) for those in alike)]
+            whole = (*shared, *(n for n in every if n not in shared))
+            if not any(set(whole) <= set(other) for other in found):
+                found[whole] = len(shared)
+    kept = {c: n for c, n in found.items() if not any(set(c) < set(other) for other in found)}
+    return tuple(kept), tuple(kept.values())

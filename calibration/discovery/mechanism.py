@@ -71,6 +71,7 @@ def mechanism(
     by_name = [f for f in (*alike, *over) if f in best and (space.bare.observe.long or by_effects[f] >= HALF * most)]
     blocks = [mask for by in blocks_room.predictable(runs, space.bare).values() for mask in by.values()]
     found: list[Mechanism] = []
+    excess = excess_misfit(space, base)
     curve = () if space.bare.observe.long or own[0] in by_name or own[0] not in alike else own[:1]
     for leader in (*by_name[:1], *curve, *by_name[1:]):
         others = alike if leader in by_name else [*alike, *over]
@@ -88,7 +89,7 @@ def mechanism(
         else:
             gain, effects = _gain_of_curve(space, runs, base, beside, predicted), ()
             again = _curve_again(space, left, bases, families, blocks, settings)
-        share = share_of_excess(space, base, explained.get(leader, 0.0))
+        share = share_of_excess(excess, explained.get(leader, 0.0))
         found.append(Mechanism(families, effects, share, gain.mean, gain.se, again, gain.errors))
         if not found[-1].fails:
             return found[-1]
@@ -146,15 +147,19 @@ def _explained(
     return found
 
 
-def share_of_excess(space: CandidateSpace, base: Candidate, explained: float) -> float:
-    """Share of the excess misfit that so much is [-]: of χ² of the base, priors included, less what noise leaves
-    (`Observer.noise_misfit`). No more than all: with noise that is stated too large there is less excess than that.
+def excess_misfit(space: CandidateSpace, base: Candidate) -> float:
+    """χ² of the base, priors included, less what noise leaves (`Observer.noise_misfit`) [σ²]."""
+    counts = np.asarray(space.weight > 0)
+    return 2 * base.cost - space.bare.observe.noise_misfit(lambda: _whitened(space, base), counts)
+
+
+def share_of_excess(excess: float, explained: float) -> float:
+    """Share of the excess misfit that so much is [-]; no more than all: with noise that is stated too large there is
+    less excess than that.
 
     Args:
-        explained: fall of χ² [σ²].
+        excess: see `excess_misfit`; explained: fall of χ² [σ²].
     """
-    counts = np.asarray(space.weight > 0)
-    excess = 2 * base.cost - space.bare.observe.noise_misfit(lambda: _whitened(space, base), counts)
     return float(explained / max(excess, explained, 1e-300))
 
 

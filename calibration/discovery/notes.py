@@ -203,7 +203,7 @@ class Mechanism:
         share: of the excess misfit, χ² less its expectation, that it explains [-].
         gain, se: on data held out, over the readings that it changes [nat a reading].
         again: share of the informative blocks of runs without which it is found again [-].
-        errors: standard errors of the gain, by rows and by each kind of block [nat a reading].
+        errors: standard error of the gain by kind of block [nat a reading].
     """
 
     families: tuple[str, ...]

@@ -68,10 +68,9 @@ class HeldOutScore:
         mean = float(np.nansum(each) / total)
         # Of rows, and of the blocks of each kind, whose readings share what was not seen.
         off = np.nansum(each, (0, 2)) - mean * counts
-        several = {kind: by for kind, by in self.blocks.items() if len(np.unique(by[by >= 0])) >= fewest}
-        groups = {"row": np.arange(len(rows)), **several}
-        errors = {kind: _error(off[rows], by[rows]) / total for kind, by in groups.items()}
-        return Gain(mean, max(errors.values()), errors)
+        several = [by for by in self.blocks.values() if len(np.unique(by[by >= 0])) >= fewest]
+        groups = [np.arange(len(rows)), *several]
+        return Gain(mean, max(_error(off[rows], by[rows]) for by in groups) / total)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +78,7 @@ class Gain:
     """A difference of two scores and its standard error [nat a reading].
 
     Attributes:
-        errors: standard errors by what the scatter is over, rows or the blocks of a kind; `se` is the largest.
+        errors: standard error by kind of block, where `se` is their mean; else empty.
     """
 
     mean: float

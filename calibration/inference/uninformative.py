@@ -11,6 +11,7 @@ from calibration.data.runs import Runs
 from calibration.inference.noise import Noise
 from calibration.inference.notes import Copied, NothingVaries
 from calibration.inference.operating import operating_readings
+from calibration.inference.unused import unused_columns
 from mmrjax.channels import Channel
 from mmrjax.robot import Robot
 
@@ -35,8 +36,7 @@ def nothing_varies(runs: Runs, robot: Robot, noise: Noise) -> NothingVaries | No
     sd = np.median(noise.sd, 0)
     if (np.ptp(foreseen, 0) >= sd).any() or (np.ptp(runs.measured(), 0) >= RANGE * sd).any():
         return None
-    unused = [n for n, x in runs.extras.items() if np.issubdtype(x.dtype, np.number) and np.nanmax(x) > np.nanmin(x)]
-    return NothingVaries(runs.source, len(runs), runs.layout.imposed_column, tuple(unused))
+    return NothingVaries(runs.source, len(runs), runs.layout.imposed_column, unused_columns(runs))
 
 
 def copied(runs: Runs, robot: Robot) -> list[Copied]:

@@ -21,12 +21,13 @@ TORQUE = channels.find("output_torque")
 
 def unused(runs: Runs) -> tuple[Unused, ...]:
     """A note on the columns of numbers that vary and have no role; row numbers and times are left out."""
-    found = [name for name, cells in runs.extras.items() if _varies(name, cells)]
-    return (
-        (Unused(runs.source, tuple((name, runs.layout.nearest(name, runs.columns)) for name in found)),)
-        if found
-        else ()
-    )
+    columns = tuple((name, runs.layout.nearest(name, runs.columns)) for name in unused_columns(runs))
+    return (Unused(runs.source, columns),) if columns else ()
+
+
+def unused_columns(runs: Runs) -> tuple[str, ...]:
+    """Names of the columns of numbers that vary and have no role."""
+    return tuple(name for name, cells in runs.extras.items() if _varies(name, cells))
 
 
 def _varies(name: str, cells: np.ndarray) -> bool:
