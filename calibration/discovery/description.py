@@ -58,7 +58,5 @@ def _missed(space: CandidateSpace, runs: Runs, noise: Noise, fit: Linearization)
 
 def unused(runs: Runs) -> tuple[str, ...]:
     """Columns of numbers that vary and have no role, and a torque at the output that a brake may set."""
-    return (
-        *unused_room.unused_columns(runs),
-        *(f"{note.theirs} as a condition" for note in unused_room.no_load_gives(runs)),
-    )
+    torques = (f"{note.theirs} as a condition" for note in unused_room.no_load_gives(runs))
+    return (*unused_room.unused_columns(runs), *torques)

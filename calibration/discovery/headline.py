@@ -51,8 +51,10 @@ def _places(said: Summary) -> list[tuple[str, ...]]:
 
 
 def _common(claims: Sequence[Sequence[tuple[str, ...]]]) -> tuple[tuple[tuple[str, ...], ...], tuple[int, ...]]:
-    """Claims of the first that share a member with one of each of the others: the members that all of them list come
-    first, then what some cannot tell from these; and how many are shared. A claim that another contains is left out."""
+    """Claims of the first verdict that share a member with one of each other verdict, and how many members all list.
+
+    These come first in a claim, then what some noises do not tell from them. A claim within another is left out.
+    """
     found: dict[tuple[str, ...], int] = {}
     for claim in claims[0]:
         alike = [[other for other in those if set(other) & set(claim)] for those in claims[1:]]
