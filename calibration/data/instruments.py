@@ -47,8 +47,8 @@ def step_of(readings: np.ndarray) -> float:
 def display_step(readings: np.ndarray, channel: Channel) -> float:
     """Step of the display that shows a channel [SI], 0 if none shows.
 
-    It is that of `step_of`. Too few different readings do not tell it; then it is the largest power of ten that divides
-    all of them, in the unit of their column and up to `COARSEST` of the largest.
+    It is that of `step_of`. Too few different readings do not tell it. Then it is the largest power of ten that
+    divides all of them, in the unit of their column and up to `COARSEST` of the largest.
 
     Args:
         readings: [SI].
