@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -38,10 +38,8 @@ from calibration.data.table import Runs, driven_on
 from mmrjax import channels
 from mmrjax.channels import MM, RPM, Channel
 from mmrjax.errors import counted
-from mmrjax.robot import NO_BRAKE
-
-if TYPE_CHECKING:
-    from mmrjax.robot import Robot
+from mmrjax.rig import Instrument
+from mmrjax.robot import NO_BRAKE, Robot
 
 __all__ = ["CONDITIONS", "MM", "RPM", "Runs", "read", "single"]
 
@@ -97,13 +95,41 @@ def _read(
 ) -> Runs:
     content = input_files.table(path, name)
     text, encoded = delimited.text(name, content)
-    lines = delimited.below_comments([line for line in text.splitlines() if line.strip()])
-    rows, notes = delimited.cells(name, lines)
+    rows, notes = delimited.cells(name, delimited.below_comments([x for x in text.splitlines() if x.strip()]))
     if not rows:
         expected = ", ".join((*layout.required(measured=True, battery=False), *layout.measured_columns))
         raise BadData(f"{name}: the file is empty; expected a header with {expected}")
-    named = [column or f"column {k}" for k, column in enumerate(rows[0], 1)]
-    header, capitals = _in_case(name, named, layout, inferred)
+    header, layout, capitals = _header(name, rows[0], layout, inferred=inferred, of_turns=of_turns)
+    meanings = layout.meanings(name, header)
+    _check_header(name, header, meanings, measured, battery, layout)
+    if measured and not inferred:
+        _check_time(name, header, meanings, layout)
+    rows, below = _rows_of_cells(name, header, meanings, rows)
+    columns, changed = _columns(name, meanings, rows, layout, battery)
+    notes = (*notes, *below, *sides.of_volts(name, columns, battery))
+    layout, unsigned = _with_instruments(columns, layout, measured)
+    _complete(name, columns, len(rows), layout)
+    if battery and layout.imposed == "voltage":
+        columns[SUPPLY] = np.full(len(rows), np.nan)
+    elif measured and not set(TIME) <= set(columns):  # a history may stop, and go on forwards against its motors
+        columns, rows, left_out = _driven_rows(name, columns, rows, layout)
+        notes = (*notes, *left_out)
+    if not any(column in columns for column in WHEN):
+        columns["order"] = np.arange(1.0, len(rows) + 1)
+    unknown = tuple(c for c, meaning in zip(header, meanings, strict=True) if meaning is None)
+    extras = {c: _extra([row[header.index(c)] for row in rows]) for c in unknown}
+    notes = (*encoded, *notes, *capitals, *changed, *(_lacks(name, columns, layout) if measured else ()))
+    notes = (*notes, *(_shows_magnitude(name, i) for i in unsigned), *_drives(name, columns, layout))
+    headings = {m.column: m.shown for m in meanings if m is not None}
+    return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest(), extras, layout, notes, headings)
+
+
+def _header(
+    name: str, first: list[str], layout: Layout, *, inferred: bool, of_turns: bool
+) -> tuple[list[str], Layout, tuple[str, ...]]:
+    """Names of the columns, the layout with the channels that they show, and notes on names that differ in case."""
+    named = [column or f"column {k}" for k, column in enumerate(first, 1)]
+    header, notes = _in_case(name, named, layout, inferred)
     repeated = sorted({c for c in header if header.count(c) > 1})
     if repeated:
         raise BadData(f"{name}: column {repeated[0]} stands {header.count(repeated[0])} times; expected once")
@@ -111,13 +137,17 @@ def _read(
         layout = _with_channels(name, header, layout, channels.EVERY)
     if of_turns and {*layout.sides, *VOLTS, *HEADING} & {m.column for m in layout.meanings(name, header) if m}:
         layout = _with_channels(name, header, layout, channels.OF_TURNS)
-    meanings = layout.meanings(name, header)
-    _check_header(name, header, meanings, measured, battery, layout)
-    if measured and not inferred:
-        _check_time(name, header, meanings, layout)
+    return header, layout, tuple(notes)
+
+
+def _rows_of_cells(
+    name: str, header: list[str], meanings: list[Meaning | None], rows: list[list[str]]
+) -> tuple[list[list[str]], tuple[str, ...]]:
+    """Rows below the header without a row of units, each as long as the header, and a note on that row."""
+    notes: tuple[str, ...] = ()
     if below := _row_of_units(name, meanings, rows[1:2]):
-        del rows[1]
-        notes = (*notes, f"{name}: the row below the header states units; rows are counted from the next")
+        rows = [rows[0], *rows[2:]]
+        notes = (f"{name}: the row below the header states units; rows are counted from the next",)
     _check_units(name, meanings, below)
     if len(rows) == 1:
         raise BadData(f"{name}: a header and no rows; expected at least one run")
@@ -126,25 +156,33 @@ def _read(
             raise BadData(
                 f"{name} row {k}: got {counted(len(row), 'cell')}; the header has {counted(len(header), 'column')}"
             )
+    return rows[1:], notes
+
+
+def _columns(
+    name: str, meanings: list[Meaning | None], rows: list[list[str]], layout: Layout, battery: bool
+) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+    """Values of the columns that mean something, and notes on cells that are read as something else."""
     columns: dict[str, np.ndarray] = {}
     bad: list[tuple[int, int, str]] = []
+    notes: tuple[str, ...] = ()
     for j, meaning in enumerate(meanings):
-        if meaning is not None:
-            cells = [row[j] for row in rows[1:]]
-            if meaning.column == "configuration":
-                cells, more = _configurations_in_case(name, cells, layout)
-                capitals = (*capitals, *more)
-            if meaning.column in TIME:
-                each = next((i for i, m in enumerate(meanings) if m is not None and m.column == "run_id"), None)
-                names = ["" if each is None else row[each] for row in rows[1:]]
-                cells, said = clock.from_the_first(name, meaning, cells, names)
-                capitals = (*capitals, *([said] if said else []))
-            if battery and meaning.column == SUPPLY and layout.imposed == "voltage":
-                _refuse_stated(name, cells)
-                continue
-            if meaning.column in layout.idle:
-                _refuse_idle(name, meaning, cells, layout)
-                continue
+        if meaning is None:
+            continue
+        cells = [row[j] for row in rows]
+        if meaning.column == "configuration":
+            cells, more = _configurations_in_case(name, cells, layout)
+            notes = (*notes, *more)
+        if meaning.column in TIME:
+            each = next((i for i, m in enumerate(meanings) if m is not None and m.column == "run_id"), None)
+            runs = ["" if each is None else row[each] for row in rows]
+            cells, note = clock.from_the_first(name, meaning, cells, runs)
+            notes = (*notes, *([note] if note else []))
+        if battery and meaning.column == SUPPLY and layout.imposed == "voltage":
+            _refuse_stated(name, cells)
+        elif meaning.column in layout.idle:
+            _refuse_idle(name, meaning, cells, layout)
+        else:
             values = []
             for k, cell in enumerate(cells, 1):
                 try:
@@ -153,41 +191,49 @@ def _read(
                     bad.append((k, j, str(error)))
             columns[meaning.column] = np.array(values)
     if bad:
-        raise BadData(_listed(name, [said for _, _, said in sorted(bad)]))
-    notes = (*notes, *sides.of_volts(name, columns, battery))
-    told = instruments.infer_instruments(layout.instruments, columns)
-    stated = {i.channel for i in told}
+        raise BadData(_listed(name, [message for _, _, message in sorted(bad)]))
+    return columns, notes
+
+
+def _with_instruments(
+    columns: Mapping[str, np.ndarray], layout: Layout, measured: bool
+) -> tuple[Layout, tuple[Instrument, ...]]:
+    """The layout with the instruments that the readings tell, and those of them that show magnitude alone."""
+    inferred = instruments.infer_instruments(layout.instruments, columns)
+    stated = {i.channel for i in inferred}
     unsigned = tuple(i for i in sides.magnitudes(columns, layout) if measured and i.channel not in stated)
-    layout = dataclasses.replace(layout, instruments=(*told, *unsigned))
-    _fill(name, columns, len(rows) - 1, layout)
+    return dataclasses.replace(layout, instruments=(*inferred, *unsigned)), unsigned
+
+
+def _complete(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) -> None:
+    """Fill columns that a table may leave out, and refuse values that contradict each other."""
+    _fill(name, columns, rows, layout)
     _check_driving(name, columns)
     _check_sides(name, columns, layout)
     _check_mass(name, columns)
     _check_deviations(name, columns, layout.channels)
-    if battery and layout.imposed == "voltage":
-        columns[SUPPLY] = np.full(len(rows) - 1, np.nan)
-    elif measured and not set(TIME) <= set(columns):  # a history may stop, and go on forwards against its motors
-        driven, said = _driven(name, columns, layout)
-        if said:
-            columns = {column: values[driven] for column, values in columns.items()}
-            rows, notes = [rows[0], *(rows[k + 1] for k in np.flatnonzero(driven))], (*notes, said)
-        if {*layout.sides, *HEADING} & set(columns):
-            _check_level(name, columns)
-        if not set(layout.sides) & set(columns):
-            _check_signs(name, columns, layout)
-    if not any(column in columns for column in WHEN):
-        columns["order"] = np.arange(1.0, len(rows))
-    unknown = tuple(c for c, meaning in zip(header, meanings, strict=True) if meaning is None)
-    extras = {c: _extra([row[header.index(c)] for row in rows[1:]]) for c in unknown}
-    notes = (*encoded, *notes, *capitals, *(_lacks(name, columns, layout) if measured else ()))
-    notes += tuple(
-        f"{name}: {channels.find(i.channel).column} is positive where its side is driven backward; it is taken to "
-        "show magnitude alone, and magnitudes are compared"
-        for i in unsigned
+
+
+def _driven_rows(
+    name: str, columns: dict[str, np.ndarray], rows: list[list[str]], layout: Layout
+) -> tuple[dict[str, np.ndarray], list[list[str]], tuple[str, ...]]:
+    """Settled runs in which something drives the motors, and a note on the others."""
+    driven, note = _driven(name, columns, layout)
+    if note:
+        columns = {column: values[driven] for column, values in columns.items()}
+        rows = [rows[k] for k in np.flatnonzero(driven)]
+    if {*layout.sides, *HEADING} & set(columns):
+        _check_level(name, columns)
+    if not set(layout.sides) & set(columns):
+        _check_signs(name, columns, layout)
+    return columns, rows, (note,) if note else ()
+
+
+def _shows_magnitude(name: str, instrument: Instrument) -> str:
+    return (
+        f"{name}: {channels.find(instrument.channel).column} is positive where its side is driven backward; it is "
+        "taken to show magnitude alone, and magnitudes are compared"
     )
-    notes += tuple(_drives(name, columns, layout))
-    headings = {m.column: m.shown for m in meanings if m is not None}
-    return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest(), extras, layout, notes, headings)
 
 
 #: Bad cells that a message lists, at most.
