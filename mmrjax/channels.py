@@ -11,12 +11,11 @@ import math
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
+from mmrjax.quantities import DEG, MM, RPM, Quantity, spelled
+
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
     from mmrjax.signals import Signals
-
-RPM = math.pi / 30  # rad/s
-MM = 1e-3  # m
 
 #: Parameters of the robot that a number may rest on: current where the motors' speed is imposed, the voltage that an
 #: imposed speed or current takes, a winding's temperature at a current after long running, and over time.
@@ -27,63 +26,63 @@ WARMING = (*HEAT, "motor.time_constant_winding", "motor.time_constant_housing")
 
 
 @dataclasses.dataclass(frozen=True)
-class Channel:
-    """One channel.
+class Channel(Quantity):
+    """A quantity that an instrument shows.
 
     Attributes:
-        name: key of its readings, field of results; noun first.
-        column, sd_column: in tables of runs, with the unit in the name.
-        unit: of those columns; factor: the SI value of one such unit.
-        label: words of reports.
         word: short name that `--noise` takes.
-        range: least and largest reading that a table may hold [unit]; sd_largest: largest sd [unit].
+        sd_largest: largest sd that a table may hold [unit].
         read: what of the signals an ideal instrument shows [SI].
         sd_share: sd that is assumed where none is known, as a share of the reading [-].
         resolution: digits after the point that a person wants to see [unit].
-        unit_si: of readings inside; empty where `factor` is 1.
         zero_at_rest: whether it shows 0 until the robot moves.
         directed: whether its sign is that of the motion; an angle counts on from where it was.
         settled, over_time: whether settled runs and histories can show it.
-        other_units: what is often written in its column by mistake, and the SI value of each.
         zero_error: sd of what its instrument may show where there is nothing to show [SI]; 0: it counts or times, and
             misses no zero.
         side: 0 or 1 of what the left or the right side alone shows; None: what both together do.
         where: it is measured, where the label does not say.
         rests_on: parameters of the robot without which it is not known, by dotted name.
+        stem: of its columns, where that is not its name.
     """
 
-    name: str
-    column: str
-    sd_column: str
-    unit: str
-    factor: float
-    label: str
     word: str
-    range: tuple[float, float]
     sd_largest: float
     read: Callable[[Robot, Signals], Any]
     sd_share: float
     resolution: int = 1
-    unit_si: str = ""
     zero_at_rest: bool = False
     directed: bool = True
     settled: bool = True
     over_time: bool = True
-    other_units: tuple[tuple[str, float], ...] = ()
     zero_error: float = 0.0
     side: int | None = None
     where: str = ""
     rests_on: tuple[str, ...] = ()
+    stem: str = ""
+
+    @property
+    def column(self) -> str:
+        """Its column in tables of runs, with the unit in the name."""
+        return f"{self.stem or self.name}_{spelled(self.unit)}"
+
+    @property
+    def deviation(self) -> Quantity:
+        """The standard deviation of its readings, as a column of tables."""
+        return Quantity(
+            f"{self.stem or self.name}_sd", self.unit, self.factor, f"standard deviation of {self.label}",
+            (0.0, self.sd_largest), other_units=self.other_units,
+        )  # fmt: skip
+
+    @property
+    def sd_column(self) -> str:
+        """The column of its standard deviations."""
+        return self.deviation.column
 
     @property
     def misses_zero(self) -> bool:
         """Whether its instrument may miss zero; that of a temperature is a convention."""
         return self.zero_error > 0 and self.directed
-
-    @property
-    def unit_shown(self) -> str:
-        """Unit of the columns as people write it: C is a coulomb, °C a temperature."""
-        return self.unit_si if self.unit_si and self.factor == 1.0 else self.unit
 
     def __reduce__(self) -> tuple[Callable[[str], Channel], tuple[str]]:
         """Pickled by its name, so that tables and results go to other processes and back."""
@@ -103,13 +102,10 @@ SIDES = ("left", "right")
 
 def _of_side(channel: Channel, side: int) -> Channel:
     """What one side shows of a channel that both sides have."""
-    stem, unit = channel.column.rsplit("_", 1)
     name = f"{channel.name}_{SIDES[side]}"
     return dataclasses.replace(
         channel,
         name=name,
-        column=f"{stem}_{SIDES[side]}_{unit}",
-        sd_column=f"{stem}_{SIDES[side]}_sd_{unit}",
         label=f"{channel.label}, {SIDES[side]}",
         word=name,
         side=side,
@@ -120,8 +116,6 @@ def _of_side(channel: Channel, side: int) -> Channel:
 _EITHER: tuple[Channel, ...] = (
     Channel(
         name="total_current",
-        column="total_current_A",
-        sd_column="total_current_sd_A",
         unit="A",
         factor=1.0,
         label="total current",
@@ -137,8 +131,6 @@ _EITHER: tuple[Channel, ...] = (
     ),
     Channel(
         name="motor_speed",
-        column="motor_speed_rpm",
-        sd_column="motor_speed_sd_rpm",
         unit="rpm",
         factor=RPM,
         label="motor speed",
@@ -149,12 +141,10 @@ _EITHER: tuple[Channel, ...] = (
         sd_share=0.005,
         unit_si="rad/s",
         zero_at_rest=True,
-        other_units=(("rad/s", 1.0), ("turns/s", 2 * math.pi), ("deg/s", math.pi / 180)),
+        other_units=(("rad/s", 1.0), ("turns/s", 2 * math.pi), ("deg/s", DEG)),
     ),
     Channel(
         name="speed",
-        column="speed_mm_s",
-        sd_column="speed_sd_mm_s",
         unit="mm/s",
         factor=MM,
         label="speed",
@@ -169,8 +159,6 @@ _EITHER: tuple[Channel, ...] = (
     ),
     Channel(
         name="motor_current",
-        column="motor_current_A",
-        sd_column="motor_current_sd_A",
         unit="A",
         factor=1.0,
         label="motor current",
@@ -187,8 +175,6 @@ _EITHER: tuple[Channel, ...] = (
     ),
     Channel(
         name="output_speed",
-        column="output_speed_rpm",
-        sd_column="output_speed_sd_rpm",
         unit="rpm",
         factor=RPM,
         label="output speed",
@@ -200,14 +186,12 @@ _EITHER: tuple[Channel, ...] = (
         resolution=2,
         unit_si="rad/s",
         zero_at_rest=True,
-        other_units=(("rad/s", 1.0), ("turns/s", 2 * math.pi), ("deg/s", math.pi / 180)),
+        other_units=(("rad/s", 1.0), ("turns/s", 2 * math.pi), ("deg/s", DEG)),
     ),
     Channel(
         name="output_angle",
-        column="output_angle_deg",
-        sd_column="output_angle_sd_deg",
         unit="deg",
-        factor=math.pi / 180,
+        factor=DEG,
         label="output angle",
         word="output_angle",
         range=(-1e6, 1e6),
@@ -223,8 +207,6 @@ _EITHER: tuple[Channel, ...] = (
     ),
     Channel(
         name="position",
-        column="position_mm",
-        sd_column="position_sd_mm",
         unit="mm",
         factor=MM,
         label="position",
@@ -242,8 +224,6 @@ _EITHER: tuple[Channel, ...] = (
     ),
     Channel(
         name="motor_voltage",
-        column="motor_voltage_V",
-        sd_column="motor_voltage_sd_V",
         unit="V",
         factor=1.0,
         label="motor voltage",
@@ -259,8 +239,6 @@ _EITHER: tuple[Channel, ...] = (
     ),
     Channel(
         name="output_torque",
-        column="output_torque_Nm",
-        sd_column="output_torque_sd_Nm",
         unit="Nm",
         factor=1.0,
         label="output torque",
@@ -276,8 +254,6 @@ _EITHER: tuple[Channel, ...] = (
     ),
     Channel(
         name="winding_temperature",
-        column="winding_temperature_C",
-        sd_column="winding_temperature_sd_C",
         unit="C",
         factor=1.0,
         label="winding temperature",
@@ -300,8 +276,6 @@ OF_TURNS: tuple[Channel, ...] = (
     *(_of_side(_BY_NAME[f"motor_{what}"], side) for what in ("current", "speed", "voltage") for side in (0, 1)),
     Channel(
         name="yaw_rate",
-        column="yaw_rate_rad_s",
-        sd_column="yaw_rate_sd_rad_s",
         unit="rad/s",
         factor=1.0,
         label="yaw rate",
@@ -313,12 +287,10 @@ OF_TURNS: tuple[Channel, ...] = (
         sd_share=0.02,
         resolution=3,
         zero_at_rest=True,
-        other_units=(("deg/s", math.pi / 180), ("rpm", RPM)),
+        other_units=(("deg/s", DEG), ("rpm", RPM)),
     ),
     Channel(
         name="lateral_speed",
-        column="lateral_speed_mm_s",
-        sd_column="lateral_speed_sd_mm_s",
         unit="mm/s",
         factor=MM,
         label="lateral speed",
@@ -333,10 +305,8 @@ OF_TURNS: tuple[Channel, ...] = (
     ),
     Channel(
         name="yaw",
-        column="yaw_deg",
-        sd_column="yaw_sd_deg",
         unit="deg",
-        factor=math.pi / 180,
+        factor=DEG,
         label="yaw angle from uphill",
         word="yaw",
         range=(-1e6, 1e6),
@@ -352,8 +322,6 @@ OF_TURNS: tuple[Channel, ...] = (
     *(
         Channel(
             name=name,
-            column=f"{name[-1]}_mm",
-            sd_column=f"{name[-1]}_sd_mm",
             unit="mm",
             factor=MM,
             label=label,

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array
 
 from mmrjax import energy
-from mmrjax.channels import MM, RPM, SIDES
+from mmrjax.channels import SIDES
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Run
@@ -21,6 +21,7 @@ from mmrjax.fidelities.mission import TOLERANCE, Mission, Start, Totals, mission
 from mmrjax.params import Scalar
 from mmrjax.profile import Profile
 from mmrjax.programs import has_tracer
+from mmrjax.quantities import MM, RPM
 from mmrjax.robot import Robot
 from mmrjax.signals import BATTERY_EMPTY, CUT_OFF
 

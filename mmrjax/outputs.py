@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mmrjax.channels import HEAT, MM, VOLTAGE, Channel
+from mmrjax.channels import HEAT, VOLTAGE, Channel
+from mmrjax.quantities import MM
 
 if TYPE_CHECKING:
     from mmrjax.signals import Result

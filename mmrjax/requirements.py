@@ -13,16 +13,15 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mmrjax import balances, energy, static_limits
-from mmrjax.channels import MM, RPM
 from mmrjax.conditions import Conditions
 from mmrjax.derived import steepest_slope
 from mmrjax.fidelities.steady import operating
 from mmrjax.fidelities.turning import circling
 from mmrjax.motor import TEMPERATURE_REFERENCE
 from mmrjax.params import Index, Scalar
+from mmrjax.quantities import CONDITIONS, MM, RPM
 from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED, CUT_OFF, Signals
-from mmrjax.tables import CONDITION_LIMITS
 
 #: Of an envelope: what a point of it states.
 AXES = ("payload_kg", "slope_deg", "charge", "ambient_C")
@@ -240,7 +239,7 @@ HALVINGS = 26
 def _payload(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
     """The largest payload that is carried for long: the robot travels, its winding settles within what is permitted,
     its gearboxes carry the torque (where their limit is stated) and its cells stay above their cut-off."""
-    most = CONDITION_LIMITS["payload"][1]
+    most = CONDITIONS["payload"].range[1]
 
     def left(robot: Robot, payload: Scalar) -> Scalar:
         at = dataclasses.replace(point, payload=payload)

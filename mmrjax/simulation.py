@@ -21,10 +21,10 @@ from mmrjax.fidelities.mission import Start
 from mmrjax.params import Scalar
 from mmrjax.profile import Profile
 from mmrjax.programs import has_tracer
+from mmrjax.quantities import CONDITIONS
 from mmrjax.results import Results
 from mmrjax.robot import NO_BRAKE, Robot, cannot_turn
 from mmrjax.signals import CODES, Result
-from mmrjax.tables import CONDITION_LIMITS
 
 #: Runs of which `simulate` keeps histories at once.
 HISTORIES = 1000
@@ -335,7 +335,8 @@ def _check_conditions(conditions: Conditions) -> None:
         value = getattr(conditions, field.name)
         if field.name == "configuration" or value is None or has_tracer(value) or not value.size:
             continue
-        low, high, unit = CONDITION_LIMITS[field.name]
+        condition = CONDITIONS[field.name]
+        (low, high), unit = condition.range, condition.unit_shown
         if id(value) not in ends:
             ends[id(value)] = _ends(value)
         if not _within(ends[id(value)], low, high):

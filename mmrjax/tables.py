@@ -25,34 +25,6 @@ SLOPES_DEG = (0.0, 5.0, 10.0, 15.0, 20.0)
 PAYLOADS_KG = (0.0, 1.5, 3.0, 5.0, 6.5, 8.0)
 VOLTAGES_V = (15.0, 24.0, 33.0)
 
-#: Least and greatest value of every condition of a run that is a number, and its unit.
-CONDITION_LIMITS: dict[str, tuple[float, float, str]] = {
-    "voltage": (-100.0, 100.0, "V"),
-    "slope_deg": (-45.0, 45.0, "deg"),
-    "payload": (0.0, 300.0, "kg"),
-    "battery": (0.0, 1.0, ""),
-    "discharge": (0.0, 360_000.0, "C"),
-    "adhesion": (1e-3, 100.0, ""),
-    "order": (0.0, 1e9, ""),
-    "duty": (-1.0, 1.0, ""),
-    "open": (-1.0, 1.0, ""),
-    "total_mass": (0.1, 500.0, "kg"),
-    "motor_speed": (-1e4, 1e4, "rad/s"),
-    "motor_acceleration": (-1e7, 1e7, "rad/s^2"),
-    "motor_current": (-2000.0, 2000.0, "A"),
-    "duty_left": (-1.0, 1.0, ""),
-    "duty_right": (-1.0, 1.0, ""),
-    "open_left": (-1.0, 1.0, ""),
-    "open_right": (-1.0, 1.0, ""),
-    "motor_speed_left": (-1e4, 1e4, "rad/s"),
-    "motor_speed_right": (-1e4, 1e4, "rad/s"),
-    "heading_deg": (-360.0, 360.0, "deg"),
-    "adhesion_lateral": (1e-3, 100.0, ""),
-    "levers_front_deg": (-180.0, 180.0, "deg"),
-    "levers_rear_deg": (-180.0, 180.0, "deg"),
-    "load_torque": (-1e4, 1e4, "N·m"),
-}
-
 
 class Surface(NamedTuple):
     """Adhesion coefficients of Table 5, longitudinal and lateral, for tracks and for wheels [-]."""

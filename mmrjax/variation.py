@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax import fidelities, params
+from mmrjax import fidelities, params, quantities
 from mmrjax import outputs as table_of_outputs
 from mmrjax.channels import Channel
 from mmrjax.compiling import compiled
@@ -21,35 +21,11 @@ from mmrjax.fidelities.base import Run
 from mmrjax.profile import Profile
 from mmrjax.robot import Robot
 from mmrjax.signals import CODES
-from mmrjax.tables import CONDITION_LIMITS
 
 #: Every condition of a run in words; `configuration` is an index among the robot's.
 CONDITIONS: dict[str, str] = {
     "configuration": "configuration of the chassis",
-    "voltage": "supply voltage",
-    "slope_deg": "slope, positive uphill",
-    "payload": "payload",
-    "battery": "on-board battery instead of the external supply",
-    "discharge": "charge already taken from the battery",
-    "adhesion": "adhesion as a ratio to the one the robot is stated for",
-    "order": "place in the sequence of runs",
-    "duty": "share of the supply's voltage that the driver gives the motors",
-    "open": "1 where the motors' circuit is open",
-    "total_mass": "total mass of robot and payload",
-    "motor_speed": "motor speed imposed on the shafts",
-    "motor_acceleration": "acceleration of an imposed motor speed",
-    "motor_current": "current imposed on each motor",
-    "duty_left": "share of the supply's voltage at the left motor",
-    "duty_right": "share of the supply's voltage at the right motor",
-    "open_left": "1 where the left motor's circuit is open",
-    "open_right": "1 where the right motor's circuit is open",
-    "motor_speed_left": "motor speed imposed on the left side",
-    "motor_speed_right": "motor speed imposed on the right side",
-    "heading_deg": "heading at the start, from uphill, positive to the left",
-    "adhesion_lateral": "the same as adhesion, across the travel",
-    "levers_front_deg": "angle of the front levers, 0 along the wheelbase outward, positive up, 180 folded",
-    "levers_rear_deg": "angle of the rear levers, 0 along the wheelbase outward, positive up, 180 folded",
-    "load_torque": "torque of a brake on the output of each drive, positive against forward rotation",
+    **{field: condition.label for field, condition in quantities.CONDITIONS.items()},
 }
 #: What every point has beside its outputs: code into `signals.STATUSES`, bit mask over `signals.FLAGS`.
 STATUS, FLAGS = CODES
@@ -113,9 +89,9 @@ class Variation(eqx.Module):
             return Axis(name, spec.unit, spec.meaning, spec.bounds, value, spec.prior_sd(value), spec)
         if name == "configuration":
             return Axis(name, "", CONDITIONS[name], (0.0, len(self.robot.configurations) - 1.0), 0.0)
-        low, high, unit = CONDITION_LIMITS[name]
-        usual = getattr(Conditions(), name)
-        return Axis(name, unit, CONDITIONS[name], (low, high), None if usual is None else float(usual))
+        condition, usual = quantities.CONDITIONS[name], getattr(Conditions(), name)
+        at = None if usual is None else float(usual)
+        return Axis(name, condition.unit_shown, condition.label, condition.range, at)
 
     @property
     def varies_robot(self) -> bool:

@@ -12,20 +12,21 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from calibration.data.columns import BRAKED, CONDITIONS, LOAD, ROWS, SIDES
+from calibration.data.columns import ROWS
 from calibration.data.errors import BadConfiguration, choices, parsed
 from calibration.data.input_files import toml_content, toml_text
 from mmrjax import channels, fidelities
+from mmrjax.quantities import CONDITIONS
 from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
 from sweeps.flags import flags
 
-_VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c] for c in ("supply_voltage_V", "payload_kg", "slope_deg"))
+_VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c].range for c in ("voltage", "payload", "slope_deg"))
 Slope = Annotated[float, Field(ge=_SLOPE[0], le=_SLOPE[1], allow_inf_nan=False)]
 Payload = Annotated[float, Field(ge=_PAYLOAD[0], le=_PAYLOAD[1], allow_inf_nan=False)]
 _SPEED = channels.find("motor_speed").range
 _CURRENT = channels.find("motor_current").range
 MotorCurrent = Annotated[float, Field(ge=_CURRENT[0], le=_CURRENT[1], allow_inf_nan=False)]
-_TORQUE = BRAKED[LOAD]
+_TORQUE = CONDITIONS["load_torque"].range
 LoadTorque = Annotated[float, Field(ge=_TORQUE[0], le=_TORQUE[1], allow_inf_nan=False)]
 MotorSpeed = Annotated[float, Field(ge=_SPEED[0], le=_SPEED[1], allow_inf_nan=False)]
 Voltage = Annotated[float, Field(ge=_VOLTAGE[0], le=_VOLTAGE[1], allow_inf_nan=False)]
@@ -289,7 +290,7 @@ class LoopBeside(MembersPart):
         return float(number) * {"min": 60.0, "h": 3600.0}.get(self.within.removeprefix(number), 1.0)
 
 
-_DUTY = SIDES["duty_left"]
+_DUTY, _HEADING = CONDITIONS["duty_left"].range, CONDITIONS["heading_deg"].range
 Duty = Annotated[float, Field(ge=_DUTY[0], le=_DUTY[1], allow_inf_nan=False)]
 
 
@@ -306,7 +307,7 @@ class TurnPart(Part):
     yaw_rate_rad_s: Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)] | None = about(
         None, "Yaw rate of the settled turn (rad/s), positive to the left; with --speed"
     )
-    heading_deg: Annotated[float, Field(ge=-360, le=360, allow_inf_nan=False)] | None = about(
+    heading_deg: Annotated[float, Field(ge=_HEADING[0], le=_HEADING[1], allow_inf_nan=False)] | None = about(
         None, "Heading at the start, from uphill, positive to the left"
     )
 

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from calibration.data.errors import BadConfiguration, choices
-from mmrjax.channels import RPM
+from mmrjax.quantities import RPM
 from mmrjax.tables import COULOMB_PER_MAH
 from sweeps.config import BatchPart, OutputPart, Part, ProfilePart, RobotPart, Sweep, about, read_toml, resolve
 from sweeps.flags import flags

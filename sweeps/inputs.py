@@ -15,8 +15,8 @@ from calibration.data.errors import BadConfiguration, choices
 from calibration.data.posterior import Posterior
 from calibration.data.robot_file import RobotFile
 from mmrjax import fidelities
-from mmrjax.channels import RPM
 from mmrjax.derived.turn import by_itself
+from mmrjax.quantities import RPM
 from mmrjax.robot import Robot, cannot_turn
 from mmrjax.tables import BENCH, SURFACES
 from sweeps import capabilities

@@ -502,7 +502,7 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np
 from mmrjax import channels
 channels.EVERY += (channels.Channel(
-    name="terminal_voltage", column="terminal_voltage_V", sd_column="terminal_voltage_sd_V", unit="V", factor=1.0,
+    name="terminal_voltage", unit="V", factor=1.0,
     label="terminal voltage", word="voltage", range=(0.0, 100.0), sd_largest=10.0,
     read=lambda robot, signals: signals.voltage, sd_share=0.01,
 ),)

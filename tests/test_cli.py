@@ -694,7 +694,7 @@ FOURTH = """
 import dataclasses
 from mmrjax import channels
 channels.EVERY += (dataclasses.replace(
-    channels.EVERY[0], name="voltage", column="terminal_voltage_V", sd_column="terminal_voltage_sd_V", unit="V",
+    channels.EVERY[0], name="voltage", stem="terminal_voltage", unit="V",
     label="voltage at the motors", word="voltage", range=(0.0, 100.0), read=lambda robot, signals: signals.voltage,
 ),)
 channels.USUAL += ("voltage",)

@@ -22,7 +22,7 @@ def unsimulated(monkeypatch):
 
 
 def test_every_name_has_an_explanation_of_its_kind(unsimulated):
-    kinds = {"effects": "effect", "statuses": "status", "flags": "flag", "channels": "channel", "outputs": "output",
+    kinds = {"effects": "effect", "statuses": "status", "flags": "flag", "channels": "channel", "conditions": "condition", "outputs": "output",
              "parameters": "parameter", "verdicts of the loop": "verdict of the loop", "verdicts of a climb": "verdict of a climb"}  # fmt: skip
     for kind, those in explain.names(EVERY).items():
         for name in those:

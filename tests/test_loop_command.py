@@ -433,7 +433,7 @@ FOURTH = """
 import csv, sys
 from mmrjax import channels
 channels.EVERY += (channels.Channel(
-    name="terminal_voltage", column="terminal_voltage_V", sd_column="terminal_voltage_sd_V", unit="V", factor=1.0,
+    name="terminal_voltage", unit="V", factor=1.0,
     label="terminal voltage", word="voltage", range=(-200.0, 200.0), sd_largest=50.0,
     read=lambda robot, signals: signals.voltage, sd_share=0.01,
 ),)

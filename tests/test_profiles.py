@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from calibration.data import profiles, units
+from calibration.data import profiles
 from calibration.data.errors import BadConfiguration, BadData
 from mmrjax import channels, robots
 from mmrjax.conditions import Conditions
@@ -98,7 +98,7 @@ def test_units_in_names(read, column, cell, field, value):
 
 def test_units_of_a_channel_are_those_of_its_row():
     for channel in channels.usual():
-        found = units.of_channel(channel.name)
+        found = channel.units
         assert channel.column == f"{channel.name}_{next(iter(found))}"
         assert len(found) == 1 + len(channel.other_units)
 

@@ -17,7 +17,7 @@ from calibration.inference import ranges
 from calibration.inference.notes import SlopesIn
 from calibration.inference.ranges import check_ranges
 from mmrjax import params, robots
-from mmrjax.channels import RPM
+from mmrjax.quantities import RPM
 
 #: Column of a table, factor on its readings, and what is said.
 WRONG = {

@@ -17,8 +17,8 @@ from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration
 from calibration.discovery import discover, scales
 from mmrjax import effects, params
-from mmrjax.channels import RPM
 from mmrjax.effects.scaled import amplitude_of, scaled, shape_of
+from mmrjax.quantities import RPM
 from sweeps.commands import rig_new
 
 #: Of rigs: kind and what is imposed; the largest and the smallest that a few draws give.

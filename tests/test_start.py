@@ -12,9 +12,9 @@ import pytest
 from worlds import paper
 
 from mmrjax import robots, stages
-from mmrjax.channels import MM
 from mmrjax.fidelities.base import History, as_tables
 from mmrjax.params import replace
+from mmrjax.quantities import MM
 from mmrjax.rig import Rig
 from mmrjax.signals import Signals
 from sweeps.commands import simulate

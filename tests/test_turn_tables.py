@@ -11,7 +11,7 @@ from calibration.data.instruments import with_inferred_instruments
 from calibration.inference.calibrate import calibrate
 from calibration.inference.ranges import check_ranges
 from mmrjax import balances
-from mmrjax.channels import RPM
+from mmrjax.quantities import RPM
 from mmrjax.signals import State
 from sweeps.inputs import read_runs
 

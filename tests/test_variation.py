@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import fidelities, params, robots
+from mmrjax import fidelities, params, quantities, robots
 from mmrjax.conditions import Conditions
 from mmrjax.errors import UsageError
 from mmrjax.fidelities.steady import steady
-from mmrjax.tables import CONDITION_LIMITS
 from mmrjax.variation import CONDITIONS, Variation, evaluate
 
 NAMES = ("motor.resistance", "6T2A.ground.friction.static", "slope_deg", "voltage")
@@ -105,12 +104,12 @@ def test_axes_know_unit_bounds_prior_and_meaning(variation):
     assert (resistance.unit, resistance.bounds, resistance.meaning) == (spec.unit, spec.bounds, spec.meaning)
     assert resistance.prior_sd == spec.prior_sd(float(variation.robot.motor.resistance)) > 0
     slope = axes["slope_deg"]
-    assert slope.spec is None and slope.prior_sd is None and slope.bounds == CONDITION_LIMITS["slope_deg"][:2]
+    assert slope.spec is None and slope.prior_sd is None and slope.bounds == quantities.CONDITIONS["slope_deg"].range
 
 
 def test_every_condition_has_words_and_limits():
     fields = {f.name for f in dataclasses.fields(Conditions)} - {"begin"}  # which of the beginnings is a run's
-    assert set(CONDITIONS) == fields == {*CONDITION_LIMITS, "configuration"}
+    assert set(CONDITIONS) == fields == {*quantities.CONDITIONS, "configuration"}
     assert all(axis.meaning for axis in Variation(robots.nominal(), tuple(CONDITIONS)).axes.values())
 
 

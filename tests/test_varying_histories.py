@@ -23,12 +23,12 @@ from calibration.inference.noise import Noise
 from calibration.inference.notes import StopsOnSlope
 from calibration.inference.observers import Histories, settled_ends
 from mmrjax import params, robots
-from mmrjax.channels import MM, RPM
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.histories import CHANGE, LONGEST, START, grid, histories
 from mmrjax.fidelities.mission import mission
 from mmrjax.profile import MODES, profile
+from mmrjax.quantities import MM, RPM
 
 #: Four segments a run: supply voltage [V] and mode; and the slope [deg] of the run.
 SEGMENTS = (0.0, 0.42, 0.84, 1.26, 1.6)

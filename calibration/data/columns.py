@@ -7,13 +7,10 @@ import difflib
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
-from calibration.data import units
 from calibration.data.errors import BadData
-from calibration.data.units import Quantity
-from mmrjax import channels
-from mmrjax.channels import RPM as RPM
+from mmrjax import channels, quantities
 from mmrjax.channels import Channel
-from mmrjax.tables import CONDITION_LIMITS
+from mmrjax.quantities import BY_COLUMN, RPM, Quantity
 
 if TYPE_CHECKING:
     from mmrjax.rig import Instrument
@@ -22,40 +19,32 @@ if TYPE_CHECKING:
 #: Column of what is imposed (`rig.IMPOSED`), and the SI value of its unit.
 SUPPLY, SPEED, CURRENT = "supply_voltage_V", "motor_speed_rpm", "motor_current_A"
 IMPOSED = {"voltage": (SUPPLY, 1.0), "motor_speed": (SPEED, RPM), "motor_current": (CURRENT, 1.0)}
-#: Condition columns with the least and greatest value allowed.
-CONDITIONS: dict[str, tuple[float, float]] = {
-    SUPPLY: (-100.0, 100.0),  # negative: backward
-    "total_mass_kg": (0.1, 500.0),
-    "payload_kg": (0.0, 300.0),
-    "slope_deg": (-45.0, 45.0),
-}
-TIME: dict[str, tuple[float, float]] = {"time_s": (0.0, 1e6)}
+#: Conditions that the packaged robot's tables state, by column.
+CONDITIONS = {c: BY_COLUMN[c] for c in (SUPPLY, "total_mass_kg", "payload_kg", "slope_deg")}
+TIME = {"time_s": BY_COLUMN["time_s"]}
 #: Rows of all runs of a log from which on readings of fewer are used (`thinning`).
 ROWS = 4000
 #: What a time history may state of its motors' driver: the share of the supply's voltage that they get, negative
 #: backward; and how they are driven: by that share, or not, their terminals shorted or their circuit open.
-DUTY: dict[str, tuple[float, float]] = {"duty": (-1.0, 1.0)}
+DUTY = {"duty": BY_COLUMN["duty"]}
 DRIVEN = ("voltage", "brake", "coast")
 #: The motors' circuit in each of these modes, see `Conditions.open`.
 CIRCUITS = dict(zip(DRIVEN, (0.0, -1.0, 1.0), strict=True))
 DRIVING = ("duty", "mode")
 #: What a table may state of a robot whose sides are driven apart: the shares of the supply's voltage that the motors
 #: of either side get; and where it heads at the start, from uphill, positive to the left.
-SIDES: dict[str, tuple[float, float]] = {"duty_left": (-1.0, 1.0), "duty_right": (-1.0, 1.0)}
+SIDES = {c: BY_COLUMN[c] for c in ("duty_left", "duty_right")}
 #: The same in volts, which are read as those shares (`sides.of_volts`).
-VOLTS: dict[str, tuple[float, float]] = dict.fromkeys(("voltage_left_V", "voltage_right_V"), CONDITIONS[SUPPLY])
+VOLTS = {c: BY_COLUMN[c] for c in ("voltage_left_V", "voltage_right_V")}
 #: The same where speeds are imposed.
 SPEEDS = tuple(channels.find(f"motor_speed_{side}").column for side in channels.SIDES)
-HEADING: dict[str, tuple[float, float]] = {"heading_deg": (-360.0, 360.0)}
+HEADING = {"heading_deg": BY_COLUMN["heading_deg"]}
 #: Angles of a tracked robot's levers, 0 along the wheelbase outward, positive up, 180 folded.
-LEVERS: dict[str, tuple[float, float]] = {
-    name: CONDITION_LIMITS[name][:2] for name in ("levers_front_deg", "levers_rear_deg")
-}
+LEVERS = {c: BY_COLUMN[c] for c in ("levers_front_deg", "levers_rear_deg")}
 #: Torque of a brake on the output of each drive, positive against forward rotation.
 LOAD = "load_torque_Nm"
-BRAKED: dict[str, tuple[float, float]] = {LOAD: CONDITION_LIMITS["load_torque"][:2]}
 #: Place of a row in the sequence in which runs were made; without it that of the row in the file.
-ORDER: dict[str, tuple[float, float]] = {"order": (0.0, 1e9)}
+ORDER = {"order": BY_COLUMN["order"]}
 #: Columns that say when a row was measured; a table without either was measured in the order of its rows.
 WHEN = ("time_s", "order")
 WORDS = ("configuration", "surface", "run_id", "mode")
@@ -69,39 +58,18 @@ ON_GROUND, ON_SHAFT = ("total_mass_kg", "payload_kg", "slope_deg"), (LOAD,)
 #: How alike the names of two columns are at least for one to be meant by the other.
 ALIKE = 0.6
 
-_OF_CONDITIONS = {
-    SUPPLY: Quantity("supply_voltage", units.VOLTAGE, CONDITIONS[SUPPLY]),
-    "total_mass_kg": Quantity("total_mass", units.MASS, CONDITIONS["total_mass_kg"]),
-    "payload_kg": Quantity("payload", units.MASS, CONDITIONS["payload_kg"]),
-    "slope_deg": Quantity("slope", units.ANGLE, CONDITIONS["slope_deg"], slope=True),
-    "time_s": Quantity("time", units.TIME, TIME["time_s"]),
-    "duty": Quantity("duty", units.SHARE, DUTY["duty"]),
-    "duty_left": Quantity("duty_left", units.SHARE, SIDES["duty_left"]),
-    "duty_right": Quantity("duty_right", units.SHARE, SIDES["duty_right"]),
-    **{name: Quantity(name.removesuffix("_V"), units.VOLTAGE, limits) for name, limits in VOLTS.items()},
-    "heading_deg": Quantity("heading", units.ANGLE, HEADING["heading_deg"]),
-    **{name: Quantity(name.removesuffix("_deg"), units.ANGLE, limits) for name, limits in LEVERS.items()},
-    LOAD: Quantity("load_torque", units.of_channel("output_torque"), BRAKED[LOAD]),
-}
+#: Conditions whose columns state a unit, in the order in which spellings of them are looked for.
+_WITH_UNITS = {**CONDITIONS, **TIME, **DUTY, **SIDES, **VOLTS, **HEADING, **LEVERS, LOAD: BY_COLUMN[LOAD]}
 
 
 def ranges() -> dict[str, tuple[float, float]]:
     """Least and greatest value of every number column."""
-    readings = {c.column: c.range for c in channels.EVERY}
-    deviations = {c.sd_column: (0.0, c.sd_largest) for c in channels.EVERY}
-    conditions = {**CONDITIONS, **DUTY, **SIDES, **VOLTS, **HEADING, **LEVERS, **BRAKED}
-    return {**conditions, **readings, **deviations, **TIME, **ORDER}
+    read = [q for c in channels.EVERY for q in (c, c.deviation)]
+    return {q.column: q.range for q in (*_WITH_UNITS.values(), *read, *ORDER.values())}
 
 
 def _of_channel(channel: Channel) -> dict[str, Quantity]:
-    size = {
-        units.spelled(unit): factor / channel.factor
-        for unit, factor in ((channel.unit, channel.factor), *channel.other_units)
-    }
-    return {
-        channel.column: Quantity(channel.name, size, channel.range),
-        channel.sd_column: Quantity(f"{channel.name}_sd", size, (0.0, channel.sd_largest)),
-    }
+    return {q.column: q for q in (channel, channel.deviation)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -248,7 +216,7 @@ class Layout:
 
     def quantities(self) -> dict[str, Quantity]:
         """What each number column holds, by its name."""
-        found: dict[str, Quantity] = {**_OF_CONDITIONS}
+        found: dict[str, Quantity] = {**_WITH_UNITS}
         for channel in channels.EVERY:
             if channel in self.channels or channel.column in (self.imposed_column, *self.sides):
                 found |= _of_channel(channel)
@@ -290,14 +258,14 @@ class Layout:
     def _by_name(self) -> Mapping[str, Meaning]:
         """Every name of a column, in any unit, with what it means."""
         known = (*self.known(), *ON_GROUND, *ON_SHAFT)
-        quantities = self.quantities()
+        held = self.quantities()
         found = {
             name: Meaning(column, name, quantity, unit)
-            for column, quantity in quantities.items()
+            for column, quantity in held.items()
             for name, unit in quantity.columns().items()
         }
         for column in known:  # its own name, whatever the unit
-            quantity = quantities.get(column)
+            quantity = held.get(column)
             own = None if quantity is None else next(iter(quantity.units))
             found[column] = Meaning(column, column, quantity, own or "")
         return found
@@ -316,7 +284,7 @@ class Layout:
         none = {*stated, *self.idle, *self.deviation_columns, *TIME}
         lacking = {column: quantity for column, quantity in self.quantities().items() if column not in none}
         spelled = {s: (column, unit) for column, q in lacking.items() for s, unit in q.columns().items()}
-        unit = units.at_the_end(name, {unit for _, unit in spelled.values()})
+        unit = quantities.at_the_end(name, {unit for _, unit in spelled.values()})
         pool = [s for s, (column, own) in spelled.items() if own == unit or (unit is None and s == column)]
         close = difflib.get_close_matches(name.casefold(), [s.casefold() for s in pool], 1, ALIKE)
         if close:

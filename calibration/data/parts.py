@@ -17,7 +17,7 @@ from importlib import resources
 from typing import Any, TypeVar
 
 from calibration.data.errors import BadData
-from mmrjax.channels import RPM
+from mmrjax.quantities import RPM
 
 MILLI = 1e-3
 GRAM_CM2 = 1e-7  # kg·m²

@@ -16,15 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from calibration.data import delimited, input_files, units
+from calibration.data import delimited, input_files
 from calibration.data.columns import LOAD, SUPPLY
 from calibration.data.errors import BadConfiguration, BadData, choices, is_number, number
-from calibration.data.units import Quantity
-from mmrjax import channels
+from mmrjax import channels, quantities
+from mmrjax.channels import Channel
 from mmrjax.errors import counted
 from mmrjax.fidelities.mission import Start
 from mmrjax.profile import APART, MODES, MOTOR_SPEED, PAIRS, SPEED, VOLTAGE, profile, sides_refused
-from mmrjax.tables import CONDITION_LIMITS, SURFACES, adhesion_ratio, lateral_ratio
+from mmrjax.quantities import Quantity
+from mmrjax.tables import SURFACES, adhesion_ratio, lateral_ratio
 
 if TYPE_CHECKING:
     from mmrjax.conditions import Conditions
@@ -38,35 +39,18 @@ CONTROLLED = tuple(mode for mode in MODES if mode in channels.USUAL)
 BETWEEN = ("held", "linear")
 #: Most rows in all, cycles included.
 LONGEST = 1_000_000
-#: Current of other consumers that the battery's parameter may have [A].
-_CURRENT_OTHER = (0.0, 50.0)
-
-
-def _range(condition: str) -> tuple[float, float]:
-    low, high, _ = CONDITION_LIMITS[condition]
-    return low, high
-
-
-def _speed(name: str) -> Quantity:
-    channel = channels.find(name)
-    return Quantity(
-        name, units.of_channel(name), (channel.range[0] * channel.factor, channel.range[1] * channel.factor)
-    )
-
-
 #: What columns can hold, by the field of `mmrjax.profile.Profile` that it becomes; the demands become `demand`.
 QUANTITIES: dict[str, Quantity] = {
-    "time": Quantity("time", units.TIME, (0.0, 1e6)),
-    "voltage": Quantity("supply_voltage", units.VOLTAGE, _range("voltage")),
-    "duty": Quantity("duty", units.SHARE, _range("duty")),
-    **{name: _speed(name) for name in CONTROLLED},
-    **{name: Quantity(name, units.SHARE, _range("duty")) for name in PAIRS[0]},
-    **{name: Quantity(name, units.VOLTAGE, _range("voltage")) for name in PAIRS[1]},
-    "yaw_rate": _speed("yaw_rate"),
-    "slope_deg": Quantity("slope", units.ANGLE, _range("slope_deg"), slope=True),
-    "payload": Quantity("payload", units.MASS, _range("payload")),
-    "load_torque": Quantity("load_torque", units.of_channel("output_torque"), _range("load_torque")),
-    "current_other": Quantity("current_other", units.CURRENT, _CURRENT_OTHER),
+    "time": quantities.named("time"),
+    "voltage": quantities.CONDITIONS["voltage"],
+    "duty": quantities.CONDITIONS["duty"],
+    **{name: channels.find(name) for name in CONTROLLED},
+    **{name: quantities.named(name) for name in (*PAIRS[0], *PAIRS[1])},
+    "yaw_rate": channels.find("yaw_rate"),
+    "slope_deg": quantities.CONDITIONS["slope_deg"],
+    "payload": quantities.CONDITIONS["payload"],
+    "load_torque": quantities.CONDITIONS["load_torque"],
+    "current_other": quantities.named("current_other"),
 }
 #: Columns of which a row has at most one, and the mode that each means.
 DEMANDS = {
@@ -375,7 +359,8 @@ class _Cells:
             self.refuse(field, row, f"a number, {allowed}")
         if not math.isfinite(written) or not low <= written <= high:
             self.refuse(field, row, allowed)
-        return quantity.value(written, unit)
+        value = quantity.value(written, unit)
+        return value * quantity.factor if isinstance(quantity, Channel) else value
 
     def held(self, field: str) -> np.ndarray:
         """A column that every row needs; the last row of a profile whose values are held needs none."""

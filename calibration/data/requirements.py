@@ -11,8 +11,9 @@ from typing import Any
 
 from calibration.data.errors import BadConfiguration, choices, stated_number
 from calibration.data.input_files import toml_content, toml_text
+from mmrjax.quantities import CONDITIONS
 from mmrjax.requirements import AXES, QUANTITIES, Quantity
-from mmrjax.tables import BENCH, CONDITION_LIMITS, SURFACES
+from mmrjax.tables import BENCH, SURFACES
 
 SCHEMA = "mmrjax.requirements/1"
 #: The packaged file: the paper's aims.
@@ -22,10 +23,10 @@ Range = tuple[float, float]
 
 #: Ranges of an envelope: least and greatest value, and unit.
 RANGES: dict[str, tuple[float, float, str]] = {
-    "payload_kg": CONDITION_LIMITS["payload"],
-    "slope_deg": (0.0, CONDITION_LIMITS["slope_deg"][1], "deg"),
+    "payload_kg": (*CONDITIONS["payload"].range, "kg"),
+    "slope_deg": (0.0, CONDITIONS["slope_deg"].range[1], "deg"),
     "state_of_charge": (0.0, 1.0, ""),
-    "supply_voltage_V": (1.0, CONDITION_LIMITS["voltage"][1], "V"),
+    "supply_voltage_V": (1.0, CONDITIONS["voltage"].range[1], "V"),
     "ambient_C": (-50.0, 80.0, "°C"),
 }
 #: Keys of an envelope.

@@ -15,8 +15,9 @@ from calibration.data.errors import rounded
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from mmrjax import params
-from mmrjax.channels import RPM, VOLTAGE
+from mmrjax.channels import VOLTAGE
 from mmrjax.errors import counted
+from mmrjax.quantities import RPM
 from mmrjax.robot import Robot
 from mmrjax.shaft import Shaft
 from mmrjax.signals import GRAVITY

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import clock, contradictions, delimited, input_files, instruments, sides, surfaces, units
+from calibration.data import clock, contradictions, delimited, input_files, instruments, sides, surfaces
 from calibration.data.columns import (
     CONDITIONS,
     DEFAULTS,
@@ -35,9 +35,10 @@ from calibration.data.columns import (
 )
 from calibration.data.errors import BadConfiguration, BadData, InputError, choices, number, parsed
 from calibration.data.table import Runs, driven_on
-from mmrjax import channels
-from mmrjax.channels import MM, RPM, Channel
+from mmrjax import channels, quantities
+from mmrjax.channels import Channel
 from mmrjax.errors import counted
+from mmrjax.quantities import MM, RPM
 from mmrjax.rig import Instrument
 from mmrjax.robot import NO_BRAKE, Robot
 
@@ -548,7 +549,7 @@ def _row_of_units(name: str, meanings: Sequence[Meaning | None], first: Sequence
     Raises:
         BadData: one among units that is none of its column's.
     """
-    cells = [units.spelled(cell.strip("[]()")) for row in first for cell in row]
+    cells = [quantities.spelled(cell.strip("[]()")) for row in first for cell in row]
     known = [() if m is None or m.quantity is None else tuple(m.quantity.columns().values()) for m in meanings]
     if len(cells) != len(meanings) or not any(c and c in each for c, each in zip(cells, known, strict=True)):
         return []
@@ -571,7 +572,7 @@ def _check_units(name: str, meanings: Sequence[Meaning | None], below: Sequence[
             continue
         named = {unit: column for column, unit in meaning.quantity.columns().items()}
         for stated, where in (
-            (units.at_the_end(meaning.shown, named), "in its name"),
+            (quantities.at_the_end(meaning.shown, named), "in its name"),
             (below[j] if below else "", "in the row below the header"),
         ):
             if stated and stated != meaning.unit:
@@ -654,7 +655,7 @@ def _hint(meaning: Meaning, cell: str, readings: tuple[str, ...]) -> str:
 
 def _unit_hint(value: str, written: str, mine: str, named: Mapping[str, str]) -> str:
     """What to do with a unit beside a number; `mine`: the column's own, `named`: columns by their units."""
-    unit = units.spelled(written)
+    unit = quantities.spelled(written)
     if unit == mine:
         return f"write {value}, the unit stands in the column's name; "
     if unit in named:

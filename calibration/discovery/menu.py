@@ -18,8 +18,8 @@ from calibration.discovery.notes import Heat, Overspeed, Overvoltage, Watch
 from calibration.discovery.reach import SLOPE, Reach, Used
 from calibration.discovery.setups import Setup
 from mmrjax import balances, channels
-from mmrjax.channels import RPM
 from mmrjax.conditions import Conditions
+from mmrjax.quantities import RPM
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals, State
 

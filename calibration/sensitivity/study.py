@@ -16,8 +16,8 @@ from calibration.sensitivity.model import Answer, Model, OutputRow, counted
 from calibration.sensitivity.result import Points
 from calibration.words.notes import in_words
 from mmrjax import fidelities
-from mmrjax.channels import RPM
 from mmrjax.conditions import Conditions
+from mmrjax.quantities import RPM
 from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
 

@@ -16,8 +16,8 @@ from calibration.data.contradictions import cannot_stand
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.requirements import STAIRS, TREAD, Envelope, Requirement, Requirements
 from mmrjax import params
-from mmrjax.channels import MM
 from mmrjax.compiling import compiled
+from mmrjax.quantities import MM
 from mmrjax.requirements import AMBIENT, AXES, CHARGE, PAYLOAD, SLOPE, Point, Ratings, evaluate, ratings
 from mmrjax.robot import Robot, cannot_turn
 from mmrjax.signals import CONVERGED, STATUSES

@@ -20,7 +20,7 @@ from calibration.discovery.notes import (
 )
 from calibration.inference import bases
 from mmrjax import channels
-from mmrjax.channels import RPM
+from mmrjax.quantities import RPM
 
 # --- amounts --------------------------------------------------------------------------------------------
 

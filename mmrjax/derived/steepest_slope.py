@@ -12,12 +12,12 @@ from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import operating, operating_point
 from mmrjax.params import Scalar
+from mmrjax.quantities import CONDITIONS
 from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED, Signals
-from mmrjax.tables import CONDITION_LIMITS
 
 #: The steepest slope that is looked at [deg]; a robot that holds it is said to hold this.
-STEEPEST = CONDITION_LIMITS["slope_deg"][1]
+STEEPEST = CONDITIONS["slope_deg"].range[1]
 #: Halvings of the bracket; what they leave, 3e-6 of a degree, one step of Newton's method takes off.
 HALVINGS = 24
 

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Array
 
 from mmrjax import channels
-from mmrjax.channels import MM
 from mmrjax.compiling import compiled
 from mmrjax.conditions import OF_SIDES, Conditions
 from mmrjax.fidelities.steady import steady, steady_batch
+from mmrjax.quantities import MM
 from mmrjax.robot import Robot
 from mmrjax.signals import Result
 

@@ -13,7 +13,7 @@ import numpy as np
 from calibration.data import effect_file
 from calibration.data.errors import BadConfiguration, number
 from calibration.words import effects as words_of
-from mmrjax import channels, derived, effects, missions, outputs, params, robots
+from mmrjax import channels, derived, effects, missions, outputs, params, quantities, robots
 from mmrjax.effects import Effect
 from mmrjax.errors import near
 from mmrjax.params import Parameter, Spec
@@ -76,6 +76,7 @@ def names(library: dict[str, type[Effect]]) -> dict[str, list[str]]:
         "verdicts of a climb": list(VERDICTS),
         "flags": list(words.FLAGS),
         "channels": [c.name for c in channels.EVERY],
+        "conditions": [c.field for c in quantities.SET if c.field],
         "outputs": list(dict.fromkeys(o.name for o in EVERY_OUTPUT)),
         "parameters": [p.name for p in params.walk(robots.nominal())],
     }
@@ -188,6 +189,19 @@ def _channel(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
             yield "" if k else "on a bench", test
 
 
+def _condition(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+    c = next((c for c in quantities.SET if name in (c.name, c.field, c.column)), None)
+    if c is None:
+        return
+    low, high = c.range
+    yield "is", f"{c.label} [{c.unit_shown or '-'}], {number(low)} to {number(high)}"
+    yield "column", c.column
+    if c.other_units or c.percent:
+        yield "other units", ", ".join([unit for unit, _ in c.other_units] + [quantities.PERCENT] * c.percent)
+    if c.field:
+        yield "from Python", f"mm.Conditions({c.field}=...)"
+
+
 def _output(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     for o in (o for o in EVERY_OUTPUT if name in (o.name, o.column)):
         yield "is", f"{o.label} [{o.unit}]"
@@ -246,4 +260,5 @@ def _bounds(spec: Spec) -> str:
 EXPLAINED: dict[str, Callable[[str, dict[str, type[Effect]]], Iterator[Line]]] = {
     "effect": _effect, "status": _status, "verdict of the loop": _verdict_of_loop, "verdict of a climb": _verdict,
     "flag": _flag, "channel": _channel, "output": _output, "parameter": _parameter,
+    "condition": _condition,
 }  # fmt: skip

@@ -13,7 +13,6 @@ from rich.table import Table
 from calibration.data import robot_file
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
-from mmrjax.channels import MM
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.modes import Mode, modes
 from mmrjax.fidelities.resonance import (
@@ -28,6 +27,7 @@ from mmrjax.fidelities.resonance import (
     vibrations,
 )
 from mmrjax.fidelities.track import track_batch
+from mmrjax.quantities import MM
 from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
 from mmrjax.tables import PAYLOADS_KG, VOLTAGES_V

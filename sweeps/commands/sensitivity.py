@@ -23,9 +23,9 @@ from calibration.sensitivity.next_runs import Candidates
 from calibration.sensitivity.result import METHODS, NEGLIGIBLE, Points, SensitivityResult
 from calibration.sensitivity.study import Study, Supply
 from calibration.words import sensitivity as words
-from mmrjax.channels import RPM
 from mmrjax.conditions import OF_TURNS
 from mmrjax.power import COULOMB_PER_MAH
+from mmrjax.quantities import RPM
 from mmrjax.robot import Robot
 from mmrjax.tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
 from sweeps import config as configuration

@@ -12,8 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mmrjax import channels
-from mmrjax.channels import MM, Channel
+from mmrjax.channels import Channel
 from mmrjax.derived.start import peak
+from mmrjax.quantities import MM
 from mmrjax.stages import Stages, ending, numbers, of_histories
 from sweeps.pages import words
 from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, axis_label, figure, looks, note

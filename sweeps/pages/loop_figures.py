@@ -14,7 +14,8 @@ from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import blocks
 from calibration.inference.bases import in_words
 from calibration.inference.details import TimeStatistics
-from mmrjax.channels import EVERY, MM, RPM, SIDES, Channel
+from mmrjax.channels import EVERY, SIDES, Channel
+from mmrjax.quantities import MM, RPM
 from sweeps.pages.figure_style import (
     BLUE,
     FAINT,

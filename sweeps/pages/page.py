@@ -16,6 +16,7 @@ from markupsafe import Markup, escape
 from calibration.data.writing import write_text
 from mmrjax import __version__, channels, effects, params
 from mmrjax.channels import Channel
+from mmrjax.quantities import SET, Condition
 from sweeps import capabilities
 from sweeps.pages import words
 from sweeps.pages.figure_style import style, svg
@@ -98,19 +99,13 @@ def changed_parameters(robot: Robot, nominal: Robot) -> list[dict[str, str]]:
     return answer
 
 
+def _column(condition: Condition) -> str:
+    """The column of a condition; an imposed speed or current stands in that of its channel."""
+    return next((c.column for c in channels.EVERY if c.name == condition.name), condition.column)
+
+
 #: Conditions of a run by their columns: heading, and format of a number.
-CONDITIONS = {
-    "supply_voltage_V": ("U [V]", "{:g}"),
-    "motor_speed_rpm": ("n [rpm]", "{:g}"),
-    "motor_current_A": ("I [A]", "{:.4g}"),
-    "total_mass_kg": ("M [kg]", "{:.1f}"),
-    "payload_kg": ("payload [kg]", "{:g}"),
-    "slope_deg": ("slope [°]", "{:g}"),
-    "load_torque_Nm": ("load torque [N·m]", "{:.4g}"),
-    "duty_left": ("duty left", "{:.3g}"),
-    "duty_right": ("duty right", "{:.3g}"),
-    "heading_deg": ("heading from uphill [°]", "{:g}"),
-}
+CONDITIONS = {_column(c): (c.heading, c.shown) for c in SET if c.heading}
 
 
 def conditions(table: dict[str, np.ndarray], *, mass: bool = False) -> dict[str, tuple[str, str]]:

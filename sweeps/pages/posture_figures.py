@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from scipy.spatial import ConvexHull
 
-from mmrjax.channels import MM
 from mmrjax.posture import BELTS, FRONT_AXLE, REAR_AXLE, Outline
+from mmrjax.quantities import MM
 from sweeps.pages.figure_style import BLUE, INK, ORANGE, VERMILION, figure
 from sweeps.results.posture import Drawn, Postures, StepMap
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mmrjax.channels import MM
 from mmrjax.fidelities.resonance import MATTERS, PERIODS, SIGNALS, TAIL, strongest
+from mmrjax.quantities import MM
 from sweeps.pages import resonance_figures, words
 from sweeps.pages.page import Album, named, render
 

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from mmrjax.channels import MM
 from mmrjax.fidelities.resonance import MATTERS, SIGNALS, strongest
+from mmrjax.quantities import MM
 from sweeps.pages import words
 from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure
 from sweeps.results.resonance import percent

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mmrjax.channels import MM, RPM, VOLTAGE
+from mmrjax.channels import VOLTAGE
+from mmrjax.quantities import MM, RPM
 from sweeps import capabilities
 from sweeps.pages import posture_words, power_figures, words
 from sweeps.pages.page import Album, columns, conditions, first_rows, label, named, render, statuses

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mmrjax.channels import MM, RPM
+from mmrjax.quantities import MM, RPM
 from mmrjax.robot import Robot
 from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, figure
 from sweeps.pages.page import Album, columns, conditions, named, render

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from mmrjax.channels import MM, SIDES
+from mmrjax.channels import SIDES
 from mmrjax.derived.turn import NONE
+from mmrjax.quantities import MM
 from mmrjax.robot import Robot
 from mmrjax.signals import NOT_SETTLED, STATUSES, Result
 from mmrjax.simulation import STRAIGHT

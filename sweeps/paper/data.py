@@ -11,9 +11,10 @@ import numpy as np
 from calibration.data import runs as records
 from calibration.inference import errors as residual
 from mmrjax import outputs
-from mmrjax.channels import MM, RPM, Channel
+from mmrjax.channels import Channel
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import History
+from mmrjax.quantities import MM, RPM
 from mmrjax.tables import CONFIGURATIONS, SURFACES, TRACKED, adhesion_ratio
 from sweeps.pages import history_figures
 from sweeps.pages.history_figures import Start

@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.data import runs as records
 from calibration.inference import errors as residual
-from mmrjax.channels import MM, RPM
+from mmrjax.quantities import MM, RPM
 from mmrjax.tables import CONFIGURATIONS, TRACKED, WHEELED
 from sweeps.pages.page import reading
 from sweeps.paper import data

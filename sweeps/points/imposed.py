@@ -10,8 +10,8 @@ import numpy as np
 
 from calibration.data.columns import Layout
 from calibration.data.errors import BadConfiguration
-from mmrjax.channels import RPM
 from mmrjax.conditions import OF_TURNS, sides_contradict
+from mmrjax.quantities import RPM
 from mmrjax.robot import NO_BRAKE, Robot, cannot_turn
 from mmrjax.tables import VOLTAGES_V
 from sweeps import capabilities

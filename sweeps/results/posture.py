@@ -12,10 +12,10 @@ from calibration.data.columns import LEVERS
 from calibration.data.table import Runs
 from calibration.sizing.sheet import Outcome
 from mmrjax import posture, static_limits
-from mmrjax.channels import MM
 from mmrjax.conditions import Conditions
 from mmrjax.masses import lever_angles
 from mmrjax.posture import Outline
+from mmrjax.quantities import MM
 from mmrjax.robot import Robot
 
 #: Angles at which the map of highest steps looks at front and rear levers [deg].

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from mmrjax.channels import MM
 from mmrjax.fidelities.modes import Mode
 from mmrjax.fidelities.resonance import SIGNALS, Crossing, Passing, Peak, Resonance, resonances, strongest
+from mmrjax.quantities import MM
 from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
 

@@ -1,0 +1,216 @@
+"""The table of quantities: what is set of a run, one row each, and how units are spelled. Importable without jax.
+
+A quantity has a name, units, a range and a rule for its sign. `CONDITIONS` are those that are set;
+`channels.EVERY` are those that an instrument shows. Columns of tables and profiles, fields of `Conditions`, options,
+pages and `explain` take names, units, ranges and words from these rows, so a new condition is a row here and a field
+of `Conditions`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Iterable, Mapping
+
+DEG = math.pi / 180  # rad
+RPM = math.pi / 30  # rad/s
+MM = 1e-3  # m
+
+#: Per cent of a slope: those of the tangent of its angle.
+PERCENT = "percent"
+#: Units as people write them beside numbers, where a column's name has another spelling.
+WRITTEN = {
+    "°": "deg", "v": "V", "volt": "V", "volts": "V", "a": "A", "amp": "A", "amps": "A", "ma": "mA", "mv": "mV",
+    "gram": "g", "grams": "g", "°c": "C", "1/min": "rpm", "u/min": "rpm",
+    "r/min": "rpm", "min-1": "rpm", "°/s": "deg/s", "nmm": "mNm", "n·mm": "mNm",
+}  # fmt: skip
+
+
+def spelled(unit: str) -> str:
+    """A unit as the end of a column's name: `km/h` is `km_h`."""
+    unit = WRITTEN.get(unit.lower(), unit)
+    return unit.replace("/", "_").replace("%", PERCENT).replace("·", "")
+
+
+def at_the_end(text: str, known: Iterable[str]) -> str | None:
+    """The one of `known` units that a column's name ends with, `torque_kNm` or `Torque [kN·m]`; None of none."""
+    end = re.split(r"[\[(\s]", text.rstrip("])"))[-1]
+    found = [unit for unit in known if unit and re.search(rf"(?:^|[^A-Za-z]){unit}$", spelled(end))]
+    return max(found, key=len, default=None)
+
+
+@dataclasses.dataclass(frozen=True)
+class Quantity:
+    """A number with its unit, its range and the rule for its sign.
+
+    Attributes:
+        name: noun; with the unit, the name of its column.
+        unit: of its column; factor: the SI value of one such unit.
+        label: words of reports.
+        range: least and greatest value [unit].
+        unit_si: of the value inside, where people write it otherwise than `unit`; empty for the same.
+        other_units: what it is also written in, and the SI value of each.
+        percent: whether per cent of a slope are understood too.
+    """
+
+    name: str
+    unit: str
+    factor: float
+    label: str
+    range: tuple[float, float]
+    unit_si: str = dataclasses.field(default="", kw_only=True)
+    other_units: tuple[tuple[str, float], ...] = dataclasses.field(default=(), kw_only=True)
+    percent: bool = dataclasses.field(default=False, kw_only=True)
+
+    @property
+    def column(self) -> str:
+        """Its column in tables, with the unit in the name."""
+        return f"{self.name}_{spelled(self.unit)}" if self.unit else self.name
+
+    @property
+    def unit_shown(self) -> str:
+        """Its unit as people write it: C is a coulomb, °C a temperature."""
+        return self.unit_si if self.unit_si and self.factor == 1.0 else self.unit
+
+    @property
+    def units(self) -> Mapping[str, float]:
+        """Value of one unit in the unit of its column, by its spelling, that of the column first."""
+        written = ((self.unit, self.factor), *self.other_units)
+        return {spelled(unit): size / self.factor for unit, size in written}
+
+    def columns(self) -> dict[str, str]:
+        """Names of the columns that may hold it, each with the unit at its end."""
+        units = [*self.units, *([PERCENT] if self.percent else [])]
+        return {f"{self.name}_{unit}" if unit else self.name: unit for unit in units}
+
+    def value(self, written: float, unit: str) -> float:
+        """What is written in `unit`, in the unit of its column."""
+        if self.percent and unit == PERCENT:
+            return math.degrees(math.atan(written / 100))
+        return written * self.units[unit]
+
+    def limits(self, unit: str) -> tuple[float, float]:
+        """Least and greatest value allowed, in `unit`."""
+        low, high = self.range
+        if self.percent and unit == PERCENT:
+            return 100 * math.tan(math.radians(low)), 100 * math.tan(math.radians(high))
+        return low / self.units[unit], high / self.units[unit]
+
+
+@dataclasses.dataclass(frozen=True)
+class Condition(Quantity):
+    """A quantity that is set from outside before a run starts.
+
+    Attributes:
+        field: of `Conditions`; empty where that has none.
+        heading: of its column on pages, empty where no page shows it; shown: format of a number there.
+    """
+
+    field: str = ""
+    heading: str = dataclasses.field(default="", kw_only=True)
+    shown: str = dataclasses.field(default="{:g}", kw_only=True)
+
+
+_MILLIVOLT, _MILLIAMPERE = (("mV", 1e-3),), (("mA", 1e-3),)
+_GRAM, _RADIAN = (("g", 1e-3),), (("rad", 1.0),)
+_TIMES = (("ms", 1e-3), ("min", 60.0), ("h", 3600.0))
+_TORQUES = (("mNm", 1e-3), ("kNm", 1e3))
+_SHARES = ((PERCENT, 1e-2),)
+_VOLTS, _SHARE, _SWITCH = (-100.0, 100.0), (-1.0, 1.0), (-1.0, 1.0)
+_RATIO, _RADIANS_PER_SECOND = (1e-3, 100.0), (-1e4, 1e4)
+
+#: Everything that can be set of a run and is a number.
+SET: tuple[Condition, ...] = (
+    Condition(
+        "supply_voltage", "V", 1.0, "supply voltage", _VOLTS, "voltage", other_units=_MILLIVOLT, heading="U [V]"
+    ),
+    Condition(
+        "motor_speed", "rad/s", 1.0, "motor speed imposed on the shafts", _RADIANS_PER_SECOND, "motor_speed",
+        heading="n [rpm]",
+    ),
+    Condition(
+        "motor_current", "A", 1.0, "current imposed on each motor", (-2000.0, 2000.0), "motor_current",
+        heading="I [A]", shown="{:.4g}",
+    ),
+    Condition(
+        "total_mass", "kg", 1.0, "total mass of robot and payload", (0.1, 500.0), "total_mass", other_units=_GRAM,
+        heading="M [kg]", shown="{:.1f}",
+    ),
+    Condition("payload", "kg", 1.0, "payload", (0.0, 300.0), "payload", other_units=_GRAM, heading="payload [kg]"),
+    Condition(
+        "slope", "deg", DEG, "slope, positive uphill", (-45.0, 45.0), "slope_deg", other_units=_RADIAN, percent=True,
+        heading="slope [°]",
+    ),
+    Condition(
+        "load_torque", "Nm", 1.0, "torque of a brake on the output of each drive, positive against forward rotation",
+        (-1e4, 1e4), "load_torque", unit_si="N·m", other_units=_TORQUES, heading="load torque [N·m]", shown="{:.4g}",
+    ),
+    Condition("battery", "", 1.0, "on-board battery instead of the external supply", (0.0, 1.0), "battery"),
+    Condition("discharge", "C", 1.0, "charge already taken from the battery", (0.0, 360_000.0), "discharge"),
+    Condition("adhesion", "", 1.0, "adhesion as a ratio to the one the robot is stated for", _RATIO, "adhesion"),
+    Condition("order", "", 1.0, "place in the sequence of runs", (0.0, 1e9), "order"),
+    Condition(
+        "duty", "", 1.0, "share of the supply's voltage that the driver gives the motors", _SHARE, "duty",
+        other_units=_SHARES,
+    ),
+    Condition("open", "", 1.0, "1 where the motors' circuit is open", _SWITCH, "open"),
+    Condition(
+        "motor_acceleration", "rad/s^2", 1.0, "acceleration of an imposed motor speed", (-1e7, 1e7),
+        "motor_acceleration",
+    ),
+    *(
+        Condition(
+            f"duty_{side}", "", 1.0, f"share of the supply's voltage at the {side} motor", _SHARE, f"duty_{side}",
+            other_units=_SHARES, heading=f"duty {side}", shown="{:.3g}",
+        )
+        for side in ("left", "right")
+    ),
+    *(
+        Condition(f"open_{side}", "", 1.0, f"1 where the {side} motor's circuit is open", _SWITCH, f"open_{side}")
+        for side in ("left", "right")
+    ),
+    *(
+        Condition(
+            f"motor_speed_{side}", "rad/s", 1.0, f"motor speed imposed on the {side} side", _RADIANS_PER_SECOND,
+            f"motor_speed_{side}",
+        )
+        for side in ("left", "right")
+    ),
+    Condition(
+        "heading", "deg", DEG, "heading at the start, from uphill, positive to the left", (-360.0, 360.0),
+        "heading_deg", other_units=_RADIAN, heading="heading from uphill [°]",
+    ),
+    Condition("adhesion_lateral", "", 1.0, "the same as adhesion, across the travel", _RATIO, "adhesion_lateral"),
+    *(
+        Condition(
+            f"levers_{end}", "deg", DEG,
+            f"angle of the {end} levers, 0 along the wheelbase outward, positive up, 180 folded", (-180.0, 180.0),
+            f"levers_{end}_deg", other_units=_RADIAN,
+        )
+        for end in ("front", "rear")
+    ),
+    Condition("time", "s", 1.0, "time since the start", (0.0, 1e6), other_units=_TIMES),
+    *(
+        Condition(f"voltage_{side}", "V", 1.0, f"voltage of the {side} motor", _VOLTS, other_units=_MILLIVOLT)
+        for side in ("left", "right")
+    ),
+    Condition(
+        "current_other", "A", 1.0, "current of other consumers on the battery", (0.0, 50.0),
+        other_units=_MILLIAMPERE,
+    ),
+)  # fmt: skip
+
+#: Conditions of a run that are numbers, by their fields of `Conditions`.
+CONDITIONS: dict[str, Condition] = {c.field: c for c in SET if c.field}
+#: The same and what else is set, by column.
+BY_COLUMN: dict[str, Condition] = {c.column: c for c in SET}
+
+
+def named(name: str) -> Condition:
+    """What is set by a name without unit: `slope`, `supply_voltage`.
+
+    Raises:
+        KeyError: no such quantity.
+    """
+    return {c.name: c for c in SET}[name]
