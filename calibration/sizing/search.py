@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
@@ -252,94 +253,149 @@ def size(
     chosen = options(robot, motors)
     problem = task(robot, asked, chosen)
     choice = space(robot, problem, chosen)
-    rng = np.random.default_rng(seed)
     columns = [list(OBJECTIVES).index(name) for name in objectives]
-    # Random designs of every choice: what can be met at all, and where to start.
-    rows = np.repeat(np.arange(len(choice.drive)), TRIES)
-    if "cost" in objectives:
-        rows = rows[np.isfinite(chosen.drive["cost"][choice.drive[rows]])]
-    x = choice.low[rows] + (choice.high[rows] - choice.low[rows]) * rng.random((len(rows), 3)) ** np.array(
-        [1.0, 1.0, 2.0]
-    )
-    f, g = measured(problem, choice, rows, x)
-    kept = g.max(axis=0) >= 0
+    drawn = _drawn(problem, choice, "cost" in objectives, np.random.default_rng(seed))
+    kept = drawn.g.max(axis=0) >= 0
     unmeetable = tuple(label for label, k in zip(problem.labels, kept, strict=True) if not k)
-    misses = 5 * np.sum(np.maximum(-g[:, kept], 0.0), axis=1)
-    shares = [len(s) for s in np.array_split(np.arange(starts), len(columns))]
-    each = [_starts(choice, rows, np.log(f[:, c]) + misses, n) for c, n in zip(columns, shares, strict=True)]
-    picked = np.concatenate(each)
-    pool, pool_f = rows, f
-    rows, x = rows[picked], x[picked]
-    weights = np.zeros((starts, len(OBJECTIVES)))
-    share = np.ones(starts) if len(columns) == 1 else np.linspace(0.98, 0.02, starts)
-    weights[:, columns[0]] += share
-    if len(columns) == 2:
-        weights[:, columns[1]] += 1 - share
-    x = np.array(_descended(
-        problem, choice.designs(rows, x), jnp.asarray(choice.low[rows]), jnp.asarray(choice.high[rows]),
-        jnp.asarray(weights), jnp.asarray(kept, float),
-    ))  # fmt: skip
-    evaluated = len(choice.drive) * TRIES + starts * STEPS
-    f, g = measured(problem, choice, rows, x)
-    cost = _cost(f, g, kept, weights)
-    refined = np.argsort(cost)[: REFINED * len(columns)]
-    x[refined], count = _refine(problem, choice, rows[refined], x[refined], kept, weights[refined], np.ones(3))
-    evaluated += count
-    f, g = measured(problem, choice, rows, x)
-    alone = np.zeros(len(OBJECTIVES))
-    alone[columns[0]] = 1.0
-    cost = _cost(f, g, kept, np.tile(alone, (starts, 1)))
-    # With ratios of the sheets and whole cells.
-    real_rows, real_x, real_w = _real(choice, rows, x, weights, np.argsort(cost))
-    for c in columns:
-        w = np.eye(len(OBJECTIVES))[c]
-        ranked = pool[np.argsort(np.where(np.isfinite(pool_f[:, c]), np.log(pool_f[:, c]) + misses, np.inf))]
-        more_rows, more_x, count = _enumerated(
-            problem, choice, np.array(list(dict.fromkeys(ranked))[:WHOLE]), kept, w
-        )
-        evaluated += count
-        real_rows, real_x = np.concatenate([real_rows, more_rows]), np.concatenate([real_x, more_x])
-        real_w = np.concatenate([real_w, np.tile(w, (len(more_rows), 1))])
-    real_x, count = _refine(problem, choice, real_rows, real_x, kept, real_w, np.array([0.0, 1.0, 0.0]))
-    evaluated += count
-    real_f, real_g = measured(problem, choice, real_rows, real_x)
-    real_cost = _cost(real_f, real_g, kept, np.tile(alone, (len(real_f), 1)))
+    search = _Search(problem, choice, kept, columns)
+    weights = search.weights(starts)
+    free = search.descended(drawn, weights)
+    real = search.real(drawn, free, weights)
     # The best of these with any ratio and parts of a cell: no search may have begun from their choice of parts.
-    top = np.argsort(real_cost)[:REFINED]
-    more_x, count = _refine(
-        problem, choice, real_rows[top], real_x[top], kept, np.tile(alone, (len(top), 1)), np.ones(3)
-    )
-    evaluated += count
-    rows, x = np.concatenate([rows, real_rows[top]]), np.concatenate([x, more_x])
-    f, g = measured(problem, choice, rows, x)
-    cost = _cost(f, g, kept, np.tile(alone, (len(rows), 1)))
+    top = np.argsort(search.cost(real))[:REFINED]
+    free = free + search.refined(real.rows[top], real.x[top], search.first(len(top)), np.ones(3))
+    evaluated = len(drawn.rows) + starts * STEPS + search.evaluated
 
-    def found(rows: np.ndarray, x: np.ndarray, f: np.ndarray, g: np.ndarray, k: int) -> Found:
-        return _found(robot, problem, choice, rows[k], x[k], f[k], np.where(kept, g[k], np.nan))
+    def found(designs: _Designs, k: int) -> Found:
+        margins = np.where(kept, designs.g[k], np.nan)
+        return _found(robot, problem, choice, designs.rows[k], designs.x[k], designs.f[k], margins)
 
-    everything = np.concatenate([rows, real_rows]), np.concatenate([x, real_x])
-    every_f, every_g = np.concatenate([f, real_f]), np.concatenate([g, real_g])
-    every_cost = np.concatenate([cost, real_cost])
-    by_motor: dict[str, Found] = {}
-    for k in np.argsort(every_cost):
-        name = chosen.drives[choice.drive[everything[0][k]]].motor.name
+    everything, by_motor = free + real, dict[str, Found]()
+    for k in np.argsort(search.cost(everything)):
+        name = chosen.drives[choice.drive[everything.rows[k]]].motor.name
         if name not in by_motor:  # a design is a robot to build, and these are a thousand
-            by_motor[name] = found(*everything, every_f, every_g, int(k))
-    order = [int(k) for k in np.argsort(real_cost) if np.all(real_g[k][kept] >= 0)]
+            by_motor[name] = found(everything, int(k))
+    good = [k for k in range(len(real.rows)) if np.all(real.g[k][kept] >= 0)]
     different: dict[tuple[int, int], int] = {}
-    for k in order:
-        different.setdefault((int(choice.drive[real_rows[k]]), int(choice.cell[real_rows[k]])), k)
-    best = [found(real_rows, real_x, real_f, real_g, k) for k in list(different.values())[:8]]
-    ideal = int(np.argmin(cost))
-    front = []
-    if len(columns) == 2:
-        good = [k for k in range(len(real_rows)) if np.all(real_g[k][kept] >= 0)]
-        front = [found(real_rows, real_x, real_f, real_g, k) for k in _undominated(real_f[:, columns], good)]
+    for k in (int(k) for k in np.argsort(search.cost(real)) if k in set(good)):
+        different.setdefault((int(choice.drive[real.rows[k]]), int(choice.cell[real.rows[k]])), k)
+    best = [found(real, k) for k in list(different.values())[:8]]
+    ideal = int(np.argmin(search.cost(free)))
+    front = [found(real, k) for k in _undominated(real.f[:, columns], good)] if len(columns) == 2 else []
     return Sizing(
         problem, chosen, objectives[0], unmeetable,
-        found(rows, x, f, g, ideal) if np.all(g[ideal][kept] >= 0) else None,
+        found(free, ideal) if np.all(free.g[ideal][kept] >= 0) else None,
         best[0] if best else None, tuple(best[1:]), by_motor, tuple(front), starts, evaluated,
     )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class _Designs:
+    """Designs: rows of the choice of parts, shape (designs,); logarithms of ratio, radius and cells in parallel,
+    shape (designs, 3); objectives and margins, shapes (designs, objectives) and (designs, limits)."""
+
+    rows: np.ndarray
+    x: np.ndarray
+    f: np.ndarray
+    g: np.ndarray
+
+    def __add__(self, other: _Designs) -> _Designs:
+        return _Designs(*(np.concatenate([mine, theirs]) for mine, theirs in zip(self, other, strict=True)))
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        return iter((self.rows, self.x, self.f, self.g))
+
+
+def _drawn(problem: Task, choice: Space, costed: bool, rng: np.random.Generator) -> _Designs:
+    """Random designs of every choice of parts: what can be met at all, and where to start.
+
+    Args:
+        costed: whether only drives count whose price is known.
+    """
+    rows = np.repeat(np.arange(len(choice.drive)), TRIES)
+    if costed:
+        rows = rows[np.isfinite(choice.options.drive["cost"][choice.drive[rows]])]
+    low, high = choice.low[rows], choice.high[rows]
+    x = low + (high - low) * rng.random((len(rows), 3)) ** np.array([1.0, 1.0, 2.0])
+    return _Designs(rows, x, *measured(problem, choice, rows, x))
+
+
+@dataclasses.dataclass
+class _Search:
+    """The steps of a search.
+
+    Attributes:
+        kept: which limits some design meets; columns: of the objectives; evaluated: designs so far.
+    """
+
+    problem: Task
+    choice: Space
+    kept: np.ndarray
+    columns: list[int]
+    evaluated: int = 0
+
+    def designs(self, rows: np.ndarray, x: np.ndarray) -> _Designs:
+        """Designs with their objectives and margins."""
+        return _Designs(rows, x, *measured(self.problem, self.choice, rows, x))
+
+    def first(self, count: int) -> np.ndarray:
+        """Weights of the first objective alone, shape (count, objectives)."""
+        return np.tile(np.eye(len(OBJECTIVES))[self.columns[0]], (count, 1))
+
+    def weights(self, starts: int) -> np.ndarray:
+        """Weights of the objectives in each start, shape (starts, objectives): along a Pareto front for two."""
+        weights = np.zeros((starts, len(OBJECTIVES)))
+        share = np.ones(starts) if len(self.columns) == 1 else np.linspace(0.98, 0.02, starts)
+        weights[:, self.columns[0]] += share
+        if len(self.columns) == 2:
+            weights[:, self.columns[1]] += 1 - share
+        return weights
+
+    def cost(self, designs: _Designs) -> np.ndarray:
+        """What is to be small by the first objective, shape (designs,)."""
+        return _cost(designs.f, designs.g, self.kept, self.first(len(designs.rows)))
+
+    def misses(self, drawn: _Designs) -> np.ndarray:
+        """How far designs are from the limits that can be met, shape (designs,)."""
+        return 5 * np.sum(np.maximum(-drawn.g[:, self.kept], 0.0), axis=1)
+
+    def refined(self, rows: np.ndarray, x: np.ndarray, weights: np.ndarray, free: np.ndarray) -> _Designs:
+        """Designs after a search on shrinking boxes around them, see `_refine`."""
+        x, count = _refine(self.problem, self.choice, rows, x, self.kept, weights, free)
+        self.evaluated += count
+        return self.designs(rows, x)
+
+    def descended(self, drawn: _Designs, weights: np.ndarray) -> _Designs:
+        """Designs with any ratio and parts of a cell, by gradients from the best of those drawn."""
+        choice, misses = self.choice, self.misses(drawn)
+        shares = [len(s) for s in np.array_split(np.arange(len(weights)), len(self.columns))]
+        picked = [
+            _starts(choice, drawn.rows, np.log(drawn.f[:, c]) + misses, n)
+            for c, n in zip(self.columns, shares, strict=True)
+        ]
+        rows, x = drawn.rows[np.concatenate(picked)], drawn.x[np.concatenate(picked)]
+        x = np.array(_descended(
+            self.problem, choice.designs(rows, x), jnp.asarray(choice.low[rows]), jnp.asarray(choice.high[rows]),
+            jnp.asarray(weights), jnp.asarray(self.kept, float),
+        ))  # fmt: skip
+        found = self.designs(rows, x)
+        best = np.argsort(_cost(found.f, found.g, self.kept, weights))[: REFINED * len(self.columns)]
+        x[best] = self.refined(rows[best], x[best], weights[best], np.ones(3)).x
+        return self.designs(rows, x)
+
+    def real(self, drawn: _Designs, free: _Designs, weights: np.ndarray) -> _Designs:
+        """Designs with ratios of the sheets and whole cells: those near `free`, and the best of every choice."""
+        rows, x, w = _real(self.choice, free.rows, free.x, weights, np.argsort(self.cost(free)))
+        misses = self.misses(drawn)
+        for c in self.columns:
+            merit = np.where(np.isfinite(drawn.f[:, c]), np.log(drawn.f[:, c]) + misses, np.inf)
+            ranked = np.array(list(dict.fromkeys(drawn.rows[np.argsort(merit)]))[:WHOLE])
+            own = np.eye(len(OBJECTIVES))[c]
+            more_rows, more_x, count = _enumerated(self.problem, self.choice, ranked, self.kept, own)
+            self.evaluated += count
+            rows, x = np.concatenate([rows, more_rows]), np.concatenate([x, more_x])
+            w = np.concatenate([w, np.tile(own, (len(more_rows), 1))])
+        return self.refined(rows, x, w, np.array([0.0, 1.0, 0.0]))
 
 
 def _starts(choice: Space, rows: np.ndarray, merit: np.ndarray, count: int) -> np.ndarray:
