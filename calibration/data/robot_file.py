@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import json
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,6 +20,7 @@ from calibration.data.input_files import toml_content, toml_text
 from calibration.data.writing import write_text
 from mmrjax import effects, params, power, robots
 from mmrjax.driver import DECAYS
+from mmrjax.effects import Effect
 from mmrjax.effects.scaled import scaled
 from mmrjax.robot import Configurations, Robot
 from mmrjax.shaft import Shaft
@@ -467,45 +468,11 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
         moves = "tracks" if float(load.on_tracks) > 0.5 else "wheels"
         tables[name] = ['load = "shaft"'] if isinstance(load, Shaft) else [f'movers = "{moves}"']
     for effect in robot.effects:
-        named = effect.configurations or type(effect)().configurations
-        acting = f"configurations = {json.dumps(effect.configurations)}  # on which it acts"
-        tables[f"effects.{effect.name}"] = [acting] if named else []
-        if type(effect).plain is not None:
-            line = f"{FACTORS} = {list(type(effect).factors)}  # sd, shape, limits: times the library's"
-            tables[f"effects.{effect.name}"].append(line)
-    start = {p.name: float(p.value) for p in params.walk(nothing)}
-    needed = rig_file.needed(robot.rig, ((p.name, float(p.value)) for p in params.walk(robot)))
-    always = (*(f"{name}." for name in robot.configurations), "effects.")
-    for parameter in params.walk(robot):
-        head_, _, key = parameter.name.rpartition(".")
-        spec, value = parameter.spec, float(parameter.value)
-        if head_.startswith("rig."):  # where the runs of one table begin is not the robot's
-            continue
-        was = start.get(parameter.name, 0.0 if head_.startswith("effects.") else None)
-        same = value == was and not parameter.name.startswith(always) and parameter.name not in needed
-        same &= parameter.name not in nothing.rig.unknown or parameter.name in robot.rig.unknown
-        if same and (not whole or head_ == "rig"):
-            continue
-        origin = f"; nominal {was:g}: {spec.source}" if was is not None and value != was else ""
-        origin = f"; {spec.source}" if value == was else origin
-        text = rig_file.value_text(parameter.name, value, robot.rig)
-        line = f"{key} = {text}  # [{spec.unit}] {spec.meaning}"
-        tables.setdefault(head_, []).append(f"{line}{origin}" if whole else line)
-    for name, (_, _, unit, what) in RATINGS.items():
-        part, _, key = name.partition(".")
-        rating = getattr(getattr(robot, part), key)
-        beside = key == "capacity_curve" and bool(tables[part])  # else it would follow from the capacity
-        if rating is not None and (whole or beside or rating != getattr(getattr(nothing, part), key)):
-            tables[part].append(f"{key} = {rating!r}  # [{unit}] {what if whole else what.partition(';')[0]}")
-    for name, what in SWITCHES.items():
-        part, _, key = name.partition(".")
-        switch = getattr(getattr(robot, part), key)
-        if whole or switch != getattr(getattr(nothing, part), key):
-            tables.setdefault(part, []).append(f"{key} = {str(switch).lower()}  # {what}")
-    for name, (_, what) in CHOICES.items():
-        part, _, key = name.partition(".")
-        if (choice := getattr(getattr(robot, part), key)) != getattr(getattr(nothing, part), key):
-            tables.setdefault(part, []).append(f"{key} = {json.dumps(choice)}  # {what}")
+        tables[f"effects.{effect.name}"] = _lines_of_effect(effect)
+    for title, line in _lines_of_parameters(robot, nothing):
+        tables.setdefault(title, []).append(line)
+    for title, line in _lines_of_ratings(robot, nothing, {name for name, lines in tables.items() if lines}):
+        tables.setdefault(title, []).append(line)
     lines = [f"# {line}" for line in note.splitlines()]
     lines += [f'schema = "{SCHEMA}"', f'base = "{"nominal" if whole else rig_file.NONE}"']
     lines += [f"sides = {int(robot.sides)}  # motors driven alike", *head]
@@ -515,6 +482,67 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
             continue
         lines += ["", f"[{title}]", *table]
     write_text(path, "\n".join(lines) + "\n")
+
+
+def _lines_of_effect(effect: Effect) -> list[str]:
+    """What the table of an effect states beside its parameters."""
+    named = effect.configurations or type(effect)().configurations
+    lines = [f"configurations = {json.dumps(effect.configurations)}  # on which it acts"] if named else []
+    if type(effect).plain is not None:
+        lines.append(f"{FACTORS} = {list(type(effect).factors)}  # sd, shape, limits: times the library's")
+    return lines
+
+
+def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, str]]:
+    """Table and line of each parameter that a file has to state, or that differs from the robot it starts from."""
+    whole = robot.rig.inherits
+    start = {p.name: float(p.value) for p in params.walk(nothing)}
+    needed = rig_file.needed(robot.rig, ((p.name, float(p.value)) for p in params.walk(robot)))
+    always = (*(f"{name}." for name in robot.configurations), "effects.")
+    for parameter in params.walk(robot):
+        table, _, key = parameter.name.rpartition(".")
+        spec, value = parameter.spec, float(parameter.value)
+        if table.startswith("rig."):  # where the runs of one table begin is not the robot's
+            continue
+        was = start.get(parameter.name, 0.0 if table.startswith("effects.") else None)
+        same = value == was and not parameter.name.startswith(always) and parameter.name not in needed
+        same &= parameter.name not in nothing.rig.unknown or parameter.name in robot.rig.unknown
+        if same and (not whole or table == "rig"):
+            continue
+        origin = f"; nominal {was:g}: {spec.source}" if was is not None and value != was else ""
+        origin = f"; {spec.source}" if value == was else origin
+        text = rig_file.value_text(parameter.name, value, robot.rig)
+        line = f"{key} = {text}  # [{spec.unit}] {spec.meaning}"
+        yield table, f"{line}{origin}" if whole else line
+
+
+def _lines_of_ratings(robot: Robot, nothing: Robot, stated: set[str]) -> Iterator[tuple[str, str]]:
+    """Table and line of each rating, switch and choice that differs from the robot that a file starts from.
+
+    Args:
+        stated: tables that state something already.
+    """
+    whole = robot.rig.inherits
+
+    def value(owner: Robot, name: str) -> Any:
+        part, _, key = name.partition(".")
+        return getattr(getattr(owner, part), key)
+
+    for name, (_, _, unit, what) in RATINGS.items():
+        part, _, key = name.partition(".")
+        rating = value(robot, name)
+        beside = key == "capacity_curve" and part in stated  # else it would follow from the capacity
+        if rating is not None and (whole or beside or rating != value(nothing, name)):
+            stated = stated | {part}
+            yield part, f"{key} = {rating!r}  # [{unit}] {what if whole else what.partition(';')[0]}"
+    for name, what in SWITCHES.items():
+        part, _, key = name.partition(".")
+        if whole or value(robot, name) != value(nothing, name):
+            yield part, f"{key} = {str(value(robot, name)).lower()}  # {what}"
+    for name, (_, what) in CHOICES.items():
+        part, _, key = name.partition(".")
+        if value(robot, name) != value(nothing, name):
+            yield part, f"{key} = {json.dumps(value(robot, name))}  # {what}"
 
 
 def _start(robot: Robot) -> Robot:

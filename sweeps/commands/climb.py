@@ -69,53 +69,7 @@ def climb(config: configuration.Climb, out: Path | None, force: bool) -> int:
     ).resolved(robot)  # fmt: skip
     along = _along(config, robot, conditions, sequence)
     with open_folder("climb", config, robot, out, force) as folder:
-
-        def run(sizes: np.ndarray) -> tuple[Terrain, Climb]:
-            with progress(1, quiet=False) as advance:
-                every = [_terrain(config, float(size) / 1000)[0] for size in sizes]
-                grounds = jax.tree.map(lambda *x: jnp.stack(x), *every)
-                told = scale.shares(advance, 1)
-                whole = [
-                    jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(sizes)), c)
-                    for c in (conditions, sequence)
-                ]
-                ended = climb_batch(
-                    robot,
-                    whole[0],
-                    grounds,
-                    whole[1],
-                    duration=config.duration_s,
-                    step=config.time_step_s,
-                    progress=told,
-                )
-                told(1.0)
-            return grounds, ended
-
-        chosen, largest = 0, None
-        tried: tuple[tuple[float, str], ...] = ()
-        derivatives: Derivatives | None = None
-        if config.find is not None:
-            grounds, ended, chosen, tried, largest = _searched(config.find, run)
-        elif along is None:
-            grounds, ended = run(np.array([np.nan]))
-        else:
-            with progress(1, quiet=False) as advance:
-                derivatives = climb_derivatives(
-                    along.given,
-                    along.values,
-                    along.widths,
-                    duration=config.duration_s,
-                    step=config.time_step_s,
-                    progress=scale.shares(advance, 1),
-                )
-            ended = derivatives.climb
-            grounds = jax.tree.map(lambda x: x[None], along.given(along.values).terrain)
-        one = jax.tree.map(lambda x: x[chosen : chosen + 1], ended)
-        found = ClimbResult(
-            robot, name, words, jax.tree.map(lambda x: x[chosen], grounds), one, tried, largest,
-            {"step": "step", "stairs": "rise of such stairs", "gap": "gap", None: ""}[config.find],
-            along, derivatives,
-        )  # fmt: skip
+        found = _climbed(config, robot, name, words, conditions, sequence, along)
         folder.write_table("history.csv", found.table)
         if rows := found.slopes:
             folder.write_table("derivatives.csv", {name: np.array([row[name] for row in rows]) for name in rows[0]})
@@ -128,6 +82,52 @@ def climb(config: configuration.Climb, out: Path | None, force: bool) -> int:
         print_climb(found)
         manifest = {"seed": None, "verdict": found.verdict}
         return leave(folder, config, manifest, solved=found.verdict != "failed", page=page("climb", found, file))
+
+
+def _climbed(
+    config: configuration.Climb,
+    robot: Robot,
+    name: str,
+    words: str,
+    conditions: Conditions,
+    sequence: Sequence,
+    along: Along | None,
+) -> ClimbResult:
+    """The climb that a configuration asks for: of one obstacle, of the largest, or with derivatives along it."""
+
+    def run(sizes: np.ndarray) -> tuple[Terrain, Climb]:
+        every = [_terrain(config, float(size) / 1000)[0] for size in sizes]
+        grounds = jax.tree.map(lambda *x: jnp.stack(x), *every)
+        alike = [jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(sizes)), c) for c in (conditions, sequence)]
+        with progress(1, quiet=False) as advance:
+            told = scale.shares(advance, 1)
+            ended = climb_batch(
+                robot, alike[0], grounds, alike[1], duration=config.duration_s, step=config.time_step_s, progress=told
+            )
+            told(1.0)
+        return grounds, ended
+
+    chosen, largest = 0, None
+    tried: tuple[tuple[float, str], ...] = ()
+    derivatives: Derivatives | None = None
+    if config.find is not None:
+        grounds, ended, chosen, tried, largest = _searched(config.find, run)
+    elif along is None:
+        grounds, ended = run(np.array([np.nan]))
+    else:
+        with progress(1, quiet=False) as advance:
+            derivatives = climb_derivatives(
+                along.given, along.values, along.widths, duration=config.duration_s, step=config.time_step_s,
+                progress=scale.shares(advance, 1),
+            )  # fmt: skip
+        ended = derivatives.climb
+        grounds = jax.tree.map(lambda x: x[None], along.given(along.values).terrain)
+    one = jax.tree.map(lambda x: x[chosen : chosen + 1], ended)
+    return ClimbResult(
+        robot, name, words, jax.tree.map(lambda x: x[chosen], grounds), one, tried, largest,
+        {"step": "step", "stairs": "rise of such stairs", "gap": "gap", None: ""}[config.find],
+        along, derivatives,
+    )  # fmt: skip
 
 
 def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, sequence: Sequence) -> Along | None:

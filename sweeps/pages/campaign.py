@@ -35,49 +35,6 @@ def write(folder: Path, file: RobotFile, layout: Layout, result: dict[str, Any])
     """
     values, found = thinned(folder / STORE, layout)
     album = Album(folder)
-    known = layout.coordinates
-    settled = np.isin(found[STATUS], signals.DONE)
-    rows = []
-    for variable in layout.variables:
-        if "units" not in variable.attributes:
-            continue
-        name, unit, label = variable.name, variable.attributes["units"], variable.attributes["long_name"]
-        usable = settled & np.isfinite(found[name])
-        numbers = found[name][usable].astype(float)
-        quantiles = np.quantile(numbers, (0.05, 0.5, 0.95)) if len(numbers) else np.full(3, np.nan)
-        extremes = result["outputs"][name]
-        ends = {key: np.nan if extremes[key] is None else extremes[key] for key in ("least", "greatest")}
-        rows.append({"name": name, "label": label, "unit": unit, **ends, "quantiles": quantiles.tolist()})
-        if len(numbers) and len(album.pictures) < DRAWN:
-            varied = {
-                n: Varied(values[usable, k], _label(n, known[n].get("units", "")), layout.labels.get(n, ()))
-                for k, n in enumerate(layout.design.names)
-            }
-            drawing = partial(campaign_figures.spread, numbers, _label(label, unit), varied)
-            album.add(f"spread_{name}", drawing)
-    verdicts = []
-    if VERDICT in found:
-        codes = found[VERDICT].astype(int)
-        about = next(v.attributes for v in layout.variables if v.name == VERDICT)
-        meanings = about["flag_meanings"].split()
-        for k in np.unique(codes):
-            short, meaning = VERDICTS[meanings[k]]
-            verdicts.append(
-                {"name": meanings[k], "count": int((codes == k).sum()), "short": short, "meaning": meaning}
-            )
-        pair = [n for n in layout.design.axes if n != SIZE and len(layout.design.axes[n]) > 1][:1]
-        if pair and SIZE in layout.design.axes:
-            # of what else varies the first values
-            rest = [k for k, n in enumerate(layout.design.names) if n not in (SIZE, *pair)]
-            shown = np.all(values[:, rest] == [layout.design.axes[layout.design.names[k]][0] for k in rest], axis=1)
-            across, up = (
-                Varied(
-                    values[shown, layout.design.names.index(n)],
-                    _label(known[n]["long_name"].split(",")[0], known[n].get("units", "")),
-                )
-                for n in (*pair, SIZE)
-            )
-            album.add("endings", partial(campaign_figures.endings, codes[shown], meanings, across, up))
     total = result["points"]
     statuses = [
         {
@@ -98,12 +55,60 @@ def write(folder: Path, file: RobotFile, layout: Layout, result: dict[str, Any])
         total=total,
         status=statuses,
         varied=_varied(layout, values),
-        outputs=rows,
-        verdicts=verdicts,
+        outputs=_outputs(album, values, found, layout, result["outputs"]),
+        verdicts=_verdicts(album, values, found, layout),
         largest=_largest(values, found, layout),
         thinned=len(values),
         **named(file),
     )
+
+
+def _outputs(
+    album: Album, values: np.ndarray, found: dict[str, np.ndarray], layout: Layout, extremes: dict[str, Any]
+) -> list[dict[str, Any]]:
+    """Rows of the table of outputs, each with its extremes and quantiles; the first of them are drawn."""
+    known, settled = layout.coordinates, np.isin(found[STATUS], signals.DONE)
+    rows = []
+    for variable in (v for v in layout.variables if "units" in v.attributes):
+        name, unit, label = variable.name, variable.attributes["units"], variable.attributes["long_name"]
+        usable = settled & np.isfinite(found[name])
+        numbers = found[name][usable].astype(float)
+        quantiles = np.quantile(numbers, (0.05, 0.5, 0.95)) if len(numbers) else np.full(3, np.nan)
+        ends = {k: np.nan if extremes[name][k] is None else extremes[name][k] for k in ("least", "greatest")}
+        rows.append({"name": name, "label": label, "unit": unit, **ends, "quantiles": quantiles.tolist()})
+        if len(numbers) and len(album.pictures) < DRAWN:
+            varied = {
+                n: Varied(values[usable, k], _label(n, known[n].get("units", "")), layout.labels.get(n, ()))
+                for k, n in enumerate(layout.design.names)
+            }
+            album.add(f"spread_{name}", partial(campaign_figures.spread, numbers, _label(label, unit), varied))
+    return rows
+
+
+def _verdicts(album: Album, values: np.ndarray, found: dict[str, np.ndarray], layout: Layout) -> list[dict[str, Any]]:
+    """How climbs ended, a row each; drawn over the size of the obstacle and the first axis beside it."""
+    if VERDICT not in found:
+        return []
+    codes, known, design = found[VERDICT].astype(int), layout.coordinates, layout.design
+    meanings = next(v.attributes for v in layout.variables if v.name == VERDICT)["flag_meanings"].split()
+    pair = [n for n in design.axes if n != SIZE and len(design.axes[n]) > 1][:1]
+    if pair and SIZE in design.axes:
+        # of what else varies the first values
+        rest = [k for k, n in enumerate(design.names) if n not in (SIZE, *pair)]
+        shown = np.all(values[:, rest] == [design.axes[design.names[k]][0] for k in rest], axis=1)
+        across, up = (
+            Varied(
+                values[shown, design.names.index(n)],
+                _label(known[n]["long_name"].split(",")[0], known[n].get("units", "")),
+            )
+            for n in (*pair, SIZE)
+        )
+        album.add("endings", partial(campaign_figures.endings, codes[shown], meanings, across, up))
+    rows = []
+    for k in np.unique(codes):
+        short, meaning = VERDICTS[meanings[k]]
+        rows.append({"name": meanings[k], "count": int((codes == k).sum()), "short": short, "meaning": meaning})
+    return rows
 
 
 def _largest(values: np.ndarray, found: dict[str, np.ndarray], layout: Layout) -> str:
