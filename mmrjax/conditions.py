@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mmrjax.errors import UsageError
+from mmrjax.precision import is_double
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
@@ -193,7 +195,7 @@ class Conditions(eqx.Module):
     @property
     def slope(self) -> Float[Array, "..."]:
         """Slope angle α, positive uphill [rad]."""
-        return jnp.radians(self.slope_deg)
+        return self.slope_deg * (math.pi / 180)
 
     def resolved(self, robot: Robot) -> Conditions:
         """The same with names of configurations replaced by their indices in `robot`.
@@ -227,8 +229,11 @@ def _number(x: Any, kind: type = float) -> Any:
     return jnp.asarray(x, kind) if isinstance(x, jax.Array) else np.asarray(x, kind)
 
 
-def _broadcast(x: Any, shape: tuple[int, ...]) -> Array:
-    return jnp.broadcast_to(x, shape) if isinstance(x, jax.Array) else jax.device_put(np.broadcast_to(x, shape))
+def _broadcast(x: Any, shape: tuple[int, ...]) -> Any:
+    """An array of that shape; of numbers that are not JAX's yet where JAX is single NumPy's, which keeps digits."""
+    if isinstance(x, jax.Array):
+        return jnp.broadcast_to(x, shape)
+    return jax.device_put(np.broadcast_to(x, shape)) if is_double() else np.broadcast_to(x, shape)
 
 
 def indices(words: np.ndarray, names: Sequence[str]) -> np.ndarray:

@@ -17,6 +17,7 @@ from mmrjax.errors import counted
 from mmrjax.fidelities.base import History
 from mmrjax.fidelities.mission import Mission
 from mmrjax.params import Scalar
+from mmrjax.precision import on_host
 from mmrjax.programs import has_tracer
 from mmrjax.signals import CODES, STATUSES, Result
 
@@ -82,6 +83,13 @@ class Results:
             known, configurations=configurations, model=model, channels=batch.robot.channels, _pending=batch
         )
         return results
+
+    def on_host(self) -> Results:
+        """The same with NumPy's arrays; what has not been computed yet is still not."""
+        batch = self.__dict__.get("_pending")
+        if batch is None or "result" in self.__dict__:
+            return jax.tree.map(np.asarray, self)
+        return Results.pending(on_host(batch), self.configurations, self.model)
 
     def _compute(self, name: str) -> None:
         """Compute what holds a name, where nothing that has been computed does."""

@@ -19,6 +19,7 @@ from mmrjax.errors import UsageError, choices
 from mmrjax.fidelities.base import Fidelity, History, Run
 from mmrjax.fidelities.mission import Start
 from mmrjax.params import Scalar
+from mmrjax.precision import ambient, at_once, in_double, in_trace
 from mmrjax.profile import Profile
 from mmrjax.programs import has_tracer
 from mmrjax.results import Results
@@ -33,6 +34,7 @@ STRAIGHT = "the robot's sides differ, and runs that say nothing of either side t
 STATUS, _ = CODES
 
 
+@in_double
 def simulate(
     robot: Robot,
     conditions: Conditions,
@@ -93,6 +95,9 @@ def simulate(
     turns = conditions.turns or (profile is not None and profile.turns)
     if not (turns or has_tracer(robot.effects)) and (unlike := robot.unlike):
         warnings.warn(f"{', '.join(unlike)}: {STRAIGHT}; {OF_TURNS[0]}=1, {OF_TURNS[1]}=1 let it turn", stacklevel=2)
+    if in_trace(robot, conditions, profile, start):
+        robot = ambient(robot)
+        conditions, profile, start = jax.device_put((conditions, profile, start))
     if profile is not None:
         return _missions(robot, conditions, profile, start, history)
     robot = robot.showing_turns() if conditions.turns else robot
@@ -192,16 +197,19 @@ class Pending:
     conditions: Conditions
     fidelity: Fidelity
 
+    @at_once
     def shown(self) -> dict[str, jax.Array]:
         """What the robot's instruments show, by channel, and the codes of how the runs ended as `status`."""
         outputs, names = self.fidelity.outputs, (*channels.names(self.robot.channels), STATUS)
         assert outputs is not None
         return _in_chunks(self.fidelity, lambda flat: outputs(self.robot, flat, names), self.conditions)
 
+    @at_once
     def result(self) -> Result:
         """Everything."""
         return _run(self.fidelity, self.robot, self.conditions, {}, history=False).result
 
+    @at_once
     def total_mass(self) -> jax.Array:
         """Mass of robot and payload, stated or the robot's own [kg]."""
         return total_mass(self.robot, self.conditions)

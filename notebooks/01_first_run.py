@@ -23,7 +23,7 @@ import jax
 import matplotlib.pyplot as plt
 import numpy as np
 
-import mmrjax as mm  # double precision, unless JAX_ENABLE_X64 says otherwise
+import mmrjax as mm
 
 # %% [markdown]
 # ## One operating point

@@ -37,7 +37,7 @@ print(one.total_current, many.table())
 
 
 def python(code: str, **environment: str) -> str:
-    clean = {k: v for k, v in os.environ.items() if k != "JAX_ENABLE_X64"}
+    clean = {k: v for k, v in os.environ.items() if k != "JAX_ENABLE_X64"}  # JAX is single, as its users find it
     answer = subprocess.run(
         [sys.executable, "-W", "error", "-c", code], cwd=ROOT, env={**clean, **environment}, capture_output=True,
         text=True, timeout=300, check=False,
@@ -109,19 +109,6 @@ def test_a_wrong_name_of_a_parameter_is_answered_by_what_is_near(robot):
         KeyError, match=r"friction_coulomb \(did you mean motor\.friction_coulomb, gearbox\.friction_c"
     ):
         mm.replace(robot, {"friction_coulomb": 0.5})
-
-
-@pytest.mark.quick(1)
-@pytest.mark.parametrize(
-    ("before", "variable", "precision"),
-    [("", {}, "float64"), ("import jax; ", {"JAX_ENABLE_X64": "0"}, "float32"),
-     *(pytest.param(*case, marks=pytest.mark.slow) for case in (
-         ("import jax; ", {}, "float64"), ("", {"JAX_ENABLE_X64": "false"}, "float32"),
-         ("", {"JAX_ENABLE_X64": "1"}, "float64")))],
-)  # fmt: skip
-def test_import_enables_double_precision_unless_the_variable_says_otherwise(before, variable, precision):
-    code = f"{before}import mmrjax, jax.numpy as jnp; print(jnp.asarray(1.0).dtype, mmrjax.nominal().motor.resistance.dtype)"
-    assert python(code, **variable).split() == [precision, precision]
 
 
 def test_package_states_its_names_version_and_types():
