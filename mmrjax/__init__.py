@@ -29,7 +29,11 @@ if TYPE_CHECKING:
     from mmrjax.robot import Robot as Robot
     from mmrjax.robots import nominal as nominal
     from mmrjax.signals import STATUSES as STATUSES
+    from mmrjax.signals import State as State
     from mmrjax.simulation import simulate as simulate
+    from mmrjax.stepping import initial_state as initial_state
+    from mmrjax.stepping import rates as rates
+    from mmrjax.stepping import step as step
     from sweeps import sweep as sweep
     from sweeps.compilation_cache import keep_programs as keep_programs
 
@@ -40,10 +44,14 @@ _HOME = {
     "Results": "results",
     "Robot": "robot",
     "STATUSES": "signals",
+    "State": "signals",
     "UsageError": "errors",
+    "initial_state": "stepping",
     "nominal": "robots",
+    "rates": "stepping",
     "replace": "params",
     "simulate": "simulation",
+    "step": "stepping",
 }
 
 #: Names of the layers above, which one door gives too; they are imported when they are asked for, and never before.
@@ -62,16 +70,20 @@ __all__ = [
     "Effect",
     "Results",
     "Robot",
+    "State",
     "UsageError",
     "__version__",
     "calibrate",
     "discover",
+    "initial_state",
     "keep_programs",
     "nominal",
+    "rates",
     "read_robot",
     "read_runs",
     "replace",
     "simulate",
+    "step",
     "sweep",
 ]
 

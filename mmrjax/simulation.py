@@ -8,13 +8,14 @@ import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mmrjax import channels, fidelities, missions, params, power
 from mmrjax.compiling import compiled
-from mmrjax.conditions import OF_TURNS, Conditions, indices, sides_contradict
+from mmrjax.conditions import OF_TURNS, Conditions, Named, sides_contradict
 from mmrjax.errors import UsageError, choices
 from mmrjax.fidelities.base import Fidelity, History, Run
 from mmrjax.fidelities.mission import Start
@@ -31,6 +32,10 @@ from mmrjax.tables import CONDITION_LIMITS
 HISTORIES = 1000
 #: What is said of runs that say nothing of either side, of a robot whose sides differ.
 STRAIGHT = "the robot's sides differ, and runs that say nothing of either side travel straight, as if steered"
+#: What is said of reverse mode through a fidelity that has none.
+FORWARD_ALONE = (
+    "derivatives are forward (jax.jacfwd, jax.jvp); for jax.grad use model steady, or mmrjax.step for runs over time"
+)
 STATUS, _ = CODES
 
 
@@ -50,7 +55,8 @@ def simulate(
     """Simulate one run, or a batch.
 
     Values are checked where they are concrete; tracers pass, so that `jax.grad`, `jax.jacfwd`, `jax.vmap` and
-    `jax.jit` go through (reverse mode through `steady` and `track`, forward mode through all). Of `steady`, what is
+    `jax.jit` go through (reverse mode through `steady` and `track`, forward mode through all; for reverse mode over
+    time see `step`). Of `steady`, what is
     asked of the results is computed when it is asked (see `Results`).
 
     Args:
@@ -99,7 +105,7 @@ def simulate(
         robot = ambient(robot)
         conditions, profile, start = jax.device_put((conditions, profile, start))
     if profile is not None:
-        return _missions(robot, conditions, profile, start, history)
+        return _forward_alone(_missions(robot, conditions, profile, start, history))
     robot = robot.showing_turns() if conditions.turns else robot
     fidelity, traced = fidelities.get(model), has_tracer((robot, conditions))
     if not traced:
@@ -111,10 +117,20 @@ def simulate(
     if fidelity.outputs is not None and not traced:
         return Results.pending(Pending(robot, conditions, fidelity), names, model)
     run = _run(fidelity, robot, conditions, stated, history and fidelities.facts(model).histories)
-    return Results(
+    results = Results(
         conditions, total_mass(robot, conditions), run.result, run.columns, run.history, names, model,
         channels=robot.channels,
     )  # fmt: skip
+    return results if fidelities.facts(model).reverse else _forward_alone(results)
+
+
+def _forward_alone(results: Results) -> Results:
+    """The same results, which answer reverse mode by a sentence: steps of adaptive length are a loop without one."""
+    if not has_tracer(results):
+        return results
+    kind = results.model if results.mission is None else f"{results.model} over a profile"
+    named: Results = eqxi.nondifferentiable_backward(results, msg=f"{kind}: {FORWARD_ALONE}")
+    return named
 
 
 def _check_battery(robot: Robot, conditions: Conditions) -> None:
@@ -304,12 +320,11 @@ def _check_robot(robot: Robot) -> None:
 def _resolved(robot: Robot, conditions: Conditions) -> Conditions:
     """Conditions with indices for names, every index one that the robot has."""
     names, which = robot.configurations.names, conditions.configuration
-    if isinstance(which, np.ndarray) and which.dtype.kind == "U":
-        found = indices(which, names)
-        if found.size and found.min() < 0:
-            name = str(np.unique(which[found < 0])[0])
-            raise UsageError(f"configuration: got {name}; {choices(name, names)}")
-        return dataclasses.replace(conditions, configuration=jnp.asarray(found))
+    if isinstance(which, Named):
+        try:
+            return dataclasses.replace(conditions, configuration=which.among(names))
+        except KeyError as error:
+            raise UsageError(f"configuration: got {error.args[0]}; {choices(error.args[0], names)}") from error
     if not has_tracer(which) and which.size and not _within(_ends(which), 0, len(names) - 1):
         wrong = _first_outside(which, 0, len(names) - 1)
         assert wrong is not None
