@@ -21,6 +21,7 @@ import calibration
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration, BadData
+from calibration.discovery.result import DiscoveryResult
 from calibration.inference import noise, observers, priors
 from calibration.inference import optimizers as fit
 from calibration.inference.calibrate import calibrate
@@ -28,9 +29,10 @@ from calibration.inference.errors import relative_error, root_mean_square
 from calibration.inference.notes import Constant, Repeats, SamePredictions, Unmeasured
 from calibration.inference.observers import SettledRuns
 from calibration.inference.remarks import remarks
-from calibration.inference.result import HeldOut
+from calibration.inference.result import CalibrationResult, ChannelErrors, HeldOut
 from mmrjax import channels, robots
 from mmrjax.fidelities.steady import steady_batch
+from mmrjax.results import Results
 from sweeps.commands.calibrate import print_calibration
 from sweeps.pages import calibration as calibration_page
 from tests.commands import rows as rows_of
@@ -159,6 +161,15 @@ def test_blocks_that_tell_nothing_of_their_own_are_said_and_not_shown(found, cap
     shown = capsys.readouterr().out
     table = [line for line in shown.splitlines() if line.startswith("│ after, held out")]
     assert [" by slope " in line or " by voltage and configuration " in line for line in table] == [True, True]
+
+
+def test_errors_and_rows_have_one_spelling_over_all_results():
+    errors = ChannelErrors(3, 2.5, 4.0, 1.1, 0.02)
+    assert errors["rms_percent"] == errors.rms_percent == 2.5 and errors["rows"] == 3
+    with pytest.raises(KeyError, match="rms_per_cent"):
+        errors["rms_per_cent"]
+    for kind in (CalibrationResult, DiscoveryResult, Results):
+        assert callable(kind.rows_table), kind
 
 
 def test_rows_have_every_row(found):

@@ -18,7 +18,7 @@ import test_fidelities
 
 import mmrjax as mm
 from calibration.data.errors import BadConfiguration
-from mmrjax import channels, fidelities, outputs, params, robots
+from mmrjax import channels, fidelities, outputs, params, results, robots
 from mmrjax.effects import ALL
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.steady import steady_batch
@@ -119,8 +119,11 @@ def test_package_states_its_names_version_and_types():
         _ = mm.simulat
     stated = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     assert mm.__version__ == stated["project"]["version"]
-    assert (ROOT / "mmrjax" / "py.typed").exists()
-    assert "py.typed" in stated["tool"]["setuptools"]["package-data"]["mmrjax"]
+    for package in ("mmrjax", "calibration", "sweeps"):
+        assert (ROOT / package / "py.typed").exists()
+        assert "py.typed" in stated["tool"]["setuptools"]["package-data"][package]
+    # an editable install is then a path, which type checkers follow, and no import hook
+    assert stated["tool"]["setuptools"]["package-dir"] == {"": "."}
 
 
 def test_type_checkers_see_every_public_name():
@@ -177,6 +180,29 @@ def test_every_result_field_and_channel_is_an_attribute(robot):
         assert getattr(one, name) is one.reading[name]
     with pytest.raises(AttributeError, match="Results has no torque"):
         _ = one.torque
+
+
+def test_every_name_of_a_result_is_typed_and_listed(robot):
+    fields = {field.name for field in dataclasses.fields(Result)}
+    assert results._Numbers.__annotations__.keys() == fields | {c.name for c in channels.EVERY}
+    one = mm.simulate(robot, mm.Conditions())
+    assert {*fields, *channels.USUAL, "statuses", "table", "model"} <= set(dir(one))
+    numbers = one.rows_table()
+    assert numbers.keys() == one.to_dict().keys()
+
+
+def test_status_compares_with_its_words_and_refuses_others(robot):
+    many = mm.simulate(robot, mm.Conditions(voltage=[24.0, 0.5, 24.0], slope_deg=[5.0, 5.0, 20.0]))
+    for codes in (many.status, many.result.status, jax.tree.map(lambda x: x, many).status):
+        assert (codes == "converged").tolist() == [True, False, False]
+        assert (codes != "stalled").tolist() == [True, False, True]
+        assert (codes == ["converged", "stalled", "converged"]).tolist() == [True, True, False]
+        assert codes[1] == "stalled" and (codes[1:] == "slides").tolist() == [False, True]
+        assert (codes == 0).tolist() == [True, False, False] and jnp.sum(codes) == np.sum(codes)
+        with pytest.raises(mm.UsageError, match="status: got convergd; did you mean converged"):
+            codes == "convergd"  # noqa: B015
+    one = mm.simulate(robot, mm.Conditions(voltage=24.0))
+    assert one.status == "converged" and f"{one.status}" == "0" and one.statuses == "converged"
 
 
 def test_to_dict_has_the_columns_of_runs_csv(robot):
