@@ -169,6 +169,9 @@ def replace(component: M, values: dict[str, Any]) -> M:
         component: a robot or a part of one.
         values: dotted names, such as `motor.resistance`, and their values [SI].
 
+    Returns:
+        Another component of the same kind.
+
     Raises:
         KeyError: a name is no parameter of `component`; the message says what is near it.
     """

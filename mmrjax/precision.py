@@ -1,9 +1,8 @@
 """Precision of the public functions: double outside a trace, and that of JAX's setting within one.
 
 JAX computes in single precision unless its user asks for double, and importing this package does not change that. A
-public function that is called outside a trace switches to double precision for its own thread until it returns. What
-it returns, and robots and conditions that are made where JAX is single, hold arrays of NumPy: those keep their digits
-there, which JAX's own do not.
+public function that is called outside a trace switches to double precision for its own thread until it returns.
+Robots, conditions and results hold NumPy's arrays where JAX is single, since its operations would cut its own arrays.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ def is_double() -> bool:
 
 
 def in_trace(*arguments: Any) -> bool:
-    """True if some of these are traced, or if JAX is tracing a function that they are constants of."""
+    """True if some of these are tracers, or if JAX is tracing a function here."""
     return has_tracer(arguments) or isinstance(jax.device_put(np.zeros(())), jax.core.Tracer)
 
 
@@ -55,7 +54,7 @@ def double_precision() -> Iterator[None]:
 def in_double(function: Callable[P, T]) -> Callable[P, T]:
     """A function that computes in double precision where it is called outside a trace.
 
-    Where JAX was single before, arrays among its results are NumPy's.
+    Arrays among its results are NumPy's where JAX was single before.
     """
 
     @functools.wraps(function)
@@ -97,8 +96,10 @@ def ambient(tree: T) -> T:
 
 
 def on_host(tree: T) -> T:
-    """The same with NumPy's arrays in the place of JAX's; of a result that is no pytree in its modules, of one that
-    has a method `on_host` by that."""
+    """The same with NumPy's arrays in the place of JAX's.
+
+    An object with a method `on_host` converts itself; a result that is no pytree has its modules converted.
+    """
     if hasattr(tree, "on_host"):
         return tree.on_host()
     if dataclasses.is_dataclass(tree) and not isinstance(tree, type) and jax.tree_util.all_leaves([tree]):

@@ -70,7 +70,7 @@ def _codes(words: Any) -> Any:
 
 
 class _Numbers:
-    """What `Results` shows of `Result` and of the channels under their own names, for type checkers and `dir`."""
+    """Fields of `Result` and channels that `Results` shows under their own names, for type checkers and `dir`."""
 
     theoretical_speed: Array
     slip: Array
@@ -308,7 +308,7 @@ class Results(_Numbers):
 
 
 def _compared(status: Any) -> Any:
-    """Codes that compare with words; those that are traced, or stand for a tree's leaves, as they are."""
+    """Codes that compare with words. Tracers, and what is no array, are returned unchanged."""
     is_array = isinstance(status, np.ndarray | jax.Array) and not isinstance(status, jax.core.Tracer)
     return np.asarray(status).view(StatusCodes) if is_array else status
 

@@ -125,7 +125,7 @@ def simulate(
 
 
 def _forward_alone(results: Results) -> Results:
-    """The same results, which answer reverse mode by a sentence: steps of adaptive length are a loop without one."""
+    """The same results, which refuse reverse mode in a sentence: a loop over steps of adaptive length has none."""
     if not has_tracer(results):
         return results
     kind = results.model if results.mission is None else f"{results.model} over a profile"

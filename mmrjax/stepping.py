@@ -55,7 +55,13 @@ def initial_state(robot: Robot, conditions: Conditions | None = None, *, rolling
 def rates(robot: Robot, state: State, command: Command, conditions: Conditions | None = None) -> State:
     """Returns the rate of every number of a state [its unit per second], as a state.
 
-    Args: as of `step`.
+    Args:
+        robot: any robot; its parameters may be tracers.
+        state: where the rates are wanted.
+        command, conditions: as of `step`.
+
+    Raises:
+        UsageError: as `step`.
     """
     robot, conditions = _cast((robot, _asked(robot, command, conditions)))
     return drive.state_of(robot, drive.rates(robot, conditions, _vector(robot, state)))
@@ -65,9 +71,9 @@ def step(robot: Robot, state: State, command: Command, dt: Scalar, conditions: C
     """Returns the state `dt` later, the command held meanwhile.
 
     The stages of Rodas4 (Hairer and Wanner, Solving Ordinary Differential Equations II, 1996, Section IV.7), an
-    L-stable method, over four parts of growing length. At a `dt` of 10 ms the paper's robot differs from steps a
-    hundred times as short by up to 4 mm/s during starts and stops, and by less than 0.1 mm in position
-    (tests/test_stepping.py). A robot that comes to rest where friction at rest holds it stands still.
+    L-stable method, over four parts of growing length. At a `dt` of 10 ms the speed of the paper's robot is within
+    4 mm/s of that with steps a hundred times as short, also during starts and stops, and its position within 0.1 mm
+    (tests/test_stepping.py). Once a robot has stopped, friction at rest holds it if it can.
 
     Args:
         robot: any robot, a vehicle or a shaft on a bench; its parameters may be tracers.
@@ -94,7 +100,7 @@ def _begun(robot: Robot, conditions: Conditions, rolling: bool) -> Float[Array, 
 def _stepped(
     robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"], dt: Scalar
 ) -> Float[Array, " unknowns"]:
-    """The unknowns of `drive` a step later. A robot that stands or comes to rest stays so where friction holds it."""
+    """The unknowns of `drive` a step later. A robot that has stopped is held if friction at rest can hold it."""
     speeds = np.isin(np.arange(len(y)), (drive.MOTOR, drive.GROUND))
     drawn = np.isin(np.arange(len(y)), (drive.CURRENT, _DISCHARGE))
     held = holds(robot, conditions)
@@ -143,7 +149,7 @@ def _cast(tree: T) -> T:
 
 
 def _vector(robot: Robot, state: State) -> Float[Array, " unknowns"]:
-    """The unknowns of `drive` that stand for a state, see `drive.state_of`."""
+    """The unknowns of `drive` for a state, the inverse of `drive.state_of`."""
     memory = [state.memory[effect.name] for effect in robot.remembering]
     own = [state.current, state.speed_motor, state.speed, state.distance, state.discharge]
     gap = [] if state.gap is None else [state.gap]
