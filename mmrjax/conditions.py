@@ -60,13 +60,11 @@ class Named(eqx.Module):
             KeyError: a name of some run that is none of them; of conditions that are traced, of any.
         """
         places = np.array([names.index(name) if name in names else -1 for name in self.names], int)
-        if isinstance(self.index, jax.core.Tracer):
-            used, found = places, jnp.asarray(places)[self.index]
-        else:
-            used = found = places[np.asarray(self.index)]
-        if used.size and used.min() < 0:
-            raise KeyError(next(n for n, k in zip(self.names, places, strict=True) if k < 0 and k in used))
-        return found
+        traced = isinstance(self.index, jax.core.Tracer)
+        for k in np.flatnonzero(places < 0):
+            if traced or (np.asarray(self.index) == k).any():
+                raise KeyError(self.names[k])
+        return jnp.asarray(places)[self.index] if traced else np.asarray(places[np.asarray(self.index)])
 
 
 class Conditions(eqx.Module):

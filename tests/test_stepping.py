@@ -204,5 +204,9 @@ def test_conditions_by_name_are_an_argument_of_compiled_functions(robot):
     assert mapped.tolist() == [1, 0, 1]
     half = jax.tree.map(lambda x: x[1:], runs).resolved(robot)
     assert half.configuration.tolist() == [0, 1] and half.voltage.tolist() == [24.0, 33.0]
+    of_others = mm.Conditions(["legs", "6T2A", "4W2T"])
+    assert jax.tree.map(lambda x: x[1:], of_others).resolved(robot).configuration.tolist() == [0, 1]
+    with pytest.raises(KeyError, match="no configuration legs"):
+        of_others.resolved(robot)
     with pytest.raises(KeyError, match="no configuration legs"):
         jax.jit(lambda c: c.resolved(robot).configuration)(mm.Conditions(["6T2A", "legs"]))
