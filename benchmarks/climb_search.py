@@ -26,6 +26,8 @@ from mmrjax.conditions import Conditions
 from mmrjax.fidelities.climb import NAMES, OVER, Sequence, climb_batch
 from mmrjax.tables import SURFACES, adhesion_ratio
 
+jax.config.update("jax_enable_x64", True)
+
 #: Times at which angles are free [s], between which they go straight.
 KNOTS = np.array([0.3, 1.5, 3.0, 4.5, 6.0, 7.5, 9.0, 10.5])
 LENGTH = 13.0

@@ -32,7 +32,7 @@ def parser(description: str, batches: str) -> argparse.ArgumentParser:
 
 
 def set_precision(single: bool) -> None:
-    """Single or double precision; the variable keeps `import mmrjax` from choosing double."""
+    """Single or double precision, of this process and of those that it starts."""
     os.environ["JAX_ENABLE_X64"] = str(not single).lower()
     jax.config.update("jax_enable_x64", not single)
 

@@ -22,6 +22,8 @@ from mmrjax.fidelities import drive, steady, track
 from mmrjax.signals import NOT_SETTLED, STATUSES
 from mmrjax.tables import SURFACES, adhesion_ratio, lateral_ratio
 
+jax.config.update("jax_enable_x64", True)
+
 VOLTAGES = np.concatenate([np.arange(0.5, 8.0, 0.25), [15.0, 24.0, 33.0]])
 #: Yaw rate from which a robot turns [rad/s].
 TURNS = 0.05

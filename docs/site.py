@@ -11,43 +11,82 @@ import inspect
 import json
 import shutil
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 DOCS = Path(__file__).parent
 FIGURES = ("before_after", "laws", "errors")
+PACKAGES = ("mmrjax", "calibration", "sweeps")
 
 
 def api() -> str:
-    """Every public name with its signature and docstring."""
+    """Every public name with its signature, what it returns and its docstring; then the types that they return."""
     import mmrjax as mm
 
     parts = [
         "# The public names",
         "`import mmrjax as mm` gives every public name; SI units unless a name says otherwise. This page is made from the docstrings.",
     ]
-    for name in sorted((n for n in mm.__all__ if not n.startswith("_")), key=str.lower):
+    names = sorted((n for n in mm.__all__ if not n.startswith("_")), key=str.lower)
+    for name in names:
         thing = getattr(mm, name)
         if not callable(thing):
             parts.append(f"## `mm.{name}`\n\n`{thing!r}`")
             continue
         signature = "" if inspect.isclass(thing) and issubclass(thing, BaseException) else _signature(thing)
-        parts.append(f"## `mm.{name}{signature}`\n\n```text\n{inspect.getdoc(thing)}\n```")
-        if inspect.isclass(thing) and not issubclass(thing, BaseException):
-            parts += [f"### `{name}.{m}`\n\n```text\n{inspect.getdoc(f)}\n```" for m, f in _methods(thing)]
+        parts.append(f"## `mm.{name}{signature}`\n\n{_text(thing)}")
+        parts += _members(thing, name)
+    parts.append("# What they return")
+    for kind in returned_types():
+        parts += [f"## `{kind.__name__}`\n\n{_text(kind)}", *_members(kind, kind.__name__)]
     return "\n\n".join(parts) + "\n"
 
 
+def returned_types() -> list[type]:
+    """Types of this project that public functions return and that are no public names themselves."""
+    import mmrjax as mm
+
+    public = [getattr(mm, name) for name in mm.__all__ if not name.startswith("_")]
+    found = {_returned(thing)[1] for thing in public if inspect.isroutine(thing)}
+    own = [kind for kind in found if inspect.isclass(kind) and kind.__module__.split(".")[0] in PACKAGES]
+    return sorted(set(own) - {thing for thing in public if inspect.isclass(thing)}, key=lambda kind: kind.__name__)
+
+
+def _returned(function: Any) -> tuple[str, Any]:
+    """The return annotation of a function, and the type of that name."""
+    stated = str(inspect.signature(function).return_annotation)
+    return stated, getattr(sys.modules[function.__module__], stated, None)
+
+
+def _text(thing: Any) -> str:
+    """A docstring; of a function with what it returns, where the docstring has no section on that."""
+    doc = inspect.getdoc(thing) or ""
+    if inspect.isroutine(thing) and "Returns:" not in doc:
+        stated, kind = _returned(thing)
+        about = (inspect.getdoc(kind) or "").split("\n")[0] if inspect.isclass(kind) else ""
+        doc += f"\n\nReturns:\n    {stated}{f': {about}' if about else ''}"
+    return f"```text\n{doc}\n```"
+
+
 def _signature(thing: Any) -> str:
-    names = [n for n in inspect.signature(thing).parameters if n not in ("self", "cls")]
-    return f"({', '.join(names)})"
+    signature = inspect.signature(thing)
+    names = [n for n in signature.parameters if n not in ("self", "cls")]
+    return f"({', '.join(names)})" + ("" if inspect.isclass(thing) else f" → {signature.return_annotation}")
 
 
-def _methods(kind: type) -> Iterator[tuple[str, Any]]:
-    for name, member in vars(kind).items():
-        if not name.startswith("_") and (inspect.isfunction(member) or isinstance(member, property)):
-            yield name, member
+def _members(thing: Any, name: str) -> list[str]:
+    """Sections of the methods and properties of a class, with what they return."""
+    if not inspect.isclass(thing) or issubclass(thing, BaseException):
+        return []
+    parts = []
+    for member, value in vars(thing).items():
+        if member.startswith("_") or not (inspect.isfunction(value) or isinstance(value, property)):
+            continue
+        function = value.fget if isinstance(value, property) else value
+        stated = inspect.signature(function).return_annotation
+        call = f"{member} → {stated}" if value is not function else f"{member}{_signature(function)}"
+        parts.append(f"### `{name}.{call}`\n\n```text\n{inspect.getdoc(value)}\n```")
+    return parts
 
 
 def glossary() -> str:

@@ -5,15 +5,13 @@
     robot = mm.nominal()
     one = mm.simulate(robot, mm.Conditions(configuration="6T2A", voltage=24.0, slope_deg=10.0, payload=3.0))
 
-Importing it imports no jax, which comes with the first name that is used, and switches jax to double precision;
-where the environment variable JAX_ENABLE_X64 is set, that stands instead (JAX_ENABLE_X64=0: single precision).
+Importing it imports no jax, which comes with the first name that is used, and changes no setting of it. The functions
+compute in double precision where they are called outside a trace, and within one in JAX's own precision.
 """
 
 from __future__ import annotations
 
 import importlib
-import os
-import sys
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
@@ -31,7 +29,11 @@ if TYPE_CHECKING:
     from mmrjax.robot import Robot as Robot
     from mmrjax.robots import nominal as nominal
     from mmrjax.signals import STATUSES as STATUSES
+    from mmrjax.signals import State as State
     from mmrjax.simulation import simulate as simulate
+    from mmrjax.stepping import initial_state as initial_state
+    from mmrjax.stepping import rates as rates
+    from mmrjax.stepping import step as step
     from sweeps import sweep as sweep
     from sweeps.compilation_cache import keep_programs as keep_programs
 
@@ -42,10 +44,14 @@ _HOME = {
     "Results": "results",
     "Robot": "robot",
     "STATUSES": "signals",
+    "State": "signals",
     "UsageError": "errors",
+    "initial_state": "stepping",
     "nominal": "robots",
+    "rates": "stepping",
     "replace": "params",
     "simulate": "simulation",
+    "step": "stepping",
 }
 
 #: Names of the layers above, which one door gives too; they are imported when they are asked for, and never before.
@@ -64,28 +70,26 @@ __all__ = [
     "Effect",
     "Results",
     "Robot",
+    "State",
     "UsageError",
     "__version__",
     "calibrate",
     "discover",
+    "initial_state",
     "keep_programs",
     "nominal",
+    "rates",
     "read_robot",
     "read_runs",
     "replace",
     "simulate",
+    "step",
     "sweep",
 ]
 
 #: For XLA_FLAGS, before JAX is imported. Without LLVM's quick selection of instructions, which acts at level 0 of its
 #: optimizations and makes wrong programs of some derivatives there (NaN, or zero; jaxlib 0.10.2).
 SOUND_AT_LEVEL_0 = "--xla_backend_extra_options=-fast-isel=false"
-
-if "JAX_ENABLE_X64" not in os.environ:
-    if "jax" in sys.modules:
-        sys.modules["jax"].config.update("jax_enable_x64", True)
-    else:
-        os.environ["JAX_ENABLE_X64"] = "true"
 
 
 def __getattr__(name: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mmrjax.errors import UsageError
+from mmrjax.precision import is_double
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
@@ -25,12 +27,51 @@ OF_SIDES = ("duty_left", "duty_right", "open_left", "open_right", "motor_speed_l
 OF_TURNS = (*OF_SIDES, "heading_deg")
 
 
+class Named(eqx.Module):
+    """Configurations by name: a pytree, so that conditions by name pass `jax.jit` and `jax.vmap`.
+
+    Attributes:
+        index: of the name of each run among `names`; names: distinct ones.
+    """
+
+    index: Int[Array, "..."] | np.ndarray
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    @staticmethod
+    def of(words: np.ndarray) -> Named:
+        """From an array of names."""
+        # one word for all, as `Conditions` broadcasts it, is looked up once
+        once = np.asarray(words[tuple(slice(1) if stride == 0 else slice(None) for stride in words.strides)])
+        index, names = np.full(once.shape, -1, np.int32), list[str]()
+        while (left := index < 0).any():
+            names.append(str(once[left][0]))
+            index[once == names[-1]] = len(names) - 1
+        return Named(np.broadcast_to(index, words.shape), tuple(names))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the batch."""
+        return self.index.shape
+
+    def among(self, names: Sequence[str]) -> Any:
+        """Returns the place of each run's name among some names.
+
+        Raises:
+            KeyError: a name of some run that is none of them; of conditions that are traced, of any.
+        """
+        places = np.array([names.index(name) if name in names else -1 for name in self.names], int)
+        traced = isinstance(self.index, jax.core.Tracer)
+        for k in np.flatnonzero(places < 0):
+            if traced or (np.asarray(self.index) == k).any():
+                raise KeyError(self.names[k])
+        return jnp.asarray(places)[self.index] if traced else np.asarray(places[np.asarray(self.index)])
+
+
 class Conditions(eqx.Module):
     """The conditions of one run, or of a batch: every field broadcast to one shape.
 
     Attributes:
-        configuration: which of the robot's configurations, its index; until `resolved` also a name, or an array
-            of names.
+        configuration: which of the robot's configurations, its index; until `resolved` also by name (`Named`).
         voltage: of the external supply [V]; not used with `battery`.
         slope_deg: slope angle, positive uphill [deg].
         payload: additional load mass m_c [kg].
@@ -58,7 +99,7 @@ class Conditions(eqx.Module):
             forward rotation, whichever way it turns; of a load on a shaft alone; None: none.
     """
 
-    configuration: Int[Array, "..."] | np.ndarray
+    configuration: Any  # Int[Array, "..."] | Named
     voltage: Float[Array, "..."]
     slope_deg: Float[Array, "..."]
     payload: Float[Array, "..."]
@@ -87,7 +128,7 @@ class Conditions(eqx.Module):
 
     def __init__(
         self,
-        configuration: str | int | Sequence[str] | np.ndarray | Array = 0,
+        configuration: str | int | Sequence[str] | np.ndarray | Array | Named = 0,
         voltage: Number = 33.0,
         slope_deg: Number = 0.0,
         payload: Number = 0.0,
@@ -118,9 +159,11 @@ class Conditions(eqx.Module):
         if not isinstance(duty, np.ndarray | jax.Array | None) and None not in (duty_left, duty_right):
             raise UsageError(sides_contradict(("duty", *OF_SIDES[:2])))
         duty = 1.0 if duty is None else duty
-        which: Any = configuration if isinstance(configuration, jax.Array) else np.asarray(configuration)
-        if which.dtype.kind != "U":
-            which = _number(which, int)
+        which: Any = configuration
+        if not isinstance(configuration, jax.Array | Named):
+            words = np.asarray(configuration)
+            which = Named.of(words) if words.dtype.kind == "U" else words
+        which = which if isinstance(which, Named) else _number(which, int)
         given = (voltage, slope_deg, payload, battery, discharge, adhesion, order, duty, open)
         numbers = [_number(v) for v in given]
         others = {"total_mass": total_mass, "motor_speed": motor_speed, "motor_acceleration": motor_acceleration}
@@ -138,7 +181,7 @@ class Conditions(eqx.Module):
             by_name = dict(zip([*names, *optional], shapes, strict=True))
             said = ", ".join(f"{name} {s}" for name, s in by_name.items() if s)
             raise ValueError(f"Conditions: shapes do not broadcast to one another: {said}") from None
-        self.configuration = np.broadcast_to(which, shape) if which.dtype.kind == "U" else _broadcast(which, shape)
+        self.configuration = jax.tree.map(lambda x: _broadcast(x, shape), which)
         # the same number for all is one array: most fields of a large batch are 0 or 1
         shared: dict[float, Array] = {}
         for k, value in enumerate(given):
@@ -193,7 +236,7 @@ class Conditions(eqx.Module):
     @property
     def slope(self) -> Float[Array, "..."]:
         """Slope angle α, positive uphill [rad]."""
-        return jnp.radians(self.slope_deg)
+        return self.slope_deg * (math.pi / 180)
 
     def resolved(self, robot: Robot) -> Conditions:
         """The same with names of configurations replaced by their indices in `robot`.
@@ -201,13 +244,14 @@ class Conditions(eqx.Module):
         Raises:
             KeyError: a name that the robot does not have; the message lists those that it has.
         """
-        if not isinstance(self.configuration, np.ndarray) or self.configuration.dtype.kind != "U":
+        if not isinstance(self.configuration, Named):
             return self
-        names = robot.configurations.names
-        which = indices(self.configuration, names)
-        if which.size and which.min() < 0:
-            robot.configurations.index(str(np.unique(self.configuration[which < 0])[0]))
-        return dataclasses.replace(self, configuration=jnp.asarray(which))
+        try:
+            which = self.configuration.among(robot.configurations.names)
+        except KeyError as error:
+            robot.configurations.index(error.args[0])  # which says what there is
+            raise
+        return dataclasses.replace(self, configuration=which)
 
 
 def sides_contradict(stated: Collection[str]) -> str:
@@ -227,15 +271,8 @@ def _number(x: Any, kind: type = float) -> Any:
     return jnp.asarray(x, kind) if isinstance(x, jax.Array) else np.asarray(x, kind)
 
 
-def _broadcast(x: Any, shape: tuple[int, ...]) -> Array:
-    return jnp.broadcast_to(x, shape) if isinstance(x, jax.Array) else jax.device_put(np.broadcast_to(x, shape))
-
-
-def indices(words: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Place of each word among some names; -1 where it is none of them."""
-    # one word for all, as `Conditions` broadcasts it, is looked up once
-    once = words[tuple(slice(1) if stride == 0 else slice(None) for stride in words.strides)]
-    found = np.full(once.shape, -1)
-    for k, name in enumerate(names):
-        found[once == name] = k
-    return np.broadcast_to(found, words.shape)
+def _broadcast(x: Any, shape: tuple[int, ...]) -> Any:
+    """An array of that shape; of numbers that are not JAX's yet where JAX is single NumPy's, which keeps digits."""
+    if isinstance(x, jax.Array):
+        return jnp.broadcast_to(x, shape)
+    return jax.device_put(np.broadcast_to(x, shape)) if is_double() else np.broadcast_to(x, shape)

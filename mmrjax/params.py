@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mmrjax.errors import near
+from mmrjax.precision import as_array
 
 #: A number, or an array of numbers: one of a batch, or a tracer.
 Scalar = Float[Array, "..."] | float
@@ -69,9 +70,9 @@ def parameter(
 
 
 def as_float(value: Any) -> Any:
-    """A number as a float array; anything that is already an array passes, without a weak type."""
+    """A number as a float array (`precision.as_array`); an array passes, without a weak type."""
     if isinstance(value, int | float):
-        return jnp.asarray(value, dtype=float)
+        return as_array(value)
     # A weakly typed array, as of `jnp.asarray(0.5)`, would be another program to compile of every function. A tracer
     # or a placeholder of a tree transformation passes.
     weak = isinstance(value, jax.Array) and not isinstance(value, jax.core.Tracer) and value.weak_type
@@ -168,6 +169,9 @@ def replace(component: M, values: dict[str, Any]) -> M:
         component: a robot or a part of one.
         values: dotted names, such as `motor.resistance`, and their values [SI].
 
+    Returns:
+        Another component of the same kind.
+
     Raises:
         KeyError: a name is no parameter of `component`; the message says what is near it.
     """
@@ -212,4 +216,4 @@ def one_by_one(numbers: Float[Array, " n"]) -> tuple[Array, ...]:
 
 def strong(robot: M) -> M:
     """`robot` without weakly typed numbers: each of those is another program to compile of the same function."""
-    return jax.tree.map(lambda x: jnp.asarray(x, x.dtype) if eqx.is_array(x) else x, robot)
+    return jax.tree.map(lambda x: jnp.asarray(x, x.dtype) if isinstance(x, jax.Array) else x, robot)

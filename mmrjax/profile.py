@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 from mmrjax.conditions import Conditions, Number
 from mmrjax.errors import UsageError, counted
 from mmrjax.params import Scalar
+from mmrjax.precision import as_array
 
 #: How the motors are driven in a segment: by a share of the supply's voltage; at a demanded motor speed or ground
 #: speed, by the driver's controller; or not: with their terminals shorted (brake) or their circuit open (coast).
@@ -177,15 +178,15 @@ def profile(
             raise UsageError(
                 f"profile, {name}: row {int(np.argmax(~np.isfinite(np.atleast_1d(x)))) + 1} is not finite"
             )
-        arrays[name] = jnp.asarray(np.broadcast_to(x, rows.shape))
+        arrays[name] = as_array(np.broadcast_to(x, rows.shape))
     for name in ("duty", *PAIRS[0]):
         duty = np.atleast_1d(np.asarray(arrays.get(name, 0.0)))
         if (np.abs(duty) > 1).any():
             raise UsageError(f"profile, {name}: got {duty[np.argmax(np.abs(duty))]:g}; expected -1 to 1")
     if len(modes) != len(rows):
         raise UsageError(f"profile, mode: got {counted(len(modes), 'value')}; expected {len(rows)}")
-    index = jnp.asarray([MODES.index(name) for name in modes])
-    return Profile(time=jnp.asarray(rows), mode=index, linear=linear, cycles=int(cycles), **arrays)
+    index = as_array([MODES.index(name) for name in modes], int)
+    return Profile(time=as_array(rows), mode=index, linear=linear, cycles=int(cycles), **arrays)
 
 
 def sides_refused(stated: Sequence[str], speed: bool, named: Callable[[str], str] = str) -> str | None:

@@ -42,7 +42,8 @@ LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "diffrax", "opt
 _KNOWN = {*OWN, "jax", "jaxlib", "equinox", "optimistix", "lineax", "diffrax", "optax", "numpy", "mujoco"}
 _KNOWN |= {"builtins", "functools", "operator", "math", "collections", "copyreg", "types"}
 #: Settings of JAX and variables of the environment that say where and what is logged or kept, not what is computed.
-_ASIDE = ("jax_compilation_cache", "jax_persistent_cache", "jax_log", "jax_logging", "jax_dump")
+#: Nor precision: what is kept is double.
+_ASIDE = ("jax_compilation_cache", "jax_persistent_cache", "jax_log", "jax_logging", "jax_dump", "jax_enable_x64")
 _HEEDED = ("XLA_", "EQX_")
 
 

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
+from jaxtyping import Array
 
 from mmrjax import missions, outputs
 from mmrjax.channels import Channel, usual
 from mmrjax.channels import names as channel_names
 from mmrjax.conditions import Conditions
-from mmrjax.errors import counted
+from mmrjax.errors import UsageError, choices, counted
 from mmrjax.fidelities.base import History
 from mmrjax.fidelities.mission import Mission
 from mmrjax.params import Scalar
+from mmrjax.precision import on_host
 from mmrjax.programs import has_tracer
 from mmrjax.signals import CODES, STATUSES, Result
 
@@ -34,11 +36,87 @@ _CONDITIONS = {
     "slope_deg": ("slope", "deg", 2),
     "load_torque_Nm": ("load torque", "N·m", 4),
 }
+STATUS, _ = CODES
 _WORDS = {"status": ("status", "", 0), "flags": ("flags", "", 0)}
 
 
+class StatusCodes(np.ndarray):
+    """Codes of how runs ended that compare with the words of `STATUSES`: `results.status == "converged"`."""
+
+    __hash__ = None  # as of every array
+
+    def __eq__(self, other: Any) -> Any:
+        return np.asarray(self) == _codes(other)
+
+    def __ne__(self, other: Any) -> Any:
+        return np.asarray(self) != _codes(other)
+
+    def __getitem__(self, key: Any) -> Any:
+        return np.asarray(np.asarray(self)[key]).view(StatusCodes)
+
+
+def _codes(words: Any) -> Any:
+    """Codes of some words of `STATUSES`; anything else as it is.
+
+    Raises:
+        UsageError: a word that is none of them.
+    """
+    asked = np.asarray(words)
+    if asked.dtype.kind != "U":
+        return words
+    if unknown := sorted(set(asked.ravel().tolist()) - set(STATUSES)):
+        raise UsageError(f"status: got {unknown[0]}; {choices(unknown[0], STATUSES)}")
+    return np.array([STATUSES.index(word) for word in asked.ravel().tolist()], int).reshape(asked.shape)
+
+
+class _Numbers:
+    """Fields of `Result` and channels that `Results` shows under their own names, for type checkers and `dir`."""
+
+    theoretical_speed: Array
+    slip: Array
+    voltage: Array
+    mass: Array
+    traction: Array
+    adhesion_used: Array
+    power_supply: Array
+    power_motor: Array
+    power_gear: Array
+    power_ground: Array
+    power_lift: Array
+    efficiency_motor: Array
+    efficiency_gear: Array
+    efficiency_chassis: Array
+    winding_settled: Array
+    voltage_cell: Array
+    status: Array
+    flags: Array
+    reading: Mapping[str, Array]
+    # channels
+    total_current: Array
+    motor_speed: Array
+    speed: Array
+    motor_current: Array
+    output_speed: Array
+    output_angle: Array
+    position: Array
+    motor_voltage: Array
+    output_torque: Array
+    winding_temperature: Array
+    motor_current_left: Array
+    motor_current_right: Array
+    motor_speed_left: Array
+    motor_speed_right: Array
+    motor_voltage_left: Array
+    motor_voltage_right: Array
+    yaw_rate: Array
+    lateral_speed: Array
+    yaw: Array
+    place_x: Array
+    place_y: Array
+
+
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class Results:
+class Results(_Numbers):
     """Results of one run, or of a batch, of one fidelity; a pytree.
 
     Of `steady`, numbers are computed when they are first asked for and kept: what the instruments show and how the
@@ -47,6 +125,7 @@ class Results:
 
     Every field of `Result`, every channel and every column that the fidelity adds is an attribute:
     `results.slip`, `results.total_current`, `results.guide_share`. All numbers have the shape of the conditions.
+    `results.status == "converged"` compares codes with a word of `STATUSES`, outside a trace.
 
     Attributes:
         conditions: with configurations as indices.
@@ -73,6 +152,11 @@ class Results:
     stated: tuple[str, ...] = ()
     channels: tuple[Channel, ...] = dataclasses.field(default_factory=usual)
 
+    def __post_init__(self) -> None:
+        result = self.result
+        if isinstance(result, Result) and (coded := _compared(result.status)) is not result.status:
+            object.__setattr__(self, "result", dataclasses.replace(result, status=coded))
+
     @staticmethod
     def pending(batch: Pending, configurations: tuple[str, ...], model: str) -> Results:
         """Results of which nothing has been computed yet."""
@@ -83,6 +167,13 @@ class Results:
         )
         return results
 
+    def on_host(self) -> Results:
+        """The same with NumPy's arrays; what has not been computed yet is still not."""
+        batch = self.__dict__.get("_pending")
+        if batch is None or "result" in self.__dict__:
+            return jax.tree.map(np.asanyarray, self)
+        return Results.pending(on_host(batch), self.configurations, self.model)
+
     def _compute(self, name: str) -> None:
         """Compute what holds a name, where nothing that has been computed does."""
         own, batch = self.__dict__, self.__dict__.get("_pending")
@@ -91,27 +182,34 @@ class Results:
         if name == "total_mass":
             own[name] = batch.total_mass()
         elif "result" not in own and name in (*channel_names(batch.robot.channels), "status"):
-            own.update(own.setdefault("_shown", batch.shown()))
+            shown = own.get("_shown") or batch.shown()
+            own["_shown"] = {**shown, STATUS: _compared(shown[STATUS])}
+            own.update(own["_shown"])
         elif "result" not in own:
             whole = batch.result()
             shown = own.get("_shown", {})
             reading = {k: shown.get(k, x) for k, x in whole.reading.items()}
-            status = shown.get("status", whole.status)
+            status = shown.get(STATUS, _compared(whole.status))
             own["result"] = dataclasses.replace(whole, reading=reading, status=status)
 
-    def __getattr__(self, name: str) -> Any:
-        self._compute(name)
-        if name in self.__dict__:
-            return self.__dict__[name]
-        result, further = self.__dict__.get("result"), self.__dict__.get("further")
-        if further is not None and name in further:
-            return further[name]
-        if result is not None and not name.startswith("__"):
-            try:
-                return getattr(result, name)
-            except AttributeError:
-                pass
-        raise AttributeError(f"{type(self).__name__} has no {name}")
+    if not TYPE_CHECKING:  # which knows the names by `_Numbers`
+
+        def __getattr__(self, name: str) -> Any:
+            self._compute(name)
+            if name in self.__dict__:
+                return self.__dict__[name]
+            result, further = self.__dict__.get("result"), self.__dict__.get("further")
+            if further is not None and name in further:
+                return further[name]
+            if result is not None and not name.startswith("__"):
+                try:
+                    return getattr(result, name)
+                except AttributeError:
+                    pass
+            raise AttributeError(f"{type(self).__name__} has no {name}")
+
+    def __dir__(self) -> list[str]:
+        return sorted({*object.__dir__(self), *_Numbers.__annotations__, *self.further})
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -127,6 +225,10 @@ class Results:
     def statuses(self) -> np.ndarray:
         """How the runs ended, in words of `STATUSES`; `status` holds their codes."""
         return np.array(STATUSES)[np.asarray(self.status)]
+
+    def rows_table(self) -> dict[str, np.ndarray]:
+        """The same as `to_dict`, under the name that results of fits have too."""
+        return self.to_dict()
 
     def to_dict(self) -> dict[str, np.ndarray]:
         """Conditions and outcomes by the columns of `runs.csv`, units in the names; arrays of the batch's shape.
@@ -203,6 +305,12 @@ class Results:
         if has_tracer(self):
             return f"Results of {self.model}, traced"
         return f"Results of {self.model}, {counted(max(self.status.size, 1), 'run')}\n{self.table()}"
+
+
+def _compared(status: Any) -> Any:
+    """Codes that compare with words. Tracers, and what is no array, are returned unchanged."""
+    is_array = isinstance(status, np.ndarray | jax.Array) and not isinstance(status, jax.core.Tracer)
+    return np.asarray(status).view(StatusCodes) if is_array else status
 
 
 jax.tree_util.register_dataclass(

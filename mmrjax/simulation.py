@@ -8,17 +8,19 @@ import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mmrjax import channels, fidelities, missions, params, power
 from mmrjax.compiling import compiled
-from mmrjax.conditions import OF_TURNS, Conditions, indices, sides_contradict
+from mmrjax.conditions import OF_TURNS, Conditions, Named, sides_contradict
 from mmrjax.errors import UsageError, choices
 from mmrjax.fidelities.base import Fidelity, History, Run
 from mmrjax.fidelities.mission import Start
 from mmrjax.params import Scalar
+from mmrjax.precision import ambient, at_once, in_double, in_trace
 from mmrjax.profile import Profile
 from mmrjax.programs import has_tracer
 from mmrjax.quantities import CONDITIONS
@@ -30,9 +32,14 @@ from mmrjax.signals import CODES, Result
 HISTORIES = 1000
 #: What is said of runs that say nothing of either side, of a robot whose sides differ.
 STRAIGHT = "the robot's sides differ, and runs that say nothing of either side travel straight, as if steered"
+#: What is said of reverse mode through a fidelity that has none.
+FORWARD_ALONE = (
+    "derivatives are forward (jax.jacfwd, jax.jvp); for jax.grad use model steady, or mmrjax.step for runs over time"
+)
 STATUS, _ = CODES
 
 
+@in_double
 def simulate(
     robot: Robot,
     conditions: Conditions,
@@ -48,7 +55,8 @@ def simulate(
     """Simulate one run, or a batch.
 
     Values are checked where they are concrete; tracers pass, so that `jax.grad`, `jax.jacfwd`, `jax.vmap` and
-    `jax.jit` go through (reverse mode through `steady` and `track`, forward mode through all). Of `steady`, what is
+    `jax.jit` go through (reverse mode through `steady` and `track`, forward mode through all; for reverse mode over
+    time see `step`). Of `steady`, what is
     asked of the results is computed when it is asked (see `Results`).
 
     Args:
@@ -93,8 +101,11 @@ def simulate(
     turns = conditions.turns or (profile is not None and profile.turns)
     if not (turns or has_tracer(robot.effects)) and (unlike := robot.unlike):
         warnings.warn(f"{', '.join(unlike)}: {STRAIGHT}; {OF_TURNS[0]}=1, {OF_TURNS[1]}=1 let it turn", stacklevel=2)
+    if in_trace(robot, conditions, profile, start):
+        robot = ambient(robot)
+        conditions, profile, start = jax.device_put((conditions, profile, start))
     if profile is not None:
-        return _missions(robot, conditions, profile, start, history)
+        return _forward_alone(_missions(robot, conditions, profile, start, history))
     robot = robot.showing_turns() if conditions.turns else robot
     fidelity, traced = fidelities.get(model), has_tracer((robot, conditions))
     if not traced:
@@ -106,10 +117,20 @@ def simulate(
     if fidelity.outputs is not None and not traced:
         return Results.pending(Pending(robot, conditions, fidelity), names, model)
     run = _run(fidelity, robot, conditions, stated, history and fidelities.facts(model).histories)
-    return Results(
+    results = Results(
         conditions, total_mass(robot, conditions), run.result, run.columns, run.history, names, model,
         channels=robot.channels,
     )  # fmt: skip
+    return results if fidelities.facts(model).reverse else _forward_alone(results)
+
+
+def _forward_alone(results: Results) -> Results:
+    """The same results, which refuse reverse mode in a sentence: a loop over steps of adaptive length has none."""
+    if not has_tracer(results):
+        return results
+    kind = results.model if results.mission is None else f"{results.model} over a profile"
+    named: Results = eqxi.nondifferentiable_backward(results, msg=f"{kind}: {FORWARD_ALONE}")
+    return named
 
 
 def _check_battery(robot: Robot, conditions: Conditions) -> None:
@@ -192,16 +213,19 @@ class Pending:
     conditions: Conditions
     fidelity: Fidelity
 
+    @at_once
     def shown(self) -> dict[str, jax.Array]:
         """What the robot's instruments show, by channel, and the codes of how the runs ended as `status`."""
         outputs, names = self.fidelity.outputs, (*channels.names(self.robot.channels), STATUS)
         assert outputs is not None
         return _in_chunks(self.fidelity, lambda flat: outputs(self.robot, flat, names), self.conditions)
 
+    @at_once
     def result(self) -> Result:
         """Everything."""
         return _run(self.fidelity, self.robot, self.conditions, {}, history=False).result
 
+    @at_once
     def total_mass(self) -> jax.Array:
         """Mass of robot and payload, stated or the robot's own [kg]."""
         return total_mass(self.robot, self.conditions)
@@ -296,12 +320,11 @@ def _check_robot(robot: Robot) -> None:
 def _resolved(robot: Robot, conditions: Conditions) -> Conditions:
     """Conditions with indices for names, every index one that the robot has."""
     names, which = robot.configurations.names, conditions.configuration
-    if isinstance(which, np.ndarray) and which.dtype.kind == "U":
-        found = indices(which, names)
-        if found.size and found.min() < 0:
-            name = str(np.unique(which[found < 0])[0])
-            raise UsageError(f"configuration: got {name}; {choices(name, names)}")
-        return dataclasses.replace(conditions, configuration=jnp.asarray(found))
+    if isinstance(which, Named):
+        try:
+            return dataclasses.replace(conditions, configuration=which.among(names))
+        except KeyError as error:
+            raise UsageError(f"configuration: got {error.args[0]}; {choices(error.args[0], names)}") from error
     if not has_tracer(which) and which.size and not _within(_ends(which), 0, len(names) - 1):
         wrong = _first_outside(which, 0, len(names) - 1)
         assert wrong is not None

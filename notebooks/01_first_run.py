@@ -23,7 +23,9 @@ import jax
 import matplotlib.pyplot as plt
 import numpy as np
 
-import mmrjax as mm  # double precision, unless JAX_ENABLE_X64 says otherwise
+import mmrjax as mm
+
+jax.config.update("jax_enable_x64", True)  # within jax.jit and jax.grad too
 
 # %% [markdown]
 # ## One operating point
@@ -56,6 +58,7 @@ left.plot(slopes, climbs.total_current)
 left.set(xlabel="slope [deg]", ylabel="total current [A]")
 right.plot(slopes, 1e3 * climbs.speed)
 right.set(xlabel="slope [deg]", ylabel="speed [mm/s]")
+assert all(np.isfinite(line.get_ydata()).any() for panel in plt.gcf().axes for line in panel.lines)
 plt.show()
 
 # %% [markdown]

@@ -27,6 +27,8 @@ import numpy as np
 
 import mmrjax as mm
 
+jax.config.update("jax_enable_x64", True)  # within jax.jit and jax.grad too
+
 runs, base = mm.read_runs("measured"), mm.nominal()
 print(f"{len(runs)} runs of {', '.join(np.unique(runs['configuration']))}")
 
@@ -70,6 +72,7 @@ for axes, (name, p) in zip(grid.flat, profiled.items(), strict=False):
     axes.plot(p.profile.value, p.profile.rise, "o-", ms=3)
     axes.set(title=name.replace("ground.", ""), ylim=(0, 10), xlabel=f"[{p.unit}]")
     axes.title.set_fontsize(8)
+assert all(np.isfinite(line.get_ydata()).any() for panel in plt.gcf().axes for line in panel.lines)
 plt.show()
 
 # %% [markdown]
@@ -103,6 +106,7 @@ for axes, channel in zip(grid, found.channels, strict=True):
         axes.plot(table["slope_deg"][mine], error[mine], "o", label=name)
     axes.set(xlabel="slope [deg]", ylabel=f"{channel.label}, simulated over measured [%]")
 grid[0].legend()
+assert all(np.isfinite(line.get_ydata()).any() for panel in plt.gcf().axes for line in panel.lines)
 plt.show()
 
 # %%

@@ -32,6 +32,8 @@ import numpy as np
 
 import mmrjax as mm
 
+jax.config.update("jax_enable_x64", True)  # within jax.jit and jax.grad too
+
 # %% [markdown]
 # ## A run, and its derivative beside it
 # The robot: nominal, with enough adhesion to climb. The runs: four measured ones of the tracked robot at 33 V
@@ -106,6 +108,7 @@ smooth = np.convolve(swing, np.ones(window) / window, "valid")
 right.plot(1e3 * time[window - 1 :], smooth)
 right.axhline(exact[0], color="k", lw=0.7, ls="--")
 right.set(xlabel="time [ms]", ylabel="d current / d mu_t [A]", title="mean over two periods; dashed: run that rolls")
+assert all(np.isfinite(line.get_ydata()).any() for panel in plt.gcf().axes for line in panel.lines)
 plt.show()
 
 # %% [markdown]
@@ -148,6 +151,7 @@ right.semilogy(chain_time, chain_slope, label="free chain")
 right.semilogy(1e3 * time, np.maximum(track_slope, 1e-6), label="belt on its path")
 right.set(xlabel="time [ms]", ylabel="|d load / d mu_t| [N]", title="derivative of the load")
 right.legend()
+assert all(np.isfinite(line.get_ydata()).any() for panel in plt.gcf().axes for line in panel.lines)
 plt.show()
 
 # %% [markdown]

@@ -30,6 +30,8 @@ import xarray as xr
 
 import mmrjax as mm
 
+jax.config.update("jax_enable_x64", True)  # within jax.jit and jax.grad too
+
 robot = mm.nominal()
 
 # %% [markdown]
@@ -108,6 +110,7 @@ for axes, values, title in ((left, elasticity[0, 2], "total current"), (right, e
     axes.barh(names, 100 * values * sds)
     axes.axvline(0, color="k", lw=0.7)
     axes.set(xlabel="change by one standard deviation [%]", title=f"{title}, 15 V, 5 deg")
+assert all(np.isfinite(bar.get_width()) for panel in plt.gcf().axes for bar in panel.patches)
 plt.show()
 
 # %% [markdown]
@@ -150,6 +153,7 @@ for shift, reading, label in ((-0.2, 0, "total current"), (0.2, 1, "speed")):
     axes.barh(place + shift, total[:, reading, 2], 0.36, label=label)
 axes.set(xlabel="total share of the variance, 15 V, 5 deg", yticks=place, yticklabels=names)
 axes.legend()
+assert all(np.isfinite(bar.get_width()) for panel in plt.gcf().axes for bar in panel.patches)
 plt.show()
 
 # %% [markdown]

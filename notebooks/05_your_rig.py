@@ -107,6 +107,7 @@ for ax, (title, robot) in zip(axes, (("plain law", plain.robot), ("slip goes wit
     ax.set(title=title, xlabel="rolling speed of the wheels [mm/s]")
 axes[0].set_ylabel("ground speed [mm/s]")
 axes[0].legend(fontsize=7, frameon=False)
+assert all(np.isfinite(line.get_ydata()).any() for panel in plt.gcf().axes for line in panel.lines)
 plt.show()
 
 # %% [markdown]

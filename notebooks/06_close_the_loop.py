@@ -54,6 +54,7 @@ for axes, channel in zip(grid, found.channels, strict=True):
     axes.set_ylabel(f"{channel.label} [σ]")
 grid[-1].set_xlabel("row of the table")
 grid[0].legend(ncols=2)
+assert all(np.isfinite(line.get_ydata()).any() for panel in plt.gcf().axes for line in panel.lines)
 plt.show()
 
 # %% [markdown]
@@ -79,6 +80,7 @@ measured = (table["configuration"] == "6T2A") & (table["supply_voltage_V"] == 33
 axes.plot(table["slope_deg"][measured], table["speed_mm_s"][measured], "ko", label="measured")
 axes.set(xlabel="slope [deg]", ylabel="speed [mm/s]", title="6T2A, 33 V, 8 kg")
 axes.legend()
+assert all(np.isfinite(line.get_ydata()).any() for panel in plt.gcf().axes for line in panel.lines)
 plt.show()
 
 # %% [markdown]

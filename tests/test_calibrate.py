@@ -3,13 +3,13 @@
 import dataclasses
 import json
 import math
-import os
 import re
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import jsonschema
 import numpy as np
@@ -21,6 +21,7 @@ import calibration
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration, BadData
+from calibration.discovery.result import DiscoveryResult
 from calibration.inference import noise, observers, priors
 from calibration.inference import optimizers as fit
 from calibration.inference.calibrate import calibrate
@@ -28,9 +29,10 @@ from calibration.inference.errors import relative_error, root_mean_square
 from calibration.inference.notes import Constant, Repeats, SamePredictions, Unmeasured
 from calibration.inference.observers import SettledRuns
 from calibration.inference.remarks import remarks
-from calibration.inference.result import HeldOut
+from calibration.inference.result import CalibrationResult, ChannelErrors, HeldOut
 from mmrjax import channels, robots
 from mmrjax.fidelities.steady import steady_batch
+from mmrjax.results import Results
 from sweeps.commands.calibrate import print_calibration
 from sweeps.pages import calibration as calibration_page
 from tests.commands import rows as rows_of
@@ -159,6 +161,15 @@ def test_blocks_that_tell_nothing_of_their_own_are_said_and_not_shown(found, cap
     shown = capsys.readouterr().out
     table = [line for line in shown.splitlines() if line.startswith("│ after, held out")]
     assert [" by slope " in line or " by voltage and configuration " in line for line in table] == [True, True]
+
+
+def test_errors_and_rows_have_one_spelling_over_all_results():
+    errors = ChannelErrors(3, 2.5, 4.0, 1.1, 0.02)
+    assert errors["rms_percent"] == errors.rms_percent == 2.5 and errors["rows"] == 3
+    with pytest.raises(KeyError, match="rms_per_cent"):
+        errors["rms_per_cent"]
+    for kind in (CalibrationResult, DiscoveryResult, Results):
+        assert callable(kind.rows_table), kind
 
 
 def test_rows_have_every_row(found):
@@ -546,16 +557,23 @@ def test_public_names_load_no_jax_until_they_are_asked_for():
 
 
 @pytest.mark.slow
-def test_single_precision_is_refused():
-    code = (
-        "import calibration\n"
-        "calibration.calibrate(calibration.read_runs('measured'), calibration.read_robot('nominal'))"
-    )
-    single = {**os.environ, "JAX_ENABLE_X64": "false"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, env=single, capture_output=True, text=True, timeout=60
-    )
-    assert 'set jax.config.update("jax_enable_x64", True) first' in done.stderr
+def test_a_calibration_is_the_same_where_jax_is_single(measured):
+    """Its threads are double too."""
+    stated = {"noise": "current=9%,motor_speed=6%,speed=4%", "blocks": True}
+    double = quick(measured, **stated)
+    with jax.enable_x64(False):
+        single = quick(measured, robot_file.load("nominal"), **stated)
+        resistance = single.robot.motor.friction_coulomb
+    assert isinstance(resistance, np.ndarray) and resistance == double.robot.motor.friction_coulomb
+    assert json.dumps(single.to_json()) == json.dumps(double.to_json())
+
+
+def test_a_calibration_is_refused_inside_a_trace_in_single_precision(measured):
+    with (
+        jax.enable_x64(False),
+        pytest.raises(BadConfiguration, match="calibrate: called inside a JAX transformation"),
+    ):
+        jax.jit(lambda x: quick(measured).objective * x)(1.0)
 
 
 @pytest.mark.slow

@@ -39,6 +39,15 @@ def test_every_public_name_has_a_docstring_with_what_it_takes():
         assert all(re.search(rf"\b{p.name}\b", doc) for p in taken), name
 
 
+def test_the_page_of_public_names_says_what_every_function_returns():
+    text = (DOCS / "api.md").read_text("utf-8")
+    for name in (n for n in mm.__all__ if n.islower() and not n.startswith("_")):
+        (section,) = re.findall(rf"^## `mm\.{name}\([^`]* → ([^`]+)`\n\n```text\n(.*?)```", text, re.M | re.S)
+        assert section[0] not in ("None", "Any", "<class 'inspect._empty'>") and "Returns" in section[1], name
+    assert [kind.__name__ for kind in site().returned_types()] == ["CalibrationResult", "DiscoveryResult", "Runs"]
+    assert "None\n```" not in text  # every member has a docstring
+
+
 def test_every_page_is_in_the_site():
     named = set(re.findall(r"[\w/-]+\.md", (ROOT / "mkdocs.yml").read_text("utf-8")))
     assert named == {str(p.relative_to(DOCS)) for p in DOCS.rglob("*.md")}

@@ -27,6 +27,19 @@ def test_dockerfile_has_the_program_s_python_and_copies_what_it_needs():
     assert not {"mmrjax", "calibration", "sweeps", "pyproject.toml", "requirements.lock", "README.md"} & set(away)
 
 
+def test_hosted_checks_run_targets_that_there_are_and_name_no_address():
+    hosted = [ROOT / ".pre-commit-config.yaml", *(ROOT / ".github").rglob("*.yml")]
+    checks = (ROOT / ".github" / "workflows" / "checks.yml").read_text("utf-8")
+    makefile = (ROOT / "Makefile").read_text("utf-8")
+    (tests,) = re.findall(r"tests: \[(.*?)\]", checks)
+    targets = {*re.findall(r"run: make (\w+)", checks), *tests.split(", ")}
+    assert {"lint", "quick", "docs", "slow", "nightly"} == targets
+    assert all(re.search(rf"^{target}:", makefile, re.M) for target in targets)
+    (versions,) = re.findall(r"python: \[(.*?)\]", checks)
+    assert f'"{PROJECT["requires-python"].removeprefix(">=")}"' == versions.split(", ")[0] and len(hosted) >= 5
+    assert not any("://" in path.read_text("utf-8") for path in hosted)
+
+
 @pytest.mark.slow
 def test_a_wheel_works_outside_of_the_repository(tmp_path):
     """With its templates, tables, rigs, parts and profiles."""

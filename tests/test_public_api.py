@@ -18,7 +18,7 @@ import test_fidelities
 
 import mmrjax as mm
 from calibration.data.errors import BadConfiguration
-from mmrjax import channels, fidelities, outputs, params, robots
+from mmrjax import channels, fidelities, outputs, params, results, robots
 from mmrjax.effects import ALL
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.steady import steady_batch
@@ -37,7 +37,7 @@ print(one.total_current, many.table())
 
 
 def python(code: str, **environment: str) -> str:
-    clean = {k: v for k, v in os.environ.items() if k != "JAX_ENABLE_X64"}
+    clean = {k: v for k, v in os.environ.items() if k != "JAX_ENABLE_X64"}  # JAX is single, as its users find it
     answer = subprocess.run(
         [sys.executable, "-W", "error", "-c", code], cwd=ROOT, env={**clean, **environment}, capture_output=True,
         text=True, timeout=300, check=False,
@@ -111,19 +111,6 @@ def test_a_wrong_name_of_a_parameter_is_answered_by_what_is_near(robot):
         mm.replace(robot, {"friction_coulomb": 0.5})
 
 
-@pytest.mark.quick(1)
-@pytest.mark.parametrize(
-    ("before", "variable", "precision"),
-    [("", {}, "float64"), ("import jax; ", {"JAX_ENABLE_X64": "0"}, "float32"),
-     *(pytest.param(*case, marks=pytest.mark.slow) for case in (
-         ("import jax; ", {}, "float64"), ("", {"JAX_ENABLE_X64": "false"}, "float32"),
-         ("", {"JAX_ENABLE_X64": "1"}, "float64")))],
-)  # fmt: skip
-def test_import_enables_double_precision_unless_the_variable_says_otherwise(before, variable, precision):
-    code = f"{before}import mmrjax, jax.numpy as jnp; print(jnp.asarray(1.0).dtype, mmrjax.nominal().motor.resistance.dtype)"
-    assert python(code, **variable).split() == [precision, precision]
-
-
 def test_package_states_its_names_version_and_types():
     assert set(mm.__all__) <= set(dir(mm))
     for name in mm.__all__:
@@ -132,8 +119,11 @@ def test_package_states_its_names_version_and_types():
         _ = mm.simulat
     stated = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     assert mm.__version__ == stated["project"]["version"]
-    assert (ROOT / "mmrjax" / "py.typed").exists()
-    assert "py.typed" in stated["tool"]["setuptools"]["package-data"]["mmrjax"]
+    for package in ("mmrjax", "calibration", "sweeps"):
+        assert (ROOT / package / "py.typed").exists()
+        assert "py.typed" in stated["tool"]["setuptools"]["package-data"][package]
+    # an editable install is then a path, which type checkers follow, and no import hook
+    assert stated["tool"]["setuptools"]["package-dir"] == {"": "."}
 
 
 def test_type_checkers_see_every_public_name():
@@ -190,6 +180,29 @@ def test_every_result_field_and_channel_is_an_attribute(robot):
         assert getattr(one, name) is one.reading[name]
     with pytest.raises(AttributeError, match="Results has no torque"):
         _ = one.torque
+
+
+def test_every_name_of_a_result_is_typed_and_listed(robot):
+    fields = {field.name for field in dataclasses.fields(Result)}
+    assert results._Numbers.__annotations__.keys() == fields | {c.name for c in channels.EVERY}
+    one = mm.simulate(robot, mm.Conditions())
+    assert {*fields, *channels.USUAL, "statuses", "table", "model"} <= set(dir(one))
+    numbers = one.rows_table()
+    assert numbers.keys() == one.to_dict().keys()
+
+
+def test_status_compares_with_its_words_and_refuses_others(robot):
+    many = mm.simulate(robot, mm.Conditions(voltage=[24.0, 0.5, 24.0], slope_deg=[5.0, 5.0, 20.0]))
+    for codes in (many.status, many.result.status, jax.tree.map(lambda x: x, many).status):
+        assert (codes == "converged").tolist() == [True, False, False]
+        assert (codes != "stalled").tolist() == [True, False, True]
+        assert (codes == ["converged", "stalled", "converged"]).tolist() == [True, True, False]
+        assert codes[1] == "stalled" and (codes[1:] == "slides").tolist() == [False, True]
+        assert (codes == 0).tolist() == [True, False, False] and jnp.sum(codes) == np.sum(codes)
+        with pytest.raises(mm.UsageError, match="status: got convergd; did you mean converged"):
+            codes == "convergd"  # noqa: B015
+    one = mm.simulate(robot, mm.Conditions(voltage=24.0))
+    assert one.status == "converged" and f"{one.status}" == "0" and one.statuses == "converged"
 
 
 def test_to_dict_has_the_columns_of_runs_csv(robot):

@@ -22,6 +22,7 @@ from mmrjax import effects, params, power, robots
 from mmrjax.driver import DECAYS
 from mmrjax.effects import Effect
 from mmrjax.effects.scaled import scaled
+from mmrjax.precision import in_double
 from mmrjax.robot import Configurations, Robot
 from mmrjax.shaft import Shaft
 from mmrjax.tables import TRACKED, WHEELED
@@ -92,6 +93,7 @@ class RobotFile:
         return Path(self.source).name
 
 
+@in_double
 def load(name_or_path: str, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> Robot:
     """A robot by its name or from its file.
 

@@ -99,6 +99,7 @@ from calibration.words.notes import in_words, sentence
 from mmrjax import channels, effects
 from mmrjax.effects import Effect
 from mmrjax.errors import counted
+from mmrjax.precision import Threads, in_double
 from mmrjax.robot import Robot
 
 #: Factors on a noise that nobody states at which the verdict is looked at too: on what is assumed, and on what the
@@ -124,6 +125,7 @@ FAR = 3.0
 Tell = Callable[[Note | str], None]
 
 
+@in_double
 def discover(
     runs: Runs,
     robot: Robot,
@@ -174,7 +176,7 @@ def discover(
     silent = channels.names(known.silent)
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises run the programs of the first one: beside what follows it, on other cores.
-    others = concurrent.futures.ThreadPoolExecutor(2, kept.BESIDE)
+    others = Threads(2, kept.BESIDE)
     sensitivity, outstanding = list[Sensitivity](), list[float]()
     try:
         if factors:

@@ -24,6 +24,7 @@ from calibration.discovery.settings import Settings
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.held_out import search_each
+from mmrjax.precision import Threads
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +82,7 @@ def ahead(
         elif space.bare.observe.menu:
             jobs.append(others.submit(predict, base.space, {"": base.candidate}, settings))
 
-    with concurrent.futures.ThreadPoolExecutor(2) as others:
+    with Threads(2) as others:
         jobs: list[concurrent.futures.Future[Any]] = [others.submit(look), others.submit(fit)]
         yield foresee
     for job in jobs:

@@ -30,6 +30,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.effects.scaled import amplitude_of, scaled, shape_of
 from mmrjax.fidelities.steady import operating_signals
+from mmrjax.precision import in_double
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
 
@@ -103,7 +104,7 @@ def library_for(robot: Robot, conditions: Conditions, library: Library, turned: 
 
 def nominal_ahead() -> None:
     """Compute what the nominal robot does on another core, for `library_for`."""
-    threading.Thread(target=_nominal, daemon=True).start()
+    threading.Thread(target=in_double(_nominal), daemon=True).start()
 
 
 def turned_in(runs: Runs, robot: Robot) -> float:

@@ -8,7 +8,6 @@ with one degree of freedom where nothing is missing (Rao 1948).
 
 from __future__ import annotations
 
-import concurrent.futures
 import dataclasses
 import functools
 from collections.abc import Sequence
@@ -26,6 +25,7 @@ from calibration.inference.normal_equations import half_solved
 from calibration.inference.optimizers import CORES
 from calibration.inference.problem import Problem
 from mmrjax.compiling import SELDOM, SMALL, compiled
+from mmrjax.precision import Threads
 
 #: Share of a signature's norm below which the free parameters explain it all.
 ABSORBED = 1e-3
@@ -316,7 +316,7 @@ def bootstrap(
         return jax.device_get(_replicates(problem, linear, effects, bases, mine))
 
     # The first batch compiles what the others run; a batch keeps one core busy.
-    with concurrent.futures.ThreadPoolExecutor(CORES) as cores:
+    with Threads(CORES) as cores:
         parts = [part(0), *cores.map(part, range(1, count))]
     whole = jax.tree.map(lambda *x: np.concatenate(x)[:replicates], *parts)
     return jax.tree.map(lambda x: x[whole.settled], whole)

@@ -41,6 +41,7 @@ from calibration.inference.residual_clusters import residual_clusters
 from calibration.inference.result import CalibrationResult
 from calibration.words.notes import in_words
 from mmrjax import fidelities
+from mmrjax.precision import SINGLE, in_double, is_double
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
 
@@ -52,6 +53,7 @@ OF_HISTORIES = "drive"
 FRICTION = "ground.friction."
 
 
+@in_double
 def calibrate(
     runs: Runs,
     robot: Robot,
@@ -94,12 +96,10 @@ def calibrate(
     Raises:
         BadData: data that cannot be fitted, see `checks.check`.
         BadConfiguration: an unknown fidelity or parameter, a prior or noise that is none, or of a mass that the
-            table states, rows that no robot near the priors reaches; or JAX computes in single precision.
+            table states, rows that no robot near the priors reaches; or a call inside `jax.jit` where JAX is single.
     """
-    if jnp.result_type(float) != jnp.float64:
-        raise BadConfiguration(
-            'calibrate: JAX computes in single precision; set jax.config.update("jax_enable_x64", True) first'
-        )
+    if not is_double():
+        raise BadConfiguration(f"calibrate: {SINGLE}")
     runs = thinned(runs.of(robot), rows)
     observe = observers.kind(runs)
     fidelity = model or (OF_HISTORIES if observe.axis else fidelities.NAMES[0])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import concurrent.futures
 import dataclasses
 import functools
 import os
@@ -18,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from calibration.inference.normal_equations import half_solved, solved
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax.compiling import OVER_TIME, SELDOM, SMALL, compiled
+from mmrjax.precision import Threads
 from mmrjax.robot import Robot
 
 #: Predicted decrease of the objective below which a point is an optimum: in ½σ² (the step left is then below
@@ -434,7 +434,7 @@ def _refilled(problem: Problem, members: Member, max_steps: int, places: int) ->
 
     if cores > 1:  # the program is made once, by a call that takes no step
         go_on(problem, first, np.zeros(places, bool), idle, np.asarray(0), most)
-    with concurrent.futures.ThreadPoolExecutor(cores) as pool:
+    with Threads(cores) as pool:
         ended = {k: found for part in pool.map(some, range(cores)) for k, found in part.items()}
     return jax.tree.map(lambda *x: np.stack(x), *(ended[k] for k in range(count)))
 

@@ -171,6 +171,13 @@ class ChannelErrors:
     rms_sigma: float
     rms: float
 
+    def __getitem__(self, name: str) -> float:
+        """A number by its name, as of the errors of `discover`."""
+        if name not in self.__dataclass_fields__:
+            raise KeyError(name)
+        number: float = getattr(self, name)
+        return number
+
 
 #: Errors by the name of the channel.
 Errors = dict[str, ChannelErrors]
@@ -427,6 +434,10 @@ class CalibrationResult:
     def rows(self) -> dict[str, np.ndarray]:
         """Conditions, readings before and after and held out, errors in percent and in σ: a table, row by row."""
         return {**self.conditions, **dict(self._readings()), "status": self.status}
+
+    def rows_table(self) -> dict[str, np.ndarray]:
+        """The same as `rows`, under the name that all results have."""
+        return self.rows()
 
     def _readings(self) -> Iterator[tuple[str, np.ndarray]]:
         main = self.main_blocks

@@ -65,6 +65,7 @@ class Facts:
         histories: whether it can keep a run over time.
         computes: parameters of a configuration that are results here and not read, such as `track.guide_share`.
         resolves: beginnings of names of parameters that it reads and fidelities without them do not.
+        reverse: whether derivatives by reverse mode (`jax.grad`) go through, next to forward ones.
         slow: whether a batch takes long enough for a bar that shows its progress.
         one_thread: whether XLA has to run on one thread: on two, runs have hung for good (docs/benchmarks.md).
     """
@@ -78,6 +79,7 @@ class Facts:
     histories: bool = False
     computes: tuple[str, ...] = ()
     resolves: tuple[str, ...] = ()
+    reverse: bool = True
     slow: bool = False
     one_thread: bool = False
 
@@ -135,6 +137,7 @@ TABLE: dict[str, Facts] = {
         options=(_duration(30.0, 86_400.0),),
         rollout=True,
         histories=True,
+        reverse=False,
     ),
     "track": Facts(
         "mmrjax.fidelities.track",

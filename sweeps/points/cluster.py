@@ -262,13 +262,10 @@ def program() -> dict[str, dict[str, str]]:
 
 @functools.cache
 def _start() -> None:
-    """Double precision and compiled programs kept, as in the command itself."""
+    """Compiled programs are kept, as in the command itself."""
     from sweeps import compilation_cache
 
     compilation_cache.keep_programs()
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
 
 
 def introduce() -> tuple[dict[str, dict[str, str]], str]:
@@ -292,9 +289,10 @@ def compute(work: bytes, name: str, chunk: int, expected: dict[str, Any]) -> dic
     differ = differences(expected, {**host, "device": {"device": device}})
     if differ:
         raise BadConfiguration(f"--scheduler: a worker that came later has another program or device: {differ}")
+    from mmrjax.precision import double_precision
     from sweeps.points.scale import Compiled, fetched
 
-    with _lock:
+    with _lock, double_precision():  # of a worker that may have other work, in its user's own precision
         if name not in _compiled:
             _compiled.clear()
             _compiled[name] = Compiled(pickle.loads(work))

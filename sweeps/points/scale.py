@@ -26,6 +26,7 @@ from jaxtyping import Array, Float
 from mmrjax import fidelities, outputs
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
+from mmrjax.precision import Threads
 from mmrjax.profile import Profile
 from mmrjax.variation import FLAGS, STATUS, Variation, evaluate, pick
 from sweeps.points.axes import Plan, adhesions
@@ -261,7 +262,7 @@ def produce(compiled: Compiled, chunks: Iterable[int], times: Times, advance: Ad
     Args:
         advance: called with how many more points are done, of chunks that are computed in parts.
     """
-    with concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="points") as maker:
+    with Threads(1, thread_name_prefix="points") as maker:
         ahead = deque[tuple[int, concurrent.futures.Future[Any]]]()
         for chunk in chunks:
             ahead.append((chunk, maker.submit(compiled.points, chunk)))

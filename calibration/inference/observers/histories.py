@@ -6,7 +6,6 @@ imposed where the rig's file says that it goes on straight lines (`Rig.between_r
 
 from __future__ import annotations
 
-import concurrent.futures
 import dataclasses
 import functools
 import operator
@@ -74,6 +73,7 @@ from mmrjax.fidelities.histories import (
     within,
 )
 from mmrjax.params import Scalar
+from mmrjax.precision import Threads
 from mmrjax.rig import Begin, Begins, Rig
 from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED, FAILED, Signals, State
@@ -1117,7 +1117,7 @@ def _evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Ev
 
     def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
         parts = [(z[k : k + TOGETHER], members[k : k + TOGETHER]) for k in range(0, len(members), TOGETHER)]
-        with concurrent.futures.ThreadPoolExecutor(CORES if made.is_set() else 1) as cores:
+        with Threads(CORES if made.is_set() else 1) as cores:
             found = list(cores.map(lambda part: some(*part), parts))
         made.set()  # by its first call the program is compiled
         return jax.tree.map(lambda *x: np.concatenate(x)[: len(members)], *found)

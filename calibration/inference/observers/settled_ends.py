@@ -10,7 +10,6 @@ own beside that of one that falls from a peak with the same creep, so the second
 
 from __future__ import annotations
 
-import concurrent.futures
 import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -28,6 +27,7 @@ from calibration.inference.problem import Problem, data_of
 from mmrjax import channels
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
+from mmrjax.precision import Threads
 
 if TYPE_CHECKING:
     from calibration.inference.observers.histories import Histories
@@ -281,7 +281,7 @@ def _misfit_of_runs(problem: Problem, points: np.ndarray) -> np.ndarray:
     filled = np.resize(points, (-(-len(points) // TOGETHER) * TOGETHER, points.shape[1]))
     parts = filled.reshape(-1, TOGETHER, points.shape[1])
     first = _misfits(problem, jnp.asarray(parts[0]))  # compiles the program
-    with concurrent.futures.ThreadPoolExecutor(CORES) as cores:
+    with Threads(CORES) as cores:
         each = [first, *cores.map(lambda part: _misfits(problem, jnp.asarray(part)), parts[1:])]
     by_row = np.sum(np.concatenate([np.asarray(x) for x in each])[: len(points)] ** 2, 2)
     by_run = np.zeros((len(points), len(observe.rows_of)))

@@ -1,0 +1,212 @@
+"""`rates`, `step` and `initial_state`: the fidelity `drive` in steps, under transformations, in either precision."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mmrjax as mm
+from mmrjax import fidelities, robots
+from mmrjax.effects import BY_NAME
+from mmrjax.fidelities import drive
+from mmrjax.fidelities.drive import rates as rates_of_unknowns
+from mmrjax.robot import Configurations
+from mmrjax.shaft import Shaft
+
+DT = 0.01
+RUNS = {
+    "tracked": mm.Conditions("6T2A", voltage=24.0, slope_deg=5.0, payload=3.0),
+    "wheeled": mm.Conditions("4W2T", voltage=15.0),
+}
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """A motor that lifts a mass on a drum, and is not known further."""
+    drum = Shaft(inertia=2e-3, loss_coulomb=0.02, torque_gravity=0.1)
+    robot = robots.blank(Configurations({"winch": drum}), sides=1.0)
+    motor = {"motor.resistance": 2.0, "motor.torque_constant": 0.05, "motor.inertia": 1e-5, "gearbox.ratio": 10.0}
+    return mm.replace(robot, {**motor, "motor.inductance": 1e-3})
+
+
+def test_states_hold_numbers_in_si_units_and_rates_are_those_of_drive(robot):
+    conditions = RUNS["tracked"].resolved(robot)
+    remembering = dataclasses.replace(robot, effects=(BY_NAME["thermal_drift"](amplitude=0.5),))
+    for one in (robot, remembering):
+        at_rest = mm.initial_state(one, conditions)
+        state = dataclasses.replace(at_rest, current=3.0, speed_motor=500.0, speed=0.4, distance=1.5)
+        found = mm.rates(one, state, None, conditions)
+        assert jax.tree.structure(found) == jax.tree.structure(at_rest)
+        sizes = jnp.asarray(drive.units(one))
+        y = jnp.stack([jnp.asarray(x, float) for x in (3.0, 500.0, 0.4, 1.5, 0.0, *state.memory.values())]) / sizes
+        wanted = drive.state_of(one, rates_of_unknowns(one, conditions, y))
+        assert float(found.distance) == 0.4 and float(found.current) != 0
+        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-12)
+
+
+def test_steps_are_runs_of_drive(robot):
+    """From rest at full voltage, at half the duty, and with the motors shorted to rest."""
+    conditions = RUNS["tracked"]
+    duties = jnp.repeat(jnp.asarray([1.0, 0.5, 0.0]), 40)
+
+    @jax.jit
+    def run(duties):
+        def one(state, duty):
+            state = mm.step(robot, state, duty, DT, conditions)
+            return state, state
+
+        return jax.lax.scan(one, mm.initial_state(robot, conditions), duties)[1]
+
+    coarse = run(duties)
+    times = jnp.arange(41) * DT
+    of_drive = drive.drive(robot, conditions.resolved(robot), times, tolerance=1e-9)
+    np.testing.assert_allclose(coarse.speed[:40], of_drive.signals.speed[1:], atol=2e-4)
+    np.testing.assert_allclose(coarse.distance[:40], of_drive.distance[1:], atol=1e-4)
+    assert of_drive.signals.speed[-1] > 0.4 and (coarse.speed[100:] == 0).all()
+    assert np.ptp(coarse.distance[100:]) == 0 and abs(coarse.current[-1]) < 1e-6
+
+
+@pytest.mark.slow
+def test_steps_converge(robot):
+    """Against a hundred times as many, over a command that changes: the figures that the docstring states."""
+    conditions = RUNS["wheeled"]
+    duties = np.repeat([1.0, 0.4, -0.5, 0.0], 40)
+
+    def run(parts):
+        @jax.jit
+        def whole(duties):
+            def one(state, duty):
+                part = lambda state, _: (mm.step(robot, state, duty, DT / parts, conditions), None)  # noqa: E731
+                state = jax.lax.scan(part, state, None, length=parts)[0]
+                return state, state
+
+            return jax.lax.scan(one, mm.initial_state(robot, conditions), duties)[1]
+
+        return whole(jnp.asarray(duties))
+
+    exact, found = run(100), run(1)
+    assert np.abs(found.speed - exact.speed).max() < 4e-3 and np.abs(found.distance - exact.distance).max() < 1e-4
+
+
+def case(kind, robot, bench):
+    """A robot, its conditions, and what a step under a duty does to its speed."""
+    one, conditions = (bench, mm.Conditions(voltage=12.0)) if kind == "shaft" else (robot, RUNS[kind])
+
+    def far(state, duty, given):
+        after = mm.step(one, state, {"duty": duty}, DT, given)
+        return after.speed_motor, after
+
+    mapped = jax.vmap(jax.value_and_grad(far, argnums=1, has_aux=True), in_axes=(None, 0, None))
+    return one, conditions, jax.jit(mapped)
+
+
+@pytest.mark.parametrize("double", [True, False])
+@pytest.mark.parametrize("kind", [*RUNS, "shaft"])
+def test_a_step_can_be_traced_by_every_transformation(kind, double, robot, bench):
+    """Conditions by name are an argument."""
+    with jax.enable_x64(double):
+        one, conditions, mapped = case(kind, robot, bench)
+        (_, after), slope = jax.eval_shape(
+            mapped, mm.initial_state(one, conditions), jnp.asarray([0.3, 0.9]), conditions
+        )
+    wanted = jnp.dtype("float64" if double else "float32")
+    assert {(x.shape, x.dtype) for x in jax.tree.leaves((after, slope))} == {((2,), wanted)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [*RUNS, "shaft"])
+def test_derivatives_of_a_step_are_differences(kind, robot, bench):
+    one, conditions, mapped = case(kind, robot, bench)
+    state, duties = mm.initial_state(one, conditions), jnp.asarray([0.3, 0.9])
+    (speed, _), slope = mapped(state, duties, conditions)
+    h = 1e-5
+    ahead, behind = (mm.step(one, state, 0.9 + d, DT, conditions).speed_motor for d in (h, -h))
+    assert (np.asarray(slope) > 0).all()
+    np.testing.assert_allclose(slope[1], (ahead - behind) / (2 * h), rtol=1e-5)
+    with jax.enable_x64(False):
+        (rough, _), rough_slope = mapped(mm.initial_state(one, conditions), jnp.asarray([0.3, 0.9]), conditions)
+    np.testing.assert_allclose(rough, speed, rtol=1e-4)
+    np.testing.assert_allclose(rough_slope, slope, rtol=1e-3)
+
+
+def test_a_robot_rolls_at_first_as_steady_travels(robot):
+    conditions = RUNS["wheeled"]
+    state = mm.initial_state(robot, conditions, rolling=True)
+    rate = mm.rates(robot, state, None, conditions)
+    assert float(state.speed) > 0.3 and abs(float(rate.speed)) < 1e-9 and abs(float(rate.speed_motor)) < 1e-6
+
+
+WRONG = {
+    "conditions: got runs of shape (2,); expected one, and jax.vmap over several": dict(
+        conditions=mm.Conditions(voltage=[15.0, 24.0])
+    ),
+    "conditions: the sides are driven apart; a step is of straight travel, use mmrjax.simulate": dict(
+        conditions=mm.Conditions(duty_left=1.0, duty_right=0.5)
+    ),
+    "conditions: the motors' speed is imposed; a step needs a voltage or a current": dict(
+        command={"motor_speed": 300.0}
+    ),
+    "command: got volts; did you mean voltage?": dict(command={"volts": 12.0}),
+    "conditions: got dict; expected mmrjax.Conditions(...)": dict(conditions={"voltage": 12.0}),
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_wrong_use_is_said(message, robot):
+    given = {"command": 1.0, "conditions": mm.Conditions(), **WRONG[message]}
+    with pytest.raises(mm.UsageError) as error:
+        mm.step(robot, mm.initial_state(robot), given["command"], DT, given["conditions"])
+    assert str(error.value).startswith(message)
+
+
+def reverse(model, **options):
+    """Reverse mode through a run, traced and not compiled."""
+
+    def speed(volts):
+        return mm.simulate(
+            robots.nominal(), mm.Conditions(voltage=volts), model=model, history=False, **options
+        ).speed
+
+    return jax.eval_shape(jax.grad(speed), 24.0)
+
+
+REFUSED = r"derivatives are forward \(jax.jacfwd, jax.jvp\); for jax.grad use model steady, or mmrjax.step for runs"
+
+
+def test_reverse_mode_is_refused_in_a_sentence_where_a_fidelity_has_none(monkeypatch):
+    assert reverse("steady").shape == ()
+    forward_alone = dataclasses.replace(fidelities.facts("steady"), reverse=False)
+    monkeypatch.setitem(fidelities.TABLE, "steady", forward_alone)
+    with pytest.raises(RuntimeError, match=f"^steady: {REFUSED}"):
+        reverse("steady")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["drive", "track"])
+def test_fidelities_have_reverse_mode_as_they_state(model):
+    if fidelities.facts(model).reverse:
+        assert reverse(model, duration=0.002).shape == ()
+        return
+    with pytest.raises(RuntimeError, match=f"^{model}: {REFUSED}"):
+        reverse(model)
+
+
+def test_conditions_by_name_are_an_argument_of_compiled_functions(robot):
+    runs = mm.Conditions(["4W2T", "6T2A", "4W2T"], voltage=[15.0, 24.0, 33.0])
+    which = jax.jit(lambda c: c.resolved(robot).configuration)(runs)
+    assert which.tolist() == runs.resolved(robot).configuration.tolist() == [1, 0, 1]
+    mapped = jax.vmap(lambda c: c.resolved(robot).configuration)(runs)
+    assert mapped.tolist() == [1, 0, 1]
+    half = jax.tree.map(lambda x: x[1:], runs).resolved(robot)
+    assert half.configuration.tolist() == [0, 1] and half.voltage.tolist() == [24.0, 33.0]
+    of_others = mm.Conditions(["legs", "6T2A", "4W2T"])
+    assert jax.tree.map(lambda x: x[1:], of_others).resolved(robot).configuration.tolist() == [0, 1]
+    with pytest.raises(KeyError, match="no configuration legs"):
+        of_others.resolved(robot)
+    with pytest.raises(KeyError, match="no configuration legs"):
+        jax.jit(lambda c: c.resolved(robot).configuration)(mm.Conditions(["6T2A", "legs"]))
