@@ -146,11 +146,11 @@ def _read(
                 _refuse_idle(name, meaning, cells, layout)
                 continue
             values, doubted = _column(meaning, cells, layout)
-            for k in np.flatnonzero(doubted):
+            for place in np.flatnonzero(doubted).tolist():
                 try:
-                    values[k] = _cell(f"{name} row {k + 1}", meaning, cells[k], layout)
+                    values[place] = _cell(f"{name} row {place + 1}", meaning, cells[place], layout)
                 except BadData as error:
-                    bad.append((int(k) + 1, j, str(error)))
+                    bad.append((place + 1, j, str(error)))
             columns[meaning.column] = values
     if bad:
         raise BadData(_listed(name, [said for _, _, said in sorted(bad)]))

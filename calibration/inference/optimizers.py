@@ -359,7 +359,8 @@ def _roots(problem: Problem, z: Numbers, active: Numbers | None) -> tuple[Array,
         coordinates = problem.coordinates if active is None else problem.coordinates.with_effects(active)
         return problem.observe.solve(coordinates.robot(problem.base, z))
 
-    return jax.vmap(one)(z, active)
+    found: tuple[Array, Array] = jax.vmap(one)(z, active)
+    return found
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -396,7 +397,7 @@ def _go_on_apart(
     at = _begun(problem, members, fresh, at)
     while True:
         at, found = _further(problem, members, at, _roots(problem, at.ahead, members.active), max_steps)
-        if np.sum(at.over) >= enough:
+        if np.asarray(at.over).sum() >= enough:
             return at, found
 
 

@@ -138,8 +138,8 @@ class SettledTurns(SettledRuns):
         linear: Linearization,
         drawn: tuple[Any, ...],
     ) -> Linearization:
-        *drawn, roots = drawn
-        return super().replicate(dataclasses.replace(problem, roots=roots), data, effects, linear, tuple(drawn))
+        rooted = dataclasses.replace(problem, roots=drawn[-1])
+        return super().replicate(rooted, data, effects, linear, drawn[:-1])
 
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return super().unreachable(status) | (status == NOT_SETTLED)
