@@ -625,6 +625,8 @@ def _answered(error: BaseException) -> int:
         place = str(error.filename or "a file")
         left = "" if place == OUTPUT else "; no run folder was left; what was kept is in its .partial"
         return _fail(f"{place}: {error.strerror}{left}", 2)
+    if isinstance(error, SystemExit) and isinstance(error.__context__, BrokenPipeError):
+        return 1  # whoever reads the output has had enough: head, or a pager that was left
     if isinstance(error, SystemExit):
         return _fail("--effects: code of a file of effects has ended the program; remove the call that does", 2)
     if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of the option parser

@@ -26,6 +26,22 @@ def test_only_a_solver_that_failed_ends_with_3(status, code, mmrjax, monkeypatch
     assert mmrjax("compare", "measured", "--no-report", "--out", "s")[0] == code
 
 
+def test_a_reader_that_has_had_enough_is_no_fault_of_a_file_of_effects(monkeypatch, capsys):
+    """As `mmrjax loop --help | head`: the option parser ends the program itself."""
+
+    def app(**_):
+        try:
+            raise BrokenPipeError
+        except BrokenPipeError:
+            raise SystemExit(1)  # noqa: B904
+
+    monkeypatch.setattr(cli, "app", app)
+    monkeypatch.setattr("sys.argv", ["mmrjax"])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 1 and capsys.readouterr().err == ""
+
+
 def test_every_command_says_what_3_means_and_the_docs_have_its_words():
     text = (DOCS / "exit-codes.md").read_text(encoding="utf-8")
     documented = {}

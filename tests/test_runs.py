@@ -85,6 +85,22 @@ def test_a_reading_without_its_stated_sd_is_refused(tmp_path):
         records.read(write(tmp_path, text))
 
 
+def test_cells_of_a_sound_table_are_read_at_once(tmp_path, monkeypatch):
+    """A log may have a million rows: a cell is looked at alone only where it may be wrong."""
+    cell = records._cell
+
+    def looked_at(where, *told):
+        assert not where, f"{where} is looked at alone"
+        return cell(where, *told)
+
+    monkeypatch.setattr(records, "_cell", looked_at)
+    runs = records.read(write(tmp_path, f"{HEADER},speed_sd_mm_s\n{ROW},4\n{ROW[:-3]}n/a,\n"))
+    assert runs["payload_kg"].tolist() == [0, 0] and runs["configuration"].tolist() == ["6T2A"] * 2
+    np.testing.assert_array_equal(runs["speed_mm_s"], [400, np.nan])
+    with pytest.raises(AssertionError, match=r"row 2 is looked at alone"):
+        records.read(write(tmp_path, f"{HEADER},speed_sd_mm_s\n{ROW},4\n{ROW},0\n"))
+
+
 def test_unknown_columns_are_reported_and_kept_out(tmp_path):
     runs = records.read(write(tmp_path, f"{HEADER},operator\n{ROW},Anna\n"))
     assert runs.unknown == ("operator",) and not runs.has("operator")

@@ -648,8 +648,20 @@ def test_a_log_in_which_nothing_moves_is_refused_unless_a_shaft_is_locked(tmp_pa
             settled(tmp_path, robot)
 
 
-@pytest.mark.parametrize("limit", [12.0, 100.0])
-def test_a_command_beyond_what_the_driver_gives_is_said_with_its_limit(tmp_path, limit):
+@pytest.mark.parametrize(("levels", "said"), [
+    ((12.0,) * 3, r"^log\.csv rows 1 to 600, supply_voltage_V: 12 V in every row; .* log three levels or more"),
+    ((6.0, 12.0), ""),
+])  # fmt: skip
+def test_a_log_of_one_level_is_said_with_what_it_lacks(tmp_path, levels, said):
+    robot = bench(tmp_path, stairs(levels))
+    (found,) = rig_facts.doubts(records.read(tmp_path / "log.csv", robot=robot), robot) or ("",)
+    assert re.search(said, found) and bool(found) == bool(said)
+
+
+@pytest.mark.parametrize(("limit", "ammeter"), [
+    (12.0, "total_current"), (12.0, "motor_current"), (100.0, "total_current"),
+])  # fmt: skip
+def test_a_command_beyond_what_the_driver_gives_is_said_with_its_limit(tmp_path, limit, ammeter):
     time, rng = np.arange(1200) / 100, np.random.default_rng(14)
     command = np.round(36 * np.sin(2.2 * time) * np.sin(0.9 * time), 3)
     volts, speed = np.clip(command, -limit, limit), np.zeros(1200)  # of 0.05 N·m/A and 1 ohm, in rad/s
@@ -658,10 +670,10 @@ def test_a_command_beyond_what_the_driver_gives_is_said_with_its_limit(tmp_path,
     columns = {
         "time_s": time,
         "supply_voltage_V": command,
-        "total_current_A": volts - 0.05 * speed + 0.05 * rng.standard_normal(1200),
+        f"{ammeter}_A": volts - 0.05 * speed + 0.05 * rng.standard_normal(1200),
         "motor_speed_rpm": speed * 30 / np.pi + 3 * rng.standard_normal(1200),
     }
-    robot = bench(tmp_path, columns)
+    robot = bench(tmp_path, columns, f'"{ammeter}", "motor_speed"')
     found = rig_facts.saturated(records.read(tmp_path / "log.csv", robot=robot))
     if limit > 36:
         assert found == ""

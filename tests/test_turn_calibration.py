@@ -1,7 +1,9 @@
 """Calibration of a robot whose sides are driven apart: tables of settled turns whose truth is known."""
 
+import dataclasses
 import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ import mmrjax as mm
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration
 from calibration.inference import blocks, identifiability, observers, priors
+from calibration.inference import optimizers as fit
 from calibration.inference.calibrate import calibrate
 from calibration.inference.observers.turns import SettledTurns
 from mmrjax import balances, channels, params, robots
@@ -86,6 +89,42 @@ def test_settled_turns_are_observed_as_turns(robot, of_world):
     assert not np.asarray(seen.adhesion_used).any()
 
 
+def posed_turns(robot, runs):
+    names = tuple(f"6T2A.{n}" for n in (LATERAL, WIDTH, "ground.friction.static"))
+    sd = np.broadcast_to([channels.find(n).factor * SDS[n] for n in SHOWN], runs.measured().shape)
+    return observers.pose(runs, robot, priors.coordinates(robot, names), sd)
+
+
+@pytest.mark.slow
+def test_a_step_of_a_fit_whose_roots_are_known_searches_for_none(robot, of_world):
+    """The search for turns is most of what there is to compile: one program of it serves every fit."""
+    posed = posed_turns(robot, of_world)
+    rows = len(of_world)
+    roots = jax.ShapeDtypeStruct((rows, 9), float), jax.ShapeDtypeStruct((rows,), bool)
+
+    def step(z, roots):
+        return dataclasses.replace(posed, roots=roots).linearised(posed.robot, z, posed.data)[1]
+
+    known = str(jax.make_jaxpr(step)(jnp.zeros(3), roots))
+    assert posed.observe.apart and "custom_jvp_call" in known
+    assert "while[" not in known
+
+
+@pytest.mark.slow
+def test_one_evaluation_of_turns_has_the_derivatives_of_the_root(robot, of_world):
+    posed = posed_turns(robot, of_world)
+
+    def through(z):
+        return (posed.signed(posed.observation(z), posed.data),) * 2
+
+    z = jnp.asarray([0.3, -0.4, 0.2])
+    apart = fit.rooted(posed, z)
+    r, jacobian = jax.jit(lambda z: apart.linearised(apart.robot, z, apart.data)[:2])(z)
+    wanted, value = jax.jit(jax.jacfwd(through, has_aux=True))(z)
+    np.testing.assert_allclose(r, value, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(jacobian, wanted, rtol=1e-5, atol=1e-6 * np.abs(wanted).max())
+
+
 def test_turns_free_what_turns_show(robot):
     straight = priors.default_names(["6T2A"], robot)
     turns = priors.default_names(["6T2A"], robot, turns=True)
@@ -111,7 +150,9 @@ def test_histories_of_turns_are_refused(robot, of_world, tmp_path):
     ]
     lines += [f"6T2A,33,13.1,0,0,1,0.5,{0.1 * k},{-0.05 * k}" for k in range(12)]
     path.write_text("\n".join(lines) + "\n")
-    with pytest.raises(BadConfiguration, match=r"history.csv: time histories of a robot that turns"):
+    with pytest.raises(
+        BadConfiguration, match=r"history.csv: time histories of a robot .* mmrjax settle history.csv"
+    ):
         calibrate(records.read(path, robot=robot), robot, model="drive", free=[f"6T2A.{LATERAL}"], noise=NOISE)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.data import rig_file
 from calibration.data.columns import CURRENT, LOAD, SPEED, SUPPLY
-from calibration.data.courses import applied, stretches
+from calibration.data.courses import applied, changing, stretches
 from calibration.data.errors import rounded
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
@@ -284,6 +284,21 @@ def jitter(runs: Runs) -> str:
     return ""
 
 
+def one_level(runs: Runs) -> str:
+    """Sentence on a log without any condition that changes; empty for others."""
+    conditions = (*changing(runs), *(c for c in runs.layout.sides if runs.has(c)))
+    column = runs.layout.imposed_column
+    if not (runs.sampled and runs.has(column) and np.isfinite(runs[column]).all()):
+        return ""
+    if any(len(np.unique(runs[c])) > 1 for c in conditions):
+        return ""
+    return (
+        f"{runs.source} rows 1 to {len(runs)}, {runs.headings.get(column, column)}: {rounded(runs[column][0])} "
+        f"{column.rpartition('_')[2]} in every row; after the start one level shows one current and one speed, by "
+        "which losses that rise with either are not told apart; log three levels or more, both ways if it turns back"
+    )
+
+
 #: Share of the largest voltage up to which rows show resistance and back-EMF, and fewest of them; the misfit up to
 #: which they do, over their voltage; the share of a larger voltage that its rows have to show.
 INNER, ROWS_INNER, FITS, REACHES = 0.25, 30, 0.2, 0.8
@@ -295,7 +310,9 @@ def saturated(runs: Runs) -> str:
     Rows of small voltage give U = R I + k ω by least squares. In rows of a larger voltage, current and speed show one
     voltage all the time if the driver limits it.
     """
-    current, speed = (CURRENT if runs.has("duty") else "total_current_A"), SPEED
+    # Of a duty, the supply's current is its share of the motors' alone.
+    known = [CURRENT, *(() if runs.has("duty") else ("total_current_A",))]
+    current, speed = next((c for c in known if runs.has(c)), CURRENT), SPEED
     if runs.layout.imposed != "voltage" or not (runs.sampled and runs.has(current) and runs.has(speed)) or runs.turns:
         return ""
     if any(runs.layout.magnitude(c.name) for c in runs.channels if c.column in (current, speed)):
@@ -348,11 +365,12 @@ def doubtful_torque(runs: Runs, robot: Robot) -> str:
 
 
 def doubts(runs: Runs, robot: Robot) -> tuple[str, ...]:
-    """Sentences on times with a gap, and on time, an imposed current or a brake's torque in another unit."""
+    """Sentences on a log's times, its levels and limits, and on units that do not fit the robot."""
     every = (
         gap(runs),
         jitter(runs),
         saturated(runs),
+        one_level(runs),
         doubtful_time(runs, robot),
         doubtful_current(runs, robot),
         doubtful_torque(runs, robot),

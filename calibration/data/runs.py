@@ -184,13 +184,13 @@ def _columns(
         elif meaning.column in layout.idle:
             _refuse_idle(name, meaning, cells, layout)
         else:
-            values = []
-            for k, cell in enumerate(cells, 1):
+            values, doubted = _column(meaning, cells, layout)
+            for place in np.flatnonzero(doubted).tolist():
                 try:
-                    values.append(_cell(f"{name} row {k}", meaning, cell, layout))
+                    values[place] = _cell(f"{name} row {place + 1}", meaning, cells[place], layout)
                 except BadData as error:
-                    bad.append((k, j, str(error)))
-            columns[meaning.column] = np.array(values)
+                    bad.append((place + 1, j, str(error)))
+            columns[meaning.column] = values
     if bad:
         raise BadData(_listed(name, [message for _, _, message in sorted(bad)]))
     return columns, notes
@@ -585,6 +585,42 @@ def _check_units(name: str, meanings: Sequence[Meaning | None], below: Sequence[
                 )
 
 
+def _column(meaning: Meaning, cells: Sequence[str], layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+    """Cells of a column as `_cell` reads them, all at once, as a log may have a million; and True for those that are
+    left to it: they may be wrong."""
+    if meaning.column in WORDS:
+        return np.array(cells), np.isin(cells, [c for c in dict.fromkeys(cells) if not _sound(meaning, c, layout)])
+    empty = np.zeros(len(cells), bool)
+    if _may_be_empty(meaning.column, layout):
+        empty = np.array([cell.lower() in MISSING for cell in cells])
+    found, (low, high) = np.full(len(cells), math.nan), meaning.limits()
+    for k in np.flatnonzero(~empty).tolist():
+        try:
+            found[k] = parsed(cells[k])
+        except ValueError:  # which stays doubted
+            continue
+    above = found > low if meaning.column in layout.deviation_columns else found >= low
+    doubted = ~empty & ~(above & (found <= high))
+    values = found if meaning.as_named else np.array([meaning.value(x) for x in found.tolist()])
+    return values, doubted
+
+
+def _may_be_empty(column: str, layout: Layout) -> bool:
+    """True for a column whose cells may have no reading."""
+    return column != layout.imposed_column and column in (
+        *layout.measured_columns, *layout.deviation_columns, *DUTY,
+    )  # fmt: skip
+
+
+def _sound(meaning: Meaning, cell: str, layout: Layout) -> bool:
+    """True for a cell that is not refused."""
+    try:
+        _cell("", meaning, cell, layout)
+    except BadData:
+        return False
+    return True
+
+
 def _cell(where: str, meaning: Meaning, cell: str, layout: Layout, kind: type[InputError] = BadData) -> Any:
     column = meaning.column
 
@@ -601,7 +637,7 @@ def _cell(where: str, meaning: Meaning, cell: str, layout: Layout, kind: type[In
         return cell
     deviations = layout.deviation_columns
     readings = (*layout.measured_columns, *deviations, *DUTY)
-    if cell.lower() in MISSING and column != layout.imposed_column and column in readings:
+    if cell.lower() in MISSING and _may_be_empty(column, layout):
         return math.nan
     low, high = meaning.limits()
     positive = column in deviations

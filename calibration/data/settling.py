@@ -450,17 +450,19 @@ def _levels(
     size = 1 if noise <= 1e-9 * largest else max(1, min(round(shortest / step / 6), 64))
     sd = noise / math.sqrt(size)
     begin, mean, count = 0, float(x[0]), 0
-    for k in range(0, len(rows), size):
-        block = x[k : k + size]
-        value = float(np.mean(block))
+    starts = np.arange(0, len(rows), size)
+    sizes = np.diff(starts, append=len(rows))
+    # Lists of numbers, as a log may have a million rows.
+    blocks = ((np.add.reduceat(x, starts) / sizes).tolist(), np.logical_or.reduceat(cuts, starts).tolist())
+    for k, more, value, cut in zip(starts.tolist(), sizes.tolist(), *blocks, strict=True):
         tolerance = max(0.5 * drift * abs(mean), 0.2 * FINE * largest, 4 * sd)
-        if count and (abs(value - mean) > tolerance or cuts[k : k + size].any()):
+        if count and (abs(value - mean) > tolerance or cut):
             # the last of averaged samples may be the next level's already
             yield rows[begin : k - size if size > 1 and k - begin > 3 * size else k]
-            begin, mean, count = k, value, len(block)
+            begin, mean, count = k, value, more
             continue
-        mean = (mean * count + value * len(block)) / (count + len(block))
-        count += len(block)
+        mean = (mean * count + value * more) / (count + more)
+        count += more
     yield rows[begin:]
 
 

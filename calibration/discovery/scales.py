@@ -29,7 +29,7 @@ from mmrjax.compiling import OVER_TIME, compiled
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.effects.scaled import amplitude_of, scaled, shape_of
-from mmrjax.fidelities.steady import operating_signals
+from mmrjax.fidelities.steady import operating_signals, shown_batch
 from mmrjax.precision import in_double
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
@@ -138,8 +138,12 @@ def _steady(robot: Robot, conditions: Conditions) -> Conditions:
     return jax.tree.map(lambda x: x if jnp.ndim(x) < 2 else x[:, x.shape[1] // 2], conditions)
 
 
-@functools.partial(compiled, options=OVER_TIME)
 def _signals(robot: Robot, conditions: Conditions) -> Signals:
+    return shown_batch(robot, conditions)[1] if conditions.turns else _travelling(robot, conditions)
+
+
+@functools.partial(compiled, options=OVER_TIME)
+def _travelling(robot: Robot, conditions: Conditions) -> Signals:
     return jax.vmap(lambda c: operating_signals(robot, c))(conditions)
 
 

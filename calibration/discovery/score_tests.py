@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from calibration.inference.bases import Bases, signature
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.normal_equations import half_solved
-from calibration.inference.optimizers import CORES
+from calibration.inference.optimizers import CORES, rooted
 from calibration.inference.problem import Problem
 from mmrjax.compiling import SELDOM, SMALL, compiled
 from mmrjax.precision import Threads
@@ -191,7 +191,7 @@ def diagnosed(
             residual, and hardly what an effect would add.
     """
     if not problem.observe.long:
-        linear = _linearised(problem, z, effects)
+        linear = _linearised(rooted(problem, z), z, effects)
     elif near is None:  # by programs of its own
         linear = problem.observe.linearise(problem, z, problem.data, effects)
     else:

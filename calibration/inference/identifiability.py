@@ -123,7 +123,7 @@ def analyse(problem: Problem, z: Array, data: Data | None = None, slope: np.ndar
         jacobian = np.asarray(fit.linearised(problem, z, data)[1])
         whole, readings = jacobian[fit.informing(data)], jacobian[: data.measured.size]
     else:
-        whole, readings = (np.asarray(j) for j in _jacobians(problem, z, data))
+        whole, readings = (np.asarray(j) for j in _jacobians(fit.rooted(problem, z), z, data))
     _, s, v = np.linalg.svd(whole, full_matrices=False)
     covariance = (v.T / s**2) @ v
     _, singular, directions = np.linalg.svd(readings, full_matrices=False)

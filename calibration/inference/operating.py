@@ -12,7 +12,7 @@ from jaxtyping import Float
 from mmrjax import channels, params
 from mmrjax.compiling import SELDOM, compiled
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.steady import steady
+from mmrjax.fidelities.steady import shown_batch, steady
 from mmrjax.robot import Robot
 from mmrjax.signals import Result, done
 
@@ -39,11 +39,12 @@ def operating_readings(
         own = np.asarray([float(c.mass) for c in robot.configurations.members])
         mass = own[np.asarray(conditions.configuration)] + np.asarray(conditions.payload)
     gripping, own_mass = jax.device_put((np.full(runs, GRIPPING), np.asarray(mass)))
-    if conditions.turns:  # what a turn takes is friction's
-        gripping = conditions.adhesion
     posed = dataclasses.replace(conditions, adhesion=gripping, total_mass=own_mass)
+    if conditions.turns:  # what a turn takes is friction's
+        posed = conditions
     padded = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[index]), posed)
-    found = _settled(params.strong(robot), padded)
+    strong = params.strong(robot)
+    found = shown_batch(strong, padded)[0] if conditions.turns else _settled(strong, padded)
     reading = np.stack([np.asarray(found.reading[c]) for c in names or channels.names(robot.channels)], 1)[:runs]
     moving = done(np.asarray(found.status))[:runs]
     return np.where(moving[:, None], reading, np.nan)

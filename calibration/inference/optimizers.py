@@ -351,6 +351,75 @@ def _go_on(
     return at, jax.vmap(lambda member, at: _ended(at, member.problem(problem).data, pin))(members, at)
 
 
+@functools.partial(compiled, options=OVER_TIME)
+def _roots(problem: Problem, z: Numbers, active: Numbers | None) -> tuple[Array, Array]:
+    """What `Observer.solve` gives at each of several z; arguments as of `Member`."""
+
+    def one(z: Array, active: Array | None) -> tuple[Array, Array] | None:
+        coordinates = problem.coordinates if active is None else problem.coordinates.with_effects(active)
+        return problem.observe.solve(coordinates.robot(problem.base, z))
+
+    found: tuple[Array, Array] = jax.vmap(one)(z, active)
+    return found
+
+
+@functools.partial(compiled, options=SELDOM)
+def _begun(problem: Problem, members: Member, fresh: Numbers, at: Progress) -> Progress:
+    """Searches side by side, those that are `fresh` from their starts."""
+
+    def begin(member: Member, fresh: Array, at: Progress) -> Progress:
+        begun = _begin(problem, member.start, member.problem(problem).data)
+        return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), begun, at)
+
+    return jax.vmap(begin)(members, fresh, at)
+
+
+@functools.partial(compiled, options=OVER_TIME)
+def _further(
+    problem: Problem, members: Member, at: Progress, roots: tuple[Array, Array], max_steps: Numbers
+) -> tuple[Progress, Optimum]:
+    """A step of each search that has not ended, its roots known, and the best point of each as an optimum."""
+    pin = no_pin(members.start.shape[-1])
+
+    def advance(member: Member, at: Progress, roots: tuple[Array, Array]) -> tuple[Progress, Optimum]:
+        here = dataclasses.replace(member.problem(problem), roots=roots)
+        new = _advance(here, at, here.data, pin, max_steps)
+        new = jax.tree.map(lambda new, old: jnp.where(at.over, old, new), new, at)
+        return new, _ended(new, here.data, pin)
+
+    return jax.vmap(advance)(members, at, roots)
+
+
+def _go_on_apart(
+    problem: Problem, members: Member, fresh: Numbers, at: Progress, enough: Numbers, max_steps: Numbers
+) -> tuple[Progress, Optimum]:
+    """`_go_on` where roots are found by a program of their own (`Observer.apart`)."""
+    at = _begun(problem, members, fresh, at)
+    while True:
+        at, found = _further(problem, members, at, _roots(problem, at.ahead, members.active), max_steps)
+        if np.asarray(at.over).sum() >= enough:
+            return at, found
+
+
+def rooted(problem: Problem, z: Z) -> Problem:
+    """The problem with its roots at z, where its observer finds them by a program of their own: that of searches."""
+    if not problem.observe.apart:
+        return problem
+    active = getattr(problem.coordinates, "active", None)
+    many = [
+        None if x is None else np.repeat(np.asarray(x)[None], problem.observe.places(problem), 0) for x in (z, active)
+    ]
+    return dataclasses.replace(problem, roots=jax.tree.map(lambda x: x[0], _roots(problem, *many)))
+
+
+def roots_of(problem: Problem, zs: Numbers) -> tuple[np.ndarray, np.ndarray]:
+    """The roots at any number of z by the program of searches, of a problem without slots; leading axis the z."""
+    places = problem.observe.places(problem)
+    filled = np.resize(zs, (-(-len(zs) // places) * places, zs.shape[1]))
+    parts = [jax.device_get(_roots(problem, part, None)) for part in filled.reshape(-1, places, zs.shape[1])]
+    return jax.tree.map(lambda *x: np.concatenate(x)[: len(zs)], *parts)
+
+
 _go_on_often = compiled(_go_on, options=SMALL)
 _go_on_seldom = compiled(_go_on, options=SELDOM)
 
@@ -420,6 +489,7 @@ def _refilled(problem: Problem, members: Member, max_steps: int, places: int) ->
     first = jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members)
     idle = _vacant(problem, first)
     go_on = _go_on_seldom if getattr(problem.coordinates, "fitted_once", False) else _go_on_often
+    go_on = _go_on_apart if problem.observe.apart else go_on
 
     def some(core: int) -> dict[int, Any]:
         mine, at = Places(range(core, count, cores), places), idle
@@ -611,16 +681,28 @@ def _put(x: np.ndarray, places: np.ndarray, values: np.ndarray) -> np.ndarray:
     return x
 
 
-@compiled
 def searches(
     problem: Problem, starts: Float[Array, "starts parameters"], data: Data
 ) -> tuple[Optimum, Int[Array, "starts rows"], Int[Array, "starts rows"]]:
-    """Levenberg-Marquardt from every start in one vmapped batch.
+    """Levenberg-Marquardt from every start.
 
     Returns:
         Where each search ended, and the status of every row where it started and where it ended.
     """
+    if not problem.observe.apart:
+        return _searches(problem, starts, data)
+    own = (np.repeat(np.asarray(x)[None], len(starts), 0) for x in (data.weight, data.measured, data.centre))
+    members = Member(np.asarray(starts), *own)
+    problem = dataclasses.replace(problem, data=data)
+    # A search of one step evaluates its start.
+    begun, ended = (searches_refilled(problem, members, steps, problem.observe.places(problem)) for steps in (1, 100))
+    return ended[0], begun[1].status, ended[1].status
 
+
+@compiled
+def _searches(
+    problem: Problem, starts: Float[Array, "starts parameters"], data: Data
+) -> tuple[Optimum, Int[Array, "starts rows"], Int[Array, "starts rows"]]:
     def search(z: Z) -> tuple[Optimum, Array, Array]:
         found, seen = levenberg_marquardt(problem, z, data)
         return found, problem.observation(z).status, seen.status
@@ -628,9 +710,13 @@ def searches(
     return jax.vmap(search)(starts)
 
 
-@functools.partial(compiled, options=OVER_TIME)
 def read(problem: Problem, robot: Robot) -> Observation:
     """What the model says of every row of the problem for any robot, compiled."""
+    return problem.observe.read(robot) if problem.observe.apart else _read(problem, robot)
+
+
+@functools.partial(compiled, options=OVER_TIME)
+def _read(problem: Problem, robot: Robot) -> Observation:
     return problem.observe(robot)
 
 

@@ -96,6 +96,7 @@ class Problem(eqx.Module):
     coordinates: Any
     observe: Observer
     data: Data
+    roots: tuple[Array, Array] | None = None  # of `Observer.solve` at z, where a program of its own found them
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -129,7 +130,7 @@ class Problem(eqx.Module):
             Residuals of readings, then of adhesion with their signs; their Jacobian by x; the observation; and the
             signals of every row, where the observer solves its equations (`Observer.solve`).
         """
-        solved = self.observe.solve(robot(x))
+        solved = self.observe.solve(robot(x)) if self.roots is None else self.roots
         if solved is None:
 
             def explicit(x: Array) -> tuple[Array, tuple[Array, Observation]]:

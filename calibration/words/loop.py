@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calibration.data.errors import rounded
 from calibration.discovery import notes
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME
 from calibration.inference import bases
@@ -249,7 +250,7 @@ def ranking(found: Ranking, most: int = 5) -> list[str]:
     if not beyond:
         return [f"{first}; no effect explains more than chance"]
     lines = [
-        f"  {k}. {e.name}, a {e.family}: lowers the misfit by {e.score:.3g} σ², "
+        f"  {k}. {e.name}, a {e.family}: lowers the misfit by {rounded(e.score)} σ², "
         f"amplitude {e.amplitude:.3g} ± {e.sd:.2g} {e.unit}".rstrip(" -")
         for k, e in enumerate(beyond, 1)
     ]

@@ -146,7 +146,7 @@ def _nothing_to_say(robot: Robot, conditions: Conditions) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class Implicit:
-    """Settled travel of one run in two halves, so that one evaluation serves all derivatives of a fit.
+    """Settled travel of one run, straight or turning, in two halves: one evaluation serves all derivatives of a fit.
 
     Attributes:
         solve: the unknowns, shape (unknowns,), and whether they were found; no derivatives.
@@ -167,7 +167,7 @@ class Fidelity:
         name: its line in `fidelities.TABLE`.
         settled: a batch of conditions to results, pure and traceable, with numbers wherever it can give some,
             whatever the status: what calibrations differentiate (forward).
-        implicit: the same of straight travel in two halves; None where it is not the root of equations.
+        implicit: the same in two halves; None where it is not the root of equations.
         run: results of a batch, as sweeps make them.
         outputs: those of a batch that are named alone [SI], of `outputs.table`, and `status`, which is quicker than
             `run`; None where it would not be. A fidelity that has it has no options.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import operator
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -12,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mmrjax import balances, channels, ground, outputs
-from mmrjax.compiling import compiled
+from mmrjax import balances, channels, ground, outputs, params
+from mmrjax.compiling import SELDOM, compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import turning
 from mmrjax.fidelities.base import Fidelity, Implicit, Progress, Run
@@ -309,6 +310,8 @@ def _settled(robot: Robot, conditions: Conditions) -> Result:
 
 
 def _solve(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " unknowns"], Bool[Array, ""]]:
+    if conditions.turns:
+        return turning.solve(robot, conditions)
     unknowns, found = _root(robot, conditions, large=False)
     return jax.lax.stop_gradient((jnp.stack(unknowns), found))
 
@@ -316,12 +319,39 @@ def _solve(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " unknown
 def _shown(
     robot: Robot, conditions: Conditions, unknowns: Float[Array, " unknowns"], found: Bool[Array, ""]
 ) -> tuple[Result, Signals, Float[Array, " unknowns"]]:
+    if conditions.turns:
+        return turning.shown(robot, conditions, unknowns, found)
     signals, status, _, left = _operating_at(robot, conditions, tuple(unknowns), found, stands=False)
     return result(robot.within(conditions.configuration), signals, status), signals, jnp.stack(left)
 
 
 #: `operating_point` in two halves.
 IMPLICIT = Implicit(_solve, _shown)
+
+
+#: Rows to which tables are padded, so that those of about one size share what is compiled; beyond the last of them a
+#: multiple of it.
+SIZES = (16, 24, 32, 48, 64, 96, 128, 192, 256)
+
+
+def shown_batch(robot: Robot, conditions: Conditions) -> tuple[Result, Signals]:
+    """Results and signals of the rows of a table, by both halves as programs of their own."""
+    robot, rows = params.strong(robot), conditions.shape[0]
+    size = next((s for s in SIZES if s >= rows), rows + -rows % SIZES[-1])
+    index = np.concatenate([np.arange(rows), np.zeros(size - rows, int)])
+    padded = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[index]), conditions)
+    found = _shown_rows(robot, padded, *_solved_rows(robot, padded))
+    return jax.tree.map(lambda x: x[:rows], found)
+
+
+@functools.partial(compiled, options=SELDOM)
+def _solved_rows(robot: Robot, conditions: Conditions) -> tuple[Float[Array, "rows unknowns"], Bool[Array, " rows"]]:
+    return jax.vmap(lambda c: IMPLICIT.solve(robot, c))(conditions)
+
+
+@functools.partial(compiled, options=SELDOM)
+def _shown_rows(robot: Robot, conditions: Conditions, unknowns: Array, found: Array) -> tuple[Result, Signals]:
+    return jax.vmap(lambda *row: IMPLICIT.shown(robot, *row)[:2])(conditions, unknowns, found)
 
 
 def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None) -> Run:

@@ -36,6 +36,7 @@ from mmrjax.signals import (
     TIPS,
     PlaneMotion,
     Result,
+    Signals,
     State,
 )
 from mmrjax.turning import SIDES
@@ -121,7 +122,8 @@ def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[
         y = y.at[2:4].set(own.motor_speed)
     if not rolling:
         return y / size
-    settled, loads, solved = _settled(robot, conditions)
+    unknowns, solved = _unknowns(robot, conditions)
+    settled, loads = _motion(robot, conditions, unknowns)
     signals = balances.turning(robot, conditions, settled, loads).signals
     memory = [jax.vmap(lambda s, e=e: e.settled(robot, s))(signals) for e in robot.remembering]
     flat = [settled.current, settled.speed_motor, *(jnp.reshape(getattr(settled, name), 1) for name in _OF_ROBOT)]
@@ -190,10 +192,14 @@ class _Search(eqx.Module):
 
 def _balance(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> Float[Array, " 9"]:
     """Rates of the unknowns that settle [1/s], and minus what the loads are too large by."""
-    whole = _whole(conditions, y)
-    travel = _turning(robot, conditions, motion_of(robot, whole), _loads(robot, conditions, y))
+    travel = _turning(robot, conditions, *_motion(robot, conditions, y))
+    return _left(robot, conditions, y, travel)
+
+
+def _left(robot: Robot, conditions: Conditions, y: Float[Array, " 9"], travel: balances.Travel) -> Float[Array, " 9"]:
+    """`_balance` where all that both sides do is known."""
     lacking = travel.grip.lacking / _load_units(robot, conditions)
-    return jnp.concatenate([_rates(robot, conditions, whole, travel)[:SETTLING], -lacking])
+    return jnp.concatenate([_rates(robot, conditions, _whole(conditions, y), travel)[:SETTLING], -lacking])
 
 
 def _whole(conditions: Conditions, y: Float[Array, " 9"]) -> Float[Array, " 11"]:
@@ -228,19 +234,29 @@ def _loads(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> Float
     return y[SETTLING:] * _load_units(robot, conditions)
 
 
-def _settled(robot: Robot, conditions: Conditions) -> tuple[PlaneMotion, Float[Array, " 2"], Bool[Array, ""]]:
-    """The motion of a settled turn on level ground, its loads, see `turning.grip`, and whether it was found.
+def _moves(conditions: Conditions) -> np.ndarray:
+    """True for those of the unknowns of a search that are not known beforehand."""
+    return np.arange(SETTLING + len(SIDES)) >= (0 if conditions.of_sides().motor_speed is None else 4)
+
+
+def _begins(robot: Robot, conditions: Conditions) -> Float[Array, " 9"]:
+    """Unknowns at which a search begins, and which keep their value if they do not move."""
+    return jnp.concatenate([_guess(robot, conditions)[:SETTLING], jnp.zeros(len(SIDES))])
+
+
+def _unknowns(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 9"], Bool[Array, ""]]:
+    """The unknowns of a settled turn on level ground, see `_Search`, and whether it was found.
 
     Broyden's method, which looks along each unknown first, finds most. Where it does not end, or at a turn that is
     not stable, implicit Euler's steps, longer and longer, follow a run to where it settles. Only the shortest of them
     may let the rates grow. The last step is Newton's and carries the derivatives, the implicit ones.
     """
-    size = SETTLING + len(SIDES)
-    moves = np.arange(size) >= (0 if conditions.of_sides().motor_speed is None else 4)
+    moves = _moves(conditions)
+    size = len(moves)
     still, slow = -np.eye(size), np.diag(np.arange(size) < SETTLING)
 
     def guess(held: tuple[Robot, Conditions]) -> Float[Array, " 9"]:
-        return jnp.concatenate([_guess(*held)[:SETTLING], jnp.zeros(len(SIDES))])
+        return _begins(*held)
 
     def secant(held: tuple[Robot, Conditions]) -> _Secant:
         start = guess(held)
@@ -307,8 +323,29 @@ def _settled(robot: Robot, conditions: Conditions) -> tuple[PlaneMotion, Float[A
     end = lanes.until(follow, turn, lambda s: (s.turns >= TURNS) | s.solved, (*held, first[0], known), most=FEW)
     sound = end.solved & jnp.all(jnp.isfinite(end.jacobian))
     slope = jnp.where(sound, end.jacobian, jnp.asarray(still))
-    y = end.y + inverse(-slope)[0](jnp.where(sound, _balance(robot, conditions, end.y), 0.0))
-    return motion_of(robot, _whole(conditions, y)), _loads(robot, conditions, y), sound
+    return end.y + inverse(-slope)[0](jnp.where(sound, _balance(robot, conditions, end.y), 0.0)), sound
+
+
+def _motion(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> tuple[PlaneMotion, Float[Array, " 2"]]:
+    """The motion of a settled turn and its loads, see `turning.grip`."""
+    return motion_of(robot, _whole(conditions, y)), _loads(robot, conditions, y)
+
+
+def solve(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 9"], Bool[Array, ""]]:
+    """The unknowns of a settled turn, and whether they were found, see `Implicit.solve`."""
+    return jax.lax.stop_gradient(_unknowns(*jax.lax.stop_gradient((robot, conditions))))
+
+
+def shown(
+    robot: Robot, conditions: Conditions, unknowns: Float[Array, " 9"], found: Bool[Array, ""]
+) -> tuple[Result, Signals, Float[Array, " 9"]]:
+    """Result, signals of both sides and what the balances leave at some unknowns, see `Implicit.shown`."""
+    motion, loads = _motion(robot, conditions, unknowns)
+    travel = balances.turning(robot, conditions, motion, loads)
+    stays = unknowns - jax.lax.stop_gradient(_begins(robot, conditions))
+    left = jnp.where(_moves(conditions), _left(robot, conditions, unknowns, travel), stays)
+    status = _status(robot, conditions, travel, motion, found)
+    return result_of(robot, travel, status), travel.signals, left
 
 
 def circling(robot: Robot, conditions: Conditions) -> tuple[balances.Travel, PlaneMotion, Array]:
@@ -322,10 +359,18 @@ def circling(robot: Robot, conditions: Conditions) -> tuple[balances.Travel, Pla
         than friction at rest is resolved; `tips` where no load is left on a side or at an end; `battery_empty`;
         `not_settled` where no settled turn was found: it may be that there is none, as friction falls with sliding.
     """
-    motion, loads, solved = _settled(robot, conditions)
+    unknowns, solved = _unknowns(robot, conditions)
+    motion, loads = _motion(robot, conditions, unknowns)
     travel = balances.turning(robot, conditions, motion, loads)
+    return travel, motion, _status(robot, conditions, travel, motion, solved)
+
+
+def _status(
+    robot: Robot, conditions: Conditions, travel: balances.Travel, motion: PlaneMotion, found: Array
+) -> Array:
+    """Status of a settled turn, whether or not it was found."""
     status = status_keeping(robot, conditions, travel, motion)
-    return travel, motion, jnp.where(solved | (status == BATTERY_EMPTY), status, NOT_SETTLED)
+    return jnp.where(found | (status == BATTERY_EMPTY), status, NOT_SETTLED)
 
 
 def _size(chassis: Chassis, ahead: Scalar, aside: Scalar, yaw: Scalar) -> Array:

@@ -168,6 +168,15 @@ class Observer(eqx.Module):
         """Where what rows show is a root: the unknowns of each, shape (rows, unknowns), and which were found."""
         return None
 
+    @property
+    def apart(self) -> bool:
+        """True if `solve` takes much longer to compile than `shown`, so that it is a program of its own."""
+        return False
+
+    def read(self, robot: Robot) -> Observation:
+        """What a robot shows in every row by the programs of `apart`, which is true."""
+        raise NotImplementedError
+
     def shown(self, robot: Robot, unknowns: Array, found: Array) -> tuple[Observation, Signals, Array]:
         """What a robot shows in every row at such unknowns, its signals, and what its equations leave there, shape
         (rows, unknowns)."""

@@ -227,8 +227,8 @@ class Histories(Observer):
             raise BadConfiguration(f"--model {fidelity}: {runs.source} holds time histories; they need --model drive")
         if runs.turns:
             raise BadConfiguration(
-                f"{runs.source}: time histories of a robot that turns are simulated, and not fitted; give its "
-                "settled turns, one a row, without time_s"
+                f"{runs.source}: time histories of a robot that turns are simulated, and not fitted; make a "
+                f"table of its settled turns: mmrjax settle {runs.source} --robot FILE"
             )
         whole, exact = runs.whole, robot.rig.imposed == "motor_speed"
         linear = robot.rig.between_rows == "linear"

@@ -36,7 +36,7 @@ from mmrjax.effects import Effect
 from mmrjax.effects.curve import WAYS, acts_along
 from mmrjax.fidelities.base import Implicit
 from mmrjax.fidelities.rest import direction
-from mmrjax.fidelities.steady import operating_signals
+from mmrjax.fidelities.steady import SIZES, operating_signals
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import FAILED, SLIDES, TIPS, Result, Signals
@@ -110,7 +110,7 @@ class SettledRuns(Observer):
 
     word: ClassVar[str] = "run"
     fewest: ClassVar[int] = 6
-    sizes_padded: ClassVar[tuple[int, ...]] = (16, 24, 32, 48, 64, 96, 128, 192, 256)
+    sizes_padded: ClassVar[tuple[int, ...]] = SIZES
     blocks: ClassVar[tuple[str, ...]] = (
         "slope", "voltage_configuration", "voltage", "duty", "speed", "current", "payload", "load_torque",
         "configuration",
@@ -212,7 +212,7 @@ class SettledRuns(Observer):
 
     @property
     def _implicit(self) -> Implicit | None:
-        return None if self.conditions.turns else fidelities.get(self.fidelity).implicit
+        return fidelities.get(self.fidelity).implicit
 
     def solve(self, robot: Robot) -> tuple[Array, Array] | None:
         implicit = self._implicit

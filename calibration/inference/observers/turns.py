@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -17,20 +16,20 @@ from calibration.inference import bases as bases_room
 from calibration.inference import priors
 from calibration.inference.bases import Bases
 from calibration.inference.blocks import TURN
-from calibration.inference.linearization import PROBED
+from calibration.inference.linearization import PROBED, Linearization, ScoredEffect
 from calibration.inference.observers.base import SearchPolicy
 from calibration.inference.observers.histories import Histories
 from calibration.inference.observers.settled import SettledLinearization, SettledRuns, shares
-from calibration.inference.problem import Observation
+from calibration.inference.optimizers import roots_of
+from calibration.inference.problem import Data, Observation, Problem
 from mmrjax import effects, fidelities
 from mmrjax.balances import ROUND
-from mmrjax.compiling import compiled
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import IN_TURNS, VARIABLES_ROUND, WAYS
-from mmrjax.fidelities.steady import operating_signals
+from mmrjax.fidelities.steady import shown_batch
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-from mmrjax.signals import NOT_SETTLED, Signals
+from mmrjax.signals import NOT_SETTLED, Result, Signals
 
 #: Variables of curves in turns; the order of runs is the table's.
 VARIABLES = (*(v for v in IN_TURNS if v != "order"), *VARIABLES_ROUND)
@@ -113,9 +112,34 @@ class SettledTurns(SettledRuns):
     def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
         return (), priors.OF_TURNS
 
-    def __call__(self, robot: Robot) -> Observation:
-        seen = super().__call__(robot)
+    def _observed(self, robot: Robot, result: Result) -> Observation:
+        seen = super()._observed(robot, result)
         return dataclasses.replace(seen, adhesion_used=jnp.zeros_like(seen.adhesion_used))
+
+    @property
+    def apart(self) -> bool:
+        return True
+
+    def read(self, robot: Robot) -> Observation:
+        return self._observed(robot, shown_batch(robot, self.conditions)[0])
+
+    def draws(
+        self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray
+    ) -> tuple[Any, ...]:
+        """As the protocol says, with the roots at each refit."""
+        drawn = super().draws(problem, z, linear, keys, factors)
+        return *drawn, roots_of(problem, drawn[2])
+
+    def replicate(
+        self,
+        problem: Problem,
+        data: Data,
+        effects: tuple[ScoredEffect, ...],
+        linear: Linearization,
+        drawn: tuple[Any, ...],
+    ) -> Linearization:
+        rooted = dataclasses.replace(problem, roots=drawn[-1])
+        return super().replicate(rooted, data, effects, linear, drawn[:-1])
 
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return super().unreachable(status) | (status == NOT_SETTLED)
@@ -124,7 +148,8 @@ class SettledTurns(SettledRuns):
         """As the protocol says: in the balances of both sides alike, and round the turn, over what each side does,
         how fast the robot turns, and which side it is."""
         names = [v for v in VARIABLES if v != "voltage" or robot.rig.shows_voltage]
-        seen = {n: np.asarray(x) for n, x in _variables(self, robot, (*names, *WAYS)).items()}
+        signals = shown_batch(robot, self.conditions)[1]
+        seen = {n: np.asarray(by_point(signals, n)) for n in (*names, *WAYS)}
         points = {bases_room.VARIABLES[v]: seen[v] for v in names}
         points |= {c: np.tile(columns[c], 2) for c in ("configuration", "order") if c in columns}
         weight = np.tile(included.astype(float), 2)
@@ -132,10 +157,3 @@ class SettledTurns(SettledRuns):
         axes = (bases_room.axes_of(robot)[0], bases_room.VARIABLES["payload"], "yaw_rate", "side")  # what is imposed
         told = points, weight, robot, bases_room.Scope(lacking, axes), {way: seen[way] for way in WAYS}
         return (*bases_room.families(*told), *bases_room.windows(*told))
-
-
-@compiled
-def _variables(observe: SettledTurns, robot: Robot, names: tuple[str, ...]) -> dict[str, Array]:
-    """Signals at every point of a fit."""
-    signals = jax.vmap(lambda c: operating_signals(robot, c))(observe.conditions)
-    return {name: by_point(signals, name) for name in names}
