@@ -359,7 +359,8 @@ def _roots(problem: Problem, z: Numbers, active: Numbers | None) -> tuple[Array,
         coordinates = problem.coordinates if active is None else problem.coordinates.with_effects(active)
         return problem.observe.solve(coordinates.robot(problem.base, z))
 
-    found: tuple[Array, Array] = jax.vmap(one)(z, active)
+    found = jax.vmap(one)(z, active)
+    assert found is not None  # of an observer that is `apart`
     return found
 
 
