@@ -660,10 +660,6 @@ def _no_number(error: Any) -> str:
 LONGEST = 390
 
 
-#: Longest message [characters].
-LONGEST = 390
-
-
 def _fail(message: str, code: int) -> int:
     print(f"mmrjax: {shortened(' '.join(message.splitlines()), LONGEST)}", file=sys.stderr)
     return code

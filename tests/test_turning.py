@@ -62,7 +62,8 @@ def test_turns_are_found_past_kinks_of_friction_and_gears():
     def circled(values, stated):
         robot = params.replace(robots.nominal(), values)
         run = mm.Conditions(**stated, open_right=0.0)
-        motion, loads, solved = turning._settled(robot, run)
+        unknowns, solved = turning._unknowns(robot, run)
+        motion, loads = turning._motion(robot, run, unknowns)
         travel = turning._turning(robot, run, motion, loads)
         gains = travel.acceleration, travel.acceleration_lateral, travel.acceleration_yaw
         return motion.speed, jnp.stack(gains), solved

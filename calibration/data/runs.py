@@ -586,8 +586,8 @@ def _check_units(name: str, meanings: Sequence[Meaning | None], below: Sequence[
 
 
 def _column(meaning: Meaning, cells: Sequence[str], layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-    """Cells of a column as `_cell` reads them, all at once, as a log may have a million; and True for those that are
-    left to it: they may be wrong."""
+    """Values of a column's cells, read all at once since a log may have a million rows; and True for cells that may
+    be wrong, which `_cell` has to read."""
     if meaning.column in WORDS:
         return np.array(cells), np.isin(cells, [c for c in dict.fromkeys(cells) if not _sound(meaning, c, layout)])
     empty = np.zeros(len(cells), bool)

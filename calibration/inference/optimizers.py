@@ -359,13 +359,14 @@ def _roots(problem: Problem, z: Numbers, active: Numbers | None) -> tuple[Array,
         coordinates = problem.coordinates if active is None else problem.coordinates.with_effects(active)
         return problem.observe.solve(coordinates.robot(problem.base, z))
 
-    found: tuple[Array, Array] = jax.vmap(one)(z, active)
+    found = jax.vmap(one)(z, active)
+    assert found is not None  # of an observer that is `apart`
     return found
 
 
 @functools.partial(compiled, options=SELDOM)
 def _begun(problem: Problem, members: Member, fresh: Numbers, at: Progress) -> Progress:
-    """Searches side by side, those that are `fresh` from their starts."""
+    """Searches side by side; `fresh` ones begin at their starts."""
 
     def begin(member: Member, fresh: Array, at: Progress) -> Progress:
         begun = _begin(problem, member.start, member.problem(problem).data)
@@ -402,7 +403,7 @@ def _go_on_apart(
 
 
 def rooted(problem: Problem, z: Z) -> Problem:
-    """The problem with its roots at z, where its observer finds them by a program of their own: that of searches."""
+    """The problem with its roots at z, found by the program of searches; unchanged if its observer is not `apart`."""
     if not problem.observe.apart:
         return problem
     active = getattr(problem.coordinates, "active", None)
@@ -413,7 +414,7 @@ def rooted(problem: Problem, z: Z) -> Problem:
 
 
 def roots_of(problem: Problem, zs: Numbers) -> tuple[np.ndarray, np.ndarray]:
-    """The roots at any number of z by the program of searches, of a problem without slots; leading axis the z."""
+    """Roots at any number of z, by the program of searches, of a problem without slots; leading axis the z."""
     places = problem.observe.places(problem)
     filled = np.resize(zs, (-(-len(zs) // places) * places, zs.shape[1]))
     parts = [jax.device_get(_roots(problem, part, None)) for part in filled.reshape(-1, places, zs.shape[1])]

@@ -235,12 +235,12 @@ def _loads(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> Float
 
 
 def _moves(conditions: Conditions) -> np.ndarray:
-    """True for those of the unknowns of a search that are not known beforehand."""
+    """True for the unknowns of a search, False for imposed speeds and their currents; shape (9,)."""
     return np.arange(SETTLING + len(SIDES)) >= (0 if conditions.of_sides().motor_speed is None else 4)
 
 
 def _begins(robot: Robot, conditions: Conditions) -> Float[Array, " 9"]:
-    """Unknowns at which a search begins, and which keep their value if they do not move."""
+    """Unknowns where a search begins; imposed speeds keep these values."""
     return jnp.concatenate([_guess(robot, conditions)[:SETTLING], jnp.zeros(len(SIDES))])
 
 

@@ -174,7 +174,7 @@ class Observer(eqx.Module):
         return False
 
     def read(self, robot: Robot) -> Observation:
-        """What a robot shows in every row by the programs of `apart`, which is true."""
+        """Returns what a robot shows in every row, of an observer whose `apart` is true."""
         raise NotImplementedError
 
     def shown(self, robot: Robot, unknowns: Array, found: Array) -> tuple[Observation, Signals, Array]:
