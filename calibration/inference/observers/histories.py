@@ -706,9 +706,10 @@ class Histories(Observer):
         active: Numbers | None = None,
         *,
         rivals: bool = False,
+        most: int | None = None,
     ) -> tuple[Optimum, Observation]:
         """As the protocol says; the runs are compiled once for all steps."""
-        data, steps = problem.data, self.policy.steps
+        data, steps = problem.data, self.policy.steps if most is None else most
 
         def searched(starts: Numbers) -> tuple[Optimum, Observation]:
             evaluate = _evaluator(problem, weights, active)
