@@ -671,7 +671,8 @@ class Histories(Observer):
         return linear.with_residual(noise - jacobian @ solved(jacobian.T @ jacobian, jacobian.T @ noise))
 
     def starts(self, problem: Problem, random: np.random.Generator, count: int) -> Float[np.ndarray, "starts z"]:
-        """As the protocol says; see `settled_ends`."""
+        """As the protocol says: where the log's equations in weak form lead (`weak_form`) and the prior mean; where a
+        ground may be slid on, as of `settled_ends`."""
 
         def search(blunt: Problem, starts: np.ndarray, steps: int) -> Optimum:
             weights = np.repeat(np.asarray(blunt.data.weight)[None], len(starts), 0)
@@ -679,6 +680,9 @@ class Histories(Observer):
             return searches_long(evaluate, starts, blunt.data, weights, steps, self.policy.batch)[0]
 
         if not problem.base.has_ground or problem.base.rig.imposed != "voltage":  # no grip that makes for valleys
+            shown = weak_form(problem)
+            if shown is not None:
+                return scans.placed(problem, np.stack([shown.z, np.zeros(len(problem.coordinates))])[:count])
             return scans.placed(problem, super().starts(problem, random, count))
         draws = random.standard_normal((settled_ends.DRAWS, len(problem.coordinates)))
         return scans.placed(problem, settled_ends.starts(problem, draws, search)[:count])
