@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -124,6 +125,27 @@ def test_the_effect_of_the_log_is_ranked_first_and_not_by_chance(space, before):
     assert found.effects[0].score > found.chance
 
 
+def test_the_ranking_comes_before_the_base_fit_which_begins_there(space, before, monkeypatch):
+    begun, kept = [], []
+
+    def fit_base(space, settings, where, near=None):
+        begun.append(near)
+        raise InterruptedError
+
+    def keep(name, make):
+        found = make()
+        kept.append(name)
+        return found
+
+    monkeypatch.setattr(discover, "fit_base", fit_base)
+    runs, library = Runs("synthetic", motor()).of(space.bare.base), {n: BY_NAME[n] for n in NAMES}
+    noise = SimpleNamespace(sd=np.broadcast_to(SD, runs.measured().shape))
+    with pytest.raises(InterruptedError):
+        discover.trace(runs, space.bare.base, noise, SETTINGS, {}, library, keep=keep)
+    assert kept == ["ranking"]
+    assert not begun[0].simulated and begun[0].z == pytest.approx(before.base.z)
+
+
 def test_noise_of_windows_is_that_of_their_readings(space, before):
     """Without an effect that the base lacks what is left is a χ² of the windows."""
     quiet = Runs("synthetic", motor(seed=5, quadratic=0.0)).of(space.bare.base)
@@ -146,9 +168,9 @@ def test_windows_across_a_jump_are_wrong(space, before, monkeypatch):
     assert right == pytest.approx(4e-4, rel=0.3) and wrong > 5 * right
 
 
-@pytest.mark.parametrize("kind", ["servo", "carriage"])
-def test_logs_of_an_angle_alone_are_twice_integrated(tmp_path, kind):
-    made = {"servo": servo, "carriage": carriage}[kind](np.random.default_rng(1))
+@pytest.mark.parametrize("kind, made", [("servo", servo), ("carriage", carriage)])
+def test_logs_of_an_angle_alone_are_twice_integrated(tmp_path, kind, made):
+    made = made(np.random.default_rng(1), levels=(0.8, 1.0, -0.9) if kind == "servo" else (1.2, 2.0, -1.6))
     robot = written(tmp_path, kind, made)
     runs = records.read(str(tmp_path / "log.csv"), robot=robot).of(robot)
     found = weak_form.weak_form(posed(runs, robot, np.maximum(0.003 * Histories.sizes(runs), 1e-9)).bare)

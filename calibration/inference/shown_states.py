@@ -17,7 +17,10 @@ from jaxtyping import Array, Float
 
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import Problem
+from mmrjax import balances, channels
+from mmrjax.channels import Channel
 from mmrjax.conditions import Conditions
+from mmrjax.signals import State
 
 #: Times between rows that a window is long, within limits [s]; its fewest rows; and how far the next one begins after
 #: it, as a share of its length.
@@ -37,7 +40,8 @@ class Plan(eqx.Module):
 
     Attributes:
         current: the channel that shows the current, -1: it follows from what is imposed.
-        motion: that which shows the motion; angle: whether it is an angle, which is read twice integrated.
+        motion: that which shows the motion, -1: it is imposed; angle: whether it is an angle, which is read twice
+            integrated; travels: whether it is of the load, and not of a shaft.
         others: channels that follow from the states.
         imposed: as of `Rig.imposed`.
     """
@@ -45,6 +49,7 @@ class Plan(eqx.Module):
     current: int = eqx.field(static=True)
     motion: int = eqx.field(static=True)
     angle: bool = eqx.field(static=True)
+    travels: bool = eqx.field(static=True)
     others: tuple[int, ...] = eqx.field(static=True)
     imposed: str = eqx.field(static=True)
 
@@ -59,34 +64,38 @@ class Plan(eqx.Module):
         return self.imposed != "motor_speed"
 
 
-#: Channels by what they show of the states.
-CURRENTS = ("motor_current", "total_current")
-SPEEDS = ("motor_speed", "output_speed", "speed")
-ANGLES = ("output_angle", "position")
-
-
 def plan_of(problem: Problem) -> Plan | None:
     """The plan of a log; None where it does not show the states."""
-    robot, count = problem.base, np.asarray(problem.data.weight).sum(0)
-    names = [c.name if n > 0 else "" for c, n in zip(problem.channels, count, strict=True)]
-    if robot.loose or robot.rig.turns or {n for n in names if n} & robot.rig.magnitudes:
+    robot, counts = problem.base, np.asarray(problem.data.weight).sum(0) > 0
+    shown = {k: c for k, c in enumerate(problem.channels) if counts[k]}
+    if robot.loose or robot.rig.turns or {c.name for c in shown.values()} & robot.rig.magnitudes:
         return None
-
-    def first(wanted: tuple[str, ...]) -> int:
-        return next((names.index(n) for n in wanted if n in names), -1)
-
-    imposed, speed, angle = robot.rig.imposed, first(SPEEDS), first(ANGLES)
+    imposed = robot.rig.imposed
     pulsed = np.ptp(np.asarray(problem.observe.of_rows.duty)) > 0  # type: ignore[attr-defined]
-    current = first(CURRENTS[:1] if pulsed else CURRENTS) if imposed == "voltage" else -1
-    motion = speed if speed >= 0 else angle
-    if imposed != "motor_speed" and motion < 0:
+    drawn = "total_current"  # of which pulses take a share
+    currents = {k: c.name == drawn for k, c in shown.items() if c.rests_on == channels.CURRENT}
+    speeds = [k for k, c in shown.items() if c.zero_at_rest and c.settled]
+    angles = [k for k, c in shown.items() if c.zero_at_rest and not c.settled]
+    if imposed == "motor_speed":
+        others = (*currents, *_voltages(shown))
+        return Plan(-1, -1, False, False, others, imposed) if others else None
+    if not (speeds or angles):
         return None
-    shown = {"motor_voltage": imposed != "voltage", "speed": robot.has_ground and speed != first(SPEEDS[2:])}
-    shown |= dict.fromkeys(CURRENTS, imposed == "motor_speed")
-    others = tuple(k for k, n in enumerate(names) if shown.get(n, False))
-    if imposed == "motor_speed" and not others:
-        return None
-    return Plan(current, motion, imposed != "motor_speed" and speed < 0, others, imposed)
+    motion = (*speeds, *angles)[0]
+    current = next(iter(sorted(currents, key=lambda k: currents[k])), -1) if imposed == "voltage" else -1
+    current = -1 if current >= 0 and pulsed and currents[current] else current
+    slips = [k for k in speeds[1:] if robot.has_ground and _travels(shown[k]) and not _travels(shown[motion])]
+    others = (*slips, *(_voltages(shown) if imposed == "motor_current" else ()))
+    return Plan(current, motion, not speeds, _travels(shown[motion]), others, imposed)
+
+
+def _voltages(shown: dict[int, Channel]) -> list[int]:
+    return [k for k, c in shown.items() if c.rests_on == channels.VOLTAGE]
+
+
+def _travels(channel: Channel) -> bool:
+    """Whether a channel shows what the load does, and not a shaft."""
+    return channel.unit_si in ("m", "m/s")
 
 
 class Rows(eqx.Module):
@@ -260,9 +269,7 @@ def rows_of(problem: Problem, plan: Plan, rate: np.ndarray) -> Rows:
 
 def _wheel_per_unit(problem: Problem, plan: Plan) -> float:
     """Speed or angle of the output for one unit of the channel of the motion [rad/unit]."""
-    robot = problem.base
-    radius = float(robot.configurations.members[0].radius)
-    name = problem.channels[plan.motion].name
-    if name in ("output_speed", "output_angle"):
-        return 1.0
-    return 1 / radius if name in ("speed", "position") else 1 / float(robot.gearbox.ratio)
+    robot, none = problem.base, jnp.zeros(())
+    chassis = robot.configurations.members[0]
+    rolling = State(none, robot.gearbox.ratio, chassis.radius, none, distance=chassis.radius)
+    return 1 / float(problem.channels[plan.motion].read(robot, balances.begin(robot, Conditions(0), rolling)))

@@ -2,11 +2,11 @@
 
 The balances give the rate of each state at the readings of a log that shows the states. The equation y' = f(y) is
 multiplied by smooth windows w(t) and integrated by parts: ∫ w f(y) dt + ∫ w' y dt = 0. No derivative of a noisy
-reading is taken. References: modulating functions, Preisig and Rippin, Comput. Chem. Eng. 17 (1993) 1; inverse dynamic
-identification, Gautier and Khalil, IEEE Trans. Robot. Autom. 6 (1990) 368; weak SINDy, Messenger and Bortz, Multiscale
-Model. Simul. 19 (2021) 1474. Both terms hold readings, and windows that overlap share their noise. Its covariance
-follows from the sds of the readings, their instruments' steps included, and weighs the windows (Bortz, Messenger and
-Dukic, Bull. Math. Biol. 85 (2023) 110). No window holds a jump of what is imposed, a gap, or rest.
+reading is taken. References: modulating functions, Preisig and Rippin, Comput. Chem. Eng. 17 (1993) 1; inverse
+dynamic identification, Gautier and Khalil, IEEE Trans. Robot. Autom. 6 (1990) 368; weak SINDy, Messenger and Bortz,
+Multiscale Model. Simul. 19 (2021) 1474. Both terms hold readings, and windows that overlap share their noise. Its
+covariance follows from the sds of the readings, their instruments' steps included, and weighs the windows (Bortz,
+Messenger and Dukic, Bull. Math. Biol. 85 (2023) 110). No window holds a jump of what is imposed, a gap, or rest.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 
 from calibration.inference.linearization import ScoredEffect, each_shape, probe, terms_of
@@ -109,7 +110,7 @@ def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str
             own = _current(robot, conditions, at, row.way)
         return balances.rolling(robot, conditions, dataclasses.replace(at, current=own), row.way), own
 
-    if robot.has_ground and plan.mechanical and names[plan.motion] in ("speed", "position"):
+    if robot.has_ground and plan.mechanical and plan.travels:
         # The wheels turn faster than the load travels by what slip takes.
         first = balances.begin(robot, conditions, state_at(turning, current))
         if any(e.balance == "slip" and e.name not in probes for e in robot.effects):
@@ -298,7 +299,7 @@ class _Joined:
         covariance = self.noise @ self.noise.T + np.diag(FLOOR * self.sd**2)
         whole, count = self.whole.copy(), growth.shape[1]
         whole[:, 1 : count + 1] -= whole[:, :1] * growth
-        return np.linalg.solve(np.linalg.cholesky(covariance), whole)
+        return solve_triangular(np.linalg.cholesky(covariance), whole, lower=True)
 
 
 def _joined(problem: Problem, plan: Plan, w: Windows, terms: Terms) -> _Joined:
