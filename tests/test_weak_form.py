@@ -45,7 +45,7 @@ SETTINGS = settings_for(Histories, 250)
 SD = np.array([8 * RPM, 0.03])  # of speed and current [SI]
 
 
-def motor(seed=0, noise=1.0, quadratic=4e-8):
+def motor(seed=0, noise=(1.0, 1.0), quadratic=4e-8):
     """U = k ω + R I + L dI/dt, J dω/dt = k I - M_0 sign ω - b ω - c ω|ω| of four runs under a staircase of voltage."""
     rng, r, k, inertia = np.random.default_rng(seed), *TRUE.values()
     rows, hold = 150, 50
@@ -66,8 +66,8 @@ def motor(seed=0, noise=1.0, quadratic=4e-8):
         "configuration": np.repeat(["bench"], 4 * rows),
         "time_s": np.tile(np.arange(rows) * EVERY, 4),
         "supply_voltage_V": np.repeat(volts, hold, 1).ravel(),
-        "motor_speed_rpm": (speed + noise * SD[0] * rng.standard_normal(speed.shape)).ravel() / RPM,
-        "motor_current_A": (current + noise * SD[1] * rng.standard_normal(current.shape)).ravel(),
+        "motor_speed_rpm": (speed + noise[0] * SD[0] * rng.standard_normal(speed.shape)).ravel() / RPM,
+        "motor_current_A": (current + noise[1] * SD[1] * rng.standard_normal(current.shape)).ravel(),
         "slope_deg": np.zeros(4 * rows),
         "payload_kg": np.zeros(4 * rows),
     }
@@ -166,6 +166,28 @@ def test_windows_across_a_jump_are_wrong(space, before, monkeypatch):
     wrong, k = weak_form.weak_form(space.bare).z, names.index("motor.inductance")
     right, wrong = (space.coordinates.base.value(z[: space.free])[k] for z in (before.base.z, wrong))
     assert right == pytest.approx(4e-4, rel=0.3) and wrong > 5 * right
+
+
+@pytest.mark.parametrize("imposed, channel", [("motor_current", "motor_speed"), ("motor_speed", "motor_current")])
+def test_a_current_or_a_speed_may_be_imposed(tmp_path, imposed, channel):
+    """Torques alone are shown then: inertia over the torque constant, and the effect where rows follow a speed that
+    turns between them; lines between rows of an imposed one differ from it by more than the effect."""
+    text = RIG.replace('imposed = "voltage"', f'imposed = "{imposed}"')
+    (tmp_path / "rig.toml").write_text(text.replace('"motor_current", "motor_speed"', f'"{channel}"'), "utf-8")
+    robot = robot_file.read(tmp_path / "rig.toml")
+    columns = motor(noise=(0.0, 1.0) if imposed == "motor_speed" else (1.0, 0.0))
+    del columns["supply_voltage_V"]
+    lines = [",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n", "utf-8")
+    mine = posed(
+        records.read(str(tmp_path / "log.csv"), robot=robot).of(robot), robot, SD[int(channel == "motor_current")]
+    )
+    found = screening.beforehand(mine, SETTINGS)
+    names, value = mine.coordinates.base.names, mine.coordinates.base.value(found.base.z[: mine.free])
+    ratio = value[names.index("motor.inertia")] / value[names.index("motor.torque_constant")]
+    assert ratio == pytest.approx(TRUE["inertia"] / TRUE["torque_constant"], rel=0.03)
+    ranked = findings.ranking_beforehand(mine, found, SETTINGS)
+    assert imposed == "motor_speed" or "churning" in [e.name for e in ranked.effects[:2]]
 
 
 @pytest.mark.parametrize("kind, made", [("servo", servo), ("carriage", carriage)])

@@ -434,7 +434,7 @@ def trace(
         space = pose(runs, robot, noise.sd, settings, stated, library)
         at = functools.partial(bases_at, runs)
         if known is not None and space.bare.observe.long:  # whose rows count here too
-            space = dataclasses.replace(space.without(list(known.screened.outliers)), near=known.simulated)
+            space = dataclasses.replace(space.without(np.array(known.screened.outliers, int)), near=known.simulated)
             progress(Step("base"))
             return same_rows(fit_base(space, settings, runs.source, near), at, known.screened, settings)
         if near is None:

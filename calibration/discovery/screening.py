@@ -202,17 +202,17 @@ def beforehand(space: CandidateSpace, settings: Settings) -> Beforehand | None:
     ways = np.where(seen, left / np.where(seen, norm, 1.0), 0.0)
     single = -ways.T @ found.residual
     none = np.zeros(0)
-    scores = ScoreTable(
-        single, np.where(seen, single / np.where(seen, norm, 1.0), 0.0), norm, none, none, none, none, none, none
-    )
+    amplitude = np.where(seen, single / np.where(seen, norm, 1.0), 0.0)
+    parts: tuple[Any, ...] = (single, amplitude, norm, *[none] * 6)
+    scores = ScoreTable(*parts)
     random = np.random.default_rng(settings.seed)
     null = np.max(np.abs(random.standard_normal((settings.replicates, len(ways))) @ ways), 1)
     slots = np.zeros(2 * settings.slots)
     sd = np.sqrt(np.diag(np.linalg.inv(found.jacobian.T @ found.jacobian)))
-    at = Optimum(
-        np.concatenate([found.z, slots]), np.concatenate([sd, slots + 1]), np.zeros((0, 0)),
-        np.asarray(0.5 * np.sum(found.residual**2)), np.asarray(0.0), np.asarray(True), np.asarray(0),
-    )  # fmt: skip
+    z, sd = np.concatenate([found.z, slots]), np.concatenate([sd, slots + 1])
+    cost = np.asarray(0.5 * np.sum(found.residual**2))
+    of_fit: tuple[Any, ...] = (z, sd, np.zeros((0, 0)), cost, np.asarray(0.0), np.asarray(True), np.asarray(0))
+    at = Optimum(*of_fit)
     base = dataclasses.replace(candidate(space, empty(settings), at, settings), simulated=False)
     slides = problem.base.has_ground and problem.base.rig.imposed == "voltage"
     return Beforehand(None if slides else base, scores, found.windows, null)

@@ -25,8 +25,9 @@ from mmrjax.signals import State
 #: Times between rows that a window is long, within limits [s]; its fewest rows; and how far the next one begins after
 #: it, as a share of its length.
 LONG, LENGTHS, FEWEST, APART = 16, (0.15, 0.3), 9, 0.25
-#: Share of its largest value by which what is imposed jumps; times the usual one, a time between rows that is a gap.
-JUMP, GAP = 0.05, 3.0
+#: Share of its largest value by which what is imposed jumps, and the acceleration of an imposed speed, with which the
+#: current does; times the usual one, a time between rows that is a gap.
+JUMP, KINK, GAP = 0.05, 0.3, 3.0
 #: Speed at which a shaft may rest: in sds of its reading, and as a share of the largest.
 REST_SD, REST = 5.0, 0.01
 #: Sds of a delay that is not known within which a jump may act.
@@ -208,12 +209,12 @@ def _jumps(observe: Any, run: int) -> np.ndarray:
     """Instants at which what is imposed on a run jumps [s]."""
     conditions, times = observe.conditions, np.asarray(observe.times[run])
     jumps = np.zeros(len(times) - 1, bool)
-    for name in ("voltage", "motor_current", "duty", "open", "load_torque", "slope_deg", "payload", "total_mass"):
+    imposed = "voltage", "motor_current", "duty", "open", "load_torque", "slope_deg", "payload", "total_mass"
+    for name, share in (*((n, JUMP) for n in imposed), ("motor_acceleration", KINK)):
         x = getattr(conditions, name)
         if x is not None and np.ndim(x) > 1:
             x = np.asarray(x)
-            size = max(float(np.abs(x).max()), 1e-300)
-            jumps |= np.abs(np.diff(x[run])) > JUMP * size
+            jumps |= np.abs(np.diff(x[run])) > share * max(float(np.abs(x).max()), 1e-300)
     return times[1:][jumps]
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -67,10 +68,10 @@ def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar) ->
         at = dataclasses.replace(state, current=current)
         return jnp.asarray(balances.driven(robot, conditions, at, way).voltage_left)
 
-    fixed = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, (robot, state))
+    fixed: Any = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, (robot, state))
     current = jnp.zeros(())
     for step in range(CURRENT_STEPS):
-        value, slope = jax.jvp(lambda x: left(*fixed, x), (current,), (jnp.ones(()),))
+        value, slope = jax.jvp(lambda x: left(fixed[0], fixed[1], x), (current,), (jnp.ones(()),))
         value = left(robot, state, current) if step == CURRENT_STEPS - 1 else value
         current = current - value / slope
     return current
@@ -86,7 +87,7 @@ def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str
         return channels.find(names[k]).read(robot, balances.begin(robot, conditions, state))
 
     if plan.imposed == "motor_speed":
-        turning = jnp.asarray(conditions.motor_speed)
+        turning: Scalar = jnp.asarray(conditions.motor_speed)
     else:
         rolling = State(none, one, chassis.radius / robot.gearbox.ratio, none, distance=chassis.radius)
         unit = per_unit(plan.motion, rolling)  # of an angle: of the output by the output's
@@ -105,7 +106,7 @@ def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str
 
     def signals_at(turning: Scalar) -> tuple[Signals, Scalar]:
         at = state_at(turning, current)
-        own = current
+        own: Scalar = current
         if plan.imposed == "voltage" and plan.current < 0:
             own = _current(robot, conditions, at, row.way)
         return balances.rolling(robot, conditions, dataclasses.replace(at, current=own), row.way), own
@@ -176,11 +177,15 @@ def _terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[Sc
         by_term = jnp.where(which >= 0, slope[:, :, np.maximum(which, 0)], shown)
         return by_term * entered[:, None]
 
+    def both(part: Callable[[Array, bool], Array]) -> tuple[Array, Array]:
+        return part(slopes[0], True), part(slopes[1], False)
+
     return Terms(
-        *values,
-        tuple(s[:, :, :size] for s in slopes),  # type: ignore[arg-type]
-        tuple(s[:, :, size + len(probes) :] for s in slopes),  # type: ignore[arg-type]
-        tuple(of_effects(s, direct) for s, direct in zip(slopes, (True, False), strict=True)),  # type: ignore[arg-type]
+        values[0],
+        values[1],
+        both(lambda s, _: s[:, :, :size]),
+        both(lambda s, _: s[:, :, size + len(probes) :]),
+        both(of_effects),
     )
 
 
@@ -310,7 +315,7 @@ def _joined(problem: Problem, plan: Plan, w: Windows, terms: Terms) -> _Joined:
     if plan.angle and plan.mechanical:
         slopes[plan.electrical] = -w.bend
 
-    def integrated(f: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def integrated(f: Any, y: Any) -> np.ndarray:
         each = [w.weight @ f[w.rows, k] + slopes[k] @ y[w.rows, k] for k in range(count)]
         return np.concatenate(each)
 
