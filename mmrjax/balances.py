@@ -289,6 +289,31 @@ def moving(robot: Robot, conditions: Conditions, state: State, way: Scalar | Non
     return _moving(robot, conditions, state, way)
 
 
+def rolling(robot: Robot, conditions: Conditions, state: State, way: Scalar | None = None) -> Signals:
+    """All signals of a robot in motion whose load follows its wheels: its inertia acts at the driving shaft, and
+    traction is what it and the demand take. Args: as of `moving`.
+    """
+    robot = robot.within(conditions.configuration)
+    chassis = robot.chassis(conditions.configuration)
+    if isinstance(chassis, Shaft):
+        return moving(robot, conditions, state, way)
+    signals = _to_slip(robot, conditions, chassis, _one_way(begin(robot, conditions, state), way))
+    signals = track(robot, chassis, _fill(signals, traction=signals.demand))
+    carried = signals.mass * (1 / robot.sides)
+    heavy = dataclasses.replace(chassis, inertia=chassis.inertia + carried * chassis.radius**2)
+    signals = gearbox(robot, heavy, signals)
+    acceleration = chassis.radius * signals.acceleration_wheel
+    return _fill(signals, acceleration=acceleration, traction=signals.demand + carried * acceleration)
+
+
+def _one_way(signals: Signals, way: Scalar | None) -> Signals:
+    """Signals with the way in which dry friction acts, as of `moving`."""
+    if way is None:
+        return signals
+    directions = "direction", "direction_travel"
+    return _fill(signals, **{d: jnp.where(way == 0, getattr(signals, d), way) for d in directions})
+
+
 #: Newton steps of the current at an imposed speed: its torque is linear but for which way power flows, and effects.
 CURRENT_STEPS = 4
 
@@ -341,11 +366,7 @@ def _current_of(signals: Callable[[Any, Scalar], Signals], given: tuple) -> Scal
 def _moving(robot: Robot, conditions: Conditions, state: State, way: Scalar | None) -> Signals:
     robot = robot.within(conditions.configuration)
     chassis = robot.chassis(conditions.configuration)
-    begun = begin(robot, conditions, state)
-    if way is not None:
-        directions = "direction", "direction_travel"
-        begun = _fill(begun, **{d: jnp.where(way == 0, getattr(begun, d), way) for d in directions})
-    signals = _to_slip(robot, conditions, chassis, begun)
+    signals = _to_slip(robot, conditions, chassis, _one_way(begin(robot, conditions, state), way))
     if isinstance(chassis, Shaft):
         signals = _fill(signals, traction=signals.demand)
         if state.gap is not None:

@@ -12,13 +12,14 @@ import pytest
 from synthetic import Analyst, table
 from worlds import histories, rigs
 
-from calibration.discovery import screening
+from calibration.discovery import candidates, screening
 from calibration.discovery.candidates import Candidate, filled
 from calibration.discovery.result import Ranked, Ranking
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import settings_for
 from calibration.inference.held_out import unseen
 from calibration.inference.observers import Histories
+from calibration.inference.optimizers import Optimum
 from calibration.words import loop as words
 from mmrjax.effects import BY_NAME
 from sweeps.commands import loop as command
@@ -138,6 +139,25 @@ def test_simulation_confirms_the_first_and_its_rivals_or_another_is_tried(
     assert tried.count("series_resistance") == 1 and tried.count("stribeck_track") == (1 if otherwise == 0 else 2)
     best = min((c for c in found.candidates if c.simulated), key=lambda c: c.cost)
     assert best.effects == (("churning",) if otherwise == 0 else ("brush_drop",))
+
+
+def test_fits_with_other_sds_are_few_steps_from_those_that_are_known(space, monkeypatch):
+    """Such a fit begins where it ended with the other sds; one that is not known takes as many steps as it needs."""
+    known, other, new = filled(["churning"], ANALYST.settings), filled(["brush_drop"], ANALYST.settings), []
+    size, at = len(space.coordinates), np.full(len(space.coordinates), 0.3)
+
+    def search(problem, starts, weights, active, most=None):
+        new.append((starts[0][0], most))
+        one = np.zeros((1, size))
+        return Optimum(
+            np.array(starts), one + 1, np.zeros((1, size, size)), one[:, 0], one[:, 0], one[:, 0], one[:, 0]
+        ), None
+
+    monkeypatch.setattr(candidates, "search_each", search)
+    near = dataclasses.replace(space, near={known: at})
+    found = candidates.fit_candidates(near, [(known, 0 * at), (other, 0 * at)], ANALYST.settings)
+    assert [c.active for c in found] == [known, other]
+    assert new == [(0.0, None), (0.3, candidates.FEW)]
 
 
 def test_a_refit_without_a_block_is_a_step_of_gauss_and_newton():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import equinox as eqx
 import jax
@@ -149,12 +149,15 @@ class CandidateSpace:
         bare: problem of the base alone; equipped: of the base and the effects in the slots, whichever these are.
         library: the effects.
         room: names of those that the program of a fit of histories has at least, see `fitted_by`.
+        near: coordinates of fits of the same histories with other sds, by their effects: from there a fit is a few
+            steps away, and none is made of effects beyond `room`.
     """
 
     bare: Problem
     equipped: Problem
     library: ScoredLibrary
     room: tuple[str, ...] = ()
+    near: Mapping[tuple[str, ...], np.ndarray] = dataclasses.field(default_factory=dict)
 
     @property
     def coordinates(self) -> ActiveSet:

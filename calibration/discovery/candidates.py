@@ -14,6 +14,7 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.dissipation import supplying
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import Settings
+from calibration.inference import scans
 from calibration.inference.held_out import search_each
 from calibration.inference.linearization import amplitude_of
 from calibration.inference.optimizers import Optimum, observation
@@ -26,6 +27,8 @@ ADHESION = 2.5
 FEWEST = 4
 #: Difference of the objective of searches that end in one place [½σ²].
 ALIKE = 1e-9
+#: Steps of Gauss and Newton from one fit to another that is near.
+FEW = 6
 #: Rise of the objective beyond which a fit with more effects is worse than without [½σ²].
 STUCK = 0.1
 
@@ -125,8 +128,8 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candid
 
     Args:
         where: opens the message.
-        near: a fit of the same runs with other weights or sds; where runs are long it is begun there and at the prior
-            mean alone.
+        near: a fit of the same runs with other weights or sds, or by regression; where runs are long it is begun
+            there and at the prior mean alone.
 
     Raises:
         BadData: too few rows are left.
@@ -171,28 +174,39 @@ def _beyond_adhesion(space: CandidateSpace) -> np.ndarray:
 def _base_searches(space: CandidateSpace, settings: Settings, near: Candidate | None) -> tuple[Optimum, Observation]:
     """Where searches of the base end, from the starts that its data propose, and what it says there."""
     observe = space.bare.observe
-    if near is not None and observe.long:
+    few = bool(space.near)
+    if near is not None and few:
+        starts = near.z[None, : space.free]
+    elif near is not None and observe.long:
         starts = np.stack([near.z[: space.free], np.zeros(space.free)])
+        if not near.simulated:
+            starts = scans.placed(space.bare, starts)
     else:
         starts = observe.starts(space.bare, np.random.default_rng(settings.seed), observe.policy.searches)
     weights = np.repeat(space.weight[None], len(starts), 0)
-    return jax.device_get(observe.search(space.bare, jnp.asarray(starts), jnp.asarray(weights), rivals=True))
+    given = jnp.asarray(starts), jnp.asarray(weights)
+    return jax.device_get(observe.search(space.bare, *given, rivals=not few, most=FEW if few else None))
 
 
 Proposal = tuple[tuple[str, ...], np.ndarray]
 
 
 def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], settings: Settings) -> list[Candidate]:
-    """Fit every (active effects, start)."""
+    """Fit every (active effects, start); what is known with other sds in a few steps from there."""
     if not proposals:
         return []
     problem, active = space.fitted_by(names for names, _ in proposals)
-    starts = [z for _, z in proposals]
-    found, _ = search_each(problem, starts, [space.weight] * len(proposals), active)
-    return [
-        candidate(space, names, jax.tree.map(lambda x: x[k], found), settings)  # noqa: B023
-        for k, (names, _) in enumerate(proposals)
-    ]
+    made: dict[int, Candidate] = {}
+    for most in (None, FEW):
+        mine = [k for k, (names, _) in enumerate(proposals) if (names in space.near) == (most is not None)]
+        if not mine:
+            continue
+        starts = [space.near.get(*proposals[k]) for k in mine]
+        found, _ = search_each(problem, starts, [space.weight] * len(mine), [active[k] for k in mine], most)
+        for j, k in enumerate(mine):
+            one = jax.tree.map(lambda x: x[j], found)  # noqa: B023
+            made[k] = candidate(space, proposals[k][0], one, settings)
+    return [made[k] for k in range(len(proposals))]
 
 
 def fit_beside(

@@ -56,7 +56,7 @@ from calibration.discovery.notes import (
     TooFewReplicates,
     Unwritten,
 )
-from calibration.discovery.outliers import Screening, ahead, screen, screen_beside
+from calibration.discovery.outliers import Screening, ahead, same_rows, screen, screen_beside
 from calibration.discovery.posterior import of_curve, of_fit
 from calibration.discovery.prediction import Predicted
 from calibration.discovery.result import (
@@ -65,11 +65,12 @@ from calibration.discovery.result import (
     FoundEffect,
     HeldOutAlternative,
     HiddenEffect,
+    Ranking,
     ReadingsOfRows,
     Sensitivity,
 )
 from calibration.discovery.score_tests import Statistics, bootstrap
-from calibration.discovery.screening import with_room
+from calibration.discovery.screening import beforehand, with_room
 from calibration.discovery.search import Search, diagnose, path, search
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings, settings_for
 from calibration.discovery.standing import standing
@@ -384,6 +385,12 @@ class LoopStages:
         return ({"axis": happens.axis, "window": (happens.low, happens.high), "rows": rows},)
 
     @property
+    def simulated(self) -> dict[tuple[str, ...], np.ndarray]:
+        """Coordinates of every fit by simulation, by its effects."""
+        every = (self.screened.base.candidate, *(() if self.searched is None else self.searched.ladder))
+        return {c.active: c.z for c in reversed(every) if c.simulated and np.isfinite(c.cost)}
+
+    @property
     def best(self) -> Candidate:
         """The candidate that is proposed: the base, where no effect is named."""
         if self.alike is None or self.searched is None or self.searched.best is None:
@@ -415,17 +422,35 @@ def trace(
     is one whole.
 
     What replicates of a bootstrap show in units of their own sds hardly depends on these: where the stages of the
-    same table with other sds are `known`, and the same rows count, their replicates serve.
+    same table with other sds are `known`, and the same rows count, their replicates serve. Fits of histories then
+    take a few steps of Gauss and Newton from those. Sets for which their program has no room are not simulated, and
+    no row is set aside anew.
 
     Where residuals are without structure and everywhere as many times the sds, it is the sds that are wrong: the
     stages go through again with such as the residuals show.
     """
 
+    first = list[Ranking]()
+
     def look(noise: Noise, near: Candidate | None = None) -> Screening:
         space = pose(runs, robot, noise.sd, settings, stated, library)
-        progress(Step("base"))
         at = functools.partial(bases_at, runs)
+        if known is not None and space.bare.observe.long:  # whose rows count here too
+            space = dataclasses.replace(space.without(np.array(known.screened.outliers, int)), near=known.simulated)
+            progress(Step("base"))
+            return same_rows(fit_base(space, settings, runs.source, near), at, known.screened, settings)
+        if near is None:
+            near = windows(space)
+        progress(Step("base"))
         return screen(fit_base(space, settings, runs.source, near), at, runs, settings)
+
+    def windows(space: CandidateSpace) -> Candidate | None:
+        """Where the base fit begins by the equations of a log in weak form, which rank the library too."""
+        found = beforehand(space, settings)
+        if found is None:
+            return None
+        first.append(keep("ranking", functools.partial(findings.ranking_beforehand, space, found, settings)))
+        return found.base
 
     def begun() -> tuple[Screening, Sds]:
         screened = look(noise, None if known is None else known.screened.base.candidate)
@@ -461,7 +486,7 @@ def trace(
     for k in range(SCREENINGS):
         progress(Step("bootstrap", (settings.replicates,)))
         screened, left = keep(f"bootstrap {k}", functools.partial(tested, screened))
-        if k == 0:
+        if k == 0 and not first:
             keep("ranking", functools.partial(findings.ranking, screened.base.space, left, settings))
         if not left.test.rejected and screened.cluster is None:
             missed = undescribed(screened.base.space, runs, sds.noise, left.linear)
@@ -470,7 +495,7 @@ def trace(
         progress(Step("effects"))
         screened, left, searched = keep(f"search {k}", functools.partial(tried, screened, left))
         after = searched.diagnosis
-        if after is None or not after.test.rejected_with_margin:
+        if after is None or not after.test.rejected_with_margin or screened.base.space.near:
             break
         more = screen_beside(screened, after.scores, lambda base: bases_at(runs, base), runs, settings)
         if more is None:
@@ -707,7 +732,8 @@ def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Note]]:
 def in_short(factor: float, traced: LoopStages, numbers: np.ndarray) -> Sensitivity:
     """What the loop says with another noise."""
     adequate = not traced.ends.test.rejected_with_margin
-    return Sensitivity(factor, traced.verdict, summary(traced, numbers), traced.members, adequate)
+    near = bool(traced.screened.base.space.near)
+    return Sensitivity(factor, traced.verdict, summary(traced, numbers), traced.members, adequate, near)
 
 
 def summary(traced: LoopStages, numbers: np.ndarray) -> Summary:

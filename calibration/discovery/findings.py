@@ -43,6 +43,7 @@ from calibration.discovery.result import (
     UnnamedDiscrepancy,
 )
 from calibration.discovery.score_tests import ScoreTable
+from calibration.discovery.screening import Beforehand
 from calibration.discovery.search import own_p, without_each
 from calibration.discovery.settings import Settings
 from calibration.discovery.stated_values import Shift
@@ -326,15 +327,29 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
 
 def ranking(space: CandidateSpace, left: Diagnosis, settings: Settings) -> Ranking:
     """The library by what each effect alone would explain of what the base leaves."""
+    test = left.test
+    listed = _ranked(space, left.scores, settings)
+    return Ranking(test.rejected, test.p_value, test.threshold("single") ** 2, listed)
+
+
+def ranking_beforehand(space: CandidateSpace, known: Beforehand, settings: Settings) -> Ranking:
+    """The same by the equations of the log in weak form, before anything is simulated."""
+    p = own_p(float(np.max(known.scores.single**2)), known.null)
+    chance = float(np.quantile(known.null, 1 - settings.family_wise_error, method="higher")) ** 2
+    listed = _ranked(space, known.scores, settings)
+    return Ranking(p <= settings.family_wise_error, p, chance, listed, known.windows)
+
+
+def _ranked(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[Ranked, ...]:
+    """The library by its scores, those last that would supply power."""
     listed = []
-    for s in effect_scores(space, left.scores, settings):
+    for s in effect_scores(space, scores, settings):
         effect = space.library[s.name]
         sd = size_of(effect) / max(s.sigmas_per_prior_sd, 1e-300)
         unit = amplitude_of(effect).spec.unit
         supplies = space.bare.observe.long and effect.dissipative and s.amplitude < 0  # as of `dissipation.supplying`
         listed.append(Ranked(s.name, effect.family(), unit, s.score, s.amplitude, sd, supplies))
-    test, listed = left.test, sorted(listed, key=lambda e: e.supplies)
-    return Ranking(test.rejected, test.p_value, test.threshold("single") ** 2, tuple(listed))
+    return tuple(sorted(listed, key=lambda e: e.supplies))
 
 
 def _plausible_score(

@@ -108,6 +108,15 @@ def screen(base: BaseFit, bases_at: Callable[[BaseFit], Bases], runs: Runs, sett
     return Screening(base, (), bases, seen, together)
 
 
+def same_rows(base: BaseFit, bases_at: Callable[[BaseFit], Bases], known: Screening, settings: Settings) -> Screening:
+    """A base fit to the rows that counted in another trace of the same table, looked at: no row is set aside anew.
+
+    Args:
+        base: fitted without the rows that `known` sets aside.
+    """
+    return Screening(base, known.outliers, *_look(base, bases_at, settings), known.cluster)
+
+
 def _together(found: Screening, outliers: np.ndarray, runs: Runs, settings: Settings) -> Cluster | None:
     """What outliers have in common."""
     rows = len(runs)

@@ -257,12 +257,14 @@ class Ranking:
         missing: whether anything is missing; p_value: of that test, family-wise.
         chance: score that the strongest effect reaches by chance alone [σ²].
         effects: the strongest first, after them those that would supply power.
+        windows: equations of the log in weak form that it is from; 0: it is from signatures along the base fit.
     """
 
     missing: bool
     p_value: float
     chance: float
     effects: tuple[Ranked, ...]
+    windows: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -730,13 +732,15 @@ class DiscoveryResult:
 
 @dataclasses.dataclass(frozen=True)
 class Sensitivity:
-    """What the loop says with another noise, in short; `factor` times the assumed one."""
+    """What the loop says with another noise, in short; `factor` times the assumed one; `near`: whether its fits are a
+    few steps of Gauss and Newton from those with the assumed one, of sets that were simulated there."""
 
     factor: float
     verdict: str
     summary: Summary
     classes: tuple[tuple[str, ...], ...]
     adequate_after: bool
+    near: bool = False
 
     @property
     def statement(self) -> str:
@@ -745,7 +749,8 @@ class Sensitivity:
 
     def to_json(self) -> dict[str, Any]:
         """As in result.json."""
-        return {n: getattr(self, n) for n in ("factor", "verdict", "statement", "classes", "adequate_after")}
+        found = {n: getattr(self, n) for n in ("factor", "verdict", "statement", "classes", "adequate_after")}
+        return found | ({"near": True} if self.near else {})
 
 
 def _effect(e: FoundEffect, support: NameSupport | None) -> dict[str, Any]:

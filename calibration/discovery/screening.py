@@ -3,7 +3,8 @@
 A signature is the derivative of the readings by an amplitude. With the signatures at one fit, a fit of any set of
 effects is a least-squares problem of a few unknowns. (Gautier and Khalil 1990 do so with torques, their inverse
 dynamic identification model.) It ranks every effect in milliseconds. Simulation then confirms the first of them,
-since a signature does not show how a run bends.
+since a signature does not show how a run bends. The equations of a log in weak form rank every effect before the
+first simulation, and state where the base fit begins (`beforehand`).
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ import numpy as np
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, candidate, empty, fit_candidates
-from calibration.discovery.score_tests import ScoreTable
+from calibration.discovery.score_tests import ABSORBED, ScoreTable
 from calibration.discovery.settings import Settings
 from calibration.inference.linearization import Linearization
 from calibration.inference.optimizers import Optimum
+from calibration.inference.weak_form import weak_form
 
 #: Sets that are fitted by simulation in a round: the first by regression and its nearest rivals, of which one is of
 #: another family.
@@ -112,7 +114,9 @@ def confirmed(space: CandidateSpace, screened: Sequence[Candidate], settings: Se
     has room, or which promise more.
     """
     fits = lambda c: {*c.effects} <= {*space.room}  # noqa: E731
-    # What the program has no room for takes another program, and has to promise that much more.
+    # What the program has no room for takes another program, and has to promise that much more; beside a verdict that
+    # is known it is not worth one.
+    screened = [c for c in screened if fits(c)] if space.near else screened
     order = sorted(screened, key=lambda c: c.cost + (0.0 if fits(c) else settings.same / 2))
     order = [c for c in order if np.isfinite(c.cost)]
     first, found = _first(space, order), dict[tuple[str, ...], Candidate]()
@@ -127,7 +131,8 @@ def confirmed(space: CandidateSpace, screened: Sequence[Candidate], settings: Se
         too: what a model lacks may have led the fit without it elsewhere."""
         made = fit_candidates(space, [(c.active, _begins(space, c)) for c in those], settings)
         found.update({c.active: c for c in made})
-        doubted = [c for c in those if less(found[c.active]) or c is first[0]]
+        new = [c for c in those if c.active not in space.near]
+        doubted = [c for c in new if less(found[c.active]) or c is first[0]]
         at_mean = [np.where(np.arange(len(c.z)) < space.free, 0.0, _begins(space, c)) for c in doubted]
         again = fit_candidates(space, [(c.active, z) for c, z in zip(doubted, at_mean, strict=True)], settings)
         found.update({c.active: c for c in again if c.cost < found[c.active].cost})
@@ -163,6 +168,54 @@ def _first(space: CandidateSpace, order: Sequence[Candidate]) -> list[Candidate]
     chosen = [sound[0], *of_others[:1], *sound[1:]]
     chosen = list({c.active: c for c in chosen}.values())[:CONFIRMED]
     return [*chosen, *(c for c in order[:1] if not c.plausible)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Beforehand:
+    """What the equations of a log in weak form say before anything is simulated.
+
+    Attributes:
+        base: the fit without effects, by regression; None where the load may slide on its ground, of which the
+            equations show nothing, so that a search does not begin there.
+        scores: of every instance; windows: how many equations there are.
+        null: root of the strongest score of tables in which nothing is missing [σ], shape (replicates,).
+    """
+
+    base: Candidate | None
+    scores: ScoreTable
+    windows: int
+    null: np.ndarray
+
+
+def beforehand(space: CandidateSpace, settings: Settings) -> Beforehand | None:
+    """Base parameters and effects by regression on a log's equations in weak form; None where it does not show its
+    states (`weak_form`)."""
+    problem = space.bare
+    found = weak_form(problem, space.library.scored) if problem.observe.long else None
+    if found is None:
+        return None
+    q = np.linalg.qr(found.jacobian)[0]
+    whole = np.concatenate([found.signatures, np.zeros((space.free, found.signatures.shape[1]))])
+    left = whole - q @ (q.T @ whole)
+    norm = np.linalg.norm(left, axis=0)
+    seen = norm > ABSORBED * np.maximum(np.linalg.norm(whole, axis=0), 1e-300)
+    ways = np.where(seen, left / np.where(seen, norm, 1.0), 0.0)
+    single = -ways.T @ found.residual
+    none = np.zeros(0)
+    amplitude = np.where(seen, single / np.where(seen, norm, 1.0), 0.0)
+    parts: tuple[Any, ...] = (single, amplitude, norm, *[none] * 6)
+    scores = ScoreTable(*parts)
+    random = np.random.default_rng(settings.seed)
+    null = np.max(np.abs(random.standard_normal((settings.replicates, len(ways))) @ ways), 1)
+    slots = np.zeros(2 * settings.slots)
+    sd = np.sqrt(np.diag(np.linalg.inv(found.jacobian.T @ found.jacobian)))
+    z, sd = np.concatenate([found.z, slots]), np.concatenate([sd, slots + 1])
+    cost = np.asarray(0.5 * np.sum(found.residual**2))
+    of_fit: tuple[Any, ...] = (z, sd, np.zeros((0, 0)), cost, np.asarray(0.0), np.asarray(True), np.asarray(0))
+    at = Optimum(*of_fit)
+    base = dataclasses.replace(candidate(space, empty(settings), at, settings), simulated=False)
+    slides = problem.base.has_ground and problem.base.rig.imposed == "voltage"
+    return Beforehand(None if slides else base, scores, found.windows, null)
 
 
 def ranked(

@@ -13,20 +13,24 @@ from calibration.inference.problem import Observation, Problem
 
 
 def search_each(
-    problem: Problem, starts: Sequence[np.ndarray], weights: Sequence[np.ndarray], active: Sequence | None = None
+    problem: Problem,
+    starts: Sequence[np.ndarray],
+    weights: Sequence[np.ndarray],
+    active: Sequence | None = None,
+    most: int | None = None,
 ) -> tuple[Optimum, Observation]:
     """Fits from any number of starts, each to its own weights.
 
     Args:
         starts: coordinates; weights: of the readings, (rows, channels) each; active: sets of effects, None for a
-            problem without slots.
+            problem without slots; most: steps of each, None for as many as it takes.
 
     Returns:
         Where each search ended, and what the model says of every row there; leading axis the starts.
     """
     z, weight = (np.stack([np.asarray(x) for x in xs]) for xs in (starts, weights))
     which = None if active is None else np.stack([np.asarray(x) for x in active])
-    return jax.device_get(problem.observe.search(problem, z, weight, which))
+    return jax.device_get(problem.observe.search(problem, z, weight, which, most=most))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mmrjax import params
+from mmrjax import balances, params
 from mmrjax.compiling import compiled
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import in_travel
@@ -121,6 +121,39 @@ def scored(effect: Effect, grid: Sequence[float] = GRID) -> ScoredEffect:
 
 
 _shaped: Callable[..., Array] = compiled(shaped)
+
+
+def shaped_as_in(robot: Robot, scored: ScoredEffect) -> ScoredEffect:
+    """An effect with its grid; with the shape that it has in a robot in which it is present."""
+    own = next((e for e in robot.effects if e.name == scored.effect.name), None)
+    if own is None or not scored.shape:
+        return scored
+    shape = getattr(own, scored.shape)
+    return dataclasses.replace(scored, values=jnp.where(jnp.asarray(own.amplitude) == 0, scored.values, shape))
+
+
+def each_shape(scored: ScoredEffect, function: Callable[[Effect, Array], Array], given: Array) -> Array:
+    """A function of an effect at every point of its shape's grid, and of what is given there, shape (grid,)."""
+    if not scored.shape:
+        return function(scored.effect, given[0])[None]
+    at = lambda v, x: function(params.replace(scored.effect, {scored.shape: v}), x)  # noqa: E731
+    return jax.vmap(at)(scored.values, given)
+
+
+def terms_of(robot: Robot, signals: Signals, effects: tuple[ScoredEffect, ...], memory: list[Array]) -> Array:
+    """Terms of effects in their balances at an instant, shape (instances,).
+
+    Args:
+        memory: of every effect at each point of its grid, any number where it has none.
+    """
+
+    def term(effect: Effect, remembered: Array) -> Array:
+        alone = dataclasses.replace(robot, effects=(effect,))
+        with_memory = dataclasses.replace(signals, memory={**signals.memory, effect.name: remembered})
+        return jnp.asarray(balances.added(alone, with_memory, effect.balance, effect.channel), float)
+
+    found = [each_shape(e, term, m) for e, m in zip(effects, memory, strict=True)]
+    return jnp.concatenate(found) if found else jnp.zeros(0)
 
 
 # --- the fit ------------------------------------------------------------------------------------------------

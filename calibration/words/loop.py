@@ -211,7 +211,8 @@ def at_other_noise(found: Sequence[Sensitivity]) -> str:
         f"with {' and with '.join(factors)} times that noise the verdict is {words}"
         for words, factors in same.items()
     ]
-    return "; ".join(each)
+    near = " (by fits a few steps from those with the stated noise)" if any(one.near for one in found) else ""
+    return "; ".join(each) + near
 
 
 def _named(one: notes.Missing) -> str:
@@ -243,9 +244,10 @@ def verdict(stages: LoopStages) -> str:
 
 def ranking(found: Ranking, most: int = 5) -> list[str]:
     """What regression says of the library, a line each: whether anything is missing, and the strongest effects."""
+    by = f"by regression on {found.windows} windows of the log" if found.windows else "by regression"
     if not found.missing:
-        return [f"by regression: nothing is missing (family-wise p = {found.p_value:.2g})"]
-    first = f"by regression, not yet confirmed: something is missing (family-wise p {p_value(found.p_value)})"
+        return [f"{by}: nothing is missing (family-wise p = {found.p_value:.2g})"]
+    first = f"{by}, not yet confirmed: something is missing (family-wise p {p_value(found.p_value)})"
     beyond = [e for e in found.effects if e.score > found.chance and not e.supplies][:most]
     if not beyond:
         return [f"{first}; no effect explains more than chance"]

@@ -288,6 +288,7 @@ class Observer(eqx.Module):
         active: Numbers | None = None,
         *,
         rivals: bool = False,
+        most: int | None = None,
     ) -> tuple[Optimum, Observation]:
         """Any number of fits, each to its own weights, and what each says of every row.
 
@@ -295,6 +296,7 @@ class Observer(eqx.Module):
             starts: shape (members, coordinates); weights: of each member's readings, (members, rows, channels).
             active: set of effects of each member, see `ActiveSet`; None leaves the problem's.
             rivals: whether all search the same optimum, so that some may be given up.
+            most: steps of each; None: those of the policy.
         """
 
     def observed(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:

@@ -29,7 +29,16 @@ from calibration.inference import bases as bases_room
 from calibration.inference import scans
 from calibration.inference.bases import Bases
 from calibration.inference.details import Memory, Strongest, TimeSide, TimeStatistics
-from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
+from calibration.inference.linearization import (
+    PROBED,
+    Linearization,
+    ScoredEffect,
+    each_shape,
+    finite,
+    probe,
+    shaped_as_in,
+    terms_of,
+)
 from calibration.inference.noise import Noise
 from calibration.inference.normal_equations import solved
 from calibration.inference.notes import CoarseSteps, Note, StopsOnSlope, Thinned
@@ -48,7 +57,8 @@ from calibration.inference.optimizers import (
 )
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import MISSING, Data, Observation, Problem
-from mmrjax import balances, channels, fidelities, params
+from calibration.inference.weak_form import weak_form
+from mmrjax import balances, channels, fidelities
 from mmrjax.channels import Channel
 from mmrjax.compiling import OVER_TIME, SELDOM, compiled
 from mmrjax.conditions import Conditions
@@ -397,7 +407,7 @@ class Histories(Observer):
         others = dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor")
         entered = tuple(probe(b) for b in others if b not in {p.balance for p in probes})
         every, size = (*probes, *entered), len(probes)
-        effects = tuple(_shaped_as_in(robot, e) for e in effects)
+        effects = tuple(shaped_as_in(robot, e) for e in effects)
         counts, places = np.array([len(e.at) for e in effects], int), [p.balance for p in every]
         entering = np.array([places.index(b) if (b := e.effect.balance) in places else 0 for e in effects], int)
         entering = np.repeat(entering, counts)
@@ -429,7 +439,7 @@ class Histories(Observer):
 
             def terms(t: Array, y: Array, held: Conditions, way: Array | None = None) -> Array:
                 signals = moving(robot, held, state_of(robot, y), way)
-                return _terms(robot, signals, effects, remembered(t))
+                return terms_of(robot, signals, effects, remembered(t))
 
             def both(by_probes: Array, t: Array, term: Array) -> Array:
                 """Changes by defects of all knots and by every instance, by the change by each probe."""
@@ -661,7 +671,8 @@ class Histories(Observer):
         return linear.with_residual(noise - jacobian @ solved(jacobian.T @ jacobian, jacobian.T @ noise))
 
     def starts(self, problem: Problem, random: np.random.Generator, count: int) -> Float[np.ndarray, "starts z"]:
-        """As the protocol says; see `settled_ends`."""
+        """As the protocol says: where the log's equations in weak form lead (`weak_form`) and the prior mean; where a
+        ground may be slid on, as of `settled_ends`."""
 
         def search(blunt: Problem, starts: np.ndarray, steps: int) -> Optimum:
             weights = np.repeat(np.asarray(blunt.data.weight)[None], len(starts), 0)
@@ -669,6 +680,9 @@ class Histories(Observer):
             return searches_long(evaluate, starts, blunt.data, weights, steps, self.policy.batch)[0]
 
         if not problem.base.has_ground or problem.base.rig.imposed != "voltage":  # no grip that makes for valleys
+            shown = weak_form(problem)
+            if shown is not None:
+                return scans.placed(problem, np.stack([shown.z, np.zeros(len(problem.coordinates))])[:count])
             return scans.placed(problem, super().starts(problem, random, count))
         draws = random.standard_normal((settled_ends.DRAWS, len(problem.coordinates)))
         return scans.placed(problem, settled_ends.starts(problem, draws, search)[:count])
@@ -706,9 +720,10 @@ class Histories(Observer):
         active: Numbers | None = None,
         *,
         rivals: bool = False,
+        most: int | None = None,
     ) -> tuple[Optimum, Observation]:
         """As the protocol says; the runs are compiled once for all steps."""
-        data, steps = problem.data, self.policy.steps
+        data, steps = problem.data, self.policy.steps if most is None else most
 
         def searched(starts: Numbers) -> tuple[Optimum, Observation]:
             evaluate = _evaluator(problem, weights, active)
@@ -1161,39 +1176,6 @@ def _responses(
     return finite(by_reading), finite(defects), observe.at_rows(runs), observe.angle(runs)
 
 
-def _shaped_as_in(robot: Robot, scored: ScoredEffect) -> ScoredEffect:
-    """An effect with its grid; with the shape that it has in a robot in which it is present."""
-    own = next((e for e in robot.effects if e.name == scored.effect.name), None)
-    if own is None or not scored.shape:
-        return scored
-    shape = getattr(own, scored.shape)
-    return dataclasses.replace(scored, values=jnp.where(jnp.asarray(own.amplitude) == 0, scored.values, shape))
-
-
-def _each(scored: ScoredEffect, function: Callable[[Effect, Array], Array], given: Array) -> Array:
-    """A function of an effect at every point of its shape's grid, and of what is given there, shape (grid,)."""
-    if not scored.shape:
-        return function(scored.effect, given[0])[None]
-    at = lambda v, x: function(params.replace(scored.effect, {scored.shape: v}), x)  # noqa: E731
-    return jax.vmap(at)(scored.values, given)
-
-
-def _terms(robot: Robot, signals: Signals, effects: tuple[ScoredEffect, ...], memory: list[Array]) -> Array:
-    """Terms of effects in their balances at an instant, shape (instances,).
-
-    Args:
-        memory: of every effect at each point of its grid, any number where it has none.
-    """
-
-    def term(effect: Effect, remembered: Array) -> Array:
-        alone = dataclasses.replace(robot, effects=(effect,))
-        with_memory = dataclasses.replace(signals, memory={**signals.memory, effect.name: remembered})
-        return jnp.asarray(balances.added(alone, with_memory, effect.balance, effect.channel), float)
-
-    found = [_each(e, term, m) for e, m in zip(effects, memory, strict=True)]
-    return jnp.concatenate(found) if found else jnp.zeros(0)
-
-
 def _remembered(
     robot: Robot, conditions: Conditions, along: Followed, effects: tuple[ScoredEffect, ...]
 ) -> Callable[[Array], list[Array]]:
@@ -1217,7 +1199,7 @@ def _remembered(
             known = dataclasses.replace(signals, memory={**signals.memory, effect.name: remembered})
             return jnp.asarray(effect.rate(robot, known), float)
 
-        return jnp.concatenate([_each(e, rate, m) for e, m in zip(mine, split(memory), strict=True)])
+        return jnp.concatenate([each_shape(e, rate, m) for e, m in zip(mine, split(memory), strict=True)])
 
     times = jnp.append(along.clock[:, 0], along.clock[-1, 2])
     steps, constant = steps_of(conditions, times)
@@ -1241,7 +1223,7 @@ def _remembered(
     angle = state_of(robot, begin).distance / robot.chassis(conditions.configuration).radius
     begun = jnp.concatenate(
         [
-            _each(e, lambda effect, _: jnp.asarray(effect.initial(robot, angle), float), jnp.zeros(len(e.at)))
+            each_shape(e, lambda effect, _: jnp.asarray(effect.initial(robot, angle), float), jnp.zeros(len(e.at)))
             for e in mine
         ]
     )

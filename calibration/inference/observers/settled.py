@@ -327,12 +327,14 @@ class SettledRuns(Observer):
         active: Numbers | None = None,
         *,
         rivals: bool = False,
+        most: int | None = None,
     ) -> tuple[Optimum, Observation]:
         data, count = problem.data, len(starts)
         measured, centre = (np.repeat(np.asarray(x)[None], count, 0) for x in (data.measured, data.centre))
         own = np.asarray(starts), np.asarray(weights), measured, centre
         members = Member(*own, active=None if active is None else np.asarray(active))
-        return searches_refilled(problem, members, self.policy.steps, self.places(problem))
+        steps = self.policy.steps if most is None else most
+        return searches_refilled(problem, members, steps, self.places(problem))
 
     def places(self, problem: Problem) -> int:
         """Searches side by side on a core: fewer where effects make the model costly, so that few wait for one."""

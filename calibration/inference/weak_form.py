@@ -1,0 +1,334 @@
+"""The equations of logs in weak form: a regression of base parameters and effects without a simulation.
+
+The balances give the rate of each state at the readings of a log that shows the states. The equation y' = f(y) is
+multiplied by smooth windows w(t) and integrated by parts: ∫ w f(y) dt + ∫ w' y dt = 0. No derivative of a noisy
+reading is taken. References: modulating functions, Preisig and Rippin, Comput. Chem. Eng. 17 (1993) 1; inverse
+dynamic identification, Gautier and Khalil, IEEE Trans. Robot. Autom. 6 (1990) 368; weak SINDy, Messenger and Bortz,
+Multiscale Model. Simul. 19 (2021) 1474. Both terms hold readings, and windows that overlap share their noise. Its
+covariance follows from the sds of the readings, their instruments' steps included, and weighs the windows (Bortz,
+Messenger and Dukic, Bull. Math. Biol. 85 (2023) 110). No window holds a jump of what is imposed, a gap, or rest.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from scipy.linalg import solve_triangular
+from scipy.optimize import least_squares
+
+from calibration.inference.linearization import ScoredEffect, each_shape, probe, terms_of
+from calibration.inference.problem import Problem
+from calibration.inference.shown_states import Plan, Rows, Windows, plan_of, rates_of, rows_of, windows_of
+from mmrjax import balances, channels
+from mmrjax.compiling import SELDOM, compiled
+from mmrjax.conditions import Conditions
+from mmrjax.effects import Effect
+from mmrjax.params import Scalar
+from mmrjax.robot import Robot
+from mmrjax.signals import Signals, State
+
+#: Windows a base parameter, from which on a regression is trusted.
+ENOUGH = 4
+#: Variance of what a window leaves beside the noise of its readings, as a share of that: windows that overlap would
+#: else tell differences of each other without noise.
+FLOOR = 0.01
+#: Steps of Newton's method to the current that a voltage drives.
+CURRENT_STEPS = 3
+#: Steps of the regression, and the relative change of what is left from which on it goes on; by how much a coordinate
+#: is moved to see how noise depends on it [prior sd].
+STEPS, SMALL, STEP = 20, 1e-4, 1e-4
+
+
+class Terms(eqx.Module):
+    """Terms of the equations at each row, of which Σ w f Δt + Σ w' y Δt is zero; shape (rows, equations, ...).
+
+    Attributes:
+        f, y: of the readings; by_z, by_reading, by_effects: their derivatives, those of y after those of f.
+    """
+
+    f: Array
+    y: Array
+    by_z: tuple[Array, Array]
+    by_reading: tuple[Array, Array]
+    by_effects: tuple[Array, Array]
+
+
+def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar) -> Scalar:
+    """Current at which the voltage balances; its derivatives are those of the last step alone."""
+
+    def left(robot: Robot, state: State, current: Scalar) -> Scalar:
+        at = dataclasses.replace(state, current=current)
+        return jnp.asarray(balances.driven(robot, conditions, at, way).voltage_left)
+
+    fixed: Any = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, (robot, state))
+    current = jnp.zeros(())
+    for step in range(CURRENT_STEPS):
+        value, slope = jax.jvp(lambda x: left(fixed[0], fixed[1], x), (current,), (jnp.ones(()),))
+        value = left(robot, state, current) if step == CURRENT_STEPS - 1 else value
+        current = current - value / slope
+    return current
+
+
+def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str]) -> tuple[Array, Array, Signals]:
+    """Terms f and y of a row's equations, and its signals; `probes`: effects that read nothing."""
+    conditions, names = row.conditions, channels.names(robot.channels)
+    chassis = robot.chassis(conditions.configuration)
+    none, one = jnp.zeros(()), jnp.ones(())
+
+    def per_unit(k: int, state: State) -> Scalar:
+        return channels.find(names[k]).read(robot, balances.begin(robot, conditions, state))
+
+    if plan.imposed == "motor_speed":
+        turning: Scalar = jnp.asarray(conditions.motor_speed)
+    else:
+        rolling = State(none, one, chassis.radius / robot.gearbox.ratio, none, distance=chassis.radius)
+        unit = per_unit(plan.motion, rolling)  # of an angle: of the output by the output's
+        read = shown[plan.motion] if not plan.angle else row.rate
+        turning = read / unit * (robot.gearbox.ratio if plan.angle else 1.0)
+    if plan.current >= 0:
+        current = shown[plan.current] / per_unit(plan.current, State(one, none, none, none, distance=none))
+    elif conditions.motor_current is not None:
+        current = jnp.asarray(conditions.motor_current)
+    else:
+        current = none
+
+    def state_at(turning: Scalar, current: Scalar) -> State:
+        rolls = chassis.radius * turning / robot.gearbox.ratio
+        return State(current, turning, rolls, none, distance=chassis.radius * row.angle)
+
+    def signals_at(turning: Scalar) -> tuple[Signals, Scalar]:
+        at = state_at(turning, current)
+        own: Scalar = current
+        if plan.imposed == "voltage" and plan.current < 0:
+            own = _current(robot, conditions, at, row.way)
+        return balances.rolling(robot, conditions, dataclasses.replace(at, current=own), row.way), own
+
+    if robot.has_ground and plan.mechanical and plan.travels:
+        # The wheels turn faster than the load travels by what slip takes.
+        first = balances.begin(robot, conditions, state_at(turning, current))
+        if any(e.balance == "slip" and e.name not in probes for e in robot.effects):
+            first = signals_at(turning)[0]
+        turning = turning + balances.added(robot, first, "slip") * robot.gearbox.ratio / chassis.radius
+    signals, own = signals_at(turning)
+    f, y = [], []
+    if plan.electrical:
+        # By its inductance the rate of the current would be mostly noise, and larger ones would leave less.
+        f.append(signals.voltage_left)
+        y.append(signals.inductance * own)
+    if plan.mechanical:  # in what the instrument shows: in what depends on a parameter, that would shrink it
+        rise = unit * (1 / robot.gearbox.ratio if plan.angle else 1.0)
+        f.append(rise * signals.acceleration_wheel * robot.gearbox.ratio)
+        y.append(shown[plan.motion] + (0.0 if plan.angle else unit * turning - read))
+    if plan.others:
+        if robot.has_ground:
+            creep = chassis.ground.speed_creep(signals.traction, signals.normal, signals.adhesion)
+            lost = balances.added(robot, signals, "slip")
+            signals = dataclasses.replace(signals, speed=signals.speed_theoretical - creep - lost)
+        says = balances.sensor(robot, signals)
+        f += [says[names[k]] - shown[k] for k in plan.others]
+        y += [none] * len(plan.others)
+    return jnp.stack([jnp.asarray(x, float) for x in f]), jnp.stack([jnp.asarray(x, float) for x in y]), signals
+
+
+@functools.partial(compiled, options=SELDOM)
+def _terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[ScoredEffect, ...]) -> Terms:
+    """Terms of every row at coordinates z, and what base parameters, readings and effects change of them."""
+    entering = tuple(dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor"))
+    probes = tuple(probe(b) for b in entering)
+    size, names = z.size, channels.names(problem.channels)
+
+    def one(row: Rows) -> tuple[Any, tuple[Any, Signals]]:
+        def both(x: Array) -> tuple[Any, tuple[Any, Signals]]:
+            base = problem.coordinates.robot(problem.base, x[:size])
+            amplitude = x[size : size + len(probes)]
+            put = tuple(eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(probes, amplitude, strict=True))
+            robot = dataclasses.replace(base, effects=(*base.effects, *put))
+            f, y, signals = _at(plan, robot, row, x[size + len(probes) :], frozenset(p.name for p in probes))
+            return (f, y), ((f, y), signals)
+
+        return jax.jacfwd(both, has_aux=True)(jnp.concatenate([z, jnp.zeros(len(probes)), row.shown]))
+
+    slopes, (values, signals) = jax.vmap(one)(rows)
+    base = problem.coordinates.robot(problem.base, z)
+    memory = _remembered(base, rows, signals, effects)
+    entered = jax.vmap(lambda s, m: terms_of(base, s, effects, m))(signals, memory)
+    # An effect changes an equation as a defect of its balance does; one of an instrument as minus a reading of it
+    # does, or where that follows from the states as a defect of that equation.
+    counts = np.array([len(e.at) for e in effects], int)
+    enters = [entering.index(b) if (b := e.effect.balance) in entering else -1 for e in effects]
+    which = np.repeat(np.array([size + k if k >= 0 else -1 for k in enters], int), counts)
+    at = np.repeat(
+        np.array([names.index(c) if (c := e.effect.channel) in names else 0 for e in effects], int), counts
+    )
+    first = len(values[0][0]) - len(plan.others)
+
+    def of_effects(slope: Array, direct: bool) -> Array:
+        shown = -slope[:, :, size + len(probes) :][:, :, at]
+        for k, channel in enumerate(plan.others):
+            shown = shown.at[:, first + k].set(jnp.asarray(1.0 * (at == channel)) * direct)
+        by_term = jnp.where(which >= 0, slope[:, :, np.maximum(which, 0)], shown)
+        return by_term * entered[:, None]
+
+    def both(part: Callable[[Array, bool], Array]) -> tuple[Array, Array]:
+        return part(slopes[0], True), part(slopes[1], False)
+
+    return Terms(
+        values[0],
+        values[1],
+        both(lambda s, _: s[:, :, :size]),
+        both(lambda s, _: s[:, :, size + len(probes) :]),
+        both(of_effects),
+    )
+
+
+def _remembered(robot: Robot, rows: Rows, signals: Signals, effects: tuple[ScoredEffect, ...]) -> list[Array]:
+    """What effects remember at every row, each at every point of its grid; shape (rows, grid)."""
+    count = rows.since.shape[0]
+    nothing = [jnp.zeros((count, len(e.at))) for e in effects]
+
+    def of_effect(scored: ScoredEffect) -> Array:
+        def rate(effect: Effect, at: Array, signals: Signals) -> Array:
+            known = dataclasses.replace(signals, memory={**signals.memory, effect.name: at})
+            return jnp.asarray(effect.rate(robot, known), float)
+
+        def begun(angle: Array) -> Array:
+            return each_shape(
+                scored, lambda e, _: jnp.asarray(e.initial(robot, angle), float), jnp.zeros(len(scored.at))
+            )
+
+        def after(memory: Array, row: tuple[Array, Array, Signals]) -> tuple[Array, Array]:
+            since, angle, signals = row
+            law = lambda m: each_shape(scored, lambda e, x: rate(e, x, signals), m)  # noqa: E731
+            speed, slope = jax.jvp(law, (memory,), (jnp.ones_like(memory),))
+            memory = jnp.where(since > 0, memory + since * speed / (1 - since * slope), begun(angle))
+            return memory, memory
+
+        return jax.lax.scan(after, begun(rows.angle[0]), (rows.since, rows.angle, signals))[1]
+
+    return [zero if e.effect.memory_size is None else of_effect(e) for e, zero in zip(effects, nothing, strict=True)]
+
+
+# --- the regression -------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class WeakForm:
+    """The windows of a log at base coordinates z, whitened: what each leaves, and what changes it.
+
+    Attributes:
+        z: coordinates of the base where the windows and the priors leave least.
+        residual: of windows, then z - centre, shape (windows + coordinates,).
+        jacobian: by the coordinates; signatures: of the windows, by each instance's amplitude in prior sds.
+        windows: how many equations there are, one or more a window.
+    """
+
+    z: np.ndarray
+    residual: np.ndarray
+    jacobian: np.ndarray
+    signatures: np.ndarray
+    windows: int
+
+
+def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakForm | None:
+    """Regression of the base parameters of a log on its equations in weak form; None where it does not show the
+    states, or has too few windows.
+
+    Args:
+        problem: of histories, without effects in its coordinates; effects: of which signatures are wanted.
+    """
+    plan = plan_of(problem)
+    if plan is None:
+        return None
+    rate = rates_of(problem, plan)
+    cut = windows_of(problem, plan, rate)
+    equations = plan.electrical + plan.mechanical + len(plan.others)
+    if equations * sum(len(w.weight) for w in cut) < ENOUGH * len(problem.coordinates):
+        return None
+    rows = rows_of(problem, plan, rate)
+
+    def joined(z: np.ndarray, effects: tuple[ScoredEffect, ...] = ()) -> list[_Joined]:
+        terms = jax.device_get(_terms(problem, plan, rows, jnp.asarray(z), effects))
+        return [_joined(problem, plan, w, terms) for w in cut]
+
+    def made(z: np.ndarray, effects: tuple[ScoredEffect, ...] = ()) -> WeakForm:
+        here, size = joined(z, effects), len(z)
+        # The noise depends on the coordinates too: were it held, a larger inertia would leave less of anything.
+        moved = [joined(z + STEP * one) for one in np.eye(size)]
+        growth = [np.stack([(m[k].sd - j.sd) / j.sd for m in moved], 1) / STEP for k, j in enumerate(here)]
+        whole = np.concatenate([j.whitened(g) for j, g in zip(here, growth, strict=True)])
+        prior = np.zeros((size, whole.shape[1]))
+        prior[:, 0], prior[:, 1 : size + 1] = z - np.asarray(problem.data.centre), np.eye(size)
+        both = np.concatenate([whole, prior])
+        return WeakForm(z, both[:, 0], both[:, 1 : size + 1], whole[:, size + 1 :], len(whole))
+
+    last: list[WeakForm] = []
+
+    def at(z: np.ndarray) -> WeakForm:
+        if not last or np.any(last[0].z != z):
+            last[:] = [made(z.copy())]
+        return last[0]
+
+    try:
+        found = least_squares(
+            lambda z: at(z).residual, np.array(problem.data.centre), lambda z: at(z).jacobian, method="lm",
+            max_nfev=STEPS, xtol=SMALL, ftol=SMALL,
+        )  # fmt: skip
+        return made(found.x, effects)
+    except (np.linalg.LinAlgError, ValueError):  # of what is not finite
+        return None
+
+
+@dataclasses.dataclass(frozen=True)
+class _Joined:
+    """Equations of the windows of a run: what each leaves, its derivatives and signatures, shape (windows, 1 +
+    coordinates + instances), and what a sd of each reading changes, shape (windows, readings)."""
+
+    whole: np.ndarray
+    noise: np.ndarray
+
+    @property
+    def sd(self) -> np.ndarray:
+        """Of each window."""
+        return np.sqrt(np.maximum(np.sum(self.noise**2, 1), 1e-300))
+
+    def whitened(self, growth: np.ndarray) -> np.ndarray:
+        """`whole` by its noise, of which `growth` is the relative growth by each coordinate."""
+        covariance = self.noise @ self.noise.T + np.diag(FLOOR * self.sd**2)
+        whole, count = self.whole.copy(), growth.shape[1]
+        whole[:, 1 : count + 1] -= whole[:, :1] * growth
+        return solve_triangular(np.linalg.cholesky(covariance), whole, lower=True)
+
+
+def _joined(problem: Problem, plan: Plan, w: Windows, terms: Terms) -> _Joined:
+    """The equations of the windows of a run."""
+    sd = np.asarray(problem.data.sd)[w.rows]
+    count = terms.f.shape[1]
+    slopes = [w.slope] * count
+    if plan.angle and plan.mechanical:
+        slopes[plan.electrical] = -w.bend
+
+    def integrated(f: Any, y: Any) -> np.ndarray:
+        each = [w.weight @ f[w.rows, k] + slopes[k] @ y[w.rows, k] for k in range(count)]
+        return np.concatenate(each)
+
+    parts = [
+        integrated(terms.f[..., None], terms.y[..., None]),
+        integrated(*terms.by_z),
+        integrated(*terms.by_effects),
+    ]
+    by, also = (np.asarray(x)[w.rows] for x in terms.by_reading)
+    noise = [
+        np.concatenate(
+            [(w.weight * by[:, k, c] + slopes[k] * also[:, k, c]) * sd[:, c] for c in range(sd.shape[1])], 1
+        )
+        for k in range(count)
+    ]
+    return _Joined(np.concatenate(parts, 1), np.concatenate(noise))

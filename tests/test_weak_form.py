@@ -1,0 +1,211 @@
+"""Regression of a log's equations in weak form, on logs from plain NumPy laws; no window holds a jump."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_log_kinds import carriage, servo, written
+
+from calibration.data import robot_file
+from calibration.data import runs as records
+from calibration.data.runs import Runs
+from calibration.discovery import discover, findings, screening
+from calibration.discovery.settings import settings_for
+from calibration.inference import shown_states, weak_form
+from calibration.inference.observers import Histories
+from mmrjax.effects import BY_NAME
+
+STEP, EVERY, RPM = 2e-4, 0.01, np.pi / 30
+TRUE = {"resistance": 0.9, "torque_constant": 0.042, "inertia": 2.4e-4}
+RIG = """
+base = "none"
+imposed = "voltage"
+channels = ["motor_current", "motor_speed"]
+sides = 1
+[motor]
+torque_constant = "0.043 ± 10 %"
+resistance = "0.8 ± 20 %"
+inductance = 0.0004
+friction_coulomb = "0.02 ± 50 %"
+friction_viscous = "3e-5 ± 100 %"
+inertia = "0.0002 ± 40 %"
+[gearbox]
+ratio = 1
+efficiency_load = "1 ± 0"
+[bench]
+load = "shaft"
+inertia = "1e-7 ± 0"
+loss_coulomb = "0 ± 0"
+"""
+NAMES = ("churning", "stribeck_track", "torque_constant_saturation", "series_resistance", "directional_friction")
+SETTINGS = settings_for(Histories, 250)
+SD = np.array([8 * RPM, 0.03])  # of speed and current [SI]
+
+
+def motor(seed=0, noise=(1.0, 1.0), quadratic=4e-8):
+    """U = k ω + R I + L dI/dt, J dω/dt = k I - M_0 sign ω - b ω - c ω|ω| of four runs under a staircase of voltage."""
+    rng, r, k, inertia = np.random.default_rng(seed), *TRUE.values()
+    rows, hold = 150, 50
+    volts = rng.uniform(6.0, 24.0, (4, rows // hold)) * np.array([[1.0], [1.0], [-1.0], [-1.0]])
+    current, speed, shown = np.zeros(4), np.zeros(4), []
+    for n in range(rows):
+        given = volts[:, n // hold]
+        shown.append((current, speed))
+        for _ in range(round(EVERY / STEP)):
+            settled = (given - k * speed) / r  # exact for the winding, whose time constant is two steps long
+            current = settled + (current - settled) * np.exp(-STEP * r / 4e-4)
+            dry = 0.02 * np.tanh(speed / 0.05)
+            torque = k * current - dry - 3e-5 * speed - quadratic * speed * abs(speed)
+            speed = speed + STEP * torque / inertia
+    current, speed = (np.array(x).T for x in zip(*shown, strict=True))
+    columns = {
+        "run_id": np.repeat(["a", "b", "c", "d"], rows),
+        "configuration": np.repeat(["bench"], 4 * rows),
+        "time_s": np.tile(np.arange(rows) * EVERY, 4),
+        "supply_voltage_V": np.repeat(volts, hold, 1).ravel(),
+        "motor_speed_rpm": (speed + noise[0] * SD[0] * rng.standard_normal(speed.shape)).ravel() / RPM,
+        "motor_current_A": (current + noise[1] * SD[1] * rng.standard_normal(current.shape)).ravel(),
+        "slope_deg": np.zeros(4 * rows),
+        "payload_kg": np.zeros(4 * rows),
+    }
+    return columns
+
+
+@pytest.fixture(scope="module")
+def space(tmp_path_factory):
+    """What can be fitted to the log of a motor that churns."""
+    file = tmp_path_factory.mktemp("motor") / "rig.toml"
+    file.write_text(RIG, encoding="utf-8")
+    return posed(Runs("synthetic", motor()).of(robot_file.read(file)), robot_file.read(file))
+
+
+def posed(runs, robot, sd=SD):
+    library = {n: BY_NAME[n] for n in NAMES}
+    return discover.pose(runs, robot, np.broadcast_to(sd, runs.measured().shape), SETTINGS, {}, library)
+
+
+@pytest.fixture(scope="module")
+def before(space):
+    return screening.beforehand(space, SETTINGS)
+
+
+def test_a_window_integrates_by_parts():
+    time = np.linspace(0.0, 0.3, 31)
+    w, slope, bend = shown_states.window(time / 0.3, 0.3)
+    x, rate, second = np.sin(9 * time), 9 * np.cos(9 * time), -81 * np.sin(9 * time)
+    assert w @ rate == pytest.approx(-slope @ x, rel=1e-5)
+    assert w @ second == pytest.approx(bend @ x, rel=1e-4)
+
+
+def test_windows_end_before_what_they_may_not_hold():
+    time = np.arange(40) * 0.01
+    usable, broken = np.ones(40, bool), np.zeros(40, bool)
+    usable[12], broken[25] = False, True
+    found = [set(rows) for rows, _ in shown_states.windows_in(time, usable, broken)]
+    assert any(max(rows) < 12 for rows in found) and any(min(rows) >= 25 for rows in found)
+    assert not any(12 in rows or {24, 25} <= rows for rows in found)
+    assert not shown_states.windows_in(time * 100, usable, broken)  # too far apart to show how states change
+
+
+def test_base_parameters_are_those_of_the_log(space, before):
+    value = space.coordinates.base.value(before.base.z[: space.free])
+    names = space.coordinates.base.names
+    for name, true in TRUE.items():
+        assert value[names.index(f"motor.{name}")] == pytest.approx(true, rel=0.01)
+    assert not before.base.simulated
+
+
+def test_the_effect_of_the_log_is_ranked_first_and_not_by_chance(space, before):
+    found = findings.ranking_beforehand(space, before, SETTINGS)
+    assert found.missing and found.windows == before.windows > 0
+    assert "churning" in [e.name for e in found.effects[:2]]
+    assert found.effects[0].score > found.chance
+
+
+def test_the_ranking_comes_before_the_base_fit_which_begins_there(space, before, monkeypatch):
+    begun, kept = [], []
+
+    def fit_base(space, settings, where, near=None):
+        begun.append(near)
+        raise InterruptedError
+
+    def keep(name, make):
+        found = make()
+        kept.append(name)
+        return found
+
+    monkeypatch.setattr(discover, "fit_base", fit_base)
+    runs, library = Runs("synthetic", motor()).of(space.bare.base), {n: BY_NAME[n] for n in NAMES}
+    noise = SimpleNamespace(sd=np.broadcast_to(SD, runs.measured().shape))
+    with pytest.raises(InterruptedError):
+        discover.trace(runs, space.bare.base, noise, SETTINGS, {}, library, keep=keep)
+    assert kept == ["ranking"]
+    assert not begun[0].simulated and begun[0].z == pytest.approx(before.base.z)
+
+
+def test_noise_of_windows_is_that_of_their_readings(space, before):
+    """Without an effect that the base lacks what is left is a χ² of the windows."""
+    quiet = Runs("synthetic", motor(seed=5, quadratic=0.0)).of(space.bare.base)
+    found = weak_form.weak_form(posed(quiet, space.bare.base).bare)
+    chi2 = np.sum(found.residual**2)
+    assert abs(chi2 - found.windows) < 4 * np.sqrt(2 * found.windows)
+
+
+def test_windows_across_a_jump_are_wrong(space, before, monkeypatch):
+    names, plan = space.bare.coordinates.names, shown_states.plan_of(space.bare)
+    cut = shown_states.windows_of(space.bare, plan, shown_states.rates_of(space.bare, plan))
+    volts = np.asarray(space.bare.observe.of_rows.voltage)
+    for w in cut:
+        for weight in w.weight:
+            inside = w.rows[np.flatnonzero(weight)]
+            assert np.ptp(volts[inside]) == 0
+    monkeypatch.setattr(shown_states, "JUMP", 9.0)
+    wrong, k = weak_form.weak_form(space.bare).z, names.index("motor.inductance")
+    right, wrong = (space.coordinates.base.value(z[: space.free])[k] for z in (before.base.z, wrong))
+    assert right == pytest.approx(4e-4, rel=0.3) and wrong > 5 * right
+
+
+@pytest.mark.parametrize("imposed, channel", [("motor_current", "motor_speed"), ("motor_speed", "motor_current")])
+def test_a_current_or_a_speed_may_be_imposed(tmp_path, imposed, channel):
+    """Torques alone are shown then: inertia over the torque constant, and the effect where rows follow a speed that
+    turns between them; lines between rows of an imposed one differ from it by more than the effect."""
+    text = RIG.replace('imposed = "voltage"', f'imposed = "{imposed}"')
+    (tmp_path / "rig.toml").write_text(text.replace('"motor_current", "motor_speed"', f'"{channel}"'), "utf-8")
+    robot = robot_file.read(tmp_path / "rig.toml")
+    columns = motor(noise=(0.0, 1.0) if imposed == "motor_speed" else (1.0, 0.0))
+    del columns["supply_voltage_V"]
+    lines = [",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n", "utf-8")
+    mine = posed(
+        records.read(str(tmp_path / "log.csv"), robot=robot).of(robot), robot, SD[int(channel == "motor_current")]
+    )
+    found = screening.beforehand(mine, SETTINGS)
+    names, value = mine.coordinates.base.names, mine.coordinates.base.value(found.base.z[: mine.free])
+    ratio = value[names.index("motor.inertia")] / value[names.index("motor.torque_constant")]
+    assert ratio == pytest.approx(TRUE["inertia"] / TRUE["torque_constant"], rel=0.03)
+    ranked = findings.ranking_beforehand(mine, found, SETTINGS)
+    assert imposed == "motor_speed" or "churning" in [e.name for e in ranked.effects[:2]]
+
+
+@pytest.mark.parametrize("kind, made", [("servo", servo), ("carriage", carriage)])
+def test_logs_of_an_angle_alone_are_twice_integrated(tmp_path, kind, made):
+    made = made(np.random.default_rng(1), levels=(0.8, 1.0, -0.9) if kind == "servo" else (1.2, 2.0, -1.6))
+    robot = written(tmp_path, kind, made)
+    runs = records.read(str(tmp_path / "log.csv"), robot=robot).of(robot)
+    found = weak_form.weak_form(posed(runs, robot, np.maximum(0.003 * Histories.sizes(runs), 1e-9)).bare)
+    assert found is not None and np.all(np.abs(found.z) < 4)
+
+
+def test_a_log_that_does_not_show_its_states_is_none(space):
+    assert weak_form.weak_form(without(space.bare, "motor_speed")) is None
+    assert shown_states.plan_of(without(space.bare, "motor_current")).electrical is False
+
+
+def without(problem, channel):
+    """The problem without the readings of a channel."""
+    weight = np.array(problem.data.weight)
+    weight[:, [c.name for c in problem.channels].index(channel)] = 0.0
+    return dataclasses.replace(problem, data=dataclasses.replace(problem.data, weight=weight))
