@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from calibration.inference.normal_equations import half_solved, solved
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax.compiling import OVER_TIME, SELDOM, SMALL, compiled
+from mmrjax.linear_equations import half_solved, solved
 from mmrjax.robot import Robot
 
 #: Predicted decrease of the objective below which a point is an optimum: in ½σ² (the step left is then below

@@ -241,7 +241,7 @@ def _integrated(
 
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda _, y, run: law(run[0], run[1], y) * run[2]),
-        Rodas4(inverted=conditions.turns),
+        Rodas4(),
         times[0],
         times[-1],
         dt0=jnp.asarray(1e-4, y0.dtype),

@@ -291,7 +291,7 @@ def follow(
         left, trips = jnp.minimum(to_end, to_trip), to_trip < to_end
         last = c.step >= left * (1 - 1e-9)
         h = jnp.where(last, left, jax.lax.stop_gradient(c.step))
-        y, q, u, _ = stages(functools.partial(rates, stands=c.stands), c.y, c.q, h, inverted=True, looped=law.LONG)
+        y, q, u, _ = stages(functools.partial(rates, stands=c.stands), c.y, c.q, h, looped=law.LONG)
         y = y.at[clock].set(jnp.where(last & ~trips, length, y[clock]))
         scale = tolerance * (1 + jnp.maximum(jnp.abs(c.y), jnp.abs(y)))
         size = law.norm(u[-1] / scale)

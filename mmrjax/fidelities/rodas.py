@@ -41,12 +41,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
 
     Source: Hairer and Wanner, Solving Ordinary Differential Equations II (1996), Section IV.7, RODAS.
     Only for autonomous right-hand sides of one flat vector: the Jacobian in time is taken to be zero.
-
-    Attributes:
-        inverted: see `stages`.
     """
-
-    inverted: bool = False
 
     term_structure: ClassVar[Any] = diffrax.ODETerm
     interpolation_cls: ClassVar[Callable[..., Any]] = RodasInterpolation
@@ -64,7 +59,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         def rate(y: Any) -> tuple[Any, Any]:
             return terms.vf(t0, y, args), y[:0]
 
-        y1, _, u, _ = stages(rate, y0, y0[:0], t1 - t0, self.inverted)
+        y1, _, u, _ = stages(rate, y0, y0[:0], t1 - t0)
         c2, c3 = (sum(d * v for d, v in zip(row, u[:5], strict=True)) for row in _D)
         dense = {"y0": y0, "y1": y1, "c2": c2, "c3": c3}
         return y1, u[-1], dense, None, RESULTS.successful

@@ -32,7 +32,6 @@ from calibration.inference.bases import Bases
 from calibration.inference.details import Memory, Strongest, TimeSide, TimeStatistics
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
-from calibration.inference.normal_equations import solved
 from calibration.inference.notes import CoarseSteps, Note, StopsOnSlope, Thinned
 from calibration.inference.observers import settled_ends
 from calibration.inference.observers.base import Observer, SearchPolicy
@@ -73,6 +72,7 @@ from mmrjax.fidelities.histories import (
     steps_of,
     within,
 )
+from mmrjax.linear_equations import solved
 from mmrjax.params import Scalar
 from mmrjax.rig import Begin, Begins, Rig
 from mmrjax.robot import Robot
