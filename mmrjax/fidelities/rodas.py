@@ -39,7 +39,9 @@ class RodasInterpolation(diffrax.LocalLinearInterpolation):
 class Rodas4(diffrax.AbstractAdaptiveSolver):
     """Stiffly accurate, L-stable Rosenbrock method of order 4(3) with six stages.
 
-    Source: Hairer and Wanner, Solving Ordinary Differential Equations II (1996), Section IV.7, RODAS.
+    Source: Hairer and Wanner, Solving Ordinary Differential Equations II (1996), Section IV.7, RODAS. diffrax has no
+    Rosenbrock method. Its implicit ones (Kvaerno's of order 3 to 5) take ten times as long over Table 8 at the same
+    accuracy, or longer (docs/lab/figures.md).
     Only for autonomous right-hand sides of one flat vector: the Jacobian in time is taken to be zero.
     """
 
