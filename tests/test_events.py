@@ -39,19 +39,26 @@ def robot_of(bench):
     return params.replace(robot, {p: getattr(bench, f) for f, p in NAMES.items() if loose or f != "backlash"})
 
 
-def simulated(bench):
-    """Derivatives, by shares of a bench's parameters `MOVED`, of current [A] and motor speed [rad/s] at the samples."""
-    robot, times = robot_of(bench), grid(SAMPLES, CHANGES[1:], start=CHANGE)
+@pytest.fixture(scope="module")
+def simulated():
+    """Signals of a bench without a backlash at the samples, and derivatives of current [A] and motor speed [rad/s] by
+    shares of its parameters `MOVED`; one program serves all."""
+    times = grid(SAMPLES, CHANGES[1:], start=CHANGE)
     run = Conditions(voltage=VOLTS[np.searchsorted(CHANGES, times, side="right") - 1])
     at = np.searchsorted(times, SAMPLES)
 
-    def of(shares):
-        moved = {NAMES[f]: getattr(bench, f) * share for f, share in zip(MOVED, shares, strict=True)}
-        signals = histories(params.replace(robot, moved), run, jnp.asarray(times))
-        found = jnp.stack([signals.current, signals.speed_motor], -1)[at]
-        return found, found
+    def of(shares, robot, values):
+        moved = {NAMES[f]: value * share for f, value, share in zip(MOVED, values, shares, strict=True)}
+        signals = histories(params.replace(robot, moved), run, jnp.asarray(times), at=at)
+        return jnp.stack([signals.current, signals.speed_motor], -1), signals
 
-    return jax.jit(jax.jacfwd(of, has_aux=True))
+    program = jax.jit(jax.jacfwd(of, has_aux=True))
+
+    def found(bench):
+        values = jnp.asarray([getattr(bench, f) for f in MOVED])
+        return program(jnp.ones(len(MOVED)), params.strong(robot_of(bench)), values)
+
+    return found
 
 
 def expected(bench, shares=None):
@@ -66,9 +73,10 @@ ALLOWED = {"rest": ((0.02, 0.005), (0.05, 0.02)), "limit": ((0.04, 0.01), (0.05,
 
 
 @pytest.mark.parametrize("name", list(ALLOWED))
-def test_histories_through_rest_and_a_current_limit_are_those_of_scipy(name):
+def test_histories_through_rest_and_a_current_limit_are_those_of_scipy(simulated, name):
     bench = BENCHES[name]
-    slopes, shown = (np.asarray(x) for x in simulated(bench)(np.ones(len(MOVED))))
+    slopes, signals = simulated(bench)
+    shown, slopes = np.stack([signals.current, signals.speed_motor], -1), np.asarray(slopes)
     exact, happened = expected(bench)
     words, near = list(happened.values()), np.zeros(len(SAMPLES), bool)
     assert words.count("rest") == words.count("start") == 2 and ("limit" in words) is (name == "limit")
@@ -84,17 +92,15 @@ def test_histories_through_rest_and_a_current_limit_are_those_of_scipy(name):
         assert error[~near].max() < away_by[1] and error[near].max() < near_by[1], moved
 
 
-def test_a_load_that_friction_holds_stands():
+def test_a_load_that_friction_holds_stands(simulated):
     """In the third stretch 1 V does not overcome friction: nothing moves, and all is in equilibrium."""
     bench = BENCHES["rest"]
-    times = jnp.asarray(grid(SAMPLES[SAMPLES <= 0.75], CHANGES[1:3]))
-    run = Conditions(voltage=VOLTS[np.searchsorted(CHANGES, times, side="right") - 1])
-    found = jax.jit(lambda robot: histories(robot, run, times))(robot_of(bench))
-    held = np.asarray(times) > 0.7
+    found, held = simulated(bench)[1], (SAMPLES > 0.7) & (SAMPLES < 0.8)
     for still in (found.speed_motor, found.speed, found.acceleration, found.torque_net):
         np.testing.assert_array_equal(np.asarray(still)[held], 0.0)
-    assert 0 < float(found.torque_output[-1]) <= bench.loss_coulomb
-    assert float(found.current[-1]) == pytest.approx(1 / bench.resistance, rel=1e-9)
+    torque = np.asarray(found.torque_output)[held]
+    assert (torque > 0).all() and (torque <= bench.loss_coulomb).all()
+    np.testing.assert_allclose(np.asarray(found.current)[held], 1 / bench.resistance, rtol=1e-9)
 
 
 @pytest.mark.slow
