@@ -1,8 +1,8 @@
 """Steps of a mission: events that they land on, and one segment of the profile. What acts at an instant is the law's
 of its motion: `mission_straight` or `mission_turning`.
 
-The loop of diffrax with its `Event` takes 1.8 to 2.5 times as long for a start and a stop, at as many steps of the
-same method, and leaves out peaks and flags (docs/lab/figures.md).
+For a start and a stop the loop of diffrax with its `Event` takes 1.8 to 2.5 times as long. It takes as many steps of
+the same method, and finds neither peaks nor flags (docs/lab/figures.md).
 """
 
 from __future__ import annotations
