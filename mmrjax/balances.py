@@ -84,7 +84,7 @@ def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar 
     speed_wheel = state.speed_motor * (1 / robot.gearbox.ratio)
     speed_theoretical = chassis.radius * speed_wheel
     rest = chassis.speed_still
-    duty = robot.driver.duty_limited(conditions.duty, state.current)
+    duty = robot.driver.duty_limited(conditions.duty, state.current, conditions.polarity)
     straight = dict.fromkeys(IN_PLANE, jnp.zeros_like(state.speed))
     signals = Signals(
         **straight,
@@ -130,7 +130,7 @@ def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
     )
     back = robot.motor.voltage_back(signals.speed_motor)
     voltage = robot.driver.voltage(source - added(robot, signals, "supply"), signals.duty, signals.pause, back)
-    blocked = robot.driver.blocks(signals.duty, signals.current, conditions.open)
+    blocked = robot.driver.blocks(signals.duty * conditions.polarity, signals.current, conditions.open)
     return _fill(signals, voltage_source=source, voltage=jnp.where(blocked, back, voltage))
 
 

@@ -209,6 +209,11 @@ class Conditions(eqx.Module):
         return self.motor_speed is not None or self.motor_current is not None
 
     @property
+    def polarity(self) -> Array:
+        """Sign of a duty that drives forward, ±1: that of the supply's voltage; of a battery 1."""
+        return jnp.where((jnp.asarray(self.battery) < 0.5) & (jnp.asarray(self.voltage) < 0), -1.0, 1.0)
+
+    @property
     def states_levers(self) -> bool:
         """Whether it is stated at which angles levers stand: the robot then rests on what they leave it."""
         return self.levers_front_deg is not None or self.levers_rear_deg is not None

@@ -81,10 +81,11 @@ class Driver(eqx.Module):
         pulsed = jnp.abs(duty) > LEAST_DUTY
         return jnp.where(pulsed, 1 / jnp.where(pulsed, jnp.abs(duty), 1.0), 1.0)
 
-    def duty_limited(self, duty: Scalar, current: Scalar) -> Scalar:
-        """Duty D [-] that holds the motor's `current` [A] at the limit, between -1 and 1."""
+    def duty_limited(self, duty: Scalar, current: Scalar, polarity: Scalar = 1.0) -> Scalar:
+        """Duty D [-] that holds the motor's `current` [A] at the limit, between -1 and 1; `polarity`: sign of the
+        supply's voltage."""
         over = at_least(0.0, jnp.abs(current) / self.current_limit - 1)
-        return clip(duty - jnp.sign(current) * STEEPNESS * over, -1.0, 1.0)
+        return clip(duty - polarity * jnp.sign(current) * STEEPNESS * over, -1.0, 1.0)
 
     def limits(self, current: Scalar) -> Scalar:
         """Whether the limit acts at a motor's `current` [A]."""

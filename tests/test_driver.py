@@ -33,6 +33,20 @@ def test_the_current_limit_takes_duty_from_what_drives_the_current(duty, current
     assert bool(LIMITED.limits(current)) is (abs(current) > 5.0)
 
 
+@pytest.mark.parametrize("volts", [6.0, -6.0])
+def test_limit_and_diode_act_alike_on_a_supply_of_either_sign(robot, volts):
+    """Beyond the limit the motors get less than the supply has, and a diode blocks what flows against it alone."""
+    bridge = dataclasses.replace(robot.driver, current_limit=1.0, returns_current=False)
+    limited = dataclasses.replace(robot, driver=bridge)
+    state = State(np.sign(volts) * 1.001, 0.0, 0.0, 0.0)
+    signals = [
+        balances.moving(limited, Conditions(voltage=volts), dataclasses.replace(state, current=way * state.current))
+        for way in (1, -1)
+    ]
+    assert float(signals[0].voltage) == pytest.approx(0.5 * volts)
+    assert float(signals[1].voltage) == 0.0  # at the back-EMF of motors that stand
+
+
 def test_a_diode_blocks_current_against_the_duty_alone():
     diode = Driver(returns_current=False)
     assert [bool(diode.blocks(d, i, 0.0)) for d, i in ((1.0, 2.0), (1.0, -2.0), (-1.0, -2.0), (-1.0, 2.0))] == [

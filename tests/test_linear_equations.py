@@ -11,7 +11,7 @@ from test_log_kinds import servo, written
 from calibration.data import runs as records
 from calibration.inference import noise, observers, priors
 from calibration.inference.optimizers import linearised_signed
-from mmrjax.linear_equations import inverted, solved
+from mmrjax.linear_equations import factorise, half_solved, inverse, inverted, regular, solution, solved, substitute
 
 #: Primitives that the CPU does by LAPACK.
 LAPACK = r"\b(lu|cholesky|triangular_solve|qr|householder_product|eigh?|svd|schur|tridiagonal_solve)\["
@@ -29,6 +29,85 @@ def test_equations_are_solved_as_by_numpy_whatever_the_pivots():
     np.testing.assert_allclose(inverse, np.linalg.inv(matrices), rtol=1e-9, atol=1e-12)
     assert np.asarray(solved(matrices[0], b[0, :, 0])) == pytest.approx(found[0, :, 0])
     assert not np.isfinite(solved(jnp.ones((3, 3)), jnp.arange(3.0))).any()
+
+
+def test_half_of_a_solution_is_that_of_a_cholesky_factor():
+    rng = np.random.default_rng(0)
+    a = rng.standard_normal((9, 5))
+    lower = np.linalg.cholesky(a.T @ a)
+    np.testing.assert_allclose(half_solved(a.T @ a, a.T), np.linalg.solve(lower, a.T), rtol=1e-9, atol=1e-12)
+    assert np.isnan(half_solved(-a.T @ a, a.T)).any()
+
+
+# --- written out, without exchanges ---------------------------------------------------------------------------------
+
+RNG = np.random.default_rng(1)
+DIAGONAL = 3 * np.eye(3)  # added to a matrix: pivots where elimination without exchanges looks for them
+EXCHANGE = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # no pivot on the diagonal at all
+
+
+@jax.jit
+def implicit(matrix, vector):
+    """What an implicit derivative makes of a matrix and a right-hand side."""
+    factors, own = regular(factorise(matrix))
+    return jnp.where(own, solution(factors, vector), 0.0)
+
+
+@jax.jit
+def eliminate(matrix, vector):
+    return solution(factorise(matrix), vector)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_elimination_and_inverse_match_numpy(n):
+    matrices, vectors = 3 * np.eye(n) + RNG.uniform(-1, 1, (200, n, n)), RNG.normal(size=(200, n))
+    expected = np.linalg.solve(matrices, vectors[..., None])[..., 0]
+    np.testing.assert_allclose(jax.vmap(eliminate)(matrices, vectors), expected, rtol=1e-10, atol=1e-13)
+    found, determinant = jax.vmap(inverse)(jnp.asarray(matrices))
+    np.testing.assert_allclose(found, np.linalg.inv(matrices), rtol=1e-10, atol=1e-13)
+    np.testing.assert_allclose(determinant, np.linalg.det(matrices), rtol=1e-10)
+
+
+def test_elimination_leaves_out_zeros_that_are_stated():
+    """The pattern of the balances: slip by speed and motor speed, voltage by current and motor speed."""
+    matrix = np.array([[-1.0, 0.0, 0.8], [0.0, -0.6, -2.6], [0.0, -0.12, -0.3]])
+    sparse = [[None if x == 0 else jnp.asarray(x) for x in row] for row in matrix]
+    vector = [jnp.asarray(x) for x in (0.3, -1.2, 0.7)]
+    found = substitute(factorise(sparse), vector)
+    np.testing.assert_allclose(found, np.linalg.solve(matrix, np.asarray(vector)), rtol=1e-14)
+    alone = substitute(factorise(sparse), [vector[0], None, None])
+    assert alone[1] is None and alone[2] is None  # the slip moves neither current nor motor speed
+    np.testing.assert_allclose(alone[0], -0.3, rtol=1e-14)
+
+
+def test_elimination_without_a_pivot_in_its_place_gives_no_number():
+    """Newton's method does not move there."""
+    assert not np.isfinite(eliminate(EXCHANGE, np.ones(3))).any()
+
+
+def test_regular_leaves_a_regular_matrix_alone():
+    matrix, vector = DIAGONAL + RNG.uniform(-1, 1, (3, 3)), RNG.normal(size=3)
+    # Two programs of the same equations, whose products and sums a compiler may fuse or not: an ulp.
+    np.testing.assert_array_max_ulp(implicit(matrix, vector), eliminate(matrix, vector), maxulp=1)
+
+
+def test_regular_gives_zero_for_a_singular_matrix_and_spoils_no_neighbour():
+    batch = np.stack([np.eye(3), np.zeros((3, 3)), np.full((3, 3), np.nan), EXCHANGE, 2 * np.eye(3)])
+    answers = jax.vmap(implicit, (0, None))(batch, np.ones(3))
+    np.testing.assert_array_equal(answers[:, 0], [1.0, 0.0, 0.0, 0.0, 0.5])
+    for direction in (jax.jacfwd, jax.jacrev):
+        by_vector = jax.vmap(direction(implicit, argnums=1), (0, None))(batch, np.ones(3))
+        np.testing.assert_array_equal(by_vector, [np.eye(3), *np.zeros((3, 3, 3)), np.eye(3) / 2])
+
+
+def test_regular_reverse_derivative_matches_numpy():
+    matrix, vector = DIAGONAL + RNG.uniform(-1, 1, (3, 3)), RNG.normal(size=3)
+    got = jax.grad(lambda a: implicit(a, vector)[0])(jnp.asarray(matrix))
+    x, back = np.linalg.solve(matrix, vector), np.linalg.inv(matrix)
+    np.testing.assert_allclose(got, -np.outer(back[0], x), rtol=1e-9)
+
+
+# --- programs ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_step_of_a_search_on_a_log_calls_no_lapack(tmp_path):

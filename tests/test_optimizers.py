@@ -15,7 +15,6 @@ from calibration.data.columns import Layout
 from calibration.inference import blocks as holdout
 from calibration.inference import identifiability, noise, observers, priors, problem
 from calibration.inference import optimizers as fit
-from calibration.inference.normal_equations import half_solved, solved
 from mmrjax import robots
 from mmrjax.signals import CONVERGED, SLIDES
 
@@ -67,19 +66,6 @@ def residuals(problem, z):
 
 def starts(size, count, seed=0):
     return jnp.asarray(np.random.default_rng(seed).standard_normal((count, size)))
-
-
-def test_normal_equations_solve():
-    rng = np.random.default_rng(0)
-    a, b = rng.standard_normal((9, 5)), rng.standard_normal(9)
-    matrix = jnp.asarray(a.T @ a)
-    lower = np.linalg.cholesky(a.T @ a)
-    np.testing.assert_allclose(
-        half_solved(matrix, jnp.asarray(a.T)), np.linalg.solve(lower, a.T), rtol=1e-9, atol=1e-12
-    )
-    x = solved(matrix, jnp.asarray(a.T @ b))
-    np.testing.assert_allclose(x, np.linalg.lstsq(a, b)[0], rtol=1e-9)
-    assert np.isnan(half_solved(-matrix, jnp.asarray(a.T))).any()
 
 
 class Bent(eqx.Module):

@@ -41,13 +41,13 @@ from calibration.discovery.notes import (
 from calibration.discovery.reach import Reach, reach_of
 from calibration.discovery.settings import Settings
 from calibration.inference import bases, priors
-from calibration.inference.normal_equations import half_solved
 from calibration.inference.optimizers import informing
 from calibration.inference.problem import Problem
 from mmrjax import channels
 from mmrjax.compiling import SELDOM, compiled
 from mmrjax.fidelities.newton import implicit_slopes
 from mmrjax.fidelities.steady import IMPLICIT
+from mmrjax.linear_equations import half_solved
 from mmrjax.robot import Robot
 
 #: Alternatives are foreseen in batches of a multiple of this, so that most classes share what is compiled.

@@ -21,10 +21,10 @@ from jaxtyping import Array, Float
 
 from calibration.inference.bases import Bases, signature
 from calibration.inference.linearization import Linearization, ScoredEffect
-from calibration.inference.normal_equations import half_solved
 from calibration.inference.optimizers import CORES, rooted
 from calibration.inference.problem import Problem
 from mmrjax.compiling import SELDOM, SMALL, compiled
+from mmrjax.linear_equations import half_solved
 from mmrjax.precision import Threads
 
 #: Share of a signature's norm below which the free parameters explain it all.

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from calibration.inference.normal_equations import half_solved, solved
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax.compiling import OVER_TIME, SELDOM, SMALL, compiled
+from mmrjax.linear_equations import half_solved, solved
 from mmrjax.precision import Threads
 from mmrjax.robot import Robot
 

@@ -10,6 +10,7 @@ and speed v_x - ω y_s; `turning.Law` at each contact takes the place of Fig. 7 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -23,8 +24,9 @@ from mmrjax import balances, undercarriage
 from mmrjax.belt import Path
 from mmrjax.chassis import Chassis
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities import elimination, half_robot, turning
+from mmrjax.fidelities import half_robot, turning
 from mmrjax.fidelities.half_robot import Average, Motion, Steady, System
+from mmrjax.linear_equations import factorise, solution
 from mmrjax.mjcf import mjx
 from mmrjax.params import Scalar
 from mmrjax.signals import CONVERGED, NOT_SETTLED, PlaneMotion, Result, Signals
@@ -251,8 +253,8 @@ def _forces(run: System, motion: Motion, stored: bool = False) -> _Forces:
 
 
 def _solver(run: System, found: _Forces) -> Callable[[Float[Array, " 10"]], Float[Array, " 10"]]:
-    factors = elimination.factorise([list(row) for row in found.mass + run.step * found.damping])
-    return lambda push: jnp.stack([jnp.asarray(x) for x in elimination.substitute(factors, list(push))])
+    factors = factorise(found.mass + run.step * found.damping)
+    return functools.partial(solution, factors)
 
 
 @eqx.filter_custom_jvp

@@ -23,9 +23,9 @@ from mmrjax.chassis import Chassis
 from mmrjax.compiling import SMALL, compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.half_robot import contacts_resist, current_after
-from mmrjax.fidelities.linear import factorise, substitute
 from mmrjax.footing import COORDINATES, FRONT, PITCH, REAR, SHAFT, Footing, Shape
 from mmrjax.lever_drives import LeverDrive, Swing, lever_drive, swing
+from mmrjax.linear_equations import factorise, solution
 from mmrjax.masses import Masses, without_levers
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
@@ -382,7 +382,7 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
     whole = whole.at[LED, LED].add(1 - run.chassis.on_tracks)
     pushed = step * (force - bias)
     factors = factorise(whole[:4, :4])
-    moved, *coupled = (substitute(factors, x) for x in (pushed[:4], whole[:4, 4], whole[:4, 5]))
+    moved, *coupled = (solution(factors, x) for x in (pushed[:4], whole[:4, 4], whole[:4, 5]))
     coupling = jnp.stack(coupled, axis=1)
     left = whole[4:, 4:] - whole[4:, :4] @ coupling
     inverse = jnp.array([[left[1, 1], -left[0, 1]], [-left[1, 0], left[0, 0]]]) / (

@@ -17,7 +17,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.driver import FAST
 from mmrjax.fidelities import turning
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
-from mmrjax.fidelities.rest import holds, standing, status_moving, voltage_at_rest
+from mmrjax.fidelities.rest import HELD, holds, standing, status_moving, voltage_at_rest
 from mmrjax.fidelities.result import result, withhold
 from mmrjax.fidelities.rosenbrock import norm, step_longest
 from mmrjax.fidelities.steady import operating_signals
@@ -83,17 +83,21 @@ moving = compiled(balances.moving)
 def rates(
     robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"], way: Scalar | None = None
 ) -> Float[Array, " unknowns"]:
-    """Rates of the unknowns, in their units [1/s]; `way` as of `balances.moving`."""
-    signals = moving(robot, conditions, state_of(robot, y), way)
+    """Rates of the unknowns, in their units [1/s]; `way` as of `balances.moving`, or `HELD`."""
+    held = jnp.asarray(False if way is None else way == HELD)
+    signals = moving(robot, conditions, state_of(robot, y), None if way is None else jnp.where(held, 0.0, way))
     winding = signals.voltage_left / signals.inductance
-    shaft = signals.acceleration_wheel * robot.gearbox.ratio
+    shaft, moves = (
+        jnp.where(held, 0.0, x)
+        for x in (signals.acceleration_wheel * robot.gearbox.ratio, jnp.asarray(signals.acceleration))
+    )
     if conditions.motor_speed is not None:  # the current follows from torque, the shaft from what is imposed
         imposed = conditions.motor_acceleration
         winding, shaft = jnp.zeros_like(winding), jnp.zeros_like(shaft) if imposed is None else imposed
     rates = [
         winding,
         shaft,
-        signals.acceleration,
+        moves,
         signals.speed,
         balances.charge_drawn(robot, conditions, signals.total_current),
         *(jnp.asarray(effect.rate(robot, signals), y.dtype) for effect in robot.remembering),
@@ -241,7 +245,7 @@ def _integrated(
 
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda _, y, run: law(run[0], run[1], y) * run[2]),
-        Rodas4(inverted=conditions.turns),
+        Rodas4(),
         times[0],
         times[-1],
         dt0=jnp.asarray(1e-4, y0.dtype),

@@ -20,10 +20,10 @@ from mmrjax.belt import Path, runs
 from mmrjax.chassis import Chassis, inertia_reduced
 from mmrjax.conditions import Conditions
 from mmrjax.contact_sums import Linearized
-from mmrjax.fidelities.linear import Factors, factorise, substitute
 from mmrjax.fidelities.rest import STARTS, creeps, direction, unless_slipping, voltage_at_rest
 from mmrjax.fidelities.result import result, travels
 from mmrjax.fidelities.steady import steady
+from mmrjax.linear_equations import Factors, factorise, solution
 from mmrjax.masses import Masses, masses
 from mmrjax.mjcf import mjx
 from mmrjax.params import Scalar
@@ -260,7 +260,7 @@ def _step(run: System, motion: Motion) -> _Step:
     pushed, mass = _pushed(run, motion, signals, pulled)
     damping = resistance(run, motion, signals, at, pulled)
     factors = factorise(mass + run.step * damping)
-    gained = substitute(factors, mass @ (pushed - motion.v))
+    gained = solution(factors, mass @ (pushed - motion.v))
     after, over = _moved(motion, run.step, later(run, motion, signals), damping @ gained, gained, signals)
     return _Step(after, over, pulled.guided, damping, factors, gained, jnp.asarray(signals.speed_slip_terms))
 
@@ -331,7 +331,7 @@ def _differentiated(
     (left, fallen, later, signals, _), d_held = eqx.filter_jvp(held, (run, motion), (d_run, d_motion))
     d_left, d_fallen, d_later, d_signals, d_guided = d_held
     # None: what is differentiated does not enter.
-    d_gained = jnp.zeros_like(left) if d_left is None else substitute(step.factors, d_left)
+    d_gained = jnp.zeros_like(left) if d_left is None else solution(step.factors, d_left)
     through = step.damping[:2] @ d_gained
     d_fallen = through if d_fallen is None else d_fallen + through
     _, (d_after, d_over) = eqx.filter_jvp(

@@ -4,7 +4,9 @@ The same rates as `drive`, by an implicit method of fixed steps: SDIRK2, two sta
 stiffly accurate (Alexander, Diagonally implicit Runge-Kutta methods for stiff O.D.E.'s, SIAM J. Numer. Anal. 14
 (1977)). A derivative follows from the implicit function theorem stage by stage: linear equations with the matrix
 of Newton's method at the solution, so that a direction more costs one tangent of the rates a stage, instead of a
-rollout.
+rollout. The Rodas4 of `drive` on the same grid takes two thirds of the time for a run. But a direction costs it six
+stages and the derivative of a Jacobian, and where friction has a kink no control of an error shortens its steps
+(measured in docs/lab/figures.md).
 
 After a jump of the voltage the current lags by L / R, often much less than a step. SDIRK2 leaves up to a fifth of the
 jump to the end of such a step. So the lag of the last jump decays exponentially in every step, and the method follows
@@ -26,6 +28,7 @@ from jaxtyping import Array, Float, Int
 
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.drive import CURRENT, GROUND, MOTOR, moving, rates, start, state_of, units, winding
+from mmrjax.fidelities.rest import HELD, standing, turning_way
 from mmrjax.linear_equations import inverted, solved
 from mmrjax.params import Scalar
 from mmrjax.rarely import rarely
@@ -206,14 +209,18 @@ def steps_of(conditions: Conditions, times: Float[Array, " times"]) -> tuple[Ste
     return Step(jnp.diff(times), since, begun, before if conditions.motor_speed is None else None, now), constant
 
 
-def _lag(rate: Float[Array, " rates"], step: Step) -> Lag:
-    """Of a step, by the rates at its start: what is left by then of the lag after the last jump."""
+def _lag(rate: Float[Array, " rates"], step: Step, current: Scalar, limit: Scalar) -> Lag:
+    """Of a step, by the rates at its start: what is left by then of the lag after the last jump.
+
+    None where the driver's limit keeps the `current` from where it would go, for it follows the limit at once.
+    """
     if not len(rate):
         return _decaying(jnp.zeros(()), jnp.zeros(()), step.length)
     slope = (rate[1] - rate[2]) / MORE
     follows = slope > 0  # but where a diode begins to block
     decay = jnp.where(follows, slope, 1.0)
     left = (rate[0] - rate[1]) / decay * jnp.exp(-decay * step.since)
+    follows &= jax.lax.stop_gradient(jnp.abs(current - left)) <= limit
     return _decaying(jnp.where(follows, left, 0.0), decay, step.length)
 
 
@@ -232,7 +239,12 @@ def _windings(robot: Robot, constant: Conditions, step: Step, y: Float[Array, " 
 
 
 def _lag_of(robot: Robot, constant: Conditions, step: Step, y: Float[Array, " unknowns"]) -> Lag:
-    return _lag(_windings(robot, constant, step, y), step)
+    return _lag(_windings(robot, constant, step, y), step, y[CURRENT], _limit(robot))
+
+
+def _limit(robot: Robot) -> Scalar:
+    """The driver's limit of a current in its unit."""
+    return robot.driver.current_limit / units(robot)[CURRENT]
 
 
 def _stage(law: Callable[[Array], Array], known: Array, guess: Array, h: Array, mean: Array, decay: Array) -> Array:
@@ -264,8 +276,8 @@ class States(eqx.Module):
 
     Attributes:
         stages: unknowns at both stages of every step, without lags; ends: at its end.
-        sides: the way in which a shaft turns (±1; 0 where friction holds it) to begin with, and at last; these differ
-            where it comes to rest within the step; before: time in such a step until it does [s].
+        sides: the way of a shaft (see `turning_way`) to begin with, and at last; these differ where it comes to rest
+            within the step; before: time in such a step until it does [s].
     """
 
     stages: Float[Array, "steps 2 unknowns"]
@@ -304,7 +316,7 @@ def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) 
     """
     steps, constant = steps_of(conditions, times)
     of_first, first_state = at_first(robot, conditions)
-    edge, along = _edge(robot, of_first)
+    along = _with_motor(robot, of_first)
 
     def taken(y: Array, step: Step) -> tuple[Array, States]:
         held, lag = step.held(constant), _lag_of(robot, constant, step, y)
@@ -331,12 +343,12 @@ def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) 
                 jnp.where(rests, rest, part.begin),
                 jnp.where(rests, mine.end, part.lag),
                 jnp.where(nears, to_rest, step.length - part.length),
-                jnp.where(rests, _side(robot, law, rest, edge), part.side),
+                jnp.where(rests, _side(robot, held, rest), part.side),
                 stages,
                 end,
             )
 
-        side = _side(robot, law, y, edge)
+        side = _side(robot, held, y)
         whole = _Part(jnp.asarray(0), y, lag.begin, step.length, side, jnp.stack([y, y]), y)
         found = jax.lax.while_loop(lambda part: part.turn < TURNS + 2, turned, whole)
         return found.end, States(found.stages, found.end, jnp.stack([side, found.side]), found.length)
@@ -344,14 +356,9 @@ def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) 
     return jax.lax.scan(taken, first_state, steps)[1]
 
 
-def _side(robot: Robot, law: Callable[[Array, Array], Array], y: Array, edge: Scalar) -> Array:
-    """The way in which a shaft turns or leaves rest, 0 where it is held there; 0 too where shafts and load do not
-    move as one: their moments of rest are apart."""
-    if not robot.moves_as_one:
-        return jnp.zeros(())
-    backward, forward = law(y, -jnp.ones(()))[MOTOR] < 0, law(y, jnp.ones(()))[MOTOR] > 0
-    way = jnp.where(y[MOTOR] == 0, 1.0 * forward - 1.0 * backward, jnp.sign(y[MOTOR]))
-    return jnp.where(forward | backward | (jnp.abs(y[MOTOR]) >= edge), way, 0.0)
+def _side(robot: Robot, conditions: Conditions, y: Array) -> Array:
+    """`turning_way` of a step; 0 where shafts and load do not move as one: their moments of rest are apart."""
+    return turning_way(robot, conditions, state_of(robot, y)) if robot.moves_as_one else jnp.zeros(())
 
 
 def followed(
@@ -365,7 +372,8 @@ def followed(
     steps, constant = steps_of(conditions, times)
     first_state = at_first(robot, conditions)[1]
     begins = jnp.concatenate([first_state[None], run.ends[:-1]])
-    # A step to rest and from it: Euler's implicit ones.
+    # A step to rest and from it, both by an approximant of the exponential: of what a current forgets that lags by a
+    # quarter of such a part, Euler's implicit one keeps a fifth.
     passes = run.sides[:, 0] != run.sides[:, 1]
     h = steps.length
     spans = jnp.where(passes[:, None], jnp.stack([run.before, h - run.before], 1), _GAMMA * h[:, None])
@@ -379,17 +387,20 @@ def followed(
         current = _current(end)
 
         by_begin, rate = jax.jacfwd(lambda y: (_windings(robot, constant, step, y),) * 2, has_aux=True)(begin)
-        by_rate, lag = jax.jacfwd(lambda r: (_lag(r, step),) * 2, has_aux=True)(rate)
+        by_rate, lag = jax.jacfwd(lambda r: (_lag(r, step, begin[CURRENT], _limit(robot)),) * 2, has_aux=True)(rate)
         ends = jnp.stack([begin - lag.begin * current, end - lag.end * current])
         places = jnp.where(passes, ends, stages) + lag.means[:, None] * current
         slopes = jax.vmap(jax.jacfwd(lambda y, way: rates(robot, held, y, way)))(places, sides)
-        first, second = jax.vmap(inverted)(one - spans[:, None, None] * slopes)
+        z = spans[:, None, None] * slopes
+        weight = jnp.where(passes, one - z / 2 + z @ z / 6, one)  # of Padé's, (0, 3): 1 / (1 - z + z²/2 - z³/6)
+        first, second = jax.vmap(inverted)(one - z @ weight)
         jump = rarely(passes, _jump, (robot, held, places[1], sides), jnp.zeros_like(end))
         # What the second stage starts from, by the first stage and by the change before the step.
         by_first = jnp.where(passes, one + jump[:, None] * one[MOTOR], (1 - _GAMMA) / _GAMMA * one)
         by_before = jnp.where(passes, 0.0, 1 - (1 - _GAMMA) / _GAMMA) * one
         kept = by_first @ first
-        carries, gains = second @ (kept + by_before), jnp.stack([spans[0] * second @ kept, spans[1] * second])
+        carries = second @ (kept + by_before)
+        gains = jnp.stack([spans[0] * second @ kept, spans[1] * second]) @ weight
         # The lag shortens the current that a step starts from, acts on both stages, and is what is left at the end.
         by_means = jnp.einsum("sij,sj->si", gains, slopes[:, :, CURRENT] + lag.decay * current)
         by_decay = lag.means @ gains[:, :, CURRENT]
@@ -487,13 +498,10 @@ def _of_steps(blocks: T, count: int) -> T:
     return jax.tree.map(lambda x: x.reshape(x.shape[0] * BLOCK, *x.shape[2:])[:count], blocks)
 
 
-def _edge(robot: Robot, conditions: Conditions) -> tuple[Scalar, Array]:
-    """Motor speed from which on a direction is one, in the unit of the unknowns; and by what the unknowns change with
-    it where shafts and robot move as one."""
-    load, size = robot.chassis(conditions.configuration), units(robot)
-    per_speed = load.radius / robot.gearbox.ratio
-    along = jnp.zeros(len(size)).at[MOTOR].set(1.0).at[GROUND].set(per_speed * size[MOTOR] / size[GROUND])
-    return load.speed_still / (per_speed * size[MOTOR]), along
+def _with_motor(robot: Robot, conditions: Conditions) -> Array:
+    """Change of the unknowns with the motor speed where shafts and robot move as one, in their units."""
+    size, per_speed = units(robot), robot.chassis(conditions.configuration).radius / robot.gearbox.ratio
+    return jnp.zeros(len(size)).at[MOTOR].set(1.0).at[GROUND].set(per_speed * size[MOTOR] / size[GROUND])
 
 
 def _jump(
@@ -524,23 +532,35 @@ def histories(
         known: the run, from `followed`, where it is known.
         at: indices of the instants that are wanted; None: every one.
 
-    A run that could not be followed is not finite from there on. Friction at rest is smooth: a robot that should
-    stand creeps where gravity pulls, below a tenth of V_s.
+    A run that could not be followed is not finite from there on. Shafts and a load that move as one stand where
+    friction holds them. Of others friction at rest is smooth: a robot that should stand creeps where gravity pulls,
+    below a tenth of V_s.
     """
     changing, constant = _in_time(conditions)
-    ys = _nodes(robot, conditions, times, known)
+    ys, sides = _nodes(robot, conditions, times, known)
+    each = ys, jnp.append(sides[:, 0], sides[-1, 1]), changing
     if at is not None:
-        ys, changing = jax.tree.map(lambda x: x[at], (ys, changing))
-    return jax.vmap(lambda y, now: moving(robot, eqx.combine(now, constant), state_of(robot, y)))(ys, changing)
+        each = jax.tree.map(lambda x: x[at], each)
+    return jax.vmap(lambda y, way, now: _shown(robot, eqx.combine(now, constant), y, way))(*each)
 
 
 def _nodes(
     robot: Robot, conditions: Conditions, times: Float[Array, " times"], known: Followed | None
-) -> Float[Array, "times unknowns"]:
-    """Unknowns at every instant."""
+) -> tuple[Float[Array, "times unknowns"], Float[Array, "steps 2"]]:
+    """Unknowns at every instant, and `sides` of every step."""
     still = jax.lax.stop_gradient(robot)
-    ends = _ends(robot, conditions, times, states(still, conditions, times) if known is None else known)
-    return jnp.concatenate([at_first(robot, conditions)[1][None], ends])
+    run = states(still, conditions, times) if known is None else known
+    ends = _ends(robot, conditions, times, run)
+    return jnp.concatenate([at_first(robot, conditions)[1][None], ends]), run.sides
+
+
+def _shown(robot: Robot, conditions: Conditions, y: Array, way: Array) -> Signals:
+    """Signals of an instant, in static equilibrium where friction holds shafts and load."""
+    state = state_of(robot, y)
+    signals = moving(robot, conditions, state)
+    if not robot.moves_as_one or conditions.motor_speed is not None:
+        return signals
+    return jax.tree.map(lambda a, b: jnp.where(way == HELD, a, b), standing(robot, conditions, state), signals)
 
 
 class Within(eqx.Module):
@@ -579,24 +599,23 @@ def within(
 
     Args: as of `histories`; at: steps that are wanted, by the index of the instant that each begins at.
     """
-    ys = _nodes(robot, conditions, times, known)
+    ys, sides = _nodes(robot, conditions, times, known)
     steps, constant = steps_of(conditions, times)
     then = jax.tree.map(lambda x: x[1:], _in_time(conditions)[0])
-    each = ys[:-1], ys[1:], steps, then
+    each = ys[:-1], ys[1:], steps, then, sides
     if at is not None:
         each = jax.tree.map(lambda x: x[at], each)
 
-    def shown(conditions: Conditions, y: Array) -> Signals:
-        return moving(robot, conditions, state_of(robot, y))
-
-    def one(y: Array, after: Array, step: Step, then: Conditions) -> Within:
+    def one(y: Array, after: Array, step: Step, then: Conditions, sides: Array) -> Within:
         held = step.held(constant)
         if step.before is None:  # what is imposed is on a line itself
-            first = shown(held, y)
-            return Within(first, first, shown(eqx.combine(then, constant), after), jnp.zeros(()))
+            first = _shown(robot, held, y, sides[0])
+            return Within(first, first, _shown(robot, eqx.combine(then, constant), after, sides[1]), jnp.zeros(()))
         lag, current = _lag_of(robot, constant, step, y), _current(y)
         at = jnp.stack([y, y - lag.begin * current, after - lag.end * current])
-        found = jax.vmap(lambda y: jax.tree.map(jnp.asarray, shown(held, y)))(at)
+        found = jax.vmap(lambda *at: jax.tree.map(jnp.asarray, _shown(robot, held, *at)))(
+            at, sides[np.array([0, 0, 1])]
+        )
         first, begin, end = (jax.tree.map(lambda x, k=k: x[k], found) for k in range(3))
         return Within(first, begin, end, lag.decay * step.length)
 

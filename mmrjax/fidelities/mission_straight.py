@@ -67,11 +67,6 @@ def source(robot: Robot, conditions: Conditions, discharge: Scalar) -> Scalar:
     return jnp.where(conditions.battery > 0.5, battery, jnp.abs(conditions.voltage))
 
 
-def forward(conditions: Conditions) -> Scalar:
-    """Sign of a duty that drives forward."""
-    return jnp.where(conditions.battery > 0.5, 1.0, jnp.sign(conditions.voltage))
-
-
 def driven(
     robot: Robot, mode: Array, demand: Scalar, conditions: Conditions, state: State, integral: Scalar
 ) -> tuple[Array, Array, Array]:
@@ -96,7 +91,7 @@ def driven(
     limited = robot.driver.duty_limited(clip(wanted, -1.0, 1.0), state.current)
     # What the limits take away, the integral gives back: it does not wind up.
     excess = (wanted - limited) * voltage_source / (robot.driver.gain * robot.motor.torque_constant + 1e-12)
-    duty = clip(jnp.where(controlled, forward(conditions) * wanted, conditions.duty), -1.0, 1.0)
+    duty = clip(jnp.where(controlled, conditions.polarity * wanted, conditions.duty), -1.0, 1.0)
     return duty, jnp.where(controlled, error - excess, 0.0), jnp.where(controlled, error, 0.0)
 
 

@@ -89,7 +89,7 @@ def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, st
     state = balances.states_of_sides(robot, conditions, motion)
     if asked.voltage_left is not None and asked.voltage_right is not None:
         volts = jnp.stack([asked.voltage_left, asked.voltage_right])
-        share = straight.forward(own) * volts / jnp.maximum(straight.source(robot, own, state.discharge), 1e-3)
+        share = own.polarity * volts / jnp.maximum(straight.source(robot, own, state.discharge), 1e-3)
         own = dataclasses.replace(own, duty=jnp.where(asked.mode == VOLTAGE, share, own.duty))
     demand = demanded(robot, conditions, asked)
     law = jax.vmap(functools.partial(straight.driven, robot, asked.mode))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float
 
-from mmrjax.fidelities.elimination import Entry, Matrix, Vector, factorise, regular, substitute
+from mmrjax.linear_equations import Entry, Matrix, Vector, factorise, regular, substitute
 
 #: f(y, shared, own): as many numbers as there are unknowns, each a scalar, so that a batch of them is an array each.
 Residual = Callable[[Vector, Any, Any], Vector]

@@ -12,6 +12,7 @@ from mmrjax import balances, one_sided
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.result import slips, travels
 from mmrjax.params import Scalar
+from mmrjax.rarely import rarely
 from mmrjax.robot import Robot
 from mmrjax.signals import NOT_SETTLED, SLIDES, STALLED, Signals, State
 
@@ -21,6 +22,10 @@ TORQUE = 1.0
 SHARE, TIME = 1e-3, 0.1
 #: From which a robot whose movers slide gains or loses speed [m/s²], and from which one that stands is starting.
 GAIN, STARTS = 1e-3, 1e-2
+
+
+#: Way of shafts that friction holds, beside ±1 and 0.
+HELD = 2.0
 
 
 def least(*values: Scalar) -> Array:
@@ -149,10 +154,39 @@ def firmness(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     by moving the robot or by sliding its movers under it; its movers where gravity along the slope less rolling
     resistance is below the ground's adhesion.
     """
-    still = _still(state)
-    forward, backward = (_carried(robot, conditions, still, sense) for sense in (1.0, -1.0))
+    forward, backward = _about_to_turn(robot, conditions, state)
     shafts = least(-forward.torque_net, backward.torque_net) / TORQUE
     return least(shafts, _ground_margin(forward, backward)) if robot.has_ground else shafts
+
+
+def _about_to_turn(robot: Robot, conditions: Conditions, state: State) -> tuple[Signals, Signals]:
+    """Signals of shafts that stand and are about to turn forward, and backward."""
+    still = _still(state)
+    return _carried(robot, conditions, still, 1.0), _carried(robot, conditions, still, -1.0)
+
+
+def turning_way(robot: Robot, conditions: Conditions, state: State) -> Array:
+    """Way in which shafts and a load that move as one turn, or leave rest, ±1 [-].
+
+    `HELD` where they stand and friction holds them by the test of `firmness`, now and at the current that will flow
+    then; 0 where it does so now alone, so that they are about to leave. Where a speed is imposed it turns them,
+    whatever friction does: 0 where it stands, within the speed that friction at rest is not resolved in.
+    """
+    motor_speed = jnp.asarray(state.speed_motor)
+    if conditions.motor_speed is not None:
+        change = jnp.asarray(0.0 if conditions.motor_acceleration is None else conditions.motor_acceleration)
+        load = robot.chassis(conditions.configuration)
+        slow = jnp.abs(motor_speed) * load.radius / robot.gearbox.ratio < load.speed_still
+        return jnp.where(slow & (change == 0), 0.0, jnp.sign(jnp.where(motor_speed == 0, change, motor_speed)))
+
+    def leaving(robot: Robot, conditions: Conditions, state: State) -> Array:
+        settled = dataclasses.replace(state, current=current_at_rest(robot, conditions, state))
+        now, then = (_about_to_turn(robot, conditions, at) for at in (state, settled))
+        (forward, backward), later = ((ahead.torque_net > 0, back.torque_net < 0) for ahead, back in (now, then))
+        held = jnp.where(later[0] | later[1], 0.0, HELD)
+        return jnp.where(forward, 1.0, jnp.where(backward, -1.0, held))
+
+    return rarely(motor_speed == 0, leaving, (robot, conditions, state), jnp.sign(motor_speed))
 
 
 def slides_in_place(robot: Robot, conditions: Conditions) -> Array:

@@ -39,14 +39,11 @@ class RodasInterpolation(diffrax.LocalLinearInterpolation):
 class Rodas4(diffrax.AbstractAdaptiveSolver):
     """Stiffly accurate, L-stable Rosenbrock method of order 4(3) with six stages.
 
-    Source: Hairer and Wanner, Solving Ordinary Differential Equations II (1996), Section IV.7, RODAS.
+    Source: Hairer and Wanner, Solving Ordinary Differential Equations II (1996), Section IV.7, RODAS. diffrax has no
+    Rosenbrock method. Its implicit ones (Kvaerno's of order 3 to 5) take ten times as long over Table 8 at the same
+    accuracy, or longer (docs/lab/figures.md).
     Only for autonomous right-hand sides of one flat vector: the Jacobian in time is taken to be zero.
-
-    Attributes:
-        inverted: see `stages`.
     """
-
-    inverted: bool = False
 
     term_structure: ClassVar[Any] = diffrax.ODETerm
     interpolation_cls: ClassVar[Callable[..., Any]] = RodasInterpolation
@@ -64,7 +61,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         def rate(y: Any) -> tuple[Any, Any]:
             return terms.vf(t0, y, args), y[:0]
 
-        y1, _, u, _ = stages(rate, y0, y0[:0], t1 - t0, self.inverted)
+        y1, _, u, _ = stages(rate, y0, y0[:0], t1 - t0)
         c2, c3 = (sum(d * v for d, v in zip(row, u[:5], strict=True)) for row in _D)
         dense = {"y0": y0, "y1": y1, "c2": c2, "c3": c3}
         return y1, u[-1], dense, None, RESULTS.successful

@@ -13,12 +13,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.linear import factorise, substitute
+from mmrjax.linear_equations import inverse
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-
-#: Unknowns up to which elimination is written out; beyond, its program takes too long to compile.
-_WRITTEN_OUT = 8
 
 _GAMMA = 0.25
 _A = (
@@ -60,7 +57,6 @@ def stages(
     y0: Float[Array, " n"],
     q0: Float[Array, " m"],
     h: Array,
-    inverted: bool = False,
     looped: bool = False,
 ) -> tuple[Array, Array, Array | list[Array], Array | list[Array]]:
     """One step over `h`, with integrals that do not act back on what they are integrals of.
@@ -69,8 +65,6 @@ def stages(
 
     Args:
         rates: f(y) and g(y).
-        inverted: invert the matrix without exchanging rows: half the time for one run alone. A pivot that vanishes
-            spoils the step, which the control of the error then rejects: a shorter one makes the diagonal dominate.
         looped: hold `rates` once for all stages but the first: a program that compiles in less time.
 
     Returns:
@@ -82,17 +76,18 @@ def stages(
         return found, found
 
     (jacobian, jacobian_q), (f, g) = jax.jacfwd(both, has_aux=True)(y0)
-    matrix = jnp.eye(y0.shape[0], dtype=y0.dtype) / (h * _GAMMA) - jacobian
-    solve = inverse(matrix)[0] if inverted else _solver(matrix)
-    u, v, y, q = [solve(f)], [], y0, q0
+    # A pivot that vanishes spoils the step, which the control of the error then rejects: a shorter one makes the
+    # diagonal dominate.
+    inverted = inverse(jnp.eye(y0.shape[0], dtype=y0.dtype) / (h * _GAMMA) - jacobian)[0]
+    u, v, y, q = [inverted @ f], [], y0, q0
     v.append(h * _GAMMA * (g + jacobian_q @ u[0]))
     if looped:
-        return _looped(rates, solve, jacobian_q, y0, q0, h, u[0], v[0])
+        return _looped(rates, inverted, jacobian_q, y0, q0, h, u[0], v[0])
     for stage in range(1, 6):
         y = y + u[-1] if stage == 5 else y0 + sum(a * x for a, x in zip(_A[stage - 1], u, strict=True))
         q = q + v[-1] if stage == 5 else q0 + sum(a * x for a, x in zip(_A[stage - 1], v, strict=True))
         f, g = rates(y)
-        u.append(solve(f + sum(c * x for c, x in zip(_C[stage - 1], u, strict=True)) / h))
+        u.append(inverted @ (f + sum(c * x for c, x in zip(_C[stage - 1], u, strict=True)) / h))
         v.append(
             h * _GAMMA * (g + sum(c * x for c, x in zip(_C[stage - 1], v, strict=True)) / h + jacobian_q @ u[-1])
         )
@@ -101,7 +96,7 @@ def stages(
 
 def _looped(
     rates: Callable[[Array], tuple[Array, Array]],
-    solve: Callable[[Array], Array],
+    inverted: Array,
     jacobian_q: Array,
     y0: Array,
     q0: Array,
@@ -121,30 +116,10 @@ def _looped(
         u, v = found
         a, c = jnp.asarray(reach)[k], jnp.asarray(turns)[k]
         f, g = rates(y0 + a @ u)
-        now = solve(f + (c @ u) / h)
+        now = inverted @ (f + (c @ u) / h)
         return u.at[k + 1].set(now), v.at[k + 1].set(h * _GAMMA * (g + (c @ v) / h + jacobian_q @ now))
 
     begun = [jnp.zeros((6, *x.shape), x.dtype).at[0].set(x) for x in (first, first_q)]
     u, v = jax.lax.fori_loop(0, 5, stage, (begun[0], begun[1]))
     last = jnp.asarray(reach)[4].at[5].set(1.0)
     return y0 + last @ u, q0 + last @ v, u, v
-
-
-def _solver(matrix: Float[Array, "n n"]) -> Callable[[Float[Array, " n"]], Float[Array, " n"]]:
-    if matrix.shape[0] <= _WRITTEN_OUT:
-        written = factorise(matrix)
-        return lambda vector: substitute(written, vector)
-    factors = jax.scipy.linalg.lu_factor(matrix)
-    return lambda vector: jax.scipy.linalg.lu_solve(factors, vector)
-
-
-def inverse(matrix: Float[Array, "n n"]) -> tuple[Callable[[Float[Array, " n"]], Float[Array, " n"]], Array]:
-    """What solves by the inverse, found in place by Gauss and Jordan, a column at a time; no rows are exchanged. And
-    the determinant."""
-    determinant = jnp.ones((), matrix.dtype)
-    for k in range(matrix.shape[0]):
-        pivot = matrix[k, k]
-        determinant *= pivot
-        row, column = matrix[k] / pivot, matrix[:, k].at[k].set(0.0)
-        matrix = (matrix - jnp.outer(column, row)).at[k].set(row).at[:, k].set((-column / pivot).at[k].set(1 / pivot))
-    return lambda vector: matrix @ vector, determinant

@@ -18,10 +18,10 @@ from mmrjax.compiling import SELDOM, compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import turning
 from mmrjax.fidelities.base import Fidelity, Implicit, Progress, Run
-from mmrjax.fidelities.elimination import Vector
 from mmrjax.fidelities.newton import root
 from mmrjax.fidelities.rest import creeps, direction, slides_in_place, standing, voltage_at_rest
 from mmrjax.fidelities.result import result, travels, turned, withhold
+from mmrjax.linear_equations import Vector
 from mmrjax.params import Scalar
 from mmrjax.rarely import rarely
 from mmrjax.robot import Robot

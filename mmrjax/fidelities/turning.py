@@ -23,7 +23,8 @@ from mmrjax.effects.base import Effect
 from mmrjax.fidelities import lanes, rest
 from mmrjax.fidelities.rest import SHARE, TIME, voltage_at_rest
 from mmrjax.fidelities.result import efficiency, known, result, withhold
-from mmrjax.fidelities.rosenbrock import inverse, norm_of_sides
+from mmrjax.fidelities.rosenbrock import norm_of_sides
+from mmrjax.linear_equations import inverse
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import (
@@ -291,8 +292,8 @@ def _unknowns(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 9"],
     def linear(held: tuple[Robot, Conditions, Array, Array], _: _Linear) -> _Linear:
         y, solved = held[2:]
         slope, found = around(*held[:2], y)
-        solve, determinant = inverse(-slope)
-        close = jnp.max(jnp.abs(solve(found))) < CLOSE
+        inverted, determinant = inverse(-slope)
+        close = jnp.max(jnp.abs(inverted @ found)) < CLOSE
         return _Linear(slope, solved & close & (determinant > 0), jnp.asarray(True))
 
     def follow(held: tuple[Robot, Conditions, Array, _Linear]) -> _Search:
@@ -303,7 +304,7 @@ def _unknowns(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 9"],
         return _Search(y, jnp.zeros_like(y), jnp.where(known.sound, known.jacobian, still), first, turns, known.sound)
 
     def turn(held: tuple[Robot, Conditions, Array, _Linear], search: _Search) -> _Search:
-        step = inverse(jnp.asarray(slow) / search.step - search.jacobian)[0](search.rates)
+        step = inverse(jnp.asarray(slow) / search.step - search.jacobian)[0] @ search.rates
         largest, next_y = jnp.max(jnp.abs(step)), search.y + step
         slope, found = around(*held[:2], next_y)
         before, after = jnp.linalg.norm(search.rates), jnp.linalg.norm(found)
@@ -323,7 +324,7 @@ def _unknowns(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 9"],
     end = lanes.until(follow, turn, lambda s: (s.turns >= TURNS) | s.solved, (*held, first[0], known), most=FEW)
     sound = end.solved & jnp.all(jnp.isfinite(end.jacobian))
     slope = jnp.where(sound, end.jacobian, jnp.asarray(still))
-    return end.y + inverse(-slope)[0](jnp.where(sound, _balance(robot, conditions, end.y), 0.0)), sound
+    return end.y + inverse(-slope)[0] @ jnp.where(sound, _balance(robot, conditions, end.y), 0.0), sound
 
 
 def _motion(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> tuple[PlaneMotion, Float[Array, " 2"]]:

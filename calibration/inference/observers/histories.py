@@ -40,7 +40,6 @@ from calibration.inference.linearization import (
     terms_of,
 )
 from calibration.inference.noise import Noise
-from calibration.inference.normal_equations import solved
 from calibration.inference.notes import CoarseSteps, Note, StopsOnSlope, Thinned
 from calibration.inference.observers import settled_ends
 from calibration.inference.observers.base import Observer, SearchPolicy
@@ -82,6 +81,7 @@ from mmrjax.fidelities.histories import (
     steps_of,
     within,
 )
+from mmrjax.linear_equations import solved
 from mmrjax.params import Scalar
 from mmrjax.precision import Threads
 from mmrjax.rig import Begin, Begins, Rig
