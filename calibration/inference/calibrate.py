@@ -26,6 +26,7 @@ from calibration.inference import (
     population,
     priors,
     scans,
+    solvers,
 )
 from calibration.inference import optimizers as fit
 from calibration.inference.multistart import Found
@@ -69,6 +70,7 @@ def calibrate(
     profiles: bool | None = None,
     blocks: Sequence[str] | bool | None = None,
     rows: int = ROWS,
+    solver: str | fit.Solver | None = None,
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> CalibrationResult:
     """Calibrate `robot` to measured runs.
@@ -89,17 +91,22 @@ def calibrate(
         blocks: kinds of blocks to hold out; True: all that tell something of such data.
             These three by default as the kind of data and the fidelity say.
         rows: of a log over time from which on readings are used of fewer, evenly in time, which its notes say.
+        solver: of optimistix, or the name of one (`solvers.NAMES`), for the searches from the starts; None takes
+            ours, which also serves all fits that begin at the optimum (profiles, blocks). Penalties on adhesion are
+            cut off at 0 for any other than ours.
         tell: is given a sentence now and then while a long calibration goes on.
 
     Raises:
         BadData: data that cannot be fitted, see `checks.check`.
         BadConfiguration: an unknown fidelity or parameter, a prior or noise that is none, or of a mass that the
-            table states, rows that no robot near the priors reaches; or JAX computes in single precision.
+            table states, rows that no robot near the priors reaches; an unknown solver; or JAX computes in single
+            precision.
     """
     if jnp.result_type(float) != jnp.float64:
         raise BadConfiguration(
             'calibrate: JAX computes in single precision; set jax.config.update("jax_enable_x64", True) first'
         )
+    solver = solvers.solver(solver) if isinstance(solver, str) else solver
     runs = thinned(runs.of(robot), rows)
     observe = observers.kind(runs)
     fidelity = model or (OF_HISTORIES if observe.axis else fidelities.NAMES[0])
@@ -161,7 +168,7 @@ def calibrate(
     if 0 < population < LEAST:
         raise BadConfiguration(f"--population: got {population}; expected 0 or at least {LEAST} members")
     evolved = _Evolved(population, generations or GENERATIONS, members)
-    found, beside = _searched(runs, base, posed, known, starts, evolved, seed, told)
+    found, beside = _searched(runs, base, posed, known, starts, evolved, seed, told, solver)
     posed, z = found.problem, np.asarray(found.best.z)
     fitted = posed.robot(jnp.asarray(z))
     after, before = fit.observation(posed, jnp.asarray(z)), fit.read(posed, posed.base)
@@ -256,25 +263,27 @@ def _searched(
     evolved: _Evolved,
     seed: int,
     tell: Callable[[Step], None],
+    solver: fit.Solver | None,
 ) -> tuple[Found, np.ndarray | None]:
     """The searches of a problem, and where they began at the optimum of `steady`, that optimum."""
     rng, size = np.random.default_rng(seed), len(posed.coordinates)
     points = posed.observe.starts(posed, rng, starts)
     if not posed.observe.long:
-        return multistart.search(posed, known, points), None
+        return multistart.search(posed, known, points, solver), None
     if not posed.observe.eased:
-        return multistart.search_one_by_one(posed, known, points, multistart.first_shares(known), tell), None
+        shares = multistart.first_shares(known)
+        return multistart.search_one_by_one(posed, known, points, shares, tell, solver), None
     tell(Step("steady"))
     if evolved.size:
         population.Members(posed, evolved.file)  # refuses a file of others before the search of steady
     draws = rng.standard_normal((fidelities.facts("steady").effort.starts, size))
     draws[0] = 0.0
-    easy = multistart.search(observers.pose(runs, base, posed.coordinates, known.sd), known, draws)
+    easy = multistart.search(observers.pose(runs, base, posed.coordinates, known.sd), known, draws, solver)
     points[0] = beside = np.asarray(easy.best.z)
     points[1:] = multistart.nearby(easy.problem, beside, rng, len(points) - 1)
     posed = dataclasses.replace(posed, data=easy.problem.data)
     if not evolved.size:
-        return multistart.search_one_by_one(posed, known, points, easy.shares, tell), beside
+        return multistart.search_one_by_one(posed, known, points, easy.shares, tell, solver), beside
     covariance = _first_generation(easy.problem, beside)
     members = population.Members(posed, evolved.file)
     everyone = population.evolve(
@@ -297,7 +306,7 @@ def _searched(
     slope, left = population.regression(posed, everyone, at) if names else (None, np.nan)
     edge = population.edges(posed.coordinates, everyone.z[at])
     searched = population.Searched(everyone, at, names, slope, left, edge)
-    return multistart.at_best(posed, known, shares, searched, tell), beside
+    return multistart.at_best(posed, known, shares, searched, tell, solver), beside
 
 
 @dataclasses.dataclass(frozen=True)

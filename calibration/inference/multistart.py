@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +30,7 @@ ROUNDS, SETTLED_SHARE = 30, 1e-3
 DRAWS = 2000
 #: Tightenings of the penalty on adhesion, tenfold each.
 TIGHTENINGS = 3
+T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,16 +93,20 @@ def unreachable(posed: Problem, status: np.ndarray) -> np.ndarray:
     return posed.observe.unreachable(np.asarray(status)) & (np.asarray(posed.data.weight).max(1) > 0)
 
 
-def search(posed: Problem, noise: Noise, points: np.ndarray) -> Found:
+def search(posed: Problem, noise: Noise, points: np.ndarray, solver: fit.Solver | None = None) -> Found:
     """Search from all points in one batch; where the noise is not known, estimate it and search again until it
     settles.
 
     The best optimum so far starts beside the points, so that every round is the same compiled batch.
+
+    Args:
+        solver: of optimistix; None for ours.
     """
+    by = functools.partial(fit.searches, solver=solver)
     z = points[0]
     shares = first_shares(noise)
     for _ in range(ROUNDS):
-        posed, found, feasible = _tighten(posed, np.concatenate([points, z[None]]))
+        posed, found, feasible = _tighten(posed, np.concatenate([points, z[None]]), by)
         best = _member(found, int(np.nanargmin(found.cost)))
         z = np.asarray(best.z)
         new = _settling(posed, noise, z, shares)
@@ -112,14 +118,19 @@ def search(posed: Problem, noise: Noise, points: np.ndarray) -> Found:
 
 
 def search_one_by_one(
-    posed: Problem, noise: Noise, points: np.ndarray, shares: np.ndarray, tell: Callable[[Step], None]
+    posed: Problem,
+    noise: Noise,
+    points: np.ndarray,
+    shares: np.ndarray,
+    tell: Callable[[Step], None],
+    solver: fit.Solver | None = None,
 ) -> Found:
     """As `search`, one search at a time: the noise settles on the first point's optimum, then the others start once
     each. One that ends lower takes its place, and the noise settles again.
 
     Args:
         posed: with the noise to begin from; shares: of the reading, that it has.
-        tell: is given what was done after every step.
+        tell: is given what was done after every step; solver: of optimistix, None for ours.
     """
     begun = time.perf_counter()
 
@@ -128,6 +139,8 @@ def search_one_by_one(
 
     def step(posed: Problem, points: np.ndarray, data: Data) -> tuple[fit.Optimum, np.ndarray, np.ndarray]:
         def one(z: np.ndarray) -> tuple[fit.Optimum, Observation, Observation]:
+            if solver is not None:
+                return _member(fit.searches_by(posed, jnp.asarray(z)[None], data, solver), 0)
             return fit.search_long(
                 posed, jnp.asarray(z), data, tell=lambda *done: tell(Step("search", (*done, minutes())))
             )
@@ -187,12 +200,18 @@ def nearby(easy: Problem, z: np.ndarray, rng: np.random.Generator, count: int) -
 
 
 def at_best(
-    posed: Problem, noise: Noise, shares: np.ndarray, searched: Searched, tell: Callable[[Step], None]
+    posed: Problem,
+    noise: Noise,
+    shares: np.ndarray,
+    searched: Searched,
+    tell: Callable[[Step], None],
+    solver: fit.Solver | None = None,
 ) -> Found:
     """What a population found, its best member searched on by gradients where those are to be trusted."""
     z = searched.found.z[searched.at]
     if searched.slope is None:
-        return dataclasses.replace(search_one_by_one(posed, noise, z[None], shares, tell), searched=searched)
+        found = search_one_by_one(posed, noise, z[None], shares, tell, solver)
+        return dataclasses.replace(found, searched=searched)
     seen = Observation(*(jnp.asarray(x[searched.at]) for x in (
         searched.found.reading, searched.found.adhesion_used, searched.found.status, searched.found.flags,
     )))  # fmt: skip
@@ -216,7 +235,7 @@ def first_shares(noise: Noise) -> np.ndarray:
     return np.where(noise.estimated, noise_room.START, np.nan)
 
 
-def _member(found: fit.Optimum, k: int) -> fit.Optimum:
+def _member(found: T, k: int) -> T:
     return jax.tree.map(lambda x: x[k], found)
 
 
@@ -239,7 +258,7 @@ def _noisier(posed: Problem, noise: Noise, shares: np.ndarray) -> Problem:
 
 
 def _tighten(
-    posed: Problem, points: np.ndarray, search: Callable[..., Any] = fit.searches
+    posed: Problem, points: np.ndarray, search: Callable[..., Any]
 ) -> tuple[Problem, fit.Optimum, np.ndarray]:
     """Search from all points, with the penalty on adhesion stiffer until no row slides at the best.
 

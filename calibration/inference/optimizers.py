@@ -1,4 +1,5 @@
-"""Maximum a posteriori by Levenberg-Marquardt with exact Jacobians, from many starts at once."""
+"""Maximum a posteriori by least squares with exact Jacobians, from many starts at once: searches by optimistix's
+solvers, ours (`levenberg_marquardt`) where none is named."""
 
 from __future__ import annotations
 
@@ -13,9 +14,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from calibration.inference.normal_equations import half_solved, solved
+from calibration.inference.levenberg_marquardt import (
+    Function,
+    OneSidedLevenbergMarquardt,
+    Searching,
+    at_known,
+    counted,
+    half_squares,
+    stride_of,
+    with_slope,
+)
+from calibration.inference.normal_equations import half_solved
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax.compiling import OVER_TIME, SELDOM, SMALL, compiled
 from mmrjax.robot import Robot
@@ -23,18 +35,10 @@ from mmrjax.robot import Robot
 #: Predicted decrease of the objective below which a point is an optimum: in ½σ² (the step left is then below
 #: a twentieth of a posterior sd, about what the integrator's tolerance leaves of a rollout), and as a share.
 DECREMENT, DECREMENT_SHARE = 1e-3, 1e-6
-#: Rejected steps in a row after which a search ends, and change of z (and of the objective, relative) at which
-#: it does; the second for rollouts.
-PATIENCE = 12
-#: Shares of the predicted fall of the objective below which a step is rejected and above which the next may be
-#: longer, and by what the length of the next is then multiplied.
-LITTLE, NEARLY_ALL = 0.01, 0.75
-SHORTER, LONGER = 0.25, 3.5
-#: Turns in which the penalties that count at the end of a step are found, at most.
-TURNS = 8
-#: Largest step, in prior deviations, that is mixed with the last one, and most of the last one that is mixed in.
-NEAR, MIXED_MOST = 0.3, 10.0
+#: Change of z (and of the residuals, relative) at which a search ends; the second for rollouts.
 TOLERANCE, TOLERANCE_LONG = 1e-6, 1e-3
+#: Steps of a solver of optimistix at most: of least squares, of a minimiser.
+MOST_STEPS = 256, 2000
 #: How many times the decrease that its linearisation predicts a search of rollouts is given the hope of.
 HOPELESS = 10.0
 #: Steps that tell what a search of rollouts still brings.
@@ -97,62 +101,34 @@ def informing(data: Data) -> np.ndarray:
     return np.r_[: held.start, held.stop : held.stop + data.centre.size]
 
 
-def counted(r: Array, jacobian: Array, held: slice) -> tuple[Array, Array]:
-    """Residuals and Jacobian as they count: penalties only where they are positive."""
-    counts = jnp.ones(r.shape, bool).at[held].set(r[held] > 0)
-    return jnp.where(counts, r, 0.0), jnp.where(counts[:, None], jacobian, 0.0)
+#: Least-squares solvers and minimisers of optimistix.
+Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
+#: A search between two steps: the best point so far and the solver's state.
+Progress = tuple[Z, Searching]
 
 
-def _cost(r: Array, held: slice) -> Array:
-    return 0.5 * jnp.sum(r.at[held].set(jnp.maximum(r[held], 0.0)) ** 2)
+def _evaluated(problem: Problem, data: Data, pin: Pin, z: Z) -> tuple[Array, Array, Observation]:
+    """Residuals (readings, penalties with their signs, then prior) at z, their Jacobian, and what the model says of
+    every row: one evaluation serves all three."""
+    r, jacobian, seen, _ = problem.linearised(lambda x: problem.robot(pin.apply(x)), z, data)
+    prior = jnp.where(pin.held, z - pin.at, z - data.centre)
+    return jnp.concatenate([r, prior]), jnp.concatenate([jacobian, jnp.eye(z.size)]), seen
 
 
-def stride_of(r: Array, jacobian: Array, held: slice, damping: Array | float) -> Array:
-    """Step to the optimum of a linearisation whose penalties count where they are positive.
+def residuals(problem: Problem, data: Data, pin: Pin) -> Function:
+    """The residuals of `_evaluated` as optimistix takes them, with the observation beside them."""
 
-    min_d ½ Σ (r + J d)² + ½ damping |d|², over readings and priors, and over the penalties that are positive at its
-    end, which are found by turns (a semismooth Newton method). The step that knows only the penalties which are
-    positive where it begins leads, from just inside the limit of adhesion, across it, and predicts a gain that is not
-    there; a search then goes along the limit in steps of 1e-4.
+    def function(z: Z, args: Any) -> tuple[Array, Observation]:
+        r, jacobian, seen = _evaluated(problem, data, pin, jax.lax.stop_gradient(z))
+        return with_slope(z, r, jacobian), seen
 
-    Args:
-        r, jacobian: residuals and slopes, of penalties too where they are negative; held: which are penalties.
-    """
-    free = jacobian.at[held].set(0.0)
-    normal = free.T @ free + damping * jnp.eye(jacobian.shape[1])
-    gradient, edge, height = free.T @ r, jacobian[held], r[held]
-
-    def value(d: Array) -> Array:
-        return _cost(r + jacobian @ d, held) + 0.5 * damping * jnp.sum(d**2)
-
-    def again(carry: tuple) -> tuple:
-        turns, active, _, best, lowest = carry
-        counts = edge * active[:, None]
-        d = -solved(normal + counts.T @ counts, gradient + counts.T @ height)
-        beyond, here = height + edge @ d > 0, value(d)
-        better = here < lowest
-        return turns + 1, beyond, active, jnp.where(better, d, best), jnp.where(better, here, lowest)
-
-    still = jnp.zeros(jacobian.shape[1])
-
-    def differs(carry: tuple) -> Array:
-        turns, active, before, _, _ = carry
-        return (turns == 0) | (turns < TURNS) & jnp.any(active != before)
-
-    start = jnp.asarray(0), height > 0, height > 0, still, jnp.asarray(jnp.inf)
-    return jax.lax.while_loop(differs, again, start)[3]
+    return function
 
 
-def _evaluated(problem: Problem, data: Data, pin: Pin) -> Callable[[Z], tuple[Array, Array, Observation]]:
-    """Residuals (readings, penalties with their signs, then prior), their Jacobian, and what the model says of every
-    row, as a function of z: one evaluation serves all three."""
-
-    def at(z: Z) -> tuple[Array, Array, Observation]:
-        r, jacobian, seen, _ = problem.linearised(lambda x: problem.robot(pin.apply(x)), z, data)
-        prior = jnp.where(pin.held, z - pin.at, z - data.centre)
-        return jnp.concatenate([r, prior]), jnp.concatenate([jacobian, jnp.eye(z.size)]), seen
-
-    return at
+def _solver(data: Data, long: bool) -> OneSidedLevenbergMarquardt:
+    """The solver of fits to such data; of rollouts where `long`."""
+    held, tolerance = penalties(data), TOLERANCE_LONG if long else TOLERANCE
+    return OneSidedLevenbergMarquardt(tolerance, tolerance, held.start, held.stop)
 
 
 def _optimum(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array) -> Optimum:
@@ -161,9 +137,9 @@ def _optimum(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: A
     half = half_solved(informed.T @ informed, jnp.eye(z.shape[0]))
     sd = jnp.linalg.norm(half, axis=0)
     ahead = r + jacobian @ stride_of(r, jacobian, held_rows, 0.0)
-    decrement = _cost(r, held_rows) - _cost(ahead, held_rows)
+    decrement = half_squares(r, held_rows) - half_squares(ahead, held_rows)
     held = jnp.where(pin.held, pin.at - data.centre, 0.0)
-    cost = _cost(r, held_rows) + 0.5 * jnp.sum(held**2)
+    cost = half_squares(r, held_rows) + 0.5 * jnp.sum(held**2)
     return Optimum(pin.apply(z), sd, half.T @ half, cost, decrement, _small(decrement, cost), steps)
 
 
@@ -177,111 +153,54 @@ def optimum(jacobian: np.ndarray, residual: np.ndarray, z: np.ndarray, data: Dat
     return _optimum(j, r, at, data, no_pin(len(z)), jnp.asarray(0))
 
 
-class Progress(eqx.Module):
-    """A search between two steps.
-
-    Attributes:
-        y: the best point so far; found: residuals and Jacobian there, and what the model says.
-        stride: the step of the linearisation there.
-        ahead: where the model is to be evaluated next; mixed: whether `mixed_step` leads there; size: of the step of
-            the linearisation, 1 / damping.
-        steps: evaluations so far; rejected: those since y was found; over: whether the search has ended.
-    """
-
-    y: Z
-    found: tuple[Float[Array, " residuals"], Float[Array, "residuals parameters"], Any]
-    stride: Z
-    ahead: Z
-    mixed: Bool[Array, ""]
-    size: Float[Array, ""]
-    steps: Int[Array, ""]
-    rejected: Int[Array, ""]
-    over: Bool[Array, ""]
-
-
-def begin_at(start: Z, nowhere: tuple[Array, Array, Any]) -> Progress:
+def _begin(solver: OneSidedLevenbergMarquardt, start: Z, size: int, aux: Any) -> Progress:
     """A search that has evaluated nothing yet.
 
     Args:
-        nowhere: of the shapes of what it will find, all 0.
+        size: number of residuals; aux: shapes and kinds of what else an evaluation gives.
     """
-    none, no = jnp.asarray(0), jnp.asarray(False)
-    return Progress(start, nowhere, jnp.zeros_like(start), start, no, jnp.asarray(1.0), none, none, no)
+    struct = jax.ShapeDtypeStruct((size,), start.dtype)
+    return start, solver.init(_unevaluated, start, None, {}, struct, aux, frozenset())
 
 
-def mixed_step(stride: Z, moved: Z, changed: Z) -> Z:
-    """A step that takes into account how the last one changed the step of the linearisation.
-
-    Where residuals are large beside their curvature, Gauss-Newton steps shrink by the same factor for as long as one
-    likes. Anderson's mixing (D. G. Anderson, J. ACM 12 (1965)) of depth one is a secant in that direction:
-    d - θ (Δy + Δd), θ = d·Δd / |Δd|².
-
-    Args:
-        stride: d, the step of the linearisation at y; moved: Δy, from the point before; changed: Δd, from the stride
-            there.
-    """
-    share = stride @ changed / jnp.maximum(changed @ changed, jnp.finfo(stride.dtype).tiny)
-    return stride - jnp.clip(share, -MIXED_MOST, MIXED_MOST) * (moved + changed)
+def _unevaluated(z: Z, args: Any) -> tuple[Array, Any]:
+    """A residual function that nothing calls."""
+    raise NotImplementedError
 
 
-def step(at: Progress, found: tuple[Array, Array, Any], held: slice, tolerance: float) -> Progress:
-    """One step of Levenberg-Marquardt (`stride_of`, damped by 1 / size), from what was found where the last one led.
-
-    A step by which the objective falls by less than `LITTLE` of what the linearisation predicts is rejected and the
-    next one shortened; one by which it falls by `NEARLY_ALL` of it lets the next one be longer (Conn, Gould, Toint
-    2000, alg. 6.1.1, with the numbers of optimistix 0.1). A step that is `mixed_step` has to leave the same penalties
-    in force, and where it is rejected that of the linearisation alone is tried next. A search ends where an accepted
-    step changes neither z nor any residual by more than the tolerance, and after `PATIENCE` steps in a row that were
-    rejected: each is a quarter of the one before, so nothing is left to gain but rounding (or, of a rollout, the
-    integrator's tolerance); `Optimum.converged` says whether that place is an optimum.
-
-    Args:
-        found: residuals, penalties with their signs, their Jacobian, and what else the evaluation gave; held: which
-            of them are penalties.
-    """
-    (r, jacobian, _), (r_old, jacobian_old, _) = found, at.found
-    moved, first = at.ahead - at.y, at.steps == 0
-    fall = _cost(r, held) - _cost(r_old, held)
-    predicted = _cost(r_old + jacobian_old @ moved, held) - _cost(r_old, held)
-    alike = jnp.all((r[held] > 0) == (r_old[held] > 0))
-    accepted = first | ((fall <= LITTLE * jnp.minimum(predicted, 0.0)) & (alike | ~at.mixed))
-    good = ~first & (predicted < 0) & (fall < NEARLY_ALL * predicted)
-    size = at.size * jnp.where(accepted, jnp.where(good, LONGER, 1.0), jnp.where(at.mixed, 1.0, SHORTER))
-    changed = counted(r, jacobian, held)[0] - counted(r_old, jacobian_old, held)[0]
-    ended = jnp.all(jnp.abs(moved) < tolerance * (1 + jnp.abs(at.ahead)))
-    ended &= accepted & jnp.all(jnp.abs(changed) < tolerance * (1 + jnp.abs(r)))
-
-    y, best = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), (at.ahead, found), (at.y, at.found))
-    tiny = jnp.finfo(size.dtype)
-    damping = jnp.where(size > tiny.eps, 1 / jnp.maximum(size, tiny.eps), tiny.max)
-    stride = stride_of(best[0], best[1], held, damping)
-    mixed = accepted & alike & (at.steps > 1) & (jnp.max(jnp.abs(stride)) < NEAR)
-    ahead = y + jnp.where(mixed, mixed_step(stride, moved, stride - at.stride), stride)
-    rejected = jnp.where(accepted, 0, at.rejected + 1)
-    over = ended | (rejected >= PATIENCE)
-    return Progress(y, best, stride, ahead, mixed, size, at.steps + 1, rejected, over)
+def _of_every_row(data: Data) -> Observation:
+    """Shapes and kinds of an observation of the rows of data."""
+    codes = jnp.zeros(data.measured.shape[0], int)
+    return jax.eval_shape(lambda: Observation(data.measured, data.measured[:, 0], codes, codes))
 
 
-def _begin(problem: Problem, start: Z, data: Data) -> Progress:
+def _step(solver: OneSidedLevenbergMarquardt, function: Function, at: Progress) -> Progress:
+    """The next step of a search."""
+    y, state, _ = solver.step(function, at[0], None, {}, at[1], frozenset())
+    return y, state
+
+
+def _begun(problem: Problem, start: Z, data: Data) -> Progress:
     """A search of a problem that has evaluated nothing yet."""
-    rows, count = data.measured.shape
-    size, codes = rows * count + rows + start.shape[0], jnp.zeros(rows, int)
-    seen = Observation(jnp.zeros((rows, count)), jnp.zeros(rows), codes, codes)
-    return begin_at(start, (jnp.zeros(size), jnp.zeros((size, start.shape[0])), seen))
+    size = penalties(data).stop + start.shape[0]
+    return _begin(_solver(data, problem.observe.long), start, size, _of_every_row(data))
 
 
-def _advance(problem: Problem, at: Progress, data: Data, pin: Pin, max_steps: int | Numbers) -> Progress:
+def _advance(problem: Problem, at: Progress, data: Data, max_steps: int | Numbers) -> Progress:
     """One step of a search. The model is evaluated in one place of the program, at the start of a step: what was
     accepted there is what the search returns, with its residuals, Jacobian and observation."""
-    found = _evaluated(problem, data, pin)(at.ahead)
-    new = step(at, found, penalties(data), TOLERANCE_LONG if problem.observe.long else TOLERANCE)
-    over = new.over | (new.steps >= max_steps) | ~jnp.all(jnp.isfinite(new.y))
-    return dataclasses.replace(new, over=over)
+    solver, function = _solver(data, problem.observe.long), residuals(problem, data, no_pin(at[0].shape[0]))
+    y, state = _step(solver, function, at)
+    done, _ = solver.terminate(function, y, None, {}, state, frozenset())
+    over = done | (state.steps >= max_steps) | ~jnp.all(jnp.isfinite(y))
+    return y, dataclasses.replace(state, over=over)
 
 
 def _ended(at: Progress, data: Data, pin: Pin) -> Optimum:
-    r, jacobian, _ = at.found
-    return _optimum(jacobian, r, at.y, data, pin, at.steps)
+    y, state = at
+    # optimistix takes no step from a start that is not finite.
+    r = jnp.where(jnp.all(jnp.isfinite(y)), state.found.residual, jnp.nan)
+    return _optimum(state.found.jacobian, r, y, data, pin, state.steps)
 
 
 def levenberg_marquardt(
@@ -289,12 +208,16 @@ def levenberg_marquardt(
 ) -> tuple[Optimum, Observation]:
     """One search, and what the model says where it ended. To be vmapped over starts, data and pins."""
     pin = no_pin(start.shape[0]) if pin is None else pin
-    end = jax.lax.while_loop(
-        lambda at: ~at.over,
-        lambda at: _advance(problem, at, data, pin, max_steps),
-        _begin(problem, pin.apply(start), data),
+    function: Any = residuals(problem, data, pin)
+    found: optx.Solution = optx.least_squares(
+        function,
+        _solver(data, problem.observe.long),
+        pin.apply(start),
+        has_aux=True,
+        max_steps=max_steps,
+        throw=False,
     )
-    return _ended(end, data, pin), end.found[2]
+    return _ended((found.value, found.state), data, pin), found.aux
 
 
 class Member(eqx.Module):
@@ -325,8 +248,8 @@ def _vacant(problem: Problem, members: Member) -> Progress:
     """Searches that have ended before they began, from which nothing is taken."""
 
     def one(member: Member) -> Progress:
-        begun = _begin(problem, member.start, member.problem(problem).data)
-        return dataclasses.replace(begun, over=jnp.asarray(True))
+        y, state = _begun(problem, member.start, member.problem(problem).data)
+        return y, dataclasses.replace(state, over=jnp.asarray(True))
 
     return jax.vmap(one)(members)
 
@@ -338,16 +261,16 @@ def _go_on(
     pin = no_pin(members.start.shape[-1])
 
     def begin(member: Member, fresh: Array, at: Progress) -> Progress:
-        begun = _begin(problem, member.start, member.problem(problem).data)
+        begun = _begun(problem, member.start, member.problem(problem).data)
         return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), begun, at)
 
     def advance(member: Member, at: Progress) -> Progress:
         here = member.problem(problem)
-        new = _advance(here, at, here.data, pin, max_steps)
-        return jax.tree.map(lambda new, old: jnp.where(at.over, old, new), new, at)
+        new = _advance(here, at, here.data, max_steps)
+        return jax.tree.map(lambda new, old: jnp.where(at[1].over, old, new), new, at)
 
     at = jax.vmap(begin)(members, fresh, at)
-    at = jax.lax.while_loop(lambda at: jnp.sum(at.over) < enough, lambda at: jax.vmap(advance)(members, at), at)
+    at = jax.lax.while_loop(lambda at: jnp.sum(at[1].over) < enough, lambda at: jax.vmap(advance)(members, at), at)
     return at, jax.vmap(lambda member, at: _ended(at, member.problem(problem).data, pin))(members, at)
 
 
@@ -409,12 +332,12 @@ def searches_refilled(problem: Problem, members: Member, max_steps: int, places:
     Returns:
         Where each search ended, and what the model says there.
     """
-    found, (_, _, seen) = _refilled(problem, members, max_steps, places)
-    return found, seen
+    found, state = _refilled(problem, members, max_steps, places)
+    return found, state.aux
 
 
-def _refilled(problem: Problem, members: Member, max_steps: int, places: int) -> tuple[Optimum, Any]:
-    """The same, with the residuals, penalties with their signs, and their Jacobian where each search ended."""
+def _refilled(problem: Problem, members: Member, max_steps: int, places: int) -> tuple[Optimum, Searching]:
+    """The same, with the solver's state where each search ended."""
     count, most = len(members.start), np.asarray(max_steps)
     cores = min(CORES, -(-count // places))
     first = jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members)
@@ -429,7 +352,7 @@ def _refilled(problem: Problem, members: Member, max_steps: int, places: int) ->
             running = int(mine.taken.sum())
             enough = places - running + (max(1, places // 4) if mine.waiting else running)
             at, found = go_on(problem, own, fresh, at, np.asarray(enough), most)
-            mine.leave(*jax.device_get((at.over, (found, at.found))))
+            mine.leave(*jax.device_get((at[1].over, (found, at[1]))))
         return mine.ended
 
     if cores > 1:  # the program is made once, by a call that takes no step
@@ -450,13 +373,18 @@ def _first_step(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Obser
     active = getattr(problem.coordinates, "active", None)
     own = [np.asarray(x)[None] for x in (z, data.weight, data.measured, data.centre)]
     members = Member(own[0], own[1], own[2], own[3], None if active is None else np.asarray(active)[None])
-    _, found = _refilled(problem, members, 1, problem.observe.places(problem))
-    return jax.tree.map(lambda x: jnp.asarray(x[0]), found)
+    _, ended = _refilled(problem, members, 1, problem.observe.places(problem))
+    state = jax.tree.map(lambda x: jnp.asarray(x[0]), ended)
+    return state.found.residual, state.found.jacobian, state.aux
 
 
-@functools.partial(compiled, options=SELDOM)
-def _counting(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
+def counting(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
+    """Residuals and Jacobian as they count, for what knows nothing of one-sided ones: penalties are cut off at 0, and
+    a reading whose slope is not finite counts as one that could not be computed."""
     return counted(*computed(r, jacobian, data), penalties(data))
+
+
+_counting = compiled(counting, options=SELDOM)
 
 
 def computed(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
@@ -474,7 +402,7 @@ def linearised_signed(problem: Problem, z: Z, data: Data) -> tuple[Array, Array,
     derivative grows without limit; such a reading, if it counts, counts as one that could not be computed.
     """
 
-    r, jacobian, seen = _evaluated(problem, data, no_pin(z.size))(z)
+    r, jacobian, seen = _evaluated(problem, data, no_pin(z.size), z)
     return *computed(r, jacobian, data), seen
 
 
@@ -484,9 +412,9 @@ def evaluated(problem: Problem, z: Z, data: Data) -> Array:
     return jnp.concatenate([problem.whitened(seen, data), z - data.centre])
 
 
-@functools.partial(jax.jit, static_argnames=("held_from", "held_to"))
-def _stepped(at: Progress, found: tuple[Array, Array, Any], held_from: int, held_to: int) -> Progress:
-    return step(at, found, slice(held_from, held_to), TOLERANCE_LONG)
+@eqx.filter_jit
+def _stepped(solver: OneSidedLevenbergMarquardt, at: Progress, r: Array, jacobian: Array) -> Progress:
+    return _step(solver, at_known(r, jacobian), at)
 
 
 def search_long(
@@ -503,22 +431,21 @@ def search_long(
     Returns:
         Where the search ended, and what the model says where it started and where it ended.
     """
-    pin, held = no_pin(start.shape[0]), penalties(data)
-    search: Progress | None = None
-    first = last = None
+    pin, solver = no_pin(start.shape[0]), _solver(data, long=True)
+    size = penalties(data).stop + start.shape[0]
+    at, first, last = _begin(solver, start, size, None), None, None
     best: Optimum | None = None
     for steps in range(1, max_steps + 1):
-        at = start if search is None else search.ahead
+        ahead = at[1].ahead
         # A step that follows a rejected one is often rejected too; that takes no Jacobian, so the last one stays.
-        r = None if search is None or search.rejected == 0 else evaluated(problem, at, data)
+        r = evaluated(problem, ahead, data) if at[1].rejected > 0 else None
         if r is None or best is None or 0.5 * jnp.sum(r**2) < best.cost:
-            r, jacobian, seen = linearised_signed(problem, at, data)
-        if search is None:
-            search, first = begin_at(start, jax.tree.map(jnp.zeros_like, (r, jacobian, None))), seen
-        search = _stepped(search, (r, jacobian, None), held.start, held.stop)
-        done = bool(search.over)
-        if search.rejected == 0:
-            best, last = _optimum(jacobian, r, search.y, data, pin, jnp.asarray(steps)), seen
+            r, jacobian, seen = linearised_signed(problem, ahead, data)
+        first = seen if first is None else first
+        at = _stepped(solver, at, r, jacobian)
+        done = bool(at[1].over)
+        if at[1].rejected == 0:
+            best, last = _optimum(jacobian, r, at[0], data, pin, jnp.asarray(steps)), seen
             done |= bool(best.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * best.cost))
         assert best is not None  # the first step only evaluates the start, and accepts it
         tell(steps, float(best.cost))
@@ -534,16 +461,14 @@ Evaluate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, Obse
 
 
 @functools.partial(compiled, options=SELDOM)
-def _steps(
-    at: Progress, found: tuple[Array, Array, Any], data: Data, weights: Array, held_from: int, held_to: int
-) -> tuple[Progress, Optimum]:
+def _steps(at: Progress, found: tuple[Array, Array, Any], data: Data, weights: Array) -> tuple[Progress, Optimum]:
     """The next step of every search, and what its best point is as an optimum."""
-    held = slice(held_from, held_to)
+
+    solver, pin = _solver(data, long=True), no_pin(at[0].shape[-1])
 
     def one(at: Progress, found: tuple[Array, Array, Any], weight: Array) -> tuple[Progress, Optimum]:
-        new = step(at, found, held, TOLERANCE_LONG)
-        (r, jacobian, _), reweighted = new.found, dataclasses.replace(data, weight=weight)
-        return new, _optimum(jacobian, r, new.y, reweighted, no_pin(new.y.shape[0]), new.steps)
+        new = _step(solver, at_known(*found), at)
+        return new, _ended(new, dataclasses.replace(data, weight=weight), pin)
 
     return jax.vmap(one)(at, found, weights)
 
@@ -571,7 +496,7 @@ def searches_long(
     Returns:
         Where each search ended, and what the model says there.
     """
-    starts, weights, held = np.asarray(starts), np.asarray(weights), penalties(data)
+    starts, weights, solver = np.asarray(starts), np.asarray(weights), _solver(data, long=True)
     mine = Places(range(len(starts)), max(places, len(starts) * rivals))
     cost, ahead = np.full(len(starts), np.inf), starts[mine.member]
     trail = np.full((LATELY, len(mine.member)), np.nan)
@@ -583,13 +508,16 @@ def searches_long(
         evaluated = evaluate(ahead[going], mine.holds[going])
         found = jax.tree.map(lambda x: _put(np.zeros((len(ahead), *x.shape[1:]), x.dtype), going, x), evaluated)  # noqa: B023
         if len(fresh):
-            begun = jax.device_get(jax.vmap(begin_at)(jnp.asarray(ahead), jax.tree.map(np.zeros_like, found)))
+            aux = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), found[2])
+            begin = functools.partial(_begin, solver, size=found[0].shape[1], aux=aux)
+            begun = jax.device_get(jax.vmap(begin)(jnp.asarray(ahead)))
             at = begun if at is None else jax.tree.map(lambda old, new: _put(old, fresh, new[fresh]), at, begun)  # noqa: B023
         assert at is not None  # the first searches are fresh
-        at, ends = jax.device_get(_steps(at, found, data, weights[mine.member], held.start, held.stop))
-        ahead, seen = at.ahead, at.found[2]
+        at, ends = jax.device_get(_steps(at, found, data, weights[mine.member]))
+        state = at[1]
+        ahead, seen = state.ahead, state.aux
         small = 0.1 * (DECREMENT + DECREMENT_SHARE * ends.cost)
-        over = at.over | (at.steps >= max_steps) | ((at.rejected == 0) & (ends.decrement < small))
+        over = state.over | (state.steps >= max_steps) | ((state.rejected == 0) & (ends.decrement < small))
         cost[mine.holds[going]] = ends.cost[going]
         if rivals:
             done = np.r_[[*mine.ended], mine.holds[over & mine.taken]].astype(int)
@@ -611,21 +539,54 @@ def _put(x: np.ndarray, places: np.ndarray, values: np.ndarray) -> np.ndarray:
     return x
 
 
-@compiled
 def searches(
-    problem: Problem, starts: Float[Array, "starts parameters"], data: Data
+    problem: Problem, starts: Float[Array, "starts parameters"], data: Data, solver: Solver | None = None
 ) -> tuple[Optimum, Int[Array, "starts rows"], Int[Array, "starts rows"]]:
-    """Levenberg-Marquardt from every start in one vmapped batch.
+    """A search from every start: of ours in one vmapped batch, of any other `solver` one after another.
 
     Returns:
         Where each search ended, and the status of every row where it started and where it ended.
     """
+    if solver is None:
+        return _searches(problem, starts, data)
+    found, start, end = searches_by(problem, starts, data, solver)
+    return found, start.status, end.status
 
+
+@compiled
+def _searches(problem: Problem, starts: Array, data: Data) -> tuple[Optimum, Array, Array]:
     def search(z: Z) -> tuple[Optimum, Array, Array]:
         found, seen = levenberg_marquardt(problem, z, data)
         return found, problem.observation(z).status, seen.status
 
     return jax.vmap(search)(starts)
+
+
+@eqx.filter_jit
+def searches_by(
+    problem: Problem, starts: Float[Array, "starts parameters"], data: Data, solver: Solver
+) -> tuple[Optimum, Observation, Observation]:
+    """Searches by a solver of optimistix, one after another: its linear algebra is LAPACK's, of which batched calls
+    have waited for each other for ever (`normal_equations`).
+
+    Returns:
+        Where each search ended, and what the model says where it started and where it ended.
+    """
+    most = MOST_STEPS[isinstance(solver, optx.AbstractMinimiser)]
+
+    def residual(z: Z, args: Any) -> Array:
+        r, jacobian, _ = _evaluated(problem, data, no_pin(z.size), jax.lax.stop_gradient(z))
+        return with_slope(z, *counting(r, jacobian, data))
+
+    def search(start: Z) -> tuple[Optimum, Observation, Observation]:
+        solved: optx.Solution = optx.least_squares(residual, solver, start, max_steps=most, throw=False)
+        z, pin = solved.value, no_pin(start.size)
+        r, jacobian, seen = _evaluated(problem, data, pin, z)
+        r, jacobian = computed(r, jacobian, data)
+        found = _optimum(jacobian, r, z, data, pin, solved.stats["num_steps"])
+        return found, problem.observation(start), seen
+
+    return jax.lax.map(search, starts)
 
 
 @functools.partial(compiled, options=OVER_TIME)

@@ -1,0 +1,293 @@
+"""Least squares with residuals that count only where they are positive, as a solver of optimistix.
+
+The objective is ½ Σ r² over all residuals, of those that are one-sided over the positive ones only. The solver is
+Levenberg-Marquardt, built from optimistix's parts: a descent that knows which one-sided residuals are positive where
+it leads, a trust region that predicts with them, and between the two Anderson's mixing. optimistix's own
+Levenberg-Marquardt of the same residuals cut off at 0 predicts, from just inside of an edge, a gain that is not
+there, and then goes along the edge in steps of 1e-4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from calibration.inference.normal_equations import solved
+
+#: Rejected steps in a row after which a search ends.
+PATIENCE = 12
+#: Shares of the predicted fall of the objective below which a step is rejected and above which the next may be
+#: longer, and by what the length of the next is then multiplied.
+LITTLE, NEARLY_ALL = 0.01, 0.75
+SHORTER, LONGER = 0.25, 3.5
+#: Turns in which the one-sided residuals that are positive at the end of a step are found, at most.
+TURNS = 8
+#: Largest step, in prior deviations, that is mixed with the last one, and most of the last one that is mixed in.
+NEAR, MIXED_MOST = 0.3, 10.0
+
+Z = Float[Array, " parameters"]
+#: A residual function of optimistix: of y and its arguments, to the residuals and what else the evaluation gives.
+Function = Callable[[Z, Any], tuple[Float[Array, " residuals"], Any]]
+
+
+@jax.custom_jvp
+def with_slope(y: Array, value: Array, slope: Array) -> Array:
+    """Returns `value`, whose derivative by y is `slope`, whatever it was computed from.
+
+    Args:
+        y: shape (n,); value: shape (m,); slope: shape (m, n).
+    """
+    return value
+
+
+@with_slope.defjvp
+def _slope(primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    return primals[1], primals[2] @ tangents[0]
+
+
+def at_known(value: Array, slope: Array, aux: Any = None) -> Function:
+    """A residual function that was evaluated elsewhere, at the one place where it will be called."""
+    return lambda y, args: (with_slope(y, value, slope), aux)
+
+
+def counted(r: Array, jacobian: Array, one_sided: slice) -> tuple[Array, Array]:
+    """Residuals and Jacobian as they count: the one-sided only where they are positive."""
+    counts = jnp.ones(r.shape, bool).at[one_sided].set(r[one_sided] > 0)
+    return jnp.where(counts, r, 0.0), jnp.where(counts[:, None], jacobian, 0.0)
+
+
+def half_squares(r: Array, one_sided: slice) -> Float[Array, ""]:
+    """The objective, half the sum of the squared residuals that count."""
+    return 0.5 * jnp.sum(r.at[one_sided].set(jnp.maximum(r[one_sided], 0.0)) ** 2)
+
+
+def stride_of(r: Array, jacobian: Array, one_sided: slice, damping: Array | float) -> Z:
+    """Step to the optimum of a linearisation whose one-sided residuals count where they are positive.
+
+    min_d ½ Σ (r + J d)² + ½ damping |d|², over the two-sided residuals, and over the one-sided that are positive at
+    its end, which are found by turns (a semismooth Newton method). The step that knows only those which are positive
+    where it begins leads, from just inside of an edge, across it, and predicts a gain that is not there.
+
+    Args:
+        r, jacobian: residuals and slopes, of one-sided residuals too where they are negative.
+    """
+    free = jacobian.at[one_sided].set(0.0)
+    normal = free.T @ free + damping * jnp.eye(jacobian.shape[1])
+    gradient, edge, height = free.T @ r, jacobian[one_sided], r[one_sided]
+
+    def value(d: Array) -> Array:
+        return half_squares(r + jacobian @ d, one_sided) + 0.5 * damping * jnp.sum(d**2)
+
+    def again(carry: tuple) -> tuple:
+        turns, active, _, best, lowest = carry
+        counts = edge * active[:, None]
+        d = -solved(normal + counts.T @ counts, gradient + counts.T @ height)
+        beyond, here = height + edge @ d > 0, value(d)
+        better = here < lowest
+        return turns + 1, beyond, active, jnp.where(better, d, best), jnp.where(better, here, lowest)
+
+    still = jnp.zeros(jacobian.shape[1])
+
+    def differs(carry: tuple) -> Array:
+        turns, active, before, _, _ = carry
+        return (turns == 0) | (turns < TURNS) & jnp.any(active != before)
+
+    start = jnp.asarray(0), height > 0, height > 0, still, jnp.asarray(jnp.inf)
+    return jax.lax.while_loop(differs, again, start)[3]
+
+
+class Linearisation(optx.FunctionInfo):
+    """Residuals, one-sided ones with their signs, and their Jacobian.
+
+    Attributes:
+        first, last: the one-sided residuals are those from `first` up to `last`.
+    """
+
+    residual: Float[Array, " residuals"]
+    jacobian: Float[Array, "residuals parameters"]
+    first: int = eqx.field(static=True)
+    last: int = eqx.field(static=True)
+
+    @property
+    def one_sided(self) -> slice:
+        """Which residuals are one-sided."""
+        return slice(self.first, self.last)
+
+    @property
+    def positive(self) -> Bool[Array, " one_sided"]:
+        """True for the one-sided residuals that count."""
+        return self.residual[self.one_sided] > 0
+
+    @property
+    def counting(self) -> Float[Array, " residuals"]:
+        """The residuals as they count."""
+        return self.residual.at[self.one_sided].set(jnp.where(self.positive, self.residual[self.one_sided], 0.0))
+
+    def as_min(self) -> Float[Array, ""]:
+        return half_squares(self.residual, self.one_sided)
+
+
+class OneSidedDescent(optx.AbstractDescent[Z, Linearisation, Linearisation]):
+    """Damped Newton steps of the linearisation, with the one-sided residuals that are positive where they lead."""
+
+    def init(self, y: Z, f_info_struct: Linearisation) -> Linearisation:
+        return f_info_struct
+
+    def query(self, y: Z, f_info: Linearisation, state: Linearisation) -> Linearisation:
+        return f_info
+
+    def step(self, step_size: Array, state: Linearisation) -> tuple[Z, optx.RESULTS]:
+        tiny = jnp.finfo(step_size.dtype)
+        damping = jnp.where(step_size > tiny.eps, 1 / jnp.maximum(step_size, tiny.eps), tiny.max)
+        return stride_of(state.residual, state.jacobian, state.one_sided, damping), optx.RESULTS.successful  # type: ignore[return-value]  # an enumeration of equinox's
+
+
+class OneSidedTrustRegion(optx.ClassicalTrustRegion):
+    """The classical trust region (Conn, Gould, Toint 2000, alg. 6.1.1), of residuals some of which are one-sided."""
+
+    high_cutoff: float = NEARLY_ALL
+    low_cutoff: float = LITTLE
+    high_constant: float = LONGER
+    low_constant: float = SHORTER
+
+    def predict_reduction(self, y_diff: Z, f_info: Linearisation) -> Array:
+        """Fall of the objective that the linearisation predicts for a step, as a negative number; 0 for a rise, which
+        a step that is mixed may have."""
+        ahead = half_squares(f_info.residual + f_info.jacobian @ y_diff, f_info.one_sided)
+        return jnp.minimum(ahead - f_info.as_min(), 0.0)
+
+
+def mixed_step(stride: Z, moved: Z, changed: Z) -> Z:
+    """A step that takes into account how the last one changed the step of the linearisation.
+
+    Where residuals are large beside their curvature, Gauss-Newton steps shrink by the same factor for as long as one
+    likes. Anderson's mixing (D. G. Anderson, J. ACM 12 (1965)) of depth one is a secant in that direction:
+    d - θ (Δy + Δd), θ = d·Δd / |Δd|².
+
+    Args:
+        stride: d, the step of the linearisation at y; moved: Δy, from the point before; changed: Δd, from the stride
+            there.
+    """
+    share = stride @ changed / jnp.maximum(changed @ changed, jnp.finfo(stride.dtype).tiny)
+    return stride - jnp.clip(share, -MIXED_MOST, MIXED_MOST) * (moved + changed)
+
+
+class Searching(eqx.Module):
+    """State of a search between two steps; y, the best point so far, is the solver's caller's.
+
+    Attributes:
+        found: at y; aux: what else the evaluation there gave; stride: the step of the linearisation there.
+        ahead: where the function is to be evaluated next; mixed: True if `mixed_step` leads there.
+        region: state of the trust region.
+        steps: evaluations so far; rejected: those since y was found; over: True if the search has ended.
+    """
+
+    found: Linearisation
+    aux: Any
+    stride: Z
+    ahead: Z
+    mixed: Bool[Array, ""]
+    region: Any
+    steps: Int[Array, ""]
+    rejected: Int[Array, ""]
+    over: Bool[Array, ""]
+
+
+class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, Searching]):
+    """Levenberg-Marquardt for residuals some of which are one-sided; evaluates the function once a step.
+
+    A step by which the objective falls by less than `LITTLE` of what the linearisation predicts is rejected and the
+    next one shortened; one by which it falls by `NEARLY_ALL` of it lets the next one be longer. A step that is
+    `mixed_step` has to leave the same one-sided residuals positive, and where it is rejected the step of the
+    linearisation alone is tried next. A search ends where an accepted step changes neither y nor any residual by more
+    than the tolerances, and after `PATIENCE` steps in a row that were rejected: each is a quarter of the one before,
+    so nothing is left to gain but rounding (or, of a rollout, the integrator's tolerance).
+
+    Attributes:
+        rtol, atol, norm: of the last step, as of optimistix's solvers.
+        first, last: the one-sided residuals are those from `first` up to `last`; the function returns them with their
+            signs.
+        near: largest step that is mixed with the last one, `NEAR`; 0 for none.
+    """
+
+    rtol: float
+    atol: float
+    first: int = eqx.field(static=True, default=0)
+    last: int = eqx.field(static=True, default=0)
+    near: float = NEAR
+    norm: Callable[[Any], Array] = eqx.field(static=True, default=optx.max_norm)
+    descent: OneSidedDescent = OneSidedDescent()
+    search: OneSidedTrustRegion = OneSidedTrustRegion()
+
+    def _linearised(self, fn: Function, y: Z, args: Any) -> tuple[Linearisation, Any]:
+        residual, slope, aux = jax.linearize(lambda y: fn(y, args), y, has_aux=True)
+        jacobian = jax.vmap(slope, out_axes=-1)(jnp.eye(y.size, dtype=y.dtype))
+        return Linearisation(residual, jacobian, self.first, self.last), aux
+
+    def init(
+        self, fn: Function, y: Z, args: Any, options: dict[str, Any], f_struct: Any, aux_struct: Any, tags: frozenset
+    ) -> Searching:
+        """Returns the state of a search that has evaluated nothing yet."""
+        none, no, still = jnp.asarray(0), jnp.asarray(False), jnp.zeros_like(y)
+        jacobian = jnp.zeros((f_struct.size, y.size), f_struct.dtype)
+        found = Linearisation(jnp.zeros(f_struct.shape, f_struct.dtype), jacobian, self.first, self.last)
+        aux = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), aux_struct)
+        return Searching(found, aux, still, y, no, self.search.init(y, found), none, none, no)
+
+    def step(
+        self, fn: Function, y: Z, args: Any, options: dict[str, Any], state: Searching, tags: frozenset
+    ) -> tuple[Z, Searching, Any]:
+        """Evaluates the function where the last step led, judges that step and finds the next."""
+        found, aux = self._linearised(fn, state.ahead, args)
+        moved, first, before = state.ahead - y, state.steps == 0, state.found
+        _, accepted, _, region = self.search.step(first, y, state.ahead, before, found, state.region)
+        alike = jnp.all(found.positive == before.positive)
+        accepted &= first | alike | ~state.mixed
+        region = _where(state.mixed & ~accepted, state.region, region)
+        ended = self._is_small(state.ahead, moved, found, before) & accepted
+
+        y, best, aux = _where(accepted, (state.ahead, found, aux), (y, before, state.aux))
+        stride, _ = self.descent.step(region.step_size, self.descent.query(y, best, best))
+        mixed = accepted & alike & (state.steps > 1) & (jnp.max(jnp.abs(stride)) < self.near)
+        ahead = y + jnp.where(mixed, mixed_step(stride, moved, stride - state.stride), stride)
+        rejected = jnp.where(accepted, 0, state.rejected + 1)
+        over = ended | (rejected >= PATIENCE)
+        new = Searching(best, aux, stride, ahead, mixed, region, state.steps + 1, rejected, over)
+        return y, new, aux
+
+    def _is_small(self, y: Z, moved: Z, found: Linearisation, before: Linearisation) -> Array:
+        """True if a step changed neither y nor any residual that counts by more than the tolerances."""
+        changed = found.counting - before.counting
+        return (self.norm(moved / (self.atol + self.rtol * jnp.abs(y))) < 1) & (
+            self.norm(changed / (self.atol + self.rtol * jnp.abs(found.residual))) < 1
+        )
+
+    def terminate(
+        self, fn: Function, y: Z, args: Any, options: dict[str, Any], state: Searching, tags: frozenset
+    ) -> tuple[Array, optx.RESULTS]:
+        """True if the search has ended."""
+        return state.over, optx.RESULTS.successful  # type: ignore[return-value]  # an enumeration of equinox's
+
+    def postprocess(
+        self,
+        fn: Function,
+        y: Z,
+        aux: Any,
+        args: Any,
+        options: dict[str, Any],
+        state: Searching,
+        tags: frozenset,
+        result: optx.RESULTS,
+    ) -> tuple[Z, Any, dict[str, Any]]:
+        """Returns the best point, what else its evaluation gave, and no statistics."""
+        return y, aux, {}
+
+
+def _where(chosen: Array, a: Any, b: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(chosen, a, b), a, b)

@@ -1,0 +1,44 @@
+"""Solvers of optimistix and optax by the names that `calibrate --solver` takes. Importable without jax."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from calibration.data.errors import BadConfiguration, choices
+
+if TYPE_CHECKING:
+    import optimistix as optx
+
+#: Name → class of optimistix.
+OF_OPTIMISTIX = {
+    "lm": "LevenbergMarquardt",
+    "dogleg": "Dogleg",
+    "gauss-newton": "GaussNewton",
+    "bfgs": "BFGS",
+    "dfp": "DFP",
+    "lbfgs": "LBFGS",
+    "nonlinear-cg": "NonlinearCG",
+}
+#: Functions of optax that take a learning rate, by their names there.
+OF_OPTAX = ("adam", "adamw", "nadam", "radam", "adabelief", "adagrad", "rmsprop", "lion", "sgd")
+NAMES = (*OF_OPTIMISTIX, *OF_OPTAX)
+#: Relative and absolute change of z and of the objective at which they end.
+TOLERANCE = 1e-6
+#: Learning rate of optax's [prior sds].
+RATE = 0.02
+
+
+def solver(name: str) -> optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser:
+    """The solver of a name, one of `NAMES`.
+
+    Raises:
+        BadConfiguration: there is none of that name.
+    """
+    if name not in NAMES:
+        raise BadConfiguration(f"--solver: got {name}; {choices(name, NAMES)}")
+    import optax
+    import optimistix as optx
+
+    if name in OF_OPTIMISTIX:
+        return getattr(optx, OF_OPTIMISTIX[name])(rtol=TOLERANCE, atol=TOLERANCE)
+    return optx.OptaxMinimiser(getattr(optax, name)(RATE), rtol=TOLERANCE, atol=TOLERANCE)
