@@ -15,6 +15,7 @@ from pydantic_core import PydanticCustomError
 from calibration.data.columns import BRAKED, CONDITIONS, LOAD, ROWS, SIDES
 from calibration.data.errors import BadConfiguration, choices, parsed
 from calibration.data.input_files import toml_content, toml_text
+from calibration.inference import solvers
 from mmrjax import channels, fidelities
 from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
 from sweeps.flags import flags
@@ -84,6 +85,13 @@ def _fidelity(model: str) -> str:
     if model not in fidelities.TABLE:
         raise PydanticCustomError("unknown", f"input should be {_either(map(repr, fidelities.TABLE))}")
     return model
+
+
+def _solver(name: str) -> str:
+    """The name of a solver of fits, refused where there is no such one."""
+    if name not in solvers.NAMES:
+        raise PydanticCustomError("unknown", choices(name, solvers.NAMES))
+    return name
 
 
 def _either(names: Iterable[str]) -> str:
@@ -556,6 +564,13 @@ class Calibrate(RobotPart, InferencePart, OutputPart):
     )
     generations: Annotated[int, Field(ge=1, le=10_000)] | None = about(
         None, "Of the population, at most", usual="30", solver=True
+    )
+    solver: Annotated[str, AfterValidator(_solver)] | None = about(
+        None,
+        f"Of the searches, from optimistix ({', '.join(solvers.OF_OPTIMISTIX)}) or optax "
+        f"({', '.join(solvers.OF_OPTAX)}), by exact derivatives",
+        usual="our Levenberg-Marquardt",
+        solver=True,
     )
     profiles: bool | None = about(None, "Profile likelihood of each", usual="steady only, but of turns")
     hold_out: bool | None = about(None, "Fit again without each block", usual="steady only")

@@ -29,7 +29,7 @@ KINDS = {
 HIDDEN = {
     "climb": {"--time-step"},
     "sweep": {"--shard", "--scheduler"},
-    "calibrate": {"--population", "--generations", "--members"},
+    "calibrate": {"--population", "--solver", "--generations", "--members"},
     "loop": {"--population", "--generations", "--members", "--replicates"},
 }
 

@@ -35,7 +35,7 @@ def calibrate(
             runs, robot, rows=config.rows, free=config.free, fix=config.fix, stated=stated,
             noise=config.noise or None, model=config.model, starts=config.starts, population=config.population,
             generations=config.generations, members=members, seed=config.seed,
-            profiles=config.profiles, blocks=config.hold_out, tell=heard,
+            profiles=config.profiles, blocks=config.hold_out, solver=config.solver, tell=heard,
         )  # fmt: skip
         found.save(folder.partial, config.robot)
         print_calibration(found)
