@@ -5,10 +5,11 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.newton import root
+from mmrjax.fidelities.newton import FewUnknowns, root
 from mmrjax.fidelities.steady import steady
 
 TOLERANCE = 1e-13
@@ -45,6 +46,18 @@ def test_root_and_derivatives_are_exact(linear):
     bend = np.array([0.0, 0.0, 2**0.5])
     for twice in (jax.jacfwd(jax.jacrev(meeting)), jax.jacrev(jax.jacfwd(meeting)), jax.jacfwd(jax.jacfwd(meeting))):
         np.testing.assert_allclose(twice(radius), bend, rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_root_finder_serves_optimistix(linear):
+    radius = jnp.asarray(2.3)
+    found = optx.root_find(
+        lambda y, of: circle(y, *of), FewUnknowns(atol=TOLERANCE, linear=linear), START, (None, radius)
+    )
+    np.testing.assert_allclose(found.value, exact(2.3), rtol=1e-13)
+    at, solved = root(circle, START, None, radius, TOLERANCE, linear, False)
+    np.testing.assert_array_equal(found.value, at)
+    assert solved and found.state.solved
 
 
 def test_root_of_a_batch_is_that_of_its_members():
