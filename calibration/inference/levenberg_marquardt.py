@@ -1,10 +1,10 @@
 """Least squares with residuals that count only where they are positive, as a solver of optimistix.
 
-The objective is ½ Σ r² over all residuals, of those that are one-sided over the positive ones only. The solver is
-Levenberg-Marquardt, built from optimistix's parts: a descent that knows which one-sided residuals are positive where
-it leads, a trust region that predicts with them, and between the two Anderson's mixing. optimistix's own
-Levenberg-Marquardt of the same residuals cut off at 0 predicts, from just inside of an edge, a gain that is not
-there, and then goes along the edge in steps of 1e-4.
+The objective is ½ Σ r² over the two-sided residuals and the positive one-sided ones. The solver is
+Levenberg-Marquardt, built from optimistix's parts: a descent that finds which one-sided residuals are positive at the
+end of its step, a trust region that predicts with them, and Anderson's mixing between the two. optimistix's own
+Levenberg-Marquardt takes the same residuals cut off at 0. From just inside of an edge its linearisation predicts a
+gain that does not exist, and it then follows the edge in steps of 1e-4.
 """
 
 from __future__ import annotations
@@ -70,9 +70,9 @@ def half_squares(r: Array, one_sided: slice) -> Float[Array, ""]:
 def stride_of(r: Array, jacobian: Array, one_sided: slice, damping: Array | float) -> Z:
     """Step to the optimum of a linearisation whose one-sided residuals count where they are positive.
 
-    min_d ½ Σ (r + J d)² + ½ damping |d|², over the two-sided residuals, and over the one-sided that are positive at
-    its end, which are found by turns (a semismooth Newton method). The step that knows only those which are positive
-    where it begins leads, from just inside of an edge, across it, and predicts a gain that is not there.
+    min_d ½ Σ (r + J d)² + ½ damping |d|², over the two-sided residuals and the one-sided ones that are positive at
+    its end; these are found by turns (a semismooth Newton method). A step that takes those that are positive at its
+    beginning crosses the edge from just inside of it, and predicts a gain that does not exist.
 
     Args:
         r, jacobian: residuals and slopes, of one-sided residuals too where they are negative.
@@ -166,8 +166,8 @@ class OneSidedTrustRegion(optx.ClassicalTrustRegion):
 def mixed_step(stride: Z, moved: Z, changed: Z) -> Z:
     """A step that takes into account how the last one changed the step of the linearisation.
 
-    Where residuals are large beside their curvature, Gauss-Newton steps shrink by the same factor for as long as one
-    likes. Anderson's mixing (D. G. Anderson, J. ACM 12 (1965)) of depth one is a secant in that direction:
+    Gauss-Newton steps shrink by a constant factor for ever if residuals are large compared with their curvature.
+    Anderson's mixing (D. G. Anderson, J. ACM 12 (1965)) of depth one is a secant in that direction:
     d - θ (Δy + Δd), θ = d·Δd / |Δd|².
 
     Args:
@@ -202,12 +202,12 @@ class Searching(eqx.Module):
 class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, Searching]):
     """Levenberg-Marquardt for residuals some of which are one-sided; evaluates the function once a step.
 
-    A step by which the objective falls by less than `LITTLE` of what the linearisation predicts is rejected and the
-    next one shortened; one by which it falls by `NEARLY_ALL` of it lets the next one be longer. A step that is
-    `mixed_step` has to leave the same one-sided residuals positive, and where it is rejected the step of the
-    linearisation alone is tried next. A search ends where an accepted step changes neither y nor any residual by more
-    than the tolerances, and after `PATIENCE` steps in a row that were rejected: each is a quarter of the one before,
-    so nothing is left to gain but rounding (or, of a rollout, the integrator's tolerance).
+    A step is rejected, and the next one shortened, if the objective falls by less than `LITTLE` of the prediction.
+    The next one may be longer if it falls by `NEARLY_ALL` of it. A `mixed_step` has to leave the same one-sided
+    residuals positive; after a rejected one the step of the linearisation alone is tried. A search ends if an
+    accepted step changes neither y nor any residual by more than the tolerances, or after `PATIENCE` rejected steps
+    in a row. Each of those is a quarter of the one before, so that only rounding is left to gain (or a rollout's
+    tolerance).
 
     Attributes:
         rtol, atol, norm: of the last step, as of optimistix's solvers.

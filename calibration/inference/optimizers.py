@@ -379,8 +379,8 @@ def _first_step(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Obser
 
 
 def counting(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
-    """Residuals and Jacobian as they count, for what knows nothing of one-sided ones: penalties are cut off at 0, and
-    a reading whose slope is not finite counts as one that could not be computed."""
+    """Residuals and Jacobian with penalties cut off at 0, for solvers without one-sided residuals. Readings whose
+    slope is not finite count as not computed."""
     return counted(*computed(r, jacobian, data), penalties(data))
 
 
@@ -542,10 +542,10 @@ def _put(x: np.ndarray, places: np.ndarray, values: np.ndarray) -> np.ndarray:
 def searches(
     problem: Problem, starts: Float[Array, "starts parameters"], data: Data, solver: Solver | None = None
 ) -> tuple[Optimum, Int[Array, "starts rows"], Int[Array, "starts rows"]]:
-    """A search from every start: of ours in one vmapped batch, of any other `solver` one after another.
+    """A search from every start: in one vmapped batch by our solver, one after another by any other `solver`.
 
     Returns:
-        Where each search ended, and the status of every row where it started and where it ended.
+        The end of each search, and the status of every row at its start and at its end.
     """
     if solver is None:
         return _searches(problem, starts, data)
@@ -566,8 +566,8 @@ def _searches(problem: Problem, starts: Array, data: Data) -> tuple[Optimum, Arr
 def searches_by(
     problem: Problem, starts: Float[Array, "starts parameters"], data: Data, solver: Solver
 ) -> tuple[Optimum, Observation, Observation]:
-    """Searches by a solver of optimistix, one after another: its linear algebra is LAPACK's, of which batched calls
-    have waited for each other for ever (`normal_equations`).
+    """Searches by a solver of optimistix, one after another: its linear algebra is LAPACK's, and batched calls of
+    that have waited for each other for ever (`normal_equations`).
 
     Returns:
         Where each search ended, and what the model says where it started and where it ended.

@@ -86,7 +86,7 @@ def _step(fn: Function, y: Vector, args: Any, apart: bool) -> tuple[Vector, Vect
 
 
 class Turning(eqx.Module):
-    """State of a search: the unknowns, and whether they are there."""
+    """State of a search: the unknowns, and True once f is 0 there."""
 
     y: Vector
     solved: Bool[Array, ""]
@@ -95,9 +95,9 @@ class Turning(eqx.Module):
 class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
     """Newton's method for a few scalars, each determined by the equation beside it (see `factorise`).
 
-    A member is there once |f| < `atol`, or after a step so small that what it leaves is. A linear f needs one pass,
-    which stands in `init`, outside the loop, where XLA fuses it over a batch with what comes before and after; the
-    loop then turns for members that crossed into another branch of f, and seldom at all.
+    A member is solved once |f| < `atol`, or after a step so small that its square is below it. A linear f needs one
+    pass. `init` makes it, outside the loop, where XLA fuses it over a batch with the code before and after; the loop
+    then turns only for members that crossed into another branch of f.
 
     Attributes:
         atol: of f; rtol, norm: not read.
@@ -145,7 +145,7 @@ class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
     def terminate(
         self, fn: Function, y: Vector, args: Any, options: dict[str, Any], state: Turning, tags: frozenset
     ) -> tuple[Array, optx.RESULTS]:
-        """True if the unknowns are there."""
+        """True if f is 0 at the unknowns."""
         return state.solved, optx.RESULTS.successful  # type: ignore[return-value]  # an enumeration of equinox's
 
     def postprocess(
@@ -159,7 +159,7 @@ class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
         tags: frozenset,
         result: optx.RESULTS,
     ) -> tuple[Vector, Any, dict[str, Any]]:
-        """Returns the unknowns, where no turn was needed too."""
+        """Returns the unknowns, also if no turn was needed."""
         return state.y, aux, {}
 
 
