@@ -5,6 +5,10 @@ that compiles nothing. Here a program is found by a name, a hash of all that its
 packages, the versions of the libraries, JAX's settings, and the arguments with shapes in the place of their arrays.
 What has no such name (a class of a user's own file, an array of keys) goes the usual way. A program is native code:
 it is read from a folder that nobody but the user can change, and from no other (`mmrjax.private`).
+
+Compared with JAX's cache alone this saves 27 % of the processor time of a warm `simulate` (5.6 s for 7.6), 23 % of a
+`sweep` and 45 % of `loop measured` (37 s for 68; docs/lab/figures.md, 2026-11-28). `jax.export` saves no more: it
+needs the same names.
 """
 
 from __future__ import annotations
