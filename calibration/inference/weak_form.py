@@ -43,8 +43,8 @@ FLOOR = 0.01
 #: Steps of Newton's method to the current that a voltage drives.
 CURRENT_STEPS = 3
 #: Steps of the regression, and the relative change of what is left from which on it goes on; by how much a coordinate
-#: is moved to see how noise depends on it [prior sd].
-STEPS, SMALL, STEP = 20, 1e-4, 1e-4
+#: is moved to see how noise depends on it, and by how much until that is looked at again [prior sd].
+STEPS, SMALL, STEP, FAR = 20, 1e-3, 1e-4, 0.5
 
 
 class Terms(eqx.Module):
@@ -258,12 +258,20 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
         terms = jax.device_get(_terms(problem, plan, rows, jnp.asarray(z), effects))
         return [_joined(problem, plan, w, terms) for w in cut]
 
+    grown: list[tuple[np.ndarray, list[np.ndarray]]] = []
+
+    def growth(z: np.ndarray, here: list[_Joined]) -> list[np.ndarray]:
+        """Relative growth of the sds by each coordinate, as it was not far away. Were it left out, a larger inertia
+        would leave less of anything."""
+        if not grown or np.max(np.abs(grown[0][0] - z)) > FAR:
+            moved = [joined(z + STEP * one) for one in np.eye(len(z))]
+            found = [np.stack([(m[k].sd - j.sd) / j.sd for m in moved], 1) / STEP for k, j in enumerate(here)]
+            grown[:] = [(z, found)]
+        return grown[0][1]
+
     def made(z: np.ndarray, effects: tuple[ScoredEffect, ...] = ()) -> WeakForm:
         here, size = joined(z, effects), len(z)
-        # The noise depends on the coordinates too: were it held, a larger inertia would leave less of anything.
-        moved = [joined(z + STEP * one) for one in np.eye(size)]
-        growth = [np.stack([(m[k].sd - j.sd) / j.sd for m in moved], 1) / STEP for k, j in enumerate(here)]
-        whole = np.concatenate([j.whitened(g) for j, g in zip(here, growth, strict=True)])
+        whole = np.concatenate([j.whitened(g) for j, g in zip(here, growth(z, here), strict=True)])
         prior = np.zeros((size, whole.shape[1]))
         prior[:, 0], prior[:, 1 : size + 1] = z - np.asarray(problem.data.centre), np.eye(size)
         both = np.concatenate([whole, prior])
