@@ -43,8 +43,8 @@ FLOOR = 0.01
 #: Steps of Newton's method to the current that a voltage drives.
 CURRENT_STEPS = 3
 #: Steps of the regression, and the relative change of what is left from which on it goes on; by how much a coordinate
-#: is moved to see how noise depends on it [prior sd].
-STEPS, SMALL, STEP = 20, 1e-4, 1e-4
+#: is moved to see how noise depends on it, and by how much until that is looked at again [prior sd].
+STEPS, SMALL, STEP, FAR = 10, 1e-3, 1e-4, 0.5
 
 
 class Terms(eqx.Module):
@@ -254,16 +254,28 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
         return None
     rows = rows_of(problem, plan, rate)
 
+    def terms_at(z: np.ndarray, effects: tuple[ScoredEffect, ...] = ()) -> Terms:
+        return jax.device_get(_terms(problem, plan, rows, jnp.asarray(z), effects))
+
     def joined(z: np.ndarray, effects: tuple[ScoredEffect, ...] = ()) -> list[_Joined]:
-        terms = jax.device_get(_terms(problem, plan, rows, jnp.asarray(z), effects))
+        terms = terms_at(z, effects)
         return [_joined(problem, plan, w, terms) for w in cut]
+
+    grown: list[tuple[np.ndarray, list[np.ndarray]]] = []
+
+    def growth(z: np.ndarray, here: list[_Joined]) -> list[np.ndarray]:
+        """Relative growth of the sds by each coordinate, as it was not far away. Were it left out, a larger inertia
+        would leave less of anything."""
+        if not grown or np.max(np.abs(grown[0][0] - z)) > FAR:
+            moved = [terms_at(z + STEP * one) for one in np.eye(len(z))]
+            sds = [[_sd(_noise(problem, plan, w, t)) for t in moved] for w in cut]
+            found = [np.stack([(m - j.sd) / j.sd for m in each], 1) / STEP for each, j in zip(sds, here, strict=True)]
+            grown[:] = [(z, found)]
+        return grown[0][1]
 
     def made(z: np.ndarray, effects: tuple[ScoredEffect, ...] = ()) -> WeakForm:
         here, size = joined(z, effects), len(z)
-        # The noise depends on the coordinates too: were it held, a larger inertia would leave less of anything.
-        moved = [joined(z + STEP * one) for one in np.eye(size)]
-        growth = [np.stack([(m[k].sd - j.sd) / j.sd for m in moved], 1) / STEP for k, j in enumerate(here)]
-        whole = np.concatenate([j.whitened(g) for j, g in zip(here, growth, strict=True)])
+        whole = np.concatenate([j.whitened(g) for j, g in zip(here, growth(z, here), strict=True)])
         prior = np.zeros((size, whole.shape[1]))
         prior[:, 0], prior[:, 1 : size + 1] = z - np.asarray(problem.data.centre), np.eye(size)
         both = np.concatenate([whole, prior])
@@ -297,7 +309,7 @@ class _Joined:
     @property
     def sd(self) -> np.ndarray:
         """Of each window."""
-        return np.sqrt(np.maximum(np.sum(self.noise**2, 1), 1e-300))
+        return _sd(self.noise)
 
     def whitened(self, growth: np.ndarray) -> np.ndarray:
         """`whole` by its noise, of which `growth` is the relative growth by each coordinate."""
@@ -307,28 +319,41 @@ class _Joined:
         return solve_triangular(np.linalg.cholesky(covariance), whole, lower=True)
 
 
-def _joined(problem: Problem, plan: Plan, w: Windows, terms: Terms) -> _Joined:
-    """The equations of the windows of a run."""
-    sd = np.asarray(problem.data.sd)[w.rows]
-    count = terms.f.shape[1]
-    slopes = [w.slope] * count
+def _sd(noise: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.maximum(np.sum(noise**2, 1), 1e-300))
+
+
+def _slopes(plan: Plan, w: Windows, equations: int) -> list[np.ndarray]:
+    """By what y of each equation is weighed in windows."""
+    slopes = [w.slope] * equations
     if plan.angle and plan.mechanical:
         slopes[plan.electrical] = -w.bend
+    return slopes
+
+
+def _noise(problem: Problem, plan: Plan, w: Windows, terms: Terms) -> np.ndarray:
+    """Change of the windows of a run by a sd of each of its readings, shape (windows, readings)."""
+    sd = np.asarray(problem.data.sd)[w.rows]
+    by, also = (np.asarray(x)[w.rows] for x in terms.by_reading)
+    slopes = _slopes(plan, w, terms.f.shape[1])
+    shown = [c for c in range(sd.shape[1]) if np.any(by[:, :, c]) or np.any(also[:, :, c])]
+    each = [
+        np.concatenate([(w.weight * by[:, k, c] + slope * also[:, k, c]) * sd[:, c] for c in shown], 1)
+        for k, slope in enumerate(slopes)
+    ]
+    return np.concatenate(each)
+
+
+def _joined(problem: Problem, plan: Plan, w: Windows, terms: Terms) -> _Joined:
+    """The equations of the windows of a run."""
+    slopes = _slopes(plan, w, terms.f.shape[1])
 
     def integrated(f: Any, y: Any) -> np.ndarray:
-        each = [w.weight @ f[w.rows, k] + slopes[k] @ y[w.rows, k] for k in range(count)]
-        return np.concatenate(each)
+        return np.concatenate([w.weight @ f[w.rows, k] + slope @ y[w.rows, k] for k, slope in enumerate(slopes)])
 
     parts = [
         integrated(terms.f[..., None], terms.y[..., None]),
         integrated(*terms.by_z),
         integrated(*terms.by_effects),
     ]
-    by, also = (np.asarray(x)[w.rows] for x in terms.by_reading)
-    noise = [
-        np.concatenate(
-            [(w.weight * by[:, k, c] + slopes[k] * also[:, k, c]) * sd[:, c] for c in range(sd.shape[1])], 1
-        )
-        for k in range(count)
-    ]
-    return _Joined(np.concatenate(parts, 1), np.concatenate(noise))
+    return _Joined(np.concatenate(parts, 1), _noise(problem, plan, w, terms))
