@@ -169,24 +169,24 @@ def turning_way(robot: Robot, conditions: Conditions, state: State) -> Array:
     """Way in which shafts and a load that move as one turn, or leave rest, ±1 [-].
 
     `HELD` where they stand and friction holds them by the test of `firmness`, now and at the current that will flow
-    then; 0 where it does so now alone, so that they are about to leave. Where a speed is imposed it turns them,
-    whatever friction does: 0 where it stands, within the speed that friction at rest is not resolved in.
+    then. 0 where it would hold them now alone, so that they are about to leave, and they are slower than friction at
+    rest is resolved. Where a speed is imposed it turns them, whatever friction does: 0 where it stands.
     """
-    motor_speed = jnp.asarray(state.speed_motor)
+    motor_speed, load = jnp.asarray(state.speed_motor), robot.chassis(conditions.configuration)
+    slow = jnp.abs(motor_speed) * load.radius / robot.gearbox.ratio < load.speed_still
     if conditions.motor_speed is not None:
         change = jnp.asarray(0.0 if conditions.motor_acceleration is None else conditions.motor_acceleration)
-        load = robot.chassis(conditions.configuration)
-        slow = jnp.abs(motor_speed) * load.radius / robot.gearbox.ratio < load.speed_still
         return jnp.where(slow & (change == 0), 0.0, jnp.sign(jnp.where(motor_speed == 0, change, motor_speed)))
 
     def leaving(robot: Robot, conditions: Conditions, state: State) -> Array:
         settled = dataclasses.replace(state, current=current_at_rest(robot, conditions, state))
         now, then = (_about_to_turn(robot, conditions, at) for at in (state, settled))
-        (forward, backward), later = ((ahead.torque_net > 0, back.torque_net < 0) for ahead, back in (now, then))
-        held = jnp.where(later[0] | later[1], 0.0, HELD)
-        return jnp.where(forward, 1.0, jnp.where(backward, -1.0, held))
+        turned, later = (1.0 * (ahead.torque_net > 0) - 1.0 * (back.torque_net < 0) for ahead, back in (now, then))
+        stands, moved = state.speed_motor == 0, jnp.sign(state.speed_motor)
+        held = jnp.where(later != 0, 0.0, jnp.where(stands, HELD, moved))
+        return jnp.where(turned == 0, held, jnp.where(stands, turned, moved))
 
-    return rarely(motor_speed == 0, leaving, (robot, conditions, state), jnp.sign(motor_speed))
+    return rarely(slow, leaving, (robot, conditions, state), jnp.sign(motor_speed))
 
 
 def slides_in_place(robot: Robot, conditions: Conditions) -> Array:
