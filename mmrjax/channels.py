@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
-from mmrjax.quantities import DEG, MM, RPM, Quantity, spelled
+from mmrjax.quantities import DEG, MM, RPM, Quantity
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
@@ -43,7 +43,6 @@ class Channel(Quantity):
         side: 0 or 1 of what the left or the right side alone shows; None: what both together do.
         where: it is measured, where the label does not say.
         rests_on: parameters of the robot without which it is not known, by dotted name.
-        stem: of its columns, where that is not its name.
     """
 
     word: str
@@ -59,12 +58,6 @@ class Channel(Quantity):
     side: int | None = None
     where: str = ""
     rests_on: tuple[str, ...] = ()
-    stem: str = ""
-
-    @property
-    def column(self) -> str:
-        """Its column in tables of runs, with the unit in the name."""
-        return f"{self.stem or self.name}_{spelled(self.unit)}"
 
     @property
     def deviation(self) -> Quantity:
@@ -322,6 +315,7 @@ OF_TURNS: tuple[Channel, ...] = (
     *(
         Channel(
             name=name,
+            stem=name[-1],
             unit="mm",
             factor=MM,
             label=label,

@@ -52,6 +52,7 @@ class Quantity:
         unit_si: of the value inside, where people write it otherwise than `unit`; empty for the same.
         other_units: what it is also written in, and the SI value of each.
         percent: whether per cent of a slope are understood too.
+        stem: of its columns, where that is not its name.
     """
 
     name: str
@@ -62,11 +63,12 @@ class Quantity:
     unit_si: str = dataclasses.field(default="", kw_only=True)
     other_units: tuple[tuple[str, float], ...] = dataclasses.field(default=(), kw_only=True)
     percent: bool = dataclasses.field(default=False, kw_only=True)
+    stem: str = dataclasses.field(default="", kw_only=True)
 
     @property
     def column(self) -> str:
         """Its column in tables, with the unit in the name."""
-        return f"{self.name}_{spelled(self.unit)}" if self.unit else self.name
+        return self._column(spelled(self.unit))
 
     @property
     def unit_shown(self) -> str:
@@ -82,7 +84,11 @@ class Quantity:
     def columns(self) -> dict[str, str]:
         """Names of the columns that may hold it, each with the unit at its end."""
         units = [*self.units, *([PERCENT] if self.percent else [])]
-        return {f"{self.name}_{unit}" if unit else self.name: unit for unit in units}
+        return {self._column(unit): unit for unit in units}
+
+    def _column(self, unit: str) -> str:
+        stem = self.stem or self.name
+        return f"{stem}_{unit}" if unit else stem
 
     def value(self, written: float, unit: str) -> float:
         """What is written in `unit`, in the unit of its column."""
