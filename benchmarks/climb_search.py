@@ -21,10 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import terrains
-from mmrjax import params, robots, terrain
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities.climb import NAMES, OVER, Sequence, climb_batch
-from mmrjax.tables import SURFACES, adhesion_ratio
+from mmrjax.climbing import terrain
+from mmrjax.climbing.climb_simulation import NAMES, OVER, Sequence, climb_batch
+from mmrjax.model import paper_robots, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_tables import SURFACES, adhesion_ratio
 
 jax.config.update("jax_enable_x64", True)
 
@@ -102,7 +103,7 @@ def main() -> None:
     parser.add_argument("--levers-current", type=float, help="at which the levers' driver limits their motors")
     parser.add_argument("--out", type=Path, help="CSV of the sequence that does best, for mmrjax climb --sequence")
     told = parser.parse_args()
-    robot, random = robots.nominal(), np.random.default_rng(told.seed)
+    robot, random = paper_robots.nominal(), np.random.default_rng(told.seed)
     if told.levers_current is not None:
         robot = params.replace(robot, {"running_gear.levers.current_limit": told.levers_current})
     adhesion = adhesion_ratio(told.surface, True) if told.adhesion is None else told.adhesion

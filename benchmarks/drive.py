@@ -90,12 +90,12 @@ def main() -> None:
     set_precision(arguments.float32)
     import jax.numpy as jnp
 
-    from mmrjax import robots
-    from mmrjax.conditions import Conditions
     from mmrjax.fidelities.drive import drive_batch
-    from mmrjax.signals import FAILED
+    from mmrjax.model import paper_robots
+    from mmrjax.model.conditions import Conditions
+    from mmrjax.model.signals import FAILED
 
-    robot, times = robots.nominal(), jnp.asarray(INSTANTS)
+    robot, times = paper_robots.nominal(), jnp.asarray(INSTANTS)
 
     @jax.jit
     def run(runs):

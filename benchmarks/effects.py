@@ -15,14 +15,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.words import effects as words
-from mmrjax import balances, channels, params, robots
-from mmrjax.conditions import Conditions
+from calibration.words import effect_words as words
 from mmrjax.effects import ALL, OF_CHANNELS, OF_TURNS, Effect
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.steady import steady
-from mmrjax.robot import Robot
-from mmrjax.tables import TRACKED, WHEELED
+from mmrjax.model import balances, channels, paper_robots, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_tables import TRACKED, WHEELED
+from mmrjax.model.robot import Robot
 
 jax.config.update("jax_enable_x64", True)
 
@@ -55,7 +55,7 @@ PASSING = tuple(e for e in ALL if e not in SETTLED and not e.needs_duty)
 
 
 def robot(effects: tuple[type[Effect], ...]) -> Robot:
-    base = params.replace(robots.nominal(), ADHESION)
+    base = params.replace(paper_robots.nominal(), ADHESION)
     return dataclasses.replace(base, effects=tuple(effect() for effect in effects))
 
 
@@ -73,7 +73,7 @@ def examples(battery: float = 0.0) -> Conditions:
 
 
 def table8() -> Conditions:
-    axes = (0, 1), robots.SLOPES_DEG, robots.PAYLOADS_KG, robots.VOLTAGES_V
+    axes = (0, 1), paper_robots.SLOPES_DEG, paper_robots.PAYLOADS_KG, paper_robots.VOLTAGES_V
     configuration, slope, payload, voltage = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 4).T
     return Conditions(configuration, voltage, slope, payload)
 

@@ -26,13 +26,13 @@ import equinox as eqx  # noqa: E402
 import numpy as np  # noqa: E402
 from measure import machine  # noqa: E402
 
-from mmrjax import params, robots  # noqa: E402
-from mmrjax.conditions import Conditions  # noqa: E402
-from mmrjax.fidelities.mission import Mission, mission  # noqa: E402
-from mmrjax.profile import Profile, profile  # noqa: E402
-from mmrjax.robot import Robot  # noqa: E402
-from mmrjax.signals import CONVERGED, GRAVITY, STATUSES  # noqa: E402
-from mmrjax.tables import WHEELED  # noqa: E402
+from mmrjax.missions.mission import Mission, mission  # noqa: E402
+from mmrjax.missions.profile import Profile, profile  # noqa: E402
+from mmrjax.model import paper_robots, params  # noqa: E402
+from mmrjax.model.conditions import Conditions  # noqa: E402
+from mmrjax.model.paper_tables import WHEELED  # noqa: E402
+from mmrjax.model.robot import Robot  # noqa: E402
+from mmrjax.model.signals import CONVERGED, GRAVITY, STATUSES  # noqa: E402
 
 INSTALL = "fastsim is not installed here: pip install fastsim==3.1.0 (Python 3.10 to 3.15), then run this again"
 #: g of FASTSim 3.1.0 (`ACC_GRAV`, 9.8015 rounded to three figures) [m/s²].
@@ -126,7 +126,7 @@ def robot_of(vehicle: Vehicle) -> Robot:
         f"{WHEELED}.ground.friction.speed_static": 1e-3,
         "driver.current_limit": 1e4,
     }
-    robot = params.replace(robots.nominal(), values)
+    robot = params.replace(paper_robots.nominal(), values)
     battery = dataclasses.replace(robot.battery, cells=vehicle.cells)
     return params.strong(dataclasses.replace(robot, battery=battery))
 

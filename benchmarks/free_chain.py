@@ -33,15 +33,16 @@ import jax.numpy as jnp
 import numpy as np
 from shaking import shaking
 
-from mmrjax import balances, masses, mjcf, params
-from mmrjax.conditions import Conditions
-from mmrjax.contact import force_contact, step
-from mmrjax.fidelities.ripple import period_pitch, ripple
 from mmrjax.fidelities.track import _batch
-from mmrjax.robot import Robot
-from mmrjax.robots import nominal
-from mmrjax.running_gear import GROUSERS, TEETH_BELT, TEETH_PULLEY, RunningGear
-from mmrjax.signals import GRAVITY, State
+from mmrjax.model import balances, masses, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.contact import force_contact, step
+from mmrjax.model.paper_robots import nominal
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import GRAVITY, State
+from mmrjax.undercarriage import mjcf
+from mmrjax.undercarriage.ripple import period_pitch, ripple
+from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT, TEETH_PULLEY, RunningGear
 
 # [s]; half of it changes the share by less than the scatter of two windows. Explicit: the damping of a grouser on the
 # mass of its link allows 2 m / b_max = 1.6e-6 s at 300 N·s/m, 0.6e-6 s at 800; main() takes a third of it if less.

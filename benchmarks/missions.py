@@ -25,11 +25,11 @@ import numpy as np  # noqa: E402
 from measure import machine  # noqa: E402
 from scipy.integrate import solve_ivp  # noqa: E402
 
-from mmrjax import params, robots  # noqa: E402
-from mmrjax.conditions import Conditions  # noqa: E402
-from mmrjax.fidelities.mission import Mission, mission  # noqa: E402
-from mmrjax.profile import Profile, profile  # noqa: E402
-from mmrjax.robot import Robot  # noqa: E402
+from mmrjax.missions.mission import Mission, mission  # noqa: E402
+from mmrjax.missions.profile import Profile, profile  # noqa: E402
+from mmrjax.model import paper_robots, params  # noqa: E402
+from mmrjax.model.conditions import Conditions  # noqa: E402
+from mmrjax.model.robot import Robot  # noqa: E402
 
 #: Drive at a voltage, stop shorted; 120 times.
 PERIOD, DRIVEN, CYCLES, VOLTAGE = 30.0, 22.0, 120, 24.0
@@ -58,7 +58,7 @@ def fleet(robots: Robot, conditions: Conditions, course: Profile) -> dict[str, j
 def drawn(count: int, seed: int = 0) -> tuple[Robot, Conditions]:
     """Robots of masses, losses and resistances around the nominal one, in both configurations, on small slopes."""
     rng = np.random.default_rng(seed)
-    robot = params.strong(robots.nominal())
+    robot = params.strong(paper_robots.nominal())
     base = {p.name: float(p.value) for p in params.walk(robot)}
     names = ("motor.resistance", "6T2A.mass", "4W2T.mass", "6T2A.track.loss_coulomb", "4W2T.track.loss_coulomb")
     values = {n: jnp.asarray(base[n] * rng.uniform(0.9, 1.1, count)) for n in names}
@@ -140,7 +140,7 @@ def main() -> None:
             "unaccounted": float(np.abs(report["unaccounted"] / report["energy"]).max()),
         }), flush=True)  # fmt: skip
         return
-    robot = params.strong(robots.nominal())
+    robot = params.strong(paper_robots.nominal())
 
     @eqx.filter_jit
     def alone(robot: Robot, conditions: Conditions, course: Profile) -> Mission:

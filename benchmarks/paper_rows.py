@@ -24,12 +24,12 @@ from measure import machine  # noqa: E402
 from shaking import SET_S  # noqa: E402
 
 from calibration.data.runs import Runs, read  # noqa: E402
-from calibration.inference.calibrate import calibrate  # noqa: E402
-from mmrjax import channels, params, robots  # noqa: E402
-from mmrjax.effects.slip import VibrationSlip  # noqa: E402
+from calibration.inference.calibration import calibrate  # noqa: E402
+from mmrjax.effects.slip_effects import VibrationSlip  # noqa: E402
 from mmrjax.fidelities.track import STEP, track_batch  # noqa: E402
-from mmrjax.robot import Robot  # noqa: E402
-from mmrjax.signals import STATUSES  # noqa: E402
+from mmrjax.model import channels, paper_robots, params  # noqa: E402
+from mmrjax.model.robot import Robot  # noqa: E402
+from mmrjax.model.signals import STATUSES  # noqa: E402
 
 NOISE = "current=1%,motor_speed=0.5%,speed=0.5%"
 #: Decimals that the paper prints of each channel's column.
@@ -91,7 +91,7 @@ def rows(printed_mass: bool) -> Runs:
 def base(changed: dict[str, float]) -> Robot:
     """Nominal with contacts that shake, adhesion on which every row climbs."""
     adhesion = {name: prior[0] for name, prior in SLIP.items() if prior is not None}
-    robot = dataclasses.replace(robots.nominal(), effects=(VibrationSlip(amplitude=jnp.asarray(0.02)),))
+    robot = dataclasses.replace(paper_robots.nominal(), effects=(VibrationSlip(amplitude=jnp.asarray(0.02)),))
     return params.replace(robot, {name: jnp.asarray(value) for name, value in (adhesion | changed).items()})
 
 

@@ -30,7 +30,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from calibration.data.errors import is_number
+from calibration.data.input_errors import is_number
 
 RECORD = Path(__file__).resolve().parents[1] / "tests" / "record" / "commands"
 ROBOTINO = Path(__file__).resolve().parents[1] / "docs" / "rigs" / "robotino"

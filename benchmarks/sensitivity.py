@@ -28,16 +28,16 @@ import numpy as np  # noqa: E402
 from measure import machine  # noqa: E402
 from worlds import paper  # noqa: E402
 
-from calibration.sensitivity import inputs as room  # noqa: E402
 from calibration.sensitivity import sobol  # noqa: E402
+from calibration.sensitivity import uncertain_inputs as room  # noqa: E402
 from calibration.sensitivity.methods import derivative_bounds  # noqa: E402
 from calibration.sensitivity.model import Model, chosen_outputs  # noqa: E402
 from calibration.sensitivity.result import Points  # noqa: E402
 from calibration.sensitivity.study import Study  # noqa: E402
 from mmrjax import nominal  # noqa: E402
-from mmrjax.conditions import Conditions  # noqa: E402
-from mmrjax.tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V  # noqa: E402
-from mmrjax.variation import Variation, evaluate  # noqa: E402
+from mmrjax.fidelities.variation import Variation, evaluate  # noqa: E402
+from mmrjax.model.conditions import Conditions  # noqa: E402
+from mmrjax.model.paper_tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V  # noqa: E402
 
 NAMES = (
     "motor.torque_constant",
@@ -110,7 +110,7 @@ def by_numpy(values: np.ndarray) -> np.ndarray:
 
 def ours() -> tuple[room.Inputs, Model, Conditions]:
     """Inputs, model and operating point of the same study here."""
-    from mmrjax import params
+    from mmrjax.model import params
 
     robot = params.replace(nominal(), {k: jax.numpy.asarray(v) for k, v in ADHESION.items()})
     inputs = room.of_priors(robot, NAMES, {})

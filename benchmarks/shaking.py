@@ -22,9 +22,13 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from measure import machine  # noqa: E402
 
-from mmrjax import balances, mjcf, params, robots  # noqa: E402
-from mmrjax.conditions import Conditions  # noqa: E402
-from mmrjax.fidelities.half_robot import (  # noqa: E402
+from mmrjax.fidelities.track import STEP, track  # noqa: E402
+from mmrjax.model import balances, paper_robots, params  # noqa: E402
+from mmrjax.model.conditions import Conditions  # noqa: E402
+from mmrjax.model.robot import Robot  # noqa: E402
+from mmrjax.model.signals import STATUSES, State  # noqa: E402
+from mmrjax.undercarriage import mjcf  # noqa: E402
+from mmrjax.undercarriage.half_robot import (  # noqa: E402
     Motion,
     advance,
     generalized,
@@ -33,11 +37,8 @@ from mmrjax.fidelities.half_robot import (  # noqa: E402
     roll,
     system,
 )
-from mmrjax.fidelities.ripple import period_pitch, touchdowns  # noqa: E402
-from mmrjax.fidelities.track import STEP, track  # noqa: E402
-from mmrjax.robot import Robot  # noqa: E402
-from mmrjax.running_gear import GROUSERS, TEETH_BELT  # noqa: E402
-from mmrjax.signals import STATUSES, State  # noqa: E402
+from mmrjax.undercarriage.ripple import period_pitch, touchdowns  # noqa: E402
+from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT  # noqa: E402
 
 SET_S = {
     "6T2A.ground.friction.static": 0.6093, "6T2A.ground.friction.dynamic": 0.5331,
@@ -62,7 +63,7 @@ POINTS, STEPS = ((15.0, 10.0, 0.0), (33.0, 5.0, 8.0)), 12_000
 def shaking(changed: dict[str, float] | None = None) -> Robot:
     """Nominal with set S."""
     values = SET_S | WHEELED | (changed or {})
-    return params.replace(robots.nominal(), {name: jnp.asarray(value) for name, value in values.items()})
+    return params.replace(paper_robots.nominal(), {name: jnp.asarray(value) for name, value in values.items()})
 
 
 @eqx.filter_jit

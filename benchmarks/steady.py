@@ -27,12 +27,12 @@ def main() -> None:
     set_precision(arguments.float32)
     import jax.numpy as jnp
 
-    from mmrjax import robots
-    from mmrjax.conditions import Conditions
     from mmrjax.fidelities.steady import steady_batch
-    from mmrjax.signals import CONVERGED
+    from mmrjax.model import paper_robots
+    from mmrjax.model.conditions import Conditions
+    from mmrjax.model.signals import CONVERGED
 
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
 
     def batch(size: int):
         wheeled, slope, payload, voltage = conditions(size).T

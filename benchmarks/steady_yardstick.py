@@ -44,12 +44,13 @@ set_precision(single=False)
 
 from worlds import vectorised
 
-from mmrjax import channels, outputs, params, robots
-from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
+from mmrjax.fidelities import outputs
 from mmrjax.fidelities.steady import steady_outputs
-from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED
+from mmrjax.model import channels, paper_robots, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import CONVERGED
 
 THREE = vectorised.NAMES
 ALL = tuple(output.name for output in outputs.table(channels.usual()))
@@ -88,7 +89,7 @@ def derivatives(robot: Robot, runs: Conditions, values: dict[str, jax.Array]) ->
 
 def compared(size: int, rounds: int) -> dict[str, Any]:
     """Both sides at one number of points: differences, rates and ratios."""
-    robot, runs, given = robots.nominal(), conditions(size), yardstick_points(size)
+    robot, runs, given = paper_robots.nominal(), conditions(size), yardstick_points(size)
     effects, amplitudes = with_effects(robot), tuple(EFFECTS.values())
     for one in (robot, effects):
         assert (np.asarray(steady_outputs(one, runs, ("status",))["status"]) == CONVERGED).all()
@@ -146,7 +147,7 @@ def compared(size: int, rounds: int) -> dict[str, Any]:
 
 def counted(size: int, rounds: int) -> dict[str, Any]:
     """Points a second on a GPU, and what XLA counts of the compiled program."""
-    robot, runs = robots.nominal(), conditions(size)
+    robot, runs = paper_robots.nominal(), conditions(size)
     rows = {}
     for name, one, wanted in (
         ("three", robot, THREE),

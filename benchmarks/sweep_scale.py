@@ -56,7 +56,8 @@ def prepared(arguments: argparse.Namespace, points: int, devices: int) -> tuple[
     """Configuration and job of a sweep."""
     import jax
 
-    from mmrjax import channels, fidelities, robots
+    from mmrjax import fidelities
+    from mmrjax.model import channels, paper_robots
     from sweeps.config_campaign import Campaign
     from sweeps.points import axes
     from sweeps.points.job import prepare
@@ -67,7 +68,7 @@ def prepared(arguments: argparse.Namespace, points: int, devices: int) -> tuple[
         duration_s=arguments.duration if arguments.model != "steady" else None,
         **plan_of(points, arguments.sampled),
     )  # fmt: skip
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     plan = axes.plan(config, robot, "benchmark")
     return config, prepare(config, robot, plan, "benchmark")
 
@@ -195,7 +196,7 @@ def weak(arguments: argparse.Namespace) -> list[dict[str, Any]]:
 
 def designs() -> list[dict[str, Any]]:
     """Points a second of each sampled design of four dimensions, out of the middle of 1e9 points."""
-    from sweeps.points.design import DESIGNS
+    from sweeps.points.sampled_design import DESIGNS
 
     rows = []
     for name, design in DESIGNS.items():

@@ -28,8 +28,8 @@ from mujoco import sysid  # noqa: E402
 
 from calibration.inference import observers, priors, problem  # noqa: E402
 from calibration.inference import optimizers as fit  # noqa: E402
-from mmrjax import channels, params, robots  # noqa: E402
-from mmrjax.conditions import Conditions  # noqa: E402
+from mmrjax.model import channels, paper_robots, params  # noqa: E402
+from mmrjax.model.conditions import Conditions  # noqa: E402
 
 VOLTAGES = (12.0, 24.0)
 STEP, SAMPLES = 5e-4, 200  # [s]
@@ -60,7 +60,7 @@ def lifted() -> Any:
         "gearbox.efficiency_load": 1.0, "motor.inductance": 1e-7, "6T2A.track.guide_share": 0.0,
         "6T2A.ground.rolling_resistance": 0.0,
     }  # fmt: skip
-    return params.replace(robots.nominal(), {k: jnp.asarray(v) for k, v in changes.items()})
+    return params.replace(paper_robots.nominal(), {k: jnp.asarray(v) for k, v in changes.items()})
 
 
 def constants(robot: Any) -> dict[str, float]:

@@ -21,11 +21,11 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 import numpy as np
 
-from mmrjax import params, robots
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities.stability import largest_step
 from mmrjax.fidelities.track import TIME_ROLLED, _batch, track
-from mmrjax.signals import STATUSES
+from mmrjax.model import paper_robots, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import STATUSES
+from mmrjax.undercarriage.stability import largest_step
 
 #: By which a run is differentiated: the first four, or all twelve, of which five are of the contacts themselves.
 DERIVED = (
@@ -59,7 +59,7 @@ ASSUMED = {
 
 
 def table8(size: int = 180):
-    axes = (0.0, 1.0), robots.SLOPES_DEG, robots.PAYLOADS_KG, robots.VOLTAGES_V
+    axes = (0.0, 1.0), paper_robots.SLOPES_DEG, paper_robots.PAYLOADS_KG, paper_robots.VOLTAGES_V
     rows = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 4)
     wheeled, slope, payload, voltage = np.tile(rows, (-(-size // len(rows)), 1))[:size].T
     return Conditions(voltage=voltage, slope_deg=slope, payload=payload, configuration=wheeled)
@@ -74,7 +74,7 @@ def timed(call) -> tuple[float, float]:
 
 def speed(batches: list[int]) -> dict:
     """Compile and run time of `batches` runs of 1.5 s from standstill."""
-    robot, found = robots.nominal(), {}
+    robot, found = paper_robots.nominal(), {}
     for size in batches:
         commands = table8(size)
         first = timed(lambda commands=commands: _batch(robot, commands, 1.5, 1e-4, 1e-3, False))
@@ -96,7 +96,7 @@ def derivatives(size: int = 30) -> dict:
 
     30 runs of 0.6 s from Table 8, rolling; each call in turn, five times over: the least processor time.
     """
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     values = {p.name: p.value for p in params.walk(robot)}
     every = table8()
     commands = jax.tree.map(lambda x: x[jnp.linspace(0, len(x) - 1, size).astype(int)], every)
@@ -133,7 +133,7 @@ def derivatives(size: int = 30) -> dict:
 
 def assumptions() -> dict:
     """Guide share, current, speed and ripple of 6T2A at 33 V over each constant that the paper does not print."""
-    robot, found = robots.nominal(), {}
+    robot, found = paper_robots.nominal(), {}
     runs = Conditions(voltage=33.0, slope_deg=[0.0, 5.0], payload=jnp.asarray([0.0, 8.0]))
 
     @jax.jit
@@ -165,7 +165,7 @@ def assumptions() -> dict:
 
 def turning(size: int = 32) -> dict:
     """Processor time of a step of the half robot and of both sides, `size` runs of 0.1 s, the least of five."""
-    robot, found = robots.nominal(), {}
+    robot, found = paper_robots.nominal(), {}
     alike = Conditions("6T2A", voltage=np.linspace(12.0, 33.0, size)).resolved(robot)
     apart = dataclasses.replace(alike, duty_left=jnp.ones(size), duty_right=jnp.linspace(-1.0, 1.0, size))
     for name, runs in (("half_robot", alike), ("both_sides", apart)):
@@ -187,7 +187,7 @@ def main() -> None:
         "derivatives": derivatives,
         "assumptions": assumptions,
         "turning": turning,
-        "step": lambda: {"largest_step_s": float(largest_step(robots.nominal(), table8()).min())},
+        "step": lambda: {"largest_step_s": float(largest_step(paper_robots.nominal(), table8()).min())},
     }
     found = {name: call() for name, call in parts.items() if chosen.only in (None, name)}
     print(json.dumps(found, indent=1))

@@ -49,15 +49,15 @@ from calibration.inference.held_out import search_each  # noqa: E402
 from calibration.inference.observers.settled import SettledRuns  # noqa: E402
 from calibration.inference.population import Members, Rows  # noqa: E402
 from calibration.inference.problem import MARGIN, STIFFNESS, Observation, Problem, data_of  # noqa: E402
-from mmrjax import channels, params, robots  # noqa: E402
-from mmrjax.conditions import Conditions  # noqa: E402
-from mmrjax.effects.electrical import BrushDrop, SeriesResistance  # noqa: E402
-from mmrjax.effects.mass import MassOffset  # noqa: E402
-from mmrjax.effects.slip import VibrationSlip  # noqa: E402
+from mmrjax.effects.electrical_effects import BrushDrop, SeriesResistance  # noqa: E402
+from mmrjax.effects.mass_effects import MassOffset  # noqa: E402
+from mmrjax.effects.slip_effects import VibrationSlip  # noqa: E402
 from mmrjax.fidelities.steady import steady  # noqa: E402
 from mmrjax.fidelities.track import STEP, track  # noqa: E402
-from mmrjax.robot import Robot  # noqa: E402
-from mmrjax.signals import Result  # noqa: E402
+from mmrjax.model import channels, paper_robots, params  # noqa: E402
+from mmrjax.model.conditions import Conditions  # noqa: E402
+from mmrjax.model.robot import Robot  # noqa: E402
+from mmrjax.model.signals import Result  # noqa: E402
 
 DURATION = 1.5  # of a run, from a rolling start [s]
 FRICTION = tuple(f"6T2A.ground.friction.{name}" for name in ("static", "dynamic", "speed_static"))
@@ -243,7 +243,7 @@ def pose(what: str) -> tuple[Posed, Robot, Runs]:
     table = read("measured")
     if what == "slip":
         table = table.where(table["configuration"] == "6T2A")
-    robot = own_mass.with_table_mass(robots.nominal(), read("measured"))
+    robot = own_mass.with_table_mass(paper_robots.nominal(), read("measured"))
     if what == "slip":
         robot = params.replace(robot, {"6T2A.track.guide_friction": 0.06})
         names, stated = FRICTION + GEAR, {}
@@ -285,7 +285,7 @@ def lumped(posed: Posed, robot: Robot, table: Runs, seen: list[np.ndarray]) -> t
     names = DRIVE + LUMPED
     zero = VibrationSlip(amplitude=jnp.asarray(0.0))
     robot = dataclasses.replace(robot, effects=(*robot.effects, zero))
-    stated = priors.guided(robots.nominal(), "6T2A")[1]
+    stated = priors.guided(paper_robots.nominal(), "6T2A")[1]
     share = {"total_current": SD_CURRENT, "motor_speed": SD_MOTOR, "speed": SD_SPEED}
     size = np.abs(posed.measured) * np.array([0.01 * share[name] for name in channels.USUAL])
     data = data_of(posed.measured, size, len(names))
@@ -434,7 +434,9 @@ def lumped_slip(arguments: argparse.Namespace) -> None:
 def timed(arguments: argparse.Namespace) -> dict[str, Any]:
     """How long one generation of gears over all twenty rows takes, wheeled ones by the track model too."""
     table = read("measured")
-    robot = own_mass.with_table_mass(params.replace(robots.nominal(), {"6T2A.track.guide_friction": 0.06}), table)
+    robot = own_mass.with_table_mass(
+        params.replace(paper_robots.nominal(), {"6T2A.track.guide_friction": 0.06}), table
+    )
     coordinates = priors.coordinates(robot, FRICTION + GEAR, any_surface=True)
     conditions = table.conditions(robot)
     data = data_of(table.measured(), SettledRuns.sizes(table), len(coordinates))

@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import mmrjax as mm
-from mmrjax import params
-from mmrjax.belt import Path, tips
 from mmrjax.fidelities import drive, steady, track
-from mmrjax.signals import NOT_SETTLED, STATUSES
-from mmrjax.tables import SURFACES, adhesion_ratio, lateral_ratio
+from mmrjax.model import params
+from mmrjax.model.paper_tables import SURFACES, adhesion_ratio, lateral_ratio
+from mmrjax.model.signals import NOT_SETTLED, STATUSES
+from mmrjax.undercarriage.belt import Path, tips
 
 jax.config.update("jax_enable_x64", True)
 

@@ -25,15 +25,16 @@ import numpy as np
 from jaxtyping import Array, Float
 from measure import machine
 
-from mmrjax import params, robots, undercarriage
-from mmrjax.conditions import Conditions
-from mmrjax.contact import Friction
-from mmrjax.fidelities.half_robot import system
 from mmrjax.fidelities.track import STEP, Trajectory, track
-from mmrjax.params import Scalar
-from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED, NOT_SETTLED
-from mmrjax.undercarriage import GROUSERS
+from mmrjax.model import paper_robots, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.contact import Friction
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import CONVERGED, NOT_SETTLED
+from mmrjax.undercarriage import side_contacts as undercarriage
+from mmrjax.undercarriage.half_robot import system
+from mmrjax.undercarriage.side_contacts import GROUSERS
 
 #: The tracked rows of the paper's tables: 15 V without payload, 33 V with 8 kg, at 0 to 20 deg.
 VOLTAGE, SLOPE, PAYLOAD = (
@@ -152,7 +153,7 @@ def gear(rng: np.random.Generator) -> Robot:
     values["6T2A.ground.friction.dynamic"] *= values["6T2A.ground.friction.static"]
     values["6T2A.ground.friction.speed_dynamic"] = 10 * values["6T2A.ground.friction.speed_static"]
     values["6T2A.track.guide_friction"] = 0.06
-    return params.replace(robots.nominal(), {name: jnp.asarray(value) for name, value in values.items()})
+    return params.replace(paper_robots.nominal(), {name: jnp.asarray(value) for name, value in values.items()})
 
 
 @eqx.filter_jit

@@ -9,13 +9,13 @@ if TYPE_CHECKING:
     from calibration.data.robot_file import load as read_robot
     from calibration.data.runs import read as read_runs
     from calibration.discovery.discover import discover
-    from calibration.inference.calibrate import calibrate
+    from calibration.inference.calibration import calibrate
 
 __all__ = ["calibrate", "discover", "read_robot", "read_runs"]
 
 #: Module and attribute of each name; imported when it is asked for, since most of them load JAX.
 _HOMES = {
-    "calibrate": ("calibration.inference.calibrate", "calibrate"),
+    "calibrate": ("calibration.inference.calibration", "calibrate"),
     "discover": ("calibration.discovery.discover", "discover"),
     "read_robot": ("calibration.data.robot_file", "load"),
     "read_runs": ("calibration.data.runs", "read"),

@@ -21,37 +21,39 @@ if TYPE_CHECKING:
     from calibration import discover as discover
     from calibration import read_robot as read_robot
     from calibration import read_runs as read_runs
-    from mmrjax.conditions import Conditions as Conditions
     from mmrjax.effects import Effect as Effect
     from mmrjax.errors import UsageError as UsageError
-    from mmrjax.params import replace as replace
-    from mmrjax.results import Results as Results
-    from mmrjax.robot import Robot as Robot
-    from mmrjax.robots import nominal as nominal
-    from mmrjax.signals import STATUSES as STATUSES
-    from mmrjax.signals import State as State
-    from mmrjax.simulation import simulate as simulate
-    from mmrjax.stepping import initial_state as initial_state
-    from mmrjax.stepping import rates as rates
-    from mmrjax.stepping import step as step
+    from mmrjax.fidelities.results import Results as Results
+    from mmrjax.fidelities.simulation import simulate as simulate
+    from mmrjax.fidelities.stepping import initial_state as initial_state
+    from mmrjax.fidelities.stepping import rates as rates
+    from mmrjax.fidelities.stepping import step as step
+    from mmrjax.missions.profile import profile as profile
+    from mmrjax.model.conditions import Conditions as Conditions
+    from mmrjax.model.paper_robots import nominal as nominal
+    from mmrjax.model.params import replace as replace
+    from mmrjax.model.robot import Robot as Robot
+    from mmrjax.model.signals import STATUSES as STATUSES
+    from mmrjax.model.signals import State as State
     from sweeps import sweep as sweep
     from sweeps.compilation_cache import keep_programs as keep_programs
 
 #: Where each public name lives.
 _HOME = {
-    "Conditions": "conditions",
+    "Conditions": "model.conditions",
     "Effect": "effects",
-    "Results": "results",
-    "Robot": "robot",
-    "STATUSES": "signals",
-    "State": "signals",
+    "Results": "fidelities.results",
+    "Robot": "model.robot",
+    "STATUSES": "model.signals",
+    "State": "model.signals",
     "UsageError": "errors",
-    "initial_state": "stepping",
-    "nominal": "robots",
-    "rates": "stepping",
-    "replace": "params",
-    "simulate": "simulation",
-    "step": "stepping",
+    "initial_state": "fidelities.stepping",
+    "nominal": "model.paper_robots",
+    "profile": "missions.profile",
+    "rates": "fidelities.stepping",
+    "replace": "model.params",
+    "simulate": "fidelities.simulation",
+    "step": "fidelities.stepping",
 }
 
 #: Names of the layers above, which one door gives too; they are imported when they are asked for, and never before.
@@ -78,6 +80,7 @@ __all__ = [
     "initial_state",
     "keep_programs",
     "nominal",
+    "profile",
     "rates",
     "read_robot",
     "read_runs",

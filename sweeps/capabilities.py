@@ -7,11 +7,13 @@ import numpy as np
 
 from calibration.data import rig_file
 from calibration.data.robot_file import RobotFile
-from mmrjax import derived, outputs, params
-from mmrjax.channels import EVERY, HEAT, SIDES, VOLTAGE, WARMING
-from mmrjax.power import Battery
-from mmrjax.robot import Robot
-from mmrjax.robots import blank
+from mmrjax import derived
+from mmrjax.fidelities import outputs
+from mmrjax.model import params
+from mmrjax.model.channels import EVERY, HEAT, SIDES, VOLTAGE, WARMING
+from mmrjax.model.paper_robots import blank
+from mmrjax.model.power import Battery
+from mmrjax.model.robot import Robot
 
 #: Columns of runs and histories that are of the ground.
 OF_GROUND = (

@@ -15,7 +15,7 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from calibration.data.errors import BadConfiguration, InputError
+from calibration.data.input_errors import BadConfiguration, InputError
 from mmrjax import SOUND_AT_LEVEL_0, __version__, fidelities
 from mmrjax.errors import shortened
 from sweeps import config, config_campaign

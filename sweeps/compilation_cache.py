@@ -3,7 +3,7 @@
 It lies in `$MMRJAX_CACHE`, else `$XDG_CACHE_HOME/mmrjax`, else `~/.cache/mmrjax`; `MMRJAX_CACHE=off` switches it off.
 JAX keys an entry by program, compiler version, flags and device; a folder of its own for each version of jaxlib and
 each kind of processor keeps native code of one machine from another with the same home. Programs are native code: a
-folder that others could change is not used (`mmrjax.private`). Importable without jax.
+folder that others could change is not used (`mmrjax.compile.private`). Importable without jax.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import stat
 import warnings
 from pathlib import Path
 
-from mmrjax.private import exposure
+from mmrjax.compile.private import exposure
 
 VARIABLE = "MMRJAX_CACHE"
-#: The same of `mmrjax.programs`, which finds programs that were kept whole there; empty to keep none so.
+#: The same of `mmrjax.compile.programs`, which finds programs that were kept whole there; empty to keep none so.
 PROGRAMS = "MMRJAX_PROGRAMS"
 OFF = ("off", "0", "no", "false")
 #: Size beyond which the oldest entries are dropped when the cache is enabled, down to half of it [bytes].

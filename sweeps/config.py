@@ -13,12 +13,13 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic_core import PydanticCustomError
 
 from calibration.data.columns import ROWS
-from calibration.data.errors import BadConfiguration, choices, parsed
+from calibration.data.input_errors import BadConfiguration, choices, parsed
 from calibration.data.input_files import toml_content, toml_text
 from calibration.inference import solvers
-from mmrjax import channels, fidelities
-from mmrjax.quantities import CONDITIONS
-from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
+from mmrjax import fidelities
+from mmrjax.model import channels
+from mmrjax.model.paper_tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
+from mmrjax.model.quantities import CONDITIONS
 from sweeps.flags import flags
 
 _VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c].range for c in ("voltage", "payload", "slope_deg"))

@@ -11,9 +11,9 @@ from typing import Any, Literal, Self
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from calibration.data.errors import BadConfiguration, choices
-from mmrjax.quantities import RPM
-from mmrjax.tables import COULOMB_PER_MAH
+from calibration.data.input_errors import BadConfiguration, choices
+from mmrjax.model.paper_tables import COULOMB_PER_MAH
+from mmrjax.model.quantities import RPM
 from sweeps.config import BatchPart, OutputPart, Part, ProfilePart, RobotPart, Sweep, about, read_toml, resolve
 from sweeps.flags import flags
 
@@ -60,8 +60,8 @@ class Campaign(RobotPart, ProfilePart, BatchPart, OutputPart):
         conditions: those that do not vary, by name.
         axes: of the grid, by name: a list, `first:last:step`, or a table with start, stop, number and scale.
         samples: a sampled design: design, number, seed, over (distributions by name), posterior.
-        outputs: names of `mmrjax.outputs.table()`, of columns of the fidelity, or flags; empty: the channels. Over a
-            profile columns of `mmrjax.missions.OUTPUTS`, or flags; empty: `missions.USUAL`.
+        outputs: names of `mmrjax.fidelities.outputs.table()`, of columns of the fidelity, or flags; empty: the
+            channels. Over a profile columns of `missions.mission_batch.OUTPUTS`, or flags; empty: its `USUAL`.
         storage: type in which outputs are stored.
         compression: of the store's chunks.
         obstacle: that every point climbs, in place of a run of the fidelity.

@@ -7,18 +7,19 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from calibration.data import effect_file, posterior, robot_file, surfaces
+from calibration.data import effect_file, robot_file, surfaces
+from calibration.data import posterior_file as posterior
 from calibration.data import runs as records
 from calibration.data.columns import IMPOSED, Layout
 from calibration.data.contradictions import misplaced
-from calibration.data.errors import BadConfiguration, choices
-from calibration.data.posterior import Posterior
+from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.posterior_file import Posterior
 from calibration.data.robot_file import RobotFile
 from mmrjax import fidelities
-from mmrjax.derived.turn import by_itself
-from mmrjax.quantities import RPM
-from mmrjax.robot import Robot, cannot_turn
-from mmrjax.tables import BENCH, SURFACES
+from mmrjax.derived.turning_figures import by_itself
+from mmrjax.model.paper_tables import BENCH, SURFACES
+from mmrjax.model.quantities import RPM
+from mmrjax.model.robot import Robot, cannot_turn
 from sweeps import capabilities
 from sweeps.config import FidelityPart, OneRun, RobotPart
 from sweeps.console import tell

@@ -21,7 +21,7 @@ def page(name: str, *found: Any, **known: Any) -> Page:
 
     It is imported when it is written: figures cost half a second, which --no-report saves.
     """
-    return lambda folder: importlib.import_module(f"sweeps.pages.{name}").write(folder, *found, **known)
+    return lambda folder: importlib.import_module(f"sweeps.pages.{name}_page").write(folder, *found, **known)
 
 
 def leave(

@@ -16,19 +16,18 @@ import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO, TypeVar
+from typing import Any, TextIO, TypeVar
 
 import numpy as np
 
 from calibration.data import writing
-from calibration.data.errors import BadConfiguration, InputError
+from calibration.data.input_errors import BadConfiguration, InputError
 from calibration.data.runs import Runs
-from mmrjax import __version__, params
+from mmrjax import __version__
+from mmrjax.model import params
+from mmrjax.model.robot import Robot
+from sweeps.config import RobotPart
 from sweeps.console import tell
-
-if TYPE_CHECKING:
-    from mmrjax.robot import Robot
-    from sweeps.config import RobotPart
 
 T = TypeVar("T")
 #: Exit codes of a command that is done: every solver gave an answer, or one failed. A run that stalls or slides, a
@@ -309,13 +308,13 @@ class RunFolder(Folder):
 
     def chunk(self, name: str) -> dict[str, np.ndarray] | None:
         """A chunk that an interrupted run finished; None if there is none that can be read."""
-        from sweeps import stages
+        from sweeps import stage_files
 
         file = self.partial / CHUNKS / f"{name}.npz"
         if not file.is_file():
             return None
         try:
-            return stages.read_arrays(file)
+            return stage_files.read_arrays(file)
         except Exception:  # whatever a damaged file makes the reader raise
             tell(f"{file}: damaged; computed again")
             return None
@@ -333,19 +332,19 @@ class RunFolder(Folder):
 
         A damaged file is reported, and the stage made again. A result that cannot be written is not kept.
         """
-        from sweeps import stages
+        from sweeps import stage_files
 
         file = self._of_stage(name)
         if file.is_file():
             try:
-                kept: T = stages.read(file)
+                kept: T = stage_files.read(file)
                 return kept
-            except stages.Unreadable:
+            except stage_files.Unreadable:
                 tell(f"{file}: damaged; computed again")
         made = make()
         aside = file.with_suffix(".writing")
-        with contextlib.suppress(OSError, stages.Unwritable):
-            stages.write(aside, made)
+        with contextlib.suppress(OSError, stage_files.Unwritable):
+            stage_files.write(aside, made)
             aside.replace(file)
         return made
 
@@ -389,7 +388,7 @@ def open_folder(
     """
     import jax
 
-    from mmrjax.programs import sources
+    from mmrjax.compile.programs import sources
 
     identity = {
         "command": command,

@@ -26,12 +26,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import params, robots
-from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.drive import drive, drive_batch
 from mmrjax.fidelities.steady import steady, steady_batch
-from mmrjax.signals import Result
+from mmrjax.model import paper_robots, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import Result
 from sweeps import cli, console
 
 console.FIRST = 1e6  # that a command works depends on the time it takes: tests of what is said don't hear it
@@ -167,19 +167,19 @@ def pytest_terminal_summary(terminalreporter):
 
 @pytest.fixture(scope="session")
 def robot():
-    return robots.nominal()
+    return paper_robots.nominal()
 
 
 @pytest.fixture(scope="session")
 def robot_with_effects():
     """Nominal, with every effect of the library at zero amplitude."""
-    return dataclasses.replace(robots.nominal(), effects=tuple(effect() for effect in ALL))
+    return dataclasses.replace(paper_robots.nominal(), effects=tuple(effect() for effect in ALL))
 
 
 @pytest.fixture(scope="session")
 def grid():
     """Rows (wheeled, slope [deg], payload [kg], voltage [V]) of Table 8 in both configurations."""
-    axes = (0.0, 1.0), robots.SLOPES_DEG, robots.PAYLOADS_KG, robots.VOLTAGES_V
+    axes = (0.0, 1.0), paper_robots.SLOPES_DEG, paper_robots.PAYLOADS_KG, paper_robots.VOLTAGES_V
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 4)
 
 
@@ -227,7 +227,7 @@ REPRESENTATIVE = (
 @pytest.fixture(scope="session")
 def robot_with_representatives():
     """Nominal, with the representative effects at zero amplitude."""
-    return dataclasses.replace(robots.nominal(), effects=tuple(BY_NAME[name]() for name in REPRESENTATIVE))
+    return dataclasses.replace(paper_robots.nominal(), effects=tuple(BY_NAME[name]() for name in REPRESENTATIVE))
 
 
 @pytest.fixture(scope="session")

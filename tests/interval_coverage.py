@@ -13,7 +13,7 @@ from calibration.inference import identifiability
 from calibration.inference import optimizers as fit
 from calibration.inference.optimizers import Pin
 from calibration.inference.problem import Data, Problem
-from mmrjax.compiling import compiled
+from mmrjax.compile.compiling import compiled
 
 
 @compiled

@@ -20,12 +20,12 @@ from calibration.discovery.outliers import Screening, screen
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import Settings, settings_for
 from calibration.inference import noise, observers
-from calibration.inference.calibrate import calibrate
+from calibration.inference.calibration import calibrate
 from calibration.inference.noise import Noise
 from calibration.inference.observers import SettledRuns
 from calibration.inference.result import CalibrationResult
-from mmrjax import robots
 from mmrjax.effects import BY_NAME, Effect
+from mmrjax.model import paper_robots
 
 #: The analyst's prior on the surface, which Table 5 does not know.
 STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("6T2A", "4W2T")}
@@ -55,7 +55,7 @@ class Analyst:
 
     def space(self, runs: Runs) -> CandidateSpace:
         """What can be fitted to a table."""
-        return discover.pose(runs, robots.nominal(), known(runs).sd, self.settings, self.stated, self.library)
+        return discover.pose(runs, paper_robots.nominal(), known(runs).sd, self.settings, self.stated, self.library)
 
     def base(self, runs: Runs) -> BaseFit:
         """The base fitted to a table."""
@@ -67,7 +67,7 @@ class Analyst:
 
     def trace(self, runs: Runs) -> LoopStages:
         """The stages of the loop up to its verdict."""
-        return discover.trace(runs, robots.nominal(), known(runs), self.settings, self.stated, self.library)
+        return discover.trace(runs, paper_robots.nominal(), known(runs), self.settings, self.stated, self.library)
 
     def result(self, traced: LoopStages, runs: Runs) -> DiscoveryResult:
         """What the loop makes of its stages."""
@@ -102,7 +102,7 @@ def small(p: Mapping[str, float] = settled.CLIMBING) -> settled.Conditions:
 @functools.cache
 def calibrated() -> CalibrationResult:
     """The packaged table from four starts, without profiles and without what is left out; made once for all files."""
-    return calibrate(read_runs("measured"), robots.nominal(), starts=4, profiles=False, blocks=())
+    return calibrate(read_runs("measured"), paper_robots.nominal(), starts=4, profiles=False, blocks=())
 
 
 #: What tables of settled runs are searched for; the whole library is what the command and the campaign search.

@@ -19,12 +19,12 @@ import xarray as xr
 from test_stages import OWN
 from worlds import rigs
 
-from calibration.data import posterior as posterior_file
+from calibration.data import posterior_file as posterior_file
 from calibration.data import robot_file
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.inference import priors
-from calibration.inference.posterior import of_coordinates
-from mmrjax import robots
+from calibration.inference.fit_posterior import of_coordinates
+from mmrjax.model import paper_robots
 from sweeps import cli
 from sweeps.points import scale
 
@@ -56,7 +56,7 @@ def base(tmp_path_factory):
     world = rigs.world(rng, "bench", "voltage", rows=(16, 20))
     rigs.case(world).write(folder)
     rigs.log(world, rng, hold=1.0, rate=50.0).write(folder / "log.csv")
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     robot_file.write(robot, folder / "robot.toml")
     names = ("motor.resistance", "motor.friction_coulomb", "6T2A.ground.friction.static")
     at = priors.coordinates(robot, names, {})

@@ -9,18 +9,18 @@ import pytest
 
 from calibration.data import robot_file
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration
-from calibration.inference.calibrate import calibrate
-from mmrjax import balances, channels, params, robots
-from mmrjax.conditions import Conditions
+from calibration.data.input_errors import BadConfiguration
+from calibration.inference.calibration import calibrate
 from mmrjax.effects import ALL
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.histories import grid, histories
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.rig import Rig
-from mmrjax.robot import Configurations
-from mmrjax.shaft import Shaft
-from mmrjax.signals import Signals, State
+from mmrjax.model import balances, channels, paper_robots, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.rig import Rig
+from mmrjax.model.robot import Configurations
+from mmrjax.model.shaft import Shaft
+from mmrjax.model.signals import Signals, State
 
 DRIVE = {
     "gearbox.ratio": 16.0, "gearbox.efficiency_load": 0.8, "motor.torque_constant": 0.05, "motor.resistance": 3.0,
@@ -34,7 +34,7 @@ VOLTAGE = np.where(TIMES % 1.0 < 0.5, 6.0, -6.0)
 def bench(backlash):
     shaft = Shaft(inertia=0.01, loss_coulomb=0.1, loss_viscous=0.01, backlash=backlash)
     rig = Rig(loose=backlash > 0)
-    return params.replace(robots.blank(Configurations({"bench": shaft}), rig=rig), DRIVE)
+    return params.replace(paper_robots.blank(Configurations({"bench": shaft}), rig=rig), DRIVE)
 
 
 @jax.jit
@@ -108,7 +108,7 @@ def test_the_derivative_by_the_backlash_is_the_difference():
 
 
 FILE = """
-schema = "mmrjax.robot/2"
+schema = "mmrjax.model.robot/2"
 base = "none"
 imposed = "voltage"
 channels = ["motor_speed", "output_angle"]

@@ -11,12 +11,12 @@ from worlds import settled, tables
 
 from calibration.data.runs import Runs
 from calibration.inference import checks
-from calibration.inference.calibrate import calibrate
+from calibration.inference.calibration import calibrate
 from calibration.inference.conduct import conduct
-from calibration.inference.notes import EndsEarly, Fact, NeverGrips, NoiseOff, Shown
-from mmrjax import params, robots
+from calibration.inference.fit_notes import EndsEarly, Fact, NeverGrips, NoiseOff, Shown
+from mmrjax.model import paper_robots, params
 
-CLIMBING = params.replace(robots.nominal(), settled.CLIMBING)
+CLIMBING = params.replace(paper_robots.nominal(), settled.CLIMBING)
 
 
 def started(p=settled.CLIMBING, duration=0.8, every=0.02):

@@ -6,8 +6,8 @@ import pytest
 
 from calibration.inference import bases
 from calibration.inference.bases import COLLINEAR, Window, collinearity, families, names, window, windows
-from mmrjax import channels
-from mmrjax.compiling import for_equations
+from mmrjax.compile.compiling import for_equations
+from mmrjax.model import channels
 
 RNG = np.random.default_rng(0)
 ROWS = 60

@@ -10,7 +10,7 @@ from browser import MEASURE, PAPER, Browser, found
 from test_loop_command import commanded, few_effects, mmrjax, starts_churning
 from test_settle import made as made_log
 
-from sweeps.pages import loop as loop_page
+from sweeps.pages import loop_page as loop_page
 
 pytestmark = [
     pytest.mark.slow,

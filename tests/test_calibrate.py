@@ -20,21 +20,21 @@ from test_residual_clusters import clustered
 import calibration
 from calibration.data import robot_file
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference import noise, observers, priors
 from calibration.inference import optimizers as fit
-from calibration.inference.calibrate import calibrate
-from calibration.inference.errors import relative_error, root_mean_square
-from calibration.inference.notes import Constant, Repeats, SamePredictions, Unmeasured
+from calibration.inference.calibration import calibrate
+from calibration.inference.fit_notes import Constant, Repeats, SamePredictions, Unmeasured
 from calibration.inference.observers import SettledRuns
 from calibration.inference.remarks import remarks
 from calibration.inference.result import CalibrationResult, ChannelErrors, HeldOut
-from mmrjax import channels, robots
+from calibration.inference.simulation_errors import relative_error, root_mean_square
+from mmrjax.fidelities.results import Results
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.results import Results
+from mmrjax.model import channels, paper_robots
 from sweeps.commands.calibrate import print_calibration
-from sweeps.pages import calibration as calibration_page
+from sweeps.pages import calibration_page as calibration_page
 from tests.commands import rows as rows_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -50,7 +50,7 @@ def measured():
 @pytest.fixture(scope="module", params=["few starts", pytest.param("all of it", marks=pytest.mark.slow)])
 def found(request, measured):
     """Of the packaged table: as quick as it goes, and as the command does it."""
-    return calibrated() if request.param == "few starts" else calibrate(measured, robots.nominal())
+    return calibrated() if request.param == "few starts" else calibrate(measured, paper_robots.nominal())
 
 
 #: For tests of what only a calibration as of the command holds: 64 starts, profiles, and what is left out.
@@ -68,7 +68,9 @@ def changed(runs, **columns):
 
 def quick(runs, robot=None, **keywords):
     """Only what is wrong with the data matters: few starts, no profiles, no blocks."""
-    return calibrate(runs, robot or robots.nominal(), **{"starts": 2, "profiles": False, "blocks": (), **keywords})
+    return calibrate(
+        runs, robot or paper_robots.nominal(), **{"starts": 2, "profiles": False, "blocks": (), **keywords}
+    )
 
 
 @pytest.mark.nightly
@@ -401,7 +403,7 @@ def gaps(measured):
 
 @pytest.fixture(scope="module")
 def found_with_gaps(gaps):
-    return calibrate(gaps, robots.nominal(), starts=4, noise="current=9%", profiles=False, blocks=("slope",))
+    return calibrate(gaps, paper_robots.nominal(), starts=4, noise="current=9%", profiles=False, blocks=("slope",))
 
 
 @pytest.mark.slow
@@ -430,7 +432,7 @@ def test_a_prediction_is_made_where_a_reading_is_missing(found_with_gaps):
 
 
 def test_a_missing_reading_weighs_nothing_whatever_number_stands_in_its_place(gaps):
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     coordinates = priors.coordinates(robot, priors.default_names(["6T2A", "4W2T"], robot))
     sd = noise.from_table(gaps, observers.kind(gaps).sizes(gaps), "current=9%,speed=4%").sd
     posed = observers.pose(gaps, robot, coordinates, sd)
@@ -511,7 +513,7 @@ FOURTH_CHANNEL = """
 import dataclasses, jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
-from mmrjax import channels
+from mmrjax.model import channels
 channels.EVERY += (channels.Channel(
     name="terminal_voltage", unit="V", factor=1.0,
     label="terminal voltage", word="voltage", range=(0.0, 100.0), sd_largest=10.0,
@@ -519,7 +521,7 @@ channels.EVERY += (channels.Channel(
 ),)
 channels.USUAL += ("terminal_voltage",)
 import calibration
-from mmrjax import robots
+from mmrjax.model import paper_robots as robots
 runs = calibration.read_runs("measured")
 volts = runs["supply_voltage_V"] * 1.001
 runs = dataclasses.replace(runs, columns={**runs.columns, "terminal_voltage_V": volts})

@@ -11,14 +11,15 @@ from calibration.data import runs as records
 from calibration.inference import noise as noise_room
 from calibration.inference import observers, priors
 from calibration.inference import optimizers as fit
-from calibration.inference.calibrate import calibrate
-from calibration.inference.notes import BesideSteady, PriorOfProduct
+from calibration.inference.calibration import calibrate
+from calibration.inference.fit_notes import BesideSteady, PriorOfProduct
 from calibration.inference.priors import GUIDED
-from calibration.words import tables
-from mmrjax import channels, fidelities, params, robots
+from calibration.words import table_words
+from mmrjax import fidelities
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.fidelities.track import track
-from mmrjax.signals import CONVERGED
+from mmrjax.model import channels, paper_robots, params
+from mmrjax.model.signals import CONVERGED
 
 GUIDE_FRICTION, GUIDE_SHARE = f"6T2A.{priors.GUIDE_FRICTION}", f"6T2A.{priors.GUIDE_SHARE}"
 STATIC = "6T2A.ground.friction.static"
@@ -30,7 +31,7 @@ TRUTH = 0.12
 @pytest.fixture(scope="module")
 def base():
     """Nominal, with adhesion for the slopes of the tests, and a friction law that is no stiffer for it."""
-    return params.replace(robots.nominal(), {STATIC: jnp.asarray(0.6), CREEP: jnp.asarray(0.1)})
+    return params.replace(paper_robots.nominal(), {STATIC: jnp.asarray(0.6), CREEP: jnp.asarray(0.1)})
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +64,7 @@ def test_in_track_the_guide_friction_stands_for_the_product(base):
     assert float(fields[GUIDE_SHARE].value) == GUIDED
     assert mean * GUIDED == pytest.approx(0.2 * 0.3)  # of the nominal robot in the other fidelities
     assert priors.known(base)[GUIDE_SHARE].value == 0.3
-    assert "free guide_friction there" in tables.would_measure(GUIDE_SHARE)
+    assert "free guide_friction there" in table_words.would_measure(GUIDE_SHARE)
 
 
 @pytest.fixture(scope="module")
@@ -134,9 +135,9 @@ def test_a_belt_too_stiff_for_the_step_is_said(base, made):
 def test_packaged_data_calibrate_through_the_track_model_and_agree_with_steady():
     """docs/benchmarks.md, Calibration through the track model; some ten minutes on two cores."""
     runs = records.read("measured")
-    found = calibrate(runs, robots.nominal(), model="track", starts=1)
+    found = calibrate(runs, paper_robots.nominal(), model="track", starts=1)
     assert found.converged and (found.status == "converged").all()
-    steady = calibrate(runs, robots.nominal(), blocks=()).parameters
+    steady = calibrate(runs, paper_robots.nominal(), blocks=()).parameters
     low, high = steady[GUIDE_SHARE].interval
     for name, entry in found.parameters.items():
         assert abs(entry.with_steady.apart_in_sd) < 1.96, name

@@ -16,13 +16,13 @@ import pytest
 import calibration
 import mmrjax as mm
 from calibration.data.columns import Layout
-from calibration.data.errors import BadData
+from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.discovery.result import DiscoveryResult, ReadingsOfRows
 from calibration.inference import estimates, noise, observers
 from calibration.inference.result import CalibrationResult
-from mmrjax import channels, params
 from mmrjax.fidelities.steady import steady_batch
+from mmrjax.model import channels, params
 from sweeps.commands import rig_new
 
 RIG = """base = "none"
@@ -139,7 +139,7 @@ def test_noise_is_of_the_channels_of_a_table(tmp_path, bench):
     assert known.source == ("series", "series", "stated") and (known.sd[:, 2] == 0.05).all()
     assert noise.default(runs.channels) == "current=2%,motor_speed=0.5%,output_torque=1%"
     assert known.scaled({"output_torque": 2.0}).sd[0].tolist() == [*known.sd[0, :2], 0.1]
-    with pytest.raises(calibration.data.errors.BadConfiguration, match="--noise speed=1%: no such channel"):
+    with pytest.raises(calibration.data.input_errors.BadConfiguration, match="--noise speed=1%: no such channel"):
         noise.from_table(runs, sizes, "speed=1%")
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from worlds import paper
 
-from mmrjax import balances, chassis, params
-from mmrjax.conditions import Conditions
-from mmrjax.signals import State
+from mmrjax.model import balances, chassis, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import State
 
 RNG = np.random.default_rng(31)
 

@@ -15,14 +15,15 @@ import jsonschema
 import numpy as np
 import pytest
 
-from calibration.data import requirements, robot_file
-from calibration.data.errors import BadConfiguration
+from calibration.data import requirements_file, robot_file
+from calibration.data.input_errors import BadConfiguration
 from calibration.sizing import sheet
-from mmrjax import params, posture
-from mmrjax.conditions import Conditions
+from mmrjax.climbing import resting_posture
+from mmrjax.derived.requirements import CUT_OFF, QUANTITIES, Point, evaluate, packed, ratings
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.requirements import CUT_OFF, QUANTITIES, Point, evaluate, packed, ratings
-from mmrjax.signals import CONVERGED, SLIDES, STALLED, STATUSES
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import CONVERGED, SLIDES, STALLED, STATUSES
 from sweeps.pages import posture_figures
 from tests.commands import command
 from tests.pages import Tables, drawn, outside
@@ -31,12 +32,12 @@ SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "check.sch
 
 
 def read(text):
-    return requirements.read(text, "r.toml")
+    return requirements_file.read(text, "r.toml")
 
 
 def some_of_the_papers(*kept: str) -> str:
     """The paper's file with some of its aims, in the same envelope; of the endurances that of standing still."""
-    text = (Path(requirements.__file__).parent / "aims" / "paper.toml").read_text("utf-8")
+    text = (Path(requirements_file.__file__).parent / "aims" / "paper.toml").read_text("utf-8")
     head, envelope, tail = text.partition("[envelope]")
     lines = [line for line in head.splitlines() if line.partition(" ")[0] in ("schema", *kept)]
     if "standing" in kept:
@@ -122,7 +123,7 @@ def test_worst_corner_is_the_worst_of_a_finer_grid(values, robot):
 @pytest.mark.slow
 def test_every_change_meets_its_requirement_and_breaks_what_it_says(folder, result, robot):
     """Each stated value, put into the robot as `--set` does, and checked anew; and half of the change does not."""
-    asked, tried = requirements.load(folder / "requirements.toml"), 0
+    asked, tried = requirements_file.load(folder / "requirements.toml"), 0
     names = [r["name"] for r in result["requirements"]]
     for k, r in enumerate(result["requirements"]):
         assert bool(r["change"]) <= (not r["met"])
@@ -309,7 +310,7 @@ def test_report_shows_the_sheet(folder, result):
 
 
 def test_paper_file_states_where_each_aim_comes_from():
-    asked = requirements.load(None)
+    asked = requirements_file.load(None)
     assert all("Section" in r.source or "Table" in r.source or "sheet" in r.source for r in asked.each)
     assert {r.name for r in asked.each} >= {"speed_m_s", "slope_deg", "payload_kg", "endurance_min", "mass_kg"}
     assert set(STATUSES) >= {"cut_off", "slides"} and len({q.name for q in QUANTITIES.values()}) == len(QUANTITIES)
@@ -354,7 +355,7 @@ REFUSED = {
     "winding_C = 30\n[envelope]\nambient_C = [0, 40]": r"^r.toml: winding_C of at most 30 contradicts the envelope, whose ambient_C goes up to 40$",
     "envelope = 3\nspeed_m_s = 1": r"^r.toml, envelope: got 3; expected a table of configuration, ",
     "speed_m_s = ": r"^r.toml: not a readable TOML file \(",
-    "schema = 'mmrjax.requirements/9'": r"^r.toml, schema: got 'mmrjax.requirements/9'; expected mmrjax.requirements/1$",
+    "schema = 'mmrjax.derived.requirements/9'": r"^r.toml, schema: got 'mmrjax.derived.requirements/9'; expected mmrjax.derived.requirements/1$",
 }
 
 
@@ -411,7 +412,7 @@ payload_kg = [0, 8]
 
 @pytest.fixture(scope="module")
 def of_posture(robot):
-    asked = requirements.read(OF_POSTURE, "posture.toml")
+    asked = requirements_file.read(OF_POSTURE, "posture.toml")
     return {o.requirement.name: o for o in sheet.check(robot, asked, changes=False)}
 
 
@@ -427,7 +428,7 @@ def test_steps_and_sizes_of_section_2_2(of_posture):
 
 @pytest.mark.slow
 def test_longer_levers_would_get_over_the_step(robot):
-    alone = requirements.read("step_mm = 300\n[envelope]\npayload_kg = [0, 8]\n", "posture.toml")
+    alone = requirements_file.read("step_mm = 300\n[envelope]\npayload_kg = [0, 8]\n", "posture.toml")
     (found,) = sheet.check(robot, alone)
     (longer,) = (c for c in found.change if c.parameter == "running_gear.lever_length")
     assert longer.before == pytest.approx(0.205) and longer.after == pytest.approx(0.259, abs=0.002)
@@ -442,20 +443,20 @@ def test_stairs_need_friction_reach_and_a_tread(robot):
     text = 'stairs_rise_mm = {{ least = 170, tread_mm = 290, surface = "{}" }}'
 
     def rise(surface):
-        (found,) = sheet.check(robot, requirements.read(text.format(surface), "stairs.toml"), changes=False)
+        (found,) = sheet.check(robot, requirements_file.read(text.format(surface), "stairs.toml"), changes=False)
         assert found.at["tread_mm"] == 290 and not found.met
         return found.value
 
     friction = float(robot.configurations["6T2A"].ground.friction.static)
     assert rise("lacquered_wood") == pytest.approx(290 * friction, rel=1e-6)
-    rests = posture.level(robot, Conditions(0, levers_front_deg=-8.4707, levers_rear_deg=-8.4707))
+    rests = resting_posture.level(robot, Conditions(0, levers_front_deg=-8.4707, levers_rear_deg=-8.4707))
     reach, high = float(rests.length) / 2, float(rests.centre_height)
     angle = math.atan(rise("asphalt") / 290)
     assert reach - high * math.tan(angle) == pytest.approx(0.29 / math.cos(angle), abs=1e-4)
     with pytest.raises(BadConfiguration, match="stairs_rise_mm: stairs without a tread; expected a table such as"):
-        requirements.read("stairs_rise_mm = 170", "stairs.toml")
+        requirements_file.read("stairs_rise_mm = 170", "stairs.toml")
     with pytest.raises(BadConfiguration, match="step_mm, tread_mm: no such key"):
-        requirements.read("step_mm = { least = 100, tread_mm = 290 }", "stairs.toml")
+        requirements_file.read("step_mm = { least = 100, tread_mm = 290 }", "stairs.toml")
 
 
 @pytest.mark.slow
@@ -485,7 +486,7 @@ def test_posture_of_a_robot_that_states_no_running_gear_is_not_known(robot):
     gear = tuple(p.name for p in params.walk(robot) if p.name.startswith("running_gear."))
     bare = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, unknown=gear))
     with pytest.raises(BadConfiguration, match="step_mm: the robot's file states no running_gear"):
-        sheet.refuse(bare, requirements.read("step_mm = 100", "posture.toml"))
+        sheet.refuse(bare, requirements_file.read("step_mm = 100", "posture.toml"))
 
 
 def test_heat_that_the_file_does_not_state_is_asked_for(tmp_path, capsys):

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from mmrjax import SOUND_AT_LEVEL_0, fidelities
 from sweeps import cli, config
 from sweeps.points import scale
@@ -409,7 +409,7 @@ def test_full_disk_names_the_file_whichever_it_is(mmrjax, tmp_path, monkeypatch)
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_text", honest)
-    monkeypatch.setattr("sweeps.pages.runs.write", picture)
+    monkeypatch.setattr("sweeps.pages.runs_page.write", picture)
     code, _, err = mmrjax("simulate", "--out", "r")
     assert code == 2 and "r.partial: No space left on device" in err
 
@@ -692,7 +692,7 @@ def test_missing_readings_weigh_nothing_and_are_said(mmrjax, tmp_path):
 
 FOURTH = """
 import dataclasses
-from mmrjax import channels
+from mmrjax.model import channels
 channels.EVERY += (dataclasses.replace(
     channels.EVERY[0], name="voltage", stem="terminal_voltage", unit="V",
     label="voltage at the motors", word="voltage", range=(0.0, 100.0), read=lambda robot, signals: signals.voltage,

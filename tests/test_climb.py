@@ -10,14 +10,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from mmrjax import footing, params, posture, static_limits, terrain
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities import climb
-from mmrjax.fidelities.climb import LOSSES, SOURCES, Sequence, climb_batch, still, system
+from mmrjax.climbing import climb_simulation as climb
+from mmrjax.climbing import footing, resting_posture, static_limits, terrain
+from mmrjax.climbing.climb_simulation import LOSSES, SOURCES, Sequence, climb_batch, still, system
 from mmrjax.fidelities.steady import steady
-from mmrjax.robots import nominal
-from mmrjax.signals import GRAVITY
-from mmrjax.tables import PITCH_TOOTH
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_robots import nominal
+from mmrjax.model.paper_tables import PITCH_TOOTH
+from mmrjax.model.signals import GRAVITY
 
 ROBOT = nominal()
 SIZE = 4  # points of every terrain of the first second, so that one program serves them
@@ -485,7 +486,7 @@ def test_static_limits_of_steps_and_gaps_are_those_of_the_dynamics():
     runs, starts = [], []
     for payload in (0.0, 8.0):
         of = HOLDS | {"payload": payload}
-        side = posture.outline(
+        side = resting_posture.outline(
             ROBOT, Conditions(0, payload=payload, levers_front_deg=180.0, levers_rear_deg=flush).resolved(ROBOT)
         )
         low = static_limits.step(side)

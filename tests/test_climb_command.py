@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from calibration.data import terrains
-from calibration.data.errors import BadConfiguration, BadData
-from mmrjax.fidelities.climb import LOSSES
-from mmrjax.robots import nominal
+from calibration.data.input_errors import BadConfiguration, BadData
+from mmrjax.climbing.climb_simulation import LOSSES
+from mmrjax.model.paper_robots import nominal
 from sweeps.commands import climb as room
-from sweeps.results.climb import Seen, coordinates
+from sweeps.results.climb_results import Seen, coordinates
 
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "climb.schema.json").read_text("utf-8"))
 

@@ -5,13 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import params, terrain
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities import climb
-from mmrjax.fidelities import climb_derivatives as room
-from mmrjax.fidelities.climb import Motion, Passed
-from mmrjax.robots import nominal
-from mmrjax.variation import Variation
+from mmrjax.climbing import climb_derivatives as room
+from mmrjax.climbing import climb_simulation as climb
+from mmrjax.climbing import terrain
+from mmrjax.climbing.climb_simulation import Motion, Passed
+from mmrjax.fidelities.variation import Variation
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_robots import nominal
 
 ROBOT = params.strong(nominal())
 

@@ -24,8 +24,8 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 events = []
 jax.monitoring.register_event_listener(lambda event, **_: events.append(event.rpartition("/")[2]))
-from mmrjax import params, robots
-from mmrjax.conditions import Conditions
+from mmrjax.model import params; from mmrjax.model import paper_robots as robots
+from mmrjax.model.conditions import Conditions
 from mmrjax.fidelities.steady import steady
 robot, runs = robots.nominal(), Conditions(voltage=[15.0, 33.0], slope_deg=5.0)
 def current(resistance, run):

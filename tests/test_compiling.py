@@ -17,12 +17,13 @@ from calibration.discovery import candidates, discover, scales
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.settings import settings_for
 from calibration.inference import noise, observers
-from mmrjax import effects, params, robots
-from mmrjax.compiling import compiled, for_equations
-from mmrjax.conditions import Conditions
+from mmrjax import effects
+from mmrjax.compile.compiling import compiled, for_equations
 from mmrjax.effects.scaled import scaled
 from mmrjax.fidelities.steady import steady
-from mmrjax.rig import Instrument, Rig
+from mmrjax.model import paper_robots, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.rig import Instrument, Rig
 
 
 def space_of(world, folder):
@@ -58,7 +59,7 @@ def effects_sd(effect):
 
 @pytest.mark.slow
 def test_what_equations_read_keeps_programs_apart():
-    bare = robots.nominal()
+    bare = paper_robots.nominal()
     alike = dataclasses.replace(bare, rig=Rig(priors=(("motor.resistance", 0.6, 0.01),), columns=(("a", "b", 2.0),)))
     unsigned = dataclasses.replace(bare, rig=Rig(instruments=(Instrument("total_current", False, 0.1),)))
     held = dataclasses.replace(bare, rig=Rig(instruments=(Instrument("total_current", True, 0.1),)))

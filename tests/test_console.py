@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from calibration.inference.notes import Step
-from calibration.words import steps
-from calibration.words.steps import still
+from calibration.inference.fit_notes import Step
+from calibration.words import step_words as steps
+from calibration.words.step_words import still
 from sweeps import console
 from sweeps.console import pulse
 

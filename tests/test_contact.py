@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import paper
 
-from mmrjax import contact
-from mmrjax.contact import Friction
+from mmrjax.model import contact
+from mmrjax.model.contact import Friction
 
 RNG = np.random.default_rng(27)
 LAW = dict(static=0.4, dynamic=0.3, speed_static=0.02, speed_dynamic=0.2)

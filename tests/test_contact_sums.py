@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import contact_sums, mjcf, params, undercarriage
-from mmrjax.belt import Path
-from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
-from mmrjax.fidelities import half_robot
-from mmrjax.fidelities.half_robot import Motion, advance, generalized, instant, system
-from mmrjax.mjcf import mjx
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.undercarriage import contact_sums, half_robot, mjcf, side_contacts
+from mmrjax.undercarriage.belt import Path
+from mmrjax.undercarriage.half_robot import Motion, advance, generalized, instant, system
+from mmrjax.undercarriage.mjcf import mjx
 
 RUNS = {
     "tracked": dict(voltage=24.0, slope_deg=5.0, payload=3.0, battery=1.0),
@@ -91,7 +91,7 @@ def _summed(setup, given, gained):
     chassis = dataclasses.replace(chassis, ground=ground, **own)
     q = jnp.stack([jnp.zeros(()), *(given[n] for n in contact_sums.MOTION[:4])])
     v = jnp.stack([given[n] for n in contact_sums.MOTION[4:]])
-    at = undercarriage.touch(path, chassis, q, v)
+    at = side_contacts.touch(path, chassis, q, v)
     return contact_sums.shares(path, chassis, at, given["slip"], given["adhesion"], gained).sum(axis=-1)
 
 

@@ -10,15 +10,16 @@ import pytest
 import test_effects as laws
 
 from calibration.data import robot_file
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.inference import bases as curves
-from mmrjax import balances, channels, effects, params, robots
+from mmrjax import effects
 from mmrjax.effects import CURVES, UNNAMED, WAVES, curve
 from mmrjax.fidelities.drive import drive
-from mmrjax.rig import Rig
-from mmrjax.robot import Configurations
-from mmrjax.shaft import Shaft
-from mmrjax.signals import Signals
+from mmrjax.model import balances, channels, paper_robots, params
+from mmrjax.model.rig import Rig
+from mmrjax.model.robot import Configurations
+from mmrjax.model.shaft import Shaft
+from mmrjax.model.signals import Signals
 
 EACH = pytest.mark.parametrize("effect", CURVES.values(), ids=list(CURVES))
 SHAPE = {"y0": 0.7, "y1": -0.4, "y2": 1.1, "y3": 0.2, "y4": -0.9, "y5": 0.5}
@@ -38,7 +39,7 @@ def robot(amplitudes=None, kinds=CURVES):
         values = {n: v for n, v in SHAPE.items() if hasattr(effect(), n)}
         values |= {} if amplitudes is None else {"amplitude": amplitudes[k]}
         every.append(params.replace(effect(), {n: jnp.asarray(v) for n, v in values.items()}))
-    return dataclasses.replace(robots.nominal(), effects=tuple(every))
+    return dataclasses.replace(paper_robots.nominal(), effects=tuple(every))
 
 
 # --- interpolation --------------------------------------------------------------------------------------
@@ -88,7 +89,7 @@ def test_curve_obeys(effect, law):
 def test_curves_at_zero_change_nothing_in_steady_and_none_is_dead():
     both = jax.jit(lambda a: jax.jacfwd(lambda a: (_steady(robot(a)),) * 2, has_aux=True)(a))
     slopes, with_them = both(jnp.zeros(len(CURVES)))
-    np.testing.assert_allclose(with_them, jax.jit(_steady)(robots.nominal()), rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(with_them, jax.jit(_steady)(paper_robots.nominal()), rtol=1e-13, atol=1e-13)
     assert np.isfinite(slopes).all()
     read = np.where(with_them == 0, np.inf, with_them)  # what this robot does not have reads 0
     moved = np.abs(slopes * SIZES / read[..., None]).max((0, 1))
@@ -112,7 +113,7 @@ def _driven(amplitudes):
 def test_settled_travel_shows_nothing_of_a_wave():
     waves = robot(jnp.asarray([laws.size(w) for w in WAVES.values()]), WAVES)
     # but for rounding: a program with effects sums in another order
-    np.testing.assert_allclose(jax.jit(_steady)(waves), jax.jit(_steady)(robots.nominal()), rtol=4e-15)
+    np.testing.assert_allclose(jax.jit(_steady)(waves), jax.jit(_steady)(paper_robots.nominal()), rtol=4e-15)
 
 
 @pytest.mark.slow
@@ -120,7 +121,7 @@ def test_curves_act_in_drive_and_at_zero_change_nothing():
     sizes = jnp.asarray([laws.size(e) for e in DRIVEN.values()])
     both = jax.jit(lambda a: jax.jvp(_driven, (a,), (0.1 * sizes,)))
     still, slope = both(jnp.zeros(len(DRIVEN)))
-    bare = robots.nominal()
+    bare = paper_robots.nominal()
     plain = jax.jit(jax.vmap(lambda c: drive(bare, c, TIMES, tolerance=1e-9)))(STARTS)
     np.testing.assert_allclose(still, laws.readings(bare, plain.signals)[:, 1:], rtol=1e-7, atol=1e-7)
     assert np.isfinite(slope).all() and np.abs(slope / still).max() > 1e-3
@@ -155,7 +156,7 @@ def test_curve_has_finite_derivatives_by_everything_at_rest(effect):
     made = params.replace(effect(), {"amplitude": jnp.asarray(0.3)})
     floats = [f.name for f in dataclasses.fields(Signals) if f.name not in ("memory", "configuration")]
     still = Signals(**{name: jnp.asarray(0.0) for name in floats})
-    slopes = eqx.filter_grad(lambda both: both[0].term(robots.nominal(), both[1]))((made, still))
+    slopes = eqx.filter_grad(lambda both: both[0].term(paper_robots.nominal(), both[1]))((made, still))
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(slopes))
 
 
@@ -173,7 +174,7 @@ def test_curves_are_those_that_the_trace_looks_for():
     assert set(curve.READINGS) == {c.name for c in channels.EVERY} - {*curve.ROUND}  # a heading is no `yaw` moment
     assert set(curve.READ_BY) <= set(curve.READINGS)
     robot = dataclasses.replace(
-        robots.blank(Configurations({"bench": Shaft(inertia=1e-3, loss_coulomb=0.1)})),
+        paper_robots.blank(Configurations({"bench": Shaft(inertia=1e-3, loss_coulomb=0.1)})),
         rig=Rig(channels=("output_torque", "position")),
     )
     columns = {name: np.arange(9.0) for name in ("order", "total_current_A", "motor_speed_rpm")}

@@ -14,14 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import SOUND_AT_LEVEL_0, derived, params
-from mmrjax.compiling import SELDOM
-from mmrjax.conditions import Conditions
-from mmrjax.derived import posture, start, steepest_slope
+from mmrjax import SOUND_AT_LEVEL_0, derived
+from mmrjax.compile.compiling import SELDOM
+from mmrjax.compile.programs import compile_by
+from mmrjax.derived import pitch_and_step, start_figures, steepest_slope
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.steady import steady
-from mmrjax.programs import compile_by
-from mmrjax.signals import CONVERGED, SLIDES, STALLED, STATUSES
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import CONVERGED, SLIDES, STALLED, STATUSES
 
 NAMES = ("motor.resistance", "motor.torque_constant", "6T2A.ground.friction.static", "6T2A.ground.rolling_resistance")
 
@@ -115,7 +116,7 @@ def test_derivatives_are_sound_without_optimizations_as_the_command_line_compile
     """The test above once more, in a process of its own; by LLVM's quick selection they were NaN."""
     code = (
         f"import pytest; ended = pytest.main(['-q', {__file__!r}, '-k', 'finite_differences and 2.5-2.0'])\n"
-        "from mmrjax.compiling import SELDOM; assert SELDOM['xla_backend_optimization_level'] == 0 == ended"
+        "from mmrjax.compile.compiling import SELDOM; assert SELDOM['xla_backend_optimization_level'] == 0 == ended"
     )
     environment = {**os.environ, "XLA_FLAGS": SOUND_AT_LEVEL_0}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
@@ -137,7 +138,7 @@ CONDITIONS = asked(0, 24.0, slope_deg=5.0, payload=3.0)
 
 @pytest.mark.slow
 def test_start_is_that_of_a_run_kept_at_many_instants(robot):
-    found = {k: float(v) for k, v in start.compute(robot, CONDITIONS).items()}
+    found = {k: float(v) for k, v in start_figures.compute(robot, CONDITIONS).items()}
     times = np.concatenate([np.linspace(0, 0.05, 5000, endpoint=False), np.linspace(0.05, 4.0, 40_000)])
     run = eqx.filter_jit(drive)(robot, CONDITIONS, jnp.asarray(times), tolerance=1e-9)
     current, speed = np.asarray(run.signals.total_current), np.asarray(run.signals.speed)
@@ -151,7 +152,7 @@ def test_start_is_that_of_a_run_kept_at_many_instants(robot):
 
 @pytest.mark.slow
 def test_start_derivatives_are_finite_differences(robot):
-    theta, f = function(robot, CONDITIONS, start.compute)
+    theta, f = function(robot, CONDITIONS, start_figures.compute)
     exact = jax.jacfwd(f)(theta)
     twice = differences(f, theta, 3e-3)
     for name, by in twice.items():
@@ -163,7 +164,7 @@ def test_start_derivatives_are_finite_differences(robot):
 @pytest.mark.slow
 def test_start_of_a_run_that_does_not_settle_has_no_numbers(robot):
     steep = dataclasses.replace(CONDITIONS, slope_deg=jnp.asarray(25.0))
-    found = start.compute(robot, steep)
+    found = start_figures.compute(robot, steep)
     assert STATUSES[int(found["status"])] == "slides"
     assert all(np.isnan(found[n]) for n in ("peak_current", "time_to_speed", "energy_start"))
 
@@ -171,15 +172,17 @@ def test_start_of_a_run_that_does_not_settle_has_no_numbers(robot):
 def test_peak_is_the_top_of_a_parabola():
     x = jnp.asarray([0.0, 0.1, 0.3, 0.5, 0.9, 1.0])  # at unequal distances
     top = np.testing.assert_allclose
-    top(start.peak(x, 3 - (x - 0.47) ** 2), 3.0, atol=1e-12)
-    top(start.peak(x, jnp.where(x < 0.8, 3 - (x - 0.37) ** 2, jnp.nan)), 3.0, atol=1e-12)  # of a run that has ended
+    top(start_figures.peak(x, 3 - (x - 0.47) ** 2), 3.0, atol=1e-12)
+    top(
+        start_figures.peak(x, jnp.where(x < 0.8, 3 - (x - 0.37) ** 2, jnp.nan)), 3.0, atol=1e-12
+    )  # of a run that has ended
     for rises in (x, -x, jnp.where(x < 0.8, x, jnp.nan)):  # no top between: the largest sample
-        assert float(start.peak(x, rises)) == float(jnp.nanmax(rises))
+        assert float(start_figures.peak(x, rises)) == float(jnp.nanmax(rises))
 
 
 def test_crossing_is_exact_for_a_cubic():
     t = jnp.linspace(0.0, 1.0, 6)
-    k, share = start.crossing(t, t**3, 3 * t**2, jnp.asarray(0.3))
+    k, share = start_figures.crossing(t, t**3, 3 * t**2, jnp.asarray(0.3))
     assert float(t[k] + share * (t[k + 1] - t[k])) == pytest.approx(0.3 ** (1 / 3), abs=1e-9)
 
 
@@ -188,8 +191,8 @@ def test_crossing_is_exact_for_a_cubic():
 
 @pytest.mark.slow
 def test_steps_of_a_posture_and_of_any_are_those_of_the_static_limits(robot):
-    found = posture.compute(robot, asked(0, 24.0, payload=8.0, levers_front_deg=-30.0, levers_rear_deg=180.0))
+    found = pitch_and_step.compute(robot, asked(0, 24.0, payload=8.0, levers_front_deg=-30.0, levers_rear_deg=180.0))
     assert math.degrees(float(found["pitch"])) == pytest.approx(8.57, abs=0.01)
     assert float(found["highest_step"]) < float(found["best_step"]) == pytest.approx(0.2456, abs=1e-4)
-    folded = posture.compute(robot, asked(0, 24.0, payload=8.0))
+    folded = pitch_and_step.compute(robot, asked(0, 24.0, payload=8.0))
     assert float(folded["pitch"]) == 0 and float(folded["highest_step"]) == pytest.approx(0.0671, abs=1e-4)

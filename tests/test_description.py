@@ -7,9 +7,9 @@ import pytest
 
 from calibration.data.runs import Runs
 from calibration.discovery.description import undescribed, unused
-from calibration.discovery.notes import Missed, Summary
-from calibration.words import loop
-from mmrjax import channels
+from calibration.discovery.loop_notes import Missed, Summary
+from calibration.words import loop_words
+from mmrjax.model import channels
 
 ROWS, SD = 40, 0.02
 CURRENT, SPEED = channels.find("total_current"), channels.find("motor_speed")
@@ -59,7 +59,9 @@ def test_what_to_check_first_is_said_with_the_columns_that_are_not_used():
     extras = {"brake_Nm": np.linspace(0, 1, 4), "constant": np.ones(4), "who": np.array(list("abab"))}
     assert unused(Runs("runs.csv", {"order": np.arange(4.0)}, extras=extras)) == ("brake_Nm",)
     missed = (Missed("total_current", 0.484, 0.02),)
-    said = loop.statement(Summary("undescribed", 0.004, None, missed=missed, unused=("brake_Nm",), far=("motor.r",)))
+    said = loop_words.statement(
+        Summary("undescribed", 0.004, None, missed=missed, unused=("brake_Nm",), far=("motor.r",))
+    )
     assert said == (
         "This model does not describe these runs: refitted, it misses total current by 48 % of its measured rms. No "
         "effect is named. Check first: columns that vary and are not used (brake_Nm); parameters far from their priors "

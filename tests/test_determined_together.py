@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from calibration.data.posterior import LOG, NORMAL, Posterior
-from calibration.inference.posterior import determined_together, undetermined
-from calibration.words.fits import determined
+from calibration.data.posterior_file import LOG, NORMAL, Posterior
+from calibration.inference.fit_posterior import determined_together, undetermined
+from calibration.words.fit_words import determined
 
 
 def posterior(correlation, kinds, spread=(1.0, 1.0), value=(3.0, 5.0)):

@@ -13,11 +13,11 @@ from calibration.discovery import discover
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
 from calibration.discovery.settings import settings_for
 from calibration.inference.observers import Histories, SettledRuns
-from calibration.words import loop as words
-from mmrjax import channels, params, robots
-from mmrjax.conditions import Conditions
+from calibration.words import loop_words as words
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
+from mmrjax.model import channels, paper_robots, params
+from mmrjax.model.conditions import Conditions
 
 FORWARD, EITHER = (15.0, 20.0, 27.0, 33.0), (15.0, 33.0, -15.0, -33.0)
 CLIMBING = {f"{c}.ground.friction.{k}": v for c in ("6T2A", "4W2T") for k, v in (("static", 0.9), ("dynamic", 0.7))}
@@ -36,7 +36,7 @@ def table(name: str, amplitude: float, voltages: tuple[float, ...]) -> Runs:
     )
     slope = slope * np.sign(voltage)
     effect = params.replace(BY_NAME[name](), {"amplitude": amplitude})
-    robot = dataclasses.replace(params.replace(robots.nominal(), CLIMBING), effects=(effect,))
+    robot = dataclasses.replace(params.replace(paper_robots.nominal(), CLIMBING), effects=(effect,))
     shown = steady_batch(robot, Conditions(wheeled, voltage, slope, payload)).reading
     columns = {
         "configuration": np.where(wheeled == 1, "4W2T", "6T2A"),
@@ -71,7 +71,7 @@ def test_runs_that_go_both_ways_are_known_by_what_drives_them_or_by_a_speed():
 
 @pytest.mark.parametrize("kind", [SettledRuns, Histories])
 def test_what_needs_runs_both_ways_is_looked_for_in_such_alone(kind):
-    names = [{e.name for e in discover.visible(BY_NAME, robots.nominal(), kind, way)} for way in (True, False)]
+    names = [{e.name for e in discover.visible(BY_NAME, paper_robots.nominal(), kind, way)} for way in (True, False)]
     # A constant torque is directional friction in settled travel.
     only = {
         "directional_friction",
@@ -96,7 +96,9 @@ def test_what_a_duty_drives_is_known_and_its_effect_looked_for_in_such_alone(sup
     columns |= {} if duty is None else {"duty": np.array(duty)}
     runs = Runs("synthetic", columns)
     assert discover.pulsed(runs) is below_one and varied_by_duty(runs) is alone
-    names = {e.name for e in discover.visible(BY_NAME, robots.nominal(), SettledRuns, True, discover.pulsed(runs))}
+    names = {
+        e.name for e in discover.visible(BY_NAME, paper_robots.nominal(), SettledRuns, True, discover.pulsed(runs))
+    }
     assert ("coast_decay" in names) is below_one
     where = DiscrepancyLocation("electrical", "voltage", ("electrical",), (), 9.0, 9.0, by_duty=alone)
     assert where.family.endswith("duty" if alone else "voltage")

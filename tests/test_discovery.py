@@ -27,8 +27,8 @@ from calibration.inference.linearization import PROBED, amplitude_of, scored, sh
 from calibration.inference.observers import SettledRuns
 from calibration.inference.observers.settled import SettledLinearization
 from calibration.inference.optimizers import observation
-from mmrjax import channels, params, robots
 from mmrjax.effects import BY_NAME
+from mmrjax.model import channels, paper_robots, params
 
 
 @pytest.fixture(scope="module", params=["few", pytest.param("many", marks=pytest.mark.slow)])
@@ -417,6 +417,6 @@ def test_bootstrap_of_the_measured_runs_settles():
     """Of tables drawn from the fit to the packaged data nearly all can be fitted again."""
     runs, settings = read_runs("measured"), dataclasses.replace(SETTLED.settings, replicates=128)
     sd = noise.inferred(runs, SettledRuns.sizes(runs), None).sd
-    space = discover.pose(runs, robots.nominal(), sd, settings, {}, SETTLED.library)
+    space = discover.pose(runs, paper_robots.nominal(), sd, settings, {}, SETTLED.library)
     screened = screen(fit_base(space, settings, "measured"), lambda b: discover.bases_at(runs, b), runs, settings)
     assert len(discover.diagnosis_of_base(screened, settings).test.null.single) >= 0.98 * settings.replicates

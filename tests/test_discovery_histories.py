@@ -12,7 +12,7 @@ from scipy import stats
 from synthetic import STATED, Analyst, known, parts, table
 from worlds import histories
 
-from calibration.data.errors import BadData
+from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.discovery.adequacy import AdequacyTest
 from calibration.discovery.discrepancy import fit_discrepancy, locate
@@ -23,9 +23,9 @@ from calibration.inference import bases, noise
 from calibration.inference.linearization import PROBED, scored, shape_of
 from calibration.inference.observers import Histories
 from calibration.inference.optimizers import levenberg_marquardt
-from mmrjax import params, robots
 from mmrjax.effects import BY_NAME, UNNAMED
 from mmrjax.effects.curve import weights
+from mmrjax.model import paper_robots, params
 
 #: What these histories are searched for; the whole library is what the command and the campaign search.
 SEARCHED = ("rotating_inertia", "series_resistance", "churning", "grouser_polygon", "pulley_eccentricity")
@@ -277,7 +277,7 @@ def test_memory_tells_noise_from_what_remembers(seen):
 def test_knots_of_a_short_run_in_any_order_end_with_its_last_sample(runs):
     short = runs.where((runs["run_id"] != "start2") | (runs["time_s"] < 0.5))
     mixed = short.where(np.random.default_rng(0).permutation(len(short)))
-    observer = Histories.of(mixed, robots.nominal())
+    observer = Histories.of(mixed, paper_robots.nominal())
     times, names = mixed["time_s"], mixed["run_id"]
     for k, name in enumerate(np.unique(names)):
         there = times[np.asarray(observer.knots[k])]
@@ -295,8 +295,8 @@ def test_histories_that_do_not_start_from_rest_are_refused(runs):
     late = runs.where(runs["time_s"] > 0.3)
     late.columns["time_s"] = late["time_s"] - 0.32
     with pytest.raises(BadData, match=r"run start0 is moving at 0 s .* begins at rest"):
-        Histories.check_start(late, known(late), robots.nominal())
-    Histories.check_start(runs, known(runs), robots.nominal())
+        Histories.check_start(late, known(late), paper_robots.nominal())
+    Histories.check_start(runs, known(runs), paper_robots.nominal())
 
 
 @pytest.mark.slow

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import mmrjax as mm
-from mmrjax import fidelities, outputs
+from mmrjax import fidelities
+from mmrjax.fidelities import outputs
 from mmrjax.fidelities.steady import steady_batch
 
 #: Driving, sliding, stalled, overhauling and reversing.

@@ -9,13 +9,13 @@ import pytest
 from scipy.integrate import cumulative_simpson
 from worlds import paper
 
-from mmrjax import balances, params
-from mmrjax.conditions import Conditions
-from mmrjax.effects.electrical import ThermalDrift
+from mmrjax.effects.electrical_effects import ThermalDrift
 from mmrjax.fidelities.drive import _status, drive, drive_batch
 from mmrjax.fidelities.result import slips
 from mmrjax.fidelities.steady import steady, steady_batch
-from mmrjax.signals import CONVERGED, STATUSES, State
+from mmrjax.model import balances, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import CONVERGED, STATUSES, State
 
 STATES = ("current", "speed_motor", "speed", "discharge")
 

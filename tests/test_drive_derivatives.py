@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import channels
-from mmrjax.conditions import Conditions
 from mmrjax.fidelities.drive import drive
-from mmrjax.signals import STATUSES
+from mmrjax.model import channels
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import STATUSES
 
 pytestmark = pytest.mark.slow  # compiles for a minute
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from mmrjax.fidelities.rodas import Rodas4
+from mmrjax.numerics.rodas import Rodas4
 
 
 def pendulum(t, y, args):

@@ -5,14 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mmrjax import balances, energy, params, robots
-from mmrjax.conditions import Conditions
-from mmrjax.driver import FAST, SLOW, STEEPNESS, Driver
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.robot import Configurations
-from mmrjax.shaft import Shaft
-from mmrjax.signals import State
+from mmrjax.model import balances, energy, paper_robots, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.driver import FAST, SLOW, STEEPNESS, Driver
+from mmrjax.model.robot import Configurations
+from mmrjax.model.shaft import Shaft
+from mmrjax.model.signals import State
 
 LIMITED = Driver(current_limit=5.0)
 
@@ -73,7 +73,7 @@ def test_supply_gives_the_duty_of_its_voltage_and_of_the_current(robot):
 def bench(decay, **load):
     """k = 0.1 N·m/A, R = 5 ohm, without losses but the shaft's 0.02 N·m."""
     shaft = Shaft(**{"inertia": 1e-3, "loss_coulomb": 0.02, **load})
-    robot = robots.blank(Configurations({"bench": shaft}), sides=1.0)
+    robot = paper_robots.blank(Configurations({"bench": shaft}), sides=1.0)
     motor = {
         "motor.resistance": 5.0,
         "motor.torque_constant": 0.1,

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from calibration.data import effect_file, robot_file
-from calibration.data.errors import BadConfiguration
-from mmrjax import params, robots
-from mmrjax.conditions import Conditions
+from calibration.data.input_errors import BadConfiguration
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
+from mmrjax.model import paper_robots, params
+from mmrjax.model.conditions import Conditions
 
 GOOD = '''
 from mmrjax.effects import Effect, amplitude
-from mmrjax.params import Scalar
-from mmrjax.robot import Robot
-from mmrjax.signals import Signals
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals
 
 
 class SealDrag(Effect):
@@ -36,7 +36,7 @@ class SealDrag(Effect):
 EXPLICIT = '''
 from typing import ClassVar
 from mmrjax.effects import Effect
-from mmrjax.params import Scalar, parameter
+from mmrjax.model.params import Scalar, parameter
 
 
 class Drag(Effect):
@@ -228,9 +228,9 @@ def test_robot_file_names_the_configurations_of_an_effect(tmp_path):
 
 def test_robot_file_may_undo_the_configurations_of_a_class(tmp_path):
     library = effect_file.library([written(tmp_path, stating('configurations = ("4W2T",)'))])
-    robot = robot_file.with_effects(robots.nominal(), ("seal_drag",), library)
+    robot = robot_file.with_effects(paper_robots.nominal(), ("seal_drag",), library)
     assert robot.effects[0].configurations == ("4W2T",)
-    robot = robot_file.with_effects(robots.nominal(), ("seal_drag",), library, {"seal_drag": []})
+    robot = robot_file.with_effects(paper_robots.nominal(), ("seal_drag",), library, {"seal_drag": []})
     assert robot.effects[0].configurations == ()
     robot_file.write(robot, tmp_path / "robot.toml")
     assert robot_file.read(tmp_path / "robot.toml", library).effects[0].configurations == ()

@@ -22,21 +22,22 @@ import pytest
 
 import mmrjax
 from calibration.discovery import setups
-from mmrjax import balances, channels, effects, params, robots
-from mmrjax.conditions import Conditions
+from mmrjax import effects
 from mmrjax.effects import ALL, BY_NAME, Effect, base
 from mmrjax.effects.contract import readable
 from mmrjax.effects.periodic import Periodic
 from mmrjax.effects.scaled import scaled
-from mmrjax.fidelities import half_robot
 from mmrjax.fidelities.drive import drive, rates, start, state_of
 from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.fidelities.track import track
-from mmrjax.params import Scalar, parameter
-from mmrjax.rig import Begin, Begins, Instrument
-from mmrjax.robot import Configurations
-from mmrjax.shaft import Shaft
-from mmrjax.signals import CONVERGED, STALLED, Signals, State
+from mmrjax.model import balances, channels, paper_robots, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar, parameter
+from mmrjax.model.rig import Begin, Begins, Instrument
+from mmrjax.model.robot import Configurations
+from mmrjax.model.shaft import Shaft
+from mmrjax.model.signals import CONVERGED, STALLED, Signals, State
+from mmrjax.undercarriage import half_robot
 
 # --- units --------------------------------------------------------------------------------------------
 
@@ -102,7 +103,7 @@ def balance_unit(effect: type[Effect]) -> str:
 
 # --- what the laws are tried on -----------------------------------------------------------------------
 
-NOMINAL = robots.nominal()
+NOMINAL = paper_robots.nominal()
 AMPLITUDES = (0.37, 1.9)  # of the prior's standard deviation
 #: Speed or current that a balance's term multiplies to a power.
 CONJUGATE = {
@@ -802,7 +803,7 @@ for name in names:
 
 @pytest.mark.slow
 def test_every_file_of_effects_can_be_imported_first():
-    first = ["mmrjax.robot", "mmrjax.balances", "mmrjax.effects", *MODULES]
+    first = ["mmrjax.model.robot", "mmrjax.model.balances", "mmrjax.effects", *MODULES]
     done = subprocess.run([sys.executable, "-c", FIRST, str(len(ALL)), *first], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
@@ -839,7 +840,10 @@ def test_simulator_has_no_import_circle():
     sources = {name.removesuffix(".__init__"): f.read_text(encoding="utf-8") for name, f in files.items()}
     imports = {name: imported(source, set(sources)) for name, source in sources.items()}
     assert circle(imports) == []
-    assert "mmrjax.robot" in imports["mmrjax.effects.base"] and "mmrjax.effects" not in imports["mmrjax.robot"]
+    assert (
+        "mmrjax.model.robot" in imports["mmrjax.effects.base"]
+        and "mmrjax.effects" not in imports["mmrjax.model.robot"]
+    )
 
 
 def test_import_circles_are_found():
@@ -1100,7 +1104,7 @@ def test_backdriving_loss_changes_nothing_where_no_load_drives():
 def _on_shaft(torque_constant, *present):
     """A winch or a bench of one drive with losses, the motor's speed imposed forward and backward."""
     load = Shaft(inertia=1e-3, loss_coulomb=0.05, loss_viscous=1e-3, torque_constant=torque_constant)
-    robot = robots.blank(Configurations({"bench": load}))
+    robot = paper_robots.blank(Configurations({"bench": load}))
     stated = {"gearbox.ratio": 20.0, "gearbox.efficiency_load": 0.8, "motor.torque_constant": 0.0259}
     robot = params.replace(robot, stated)
     runs = Conditions(0, voltage=0.0, motor_speed=[100.0, -100.0, 300.0, -300.0])
@@ -1199,7 +1203,7 @@ def test_friction_along_the_travel_and_over_a_turn_turns_round_with_the_speed():
 def test_friction_by_the_position_begins_where_a_history_does():
     names = ("position_friction", "angle_friction", "presliding")
     load = Shaft(inertia=1e-3, loss_coulomb=0.05, loss_viscous=1e-3)
-    robot = robots.blank(Configurations({"bench": load}))
+    robot = paper_robots.blank(Configurations({"bench": load}))
     begins = Begins({"begin_a": Begin(angle=1.5), "begin_b": Begin(angle=-2.0)})
     rig = dataclasses.replace(robot.rig, begins=begins, start="measured")
     robot = dataclasses.replace(with_effects(*(BY_NAME[n]() for n in names), robot=robot), rig=rig)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from mmrjax import balances, energy
-from mmrjax.conditions import Conditions
-from mmrjax.signals import State
+from mmrjax.model import balances, energy
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import State
 
 #: (configuration, voltage, slope [deg], payload [kg], on the battery, current [A], motor speed [rad/s], speed [m/s]).
 INSTANTS = {

@@ -11,10 +11,11 @@ import mmrjax as mm
 from calibration.inference.details import EquationDefects
 from calibration.inference.observers.settled import EQUATIONS, SettledLinearization, _defects
 from calibration.inference.observers.turns import TurnLinearization
-from mmrjax import channels, effects
-from mmrjax.signals import Signals
-from sweeps.pages import loop as page
+from mmrjax import effects
+from mmrjax.model import channels
+from mmrjax.model.signals import Signals
 from sweeps.pages import loop_figures
+from sweeps.pages import loop_page as page
 
 ROWS, COUNT, RANDOM = 12, 3, np.random.default_rng(0)
 #: Sizes of voltage, torque and speed; and how many sds of a reading a defect of that size is.

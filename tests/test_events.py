@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from worlds.events import Bench, through
 
-from mmrjax import params, robots
-from mmrjax.conditions import Conditions
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.histories import CHANGE, grid, histories
-from mmrjax.rig import Rig
-from mmrjax.robot import Configurations
-from mmrjax.shaft import Shaft
+from mmrjax.model import paper_robots, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.rig import Rig
+from mmrjax.model.robot import Configurations
+from mmrjax.model.shaft import Shaft
 
 #: Forward, braked to rest, held by friction, back from rest, and forward through rest [V].
 VOLTS, CHANGES = np.array([6.0, 0.0, 1.0, -6.0, 6.0]), np.array([0.0, 0.4, 0.6, 0.8, 1.1])
@@ -35,7 +35,7 @@ SHARE = 1e-3
 def robot_of(bench):
     loose = bench.backlash > 0
     shaft = Shaft(inertia=1.0, loss_coulomb=1.0, backlash=float(loose))
-    robot = robots.blank(Configurations({"bench": shaft}), rig=Rig(loose=loose))
+    robot = paper_robots.blank(Configurations({"bench": shaft}), rig=Rig(loose=loose))
     return params.replace(robot, {p: getattr(bench, f) for f, p in NAMES.items() if loose or f != "backlash"})
 
 

@@ -12,19 +12,19 @@ from test_worlds_tables import SHAPES
 from worlds import laws, settled, tables
 
 from calibration.data import robot_file
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import experiments, menu, predicted
 from calibration.discovery.candidates import Candidate, filled, fit_candidates
 from calibration.discovery.classes import Classes
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.notes import Heat, NothingPossible, Overspeed, Overvoltage
+from calibration.discovery.loop_notes import Heat, NothingPossible, Overspeed, Overvoltage
 from calibration.discovery.reach import reach
 from calibration.discovery.stated_values import Shift
-from mmrjax import channels, params, robots
-from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME, OF_CHANNELS
 from mmrjax.fidelities.steady import IMPLICIT
-from sweeps import stages
+from mmrjax.model import channels, paper_robots, params
+from mmrjax.model.conditions import Conditions
+from sweeps import stage_files
 
 PAIRS = {
     ("series_resistance", "supply_sag"): {"one motor, 6T2A", "one motor, 4W2T", "stall, one motor"},
@@ -40,7 +40,7 @@ def conditions(made):
     return Conditions(c.wheeled.astype(int), c.U, np.degrees(c.slope), c.payload, total_mass=c.mass)
 
 
-CLIMBING = params.replace(robots.nominal(), settled.CLIMBING)
+CLIMBING = params.replace(paper_robots.nominal(), settled.CLIMBING)
 REACH = reach(CLIMBING, conditions(settled.table8()), channels.USUAL)
 MENU = menu.menu(REACH)
 SPANS, BY = predicted.spans(MENU), {e.name: e for e in MENU}
@@ -528,6 +528,6 @@ def test_finer_steps_are_within_the_tables_ranges(rover):
 
 
 def test_every_experiment_is_kept_in_a_stage(tmp_path):
-    stages.write(tmp_path / "menu", MENU)
-    assert stages.read(tmp_path / "menu") == MENU
+    stage_files.write(tmp_path / "menu", MENU)
+    assert stage_files.read(tmp_path / "menu") == MENU
     assert {type(e) for e in MENU} == {menu.Act, menu.Run}

@@ -2,9 +2,10 @@
 
 import pytest
 
-from calibration.words import effects as words_of
-from mmrjax import channels, effects, params, robots
+from calibration.words import effect_words as words_of
+from mmrjax import effects
 from mmrjax.errors import choices, near
+from mmrjax.model import channels, paper_robots, params
 from sweeps.commands import explain
 from sweeps.pages import words
 
@@ -56,7 +57,7 @@ def test_a_typical_size_is_simulated(robot):
 
 
 def test_parameters_and_channels_are_explained_by_their_rows():
-    known = {p.name: p for p in params.walk(robots.nominal())}
+    known = {p.name: p for p in params.walk(paper_robots.nominal())}
     lines = dict(said("parameter", "motor.resistance"))
     spec = known["motor.resistance"].spec
     assert lines["means"] == f"{spec.meaning} [{spec.unit}]" and lines["nominal"] == f"0.611 ohm; {spec.source}"

@@ -10,8 +10,8 @@ import fastsim_comparison as comparison
 import numpy as np
 import pytest
 
-from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady_batch
+from mmrjax.model.conditions import Conditions
 
 INSTALLED = importlib.util.find_spec("fastsim") is not None
 

@@ -13,12 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import channels, fidelities, params
-from mmrjax.conditions import Conditions
+from mmrjax import fidelities
 from mmrjax.fidelities import Effort, Facts, Option
 from mmrjax.fidelities.base import Fidelity, History, Run
 from mmrjax.fidelities.steady import operating_point, steady_batch
-from mmrjax.signals import STATUSES, Result
+from mmrjax.model import channels, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import STATUSES, Result
 
 ROOT = Path(__file__).resolve().parents[1]
 RUNS = Conditions(configuration=[0, 1], voltage=24.0, slope_deg=[5.0, 0.0])

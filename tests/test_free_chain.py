@@ -4,7 +4,7 @@ import free_chain
 import numpy as np
 import pytest
 
-from mmrjax.running_gear import RunningGear
+from mmrjax.undercarriage.running_gear import RunningGear
 
 pytestmark = pytest.mark.slow  # compiles for a minute
 

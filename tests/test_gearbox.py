@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from worlds import paper
 
-from mmrjax.gearbox import Gearbox
+from mmrjax.model.gearbox import Gearbox
 
 RNG = np.random.default_rng(19)
 

@@ -15,11 +15,11 @@ from synthetic import calibrated
 
 from calibration.data import runs as records
 from calibration.inference import identifiability
-from calibration.inference.calibrate import calibrate
+from calibration.inference.calibration import calibrate
 from calibration.inference.identifiability import HELD, held_by_prior
-from mmrjax import robots
+from mmrjax.model import paper_robots
 from sweeps.commands import calibrate as command
-from sweeps.pages import calibration as calibration_page
+from sweeps.pages import calibration_page as calibration_page
 
 
 def linear(jacobian):
@@ -94,7 +94,9 @@ def found():
             return calibrated()
         if case not in made:
             runs = records.read("measured")
-            made[case] = calibrate(runs, robots.nominal(), starts=2, profiles=False, blocks=(), **CALIBRATIONS[case])
+            made[case] = calibrate(
+                runs, paper_robots.nominal(), starts=2, profiles=False, blocks=(), **CALIBRATIONS[case]
+            )
         return made[case]
 
     return of

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from mmrjax import params, robots
-from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.histories import LONGEST, START, followed, grid, histories
+from mmrjax.model import paper_robots, params
+from mmrjax.model.conditions import Conditions
 
 RUNS = Conditions(
     voltage=np.array([15.0, 33.0, 24.0]),
@@ -47,7 +47,7 @@ def test_grid_holds_the_instants_and_is_fine_where_a_start_is_young():
 
 
 def test_histories_follow_drive():
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     times = jnp.asarray(np.concatenate([[0.0], TIMES]))
     s = jax.jit(jax.vmap(lambda c: drive(robot, c, times, tolerance=1e-9, max_steps=20000).signals))(RUNS)
     expected = np.stack([np.asarray(getattr(s, k)) for k in STATE], -1)[:, 1:]
@@ -69,7 +69,7 @@ def test_histories_follow_drive():
 )
 def test_derivatives_are_those_of_what_is_computed(changes):
     """By parameters and by the amplitude of every effect with a memory, against central differences."""
-    robot = dataclasses.replace(robots.nominal(), effects=tuple(BY_NAME[n]() for n in EFFECTS))
+    robot = dataclasses.replace(paper_robots.nominal(), effects=tuple(BY_NAME[n]() for n in EFFECTS))
     robot = params.strong(params.replace(robot, {k: jnp.asarray(v) for k, v in changes.items()}))
     names = [
         "motor.resistance", "motor.inertia", "motor.inductance", "6T2A.ground.friction.static", "4W2T.radius",
@@ -95,7 +95,7 @@ def test_derivatives_are_those_of_what_is_computed(changes):
 
 @pytest.mark.slow
 def test_repeated_instants_change_nothing():
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     short, long = GRID[:120], np.concatenate([GRID[:120], np.repeat(GRID[119], 7)])
     one = jax.tree.map(lambda x: x[0], RUNS)
     first, second = (
@@ -107,13 +107,13 @@ def test_repeated_instants_change_nothing():
 
 
 def test_run_that_cannot_be_followed_is_not_finite():
-    robot = params.replace(robots.nominal(), {"motor.resistance": jnp.asarray(jnp.nan)})
+    robot = params.replace(paper_robots.nominal(), {"motor.resistance": jnp.asarray(jnp.nan)})
     assert not np.isfinite(seen_compiled(robot)).any()
 
 
 @pytest.mark.slow
 def test_known_states_change_neither_values_nor_derivatives():
-    robot, run, times = robots.nominal(), jax.tree.map(lambda x: x[0], RUNS), jnp.asarray(GRID[:60])
+    robot, run, times = paper_robots.nominal(), jax.tree.map(lambda x: x[0], RUNS), jnp.asarray(GRID[:60])
     friction = float(robot.motor.friction_coulomb)
 
     def current(x, known=None):

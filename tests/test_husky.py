@@ -12,7 +12,7 @@ from calibration.data import surfaces
 from calibration.discovery import discover
 from calibration.discovery.candidates import fit_base
 from calibration.inference import blocks, observers, priors
-from calibration.inference.calibrate import calibrate
+from calibration.inference.calibration import calibrate
 from calibration.inference.observers import SettledTurns
 
 HUSKY = Path(__file__).resolve().parents[1] / "docs" / "rigs" / "husky"

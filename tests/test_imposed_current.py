@@ -10,17 +10,17 @@ import pytest
 
 from calibration.data import rig_facts, robot_file
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.discovery import discover
 from calibration.inference import bases, checks, observers
 from calibration.inference import blocks as holdout
-from calibration.inference.calibrate import calibrate
-from mmrjax import params
-from mmrjax.balances import absent
-from mmrjax.conditions import Conditions
+from calibration.inference.calibration import calibrate
 from mmrjax.fidelities import histories as integrator
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.steady import steady
+from mmrjax.model import params
+from mmrjax.model.balances import absent
+from mmrjax.model.conditions import Conditions
 from sweeps.pages import comparison_figures
 
 K, RATIO, ETA = 0.05, 10.0, 0.9

@@ -8,10 +8,10 @@ import pytest
 
 from calibration.data import input_files, robot_file
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration, BadData, InputError
+from calibration.data.input_errors import BadConfiguration, BadData, InputError
 from calibration.discovery.discover import without_copies
 from calibration.inference.checks import _stuck
-from calibration.inference.notes import StiffSupply
+from calibration.inference.fit_notes import StiffSupply
 from mmrjax.errors import counted
 from sweeps.pages import comparison_figures
 

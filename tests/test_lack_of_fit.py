@@ -14,13 +14,13 @@ from worlds import settled, tables
 from calibration.data.runs import Runs
 from calibration.discovery.discover import Sds, of_sds
 from calibration.inference import lack_of_fit
-from calibration.inference.calibrate import calibrate
-from calibration.inference.errors import root_mean_square
+from calibration.inference.calibration import calibrate
+from calibration.inference.fit_notes import Shown
 from calibration.inference.lack_of_fit import Residuals, adequacy
 from calibration.inference.noise_factor import noise_factors, noise_remarks
-from calibration.inference.notes import Shown
 from calibration.inference.observers import SettledRuns
-from mmrjax import params, robots
+from calibration.inference.simulation_errors import root_mean_square
+from mmrjax.model import paper_robots, params
 
 SIGMA = np.array([0.02, 0.5, 3e-3])
 GRID = settled.table8()
@@ -183,7 +183,7 @@ def test_right_sds_and_residuals_with_structure_say_nothing_of_sds():
 
 @pytest.mark.slow
 def test_calibration_says_whether_it_is_adequate():
-    climbing = params.replace(robots.nominal(), settled.CLIMBING)
+    climbing = params.replace(paper_robots.nominal(), settled.CLIMBING)
     few = {"starts": 2, "profiles": False, "blocks": ()}
     clean = tables.narrow(seed=3, free=settled.FRICTION)
     assert calibrate(table(clean), climbing, **few).adequacy.adequate

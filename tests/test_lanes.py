@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax.fidelities import lanes
+from mmrjax.numerics import lanes
 
 
 def halves(own):

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import params
-from mmrjax.lever_drives import lever_drive, swing
-from mmrjax.robots import nominal
+from mmrjax.climbing.lever_drives import lever_drive, swing
+from mmrjax.model import params
+from mmrjax.model.paper_robots import nominal
 
 ROBOT = nominal()
 INERTIA, STEP = 0.3, 1e-4  # of a pair with what it carries [kg·m²]; [s]

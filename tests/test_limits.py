@@ -5,11 +5,11 @@ import dataclasses
 import jax.numpy as jnp
 import pytest
 
-from mmrjax.conditions import Conditions
 from mmrjax.fidelities.rest import creeps, direction
 from mmrjax.fidelities.result import exceeded, travels
-from mmrjax.power import Battery
-from mmrjax.signals import CONVERGED, REVERSES, ROLLS_BACK, STATUSES, Signals, done
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.power import Battery
+from mmrjax.model.signals import CONVERGED, REVERSES, ROLLS_BACK, STATUSES, Signals, done
 
 FINE = dict(
     battery=1.0, voltage_source=30.0, total_current=2.0, current=1.0, speed_motor=600.0, torque_gear=2.0,

@@ -11,7 +11,16 @@ from test_log_kinds import servo, written
 from calibration.data import runs as records
 from calibration.inference import noise, observers, priors
 from calibration.inference.optimizers import linearised_signed
-from mmrjax.linear_equations import factorise, half_solved, inverse, inverted, regular, solution, solved, substitute
+from mmrjax.numerics.linear_equations import (
+    factorise,
+    half_solved,
+    inverse,
+    inverted,
+    regular,
+    solution,
+    solved,
+    substitute,
+)
 
 #: Primitives that the CPU does by LAPACK.
 LAPACK = r"\b(lu|cholesky|triangular_solve|qr|householder_product|eigh?|svd|schur|tridiagonal_solve)\["

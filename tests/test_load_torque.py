@@ -13,18 +13,18 @@ from worlds import logs, rigs
 import mmrjax as mm
 from calibration.data import profiles, rig_facts, robot_file
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.inference import bases, blocks
 from calibration.inference.observers import Histories, SettledRuns
-from mmrjax import balances
-from mmrjax.conditions import Conditions
 from mmrjax.errors import UsageError
 from mmrjax.fidelities import rest
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.histories import grid, histories
 from mmrjax.fidelities.steady import steady_batch, steady_outputs
-from mmrjax.rig import Rig
-from mmrjax.signals import STATUSES, State
+from mmrjax.model import balances
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.rig import Rig
+from mmrjax.model.signals import STATUSES, State
 from sweeps.config import Sweep
 from sweeps.config_campaign import of_grid
 
@@ -158,7 +158,7 @@ def test_a_log_with_a_brake_is_that_of_another_implementation(tmp_path):
 def test_a_brake_on_a_vehicle_is_refused():
     with pytest.raises(UsageError, match=r"load_torque: the robot is a vehicle.*slope_deg or payload"):
         mm.simulate(mm.nominal(), mm.Conditions(load_torque=0.1))
-    profile = mm.profile.profile([0.0, 1.0], load_torque=0.1)
+    profile = mm.profile([0.0, 1.0], load_torque=0.1)
     with pytest.raises(UsageError, match="load_torque: the robot is a vehicle"):
         mm.simulate(mm.nominal(), mm.Conditions(), profile=profile)
 

@@ -22,8 +22,8 @@ from worlds import histories, settled, tables
 
 from calibration.data import effect_file, robot_file
 from calibration.inference import bases as curves
-from mmrjax import params
 from mmrjax.effects import BY_NAME
+from mmrjax.model import params
 from sweeps import cli
 from sweeps.commands import loop as room
 
@@ -35,8 +35,8 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 from mmrjax.effects import Effect
-from mmrjax.params import Scalar, parameter
-from mmrjax.signals import Signals
+from mmrjax.model.params import Scalar, parameter
+from mmrjax.model.signals import Signals
 
 
 class PayloadBinding(Effect):
@@ -162,7 +162,7 @@ def test_result_has_the_schema_of_the_issue(done):
     jsonschema.validate(r, schema)
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate({**r, "verdict": "perhaps"}, schema)
-    assert r["schema"] == "mmrjax.loop/3" and r["verdict"] in ("named", "class")
+    assert r["schema"] == "mmrjax.climbing.belt_loop/3" and r["verdict"] in ("named", "class")
     (effect,) = r["effects"]
     assert {"name", "class", "balance", "equation", "parameters", "p_value", "score"} <= set(effect)
     assert effect["name"] == effect["class"][0] and "churning" in effect["class"]
@@ -431,7 +431,7 @@ def test_report_of_histories_shows_what_only_they_tell(started):
 
 FOURTH = """
 import csv, sys
-from mmrjax import channels
+from mmrjax.model import channels
 channels.EVERY += (channels.Channel(
     name="terminal_voltage", unit="V", factor=1.0,
     label="terminal voltage", word="voltage", range=(-200.0, 200.0), sd_largest=50.0,

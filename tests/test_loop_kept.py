@@ -15,14 +15,15 @@ from worlds import rigs
 
 from calibration.data import robot_file
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import discover as room
 from calibration.discovery import kept
 from calibration.discovery.kept import OutOfTime
-from calibration.discovery.notes import Outstanding
-from mmrjax import programs, robots
+from calibration.discovery.loop_notes import Outstanding
+from mmrjax.compile import programs
+from mmrjax.model import paper_robots
 from sweeps import config
-from sweeps import stages as kept_stages
+from sweeps import stage_files as kept_stages
 from sweeps.commands import loop as command
 from sweeps.store import RunFolder, open_folder
 
@@ -50,7 +51,7 @@ def test_a_stage_of_another_version_is_made_again(tmp_path, monkeypatch):
     def stage(make):
         with (
             pytest.raises(KeyboardInterrupt),
-            open_folder("loop", told, robots.nominal(), tmp_path / "x", False) as folder,
+            open_folder("loop", told, paper_robots.nominal(), tmp_path / "x", False) as folder,
         ):
             found.append(folder.stage("base", make))
             raise KeyboardInterrupt

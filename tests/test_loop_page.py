@@ -19,15 +19,15 @@ from worlds import settled, tables
 
 from calibration.data.writing import finite
 from calibration.discovery.clusters import Cluster
-from calibration.discovery.notes import Asked, NameSupport, NameTest, RuledOut
+from calibration.discovery.loop_notes import Asked, NameSupport, NameTest, RuledOut
 from calibration.discovery.result import Alternative, Estimate, HiddenEffect, Resolved, StatedValue
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference.identifiability import HELD
-from calibration.words import loop as words
-from mmrjax import channels
+from calibration.words import loop_words as words
+from mmrjax.model import channels
 from sweeps.commands import loop as room
-from sweeps.pages import loop as loop_page
 from sweeps.pages import loop_figures
+from sweeps.pages import loop_page as loop_page
 from sweeps.pages import page as page_room
 
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "loop.schema.json").read_text("utf-8"))

@@ -9,7 +9,7 @@ import pytest
 from calibration.discovery import mechanism as room
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.notes import Mechanism
+from calibration.discovery.loop_notes import Mechanism
 from calibration.discovery.prediction import Gain, HeldOutScore
 from calibration.discovery.settings import settings_for
 from calibration.inference.observers import SettledRuns

@@ -10,13 +10,13 @@ import pytest
 from scipy.integrate import solve_ivp
 from worlds import events, paper
 
-from mmrjax import energy, params, robots
-from mmrjax.conditions import Conditions
 from mmrjax.errors import UsageError
-from mmrjax.fidelities import mission_straight, mission_turning
-from mmrjax.fidelities.mission import TOLERANCE, Start, mission
-from mmrjax.profile import MODES, Profile, profile
-from mmrjax.signals import FLAGS, STATUSES
+from mmrjax.missions import mission_straight, mission_turning
+from mmrjax.missions.mission import TOLERANCE, Start, mission
+from mmrjax.missions.profile import MODES, Profile, profile
+from mmrjax.model import energy, paper_robots, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import FLAGS, STATUSES
 
 RPM = np.pi / 30
 ROWS = 8
@@ -55,7 +55,7 @@ def flagged(flags):
 
 @pytest.fixture(scope="module")
 def robot():
-    return params.strong(robots.nominal())
+    return params.strong(paper_robots.nominal())
 
 
 MANY = (

@@ -13,12 +13,15 @@ from scipy.integrate import solve_ivp
 
 import mmrjax as mm
 from calibration.data import robot_file
-from calibration.data.errors import BadConfiguration
-from mmrjax import channels, derived, missions, outputs, params, robots
-from mmrjax.fidelities.mission import mission
-from mmrjax.fidelities.mission_steps import MARKS
-from mmrjax.profile import profile
-from mmrjax.signals import STATUSES
+from calibration.data.input_errors import BadConfiguration
+from mmrjax import derived
+from mmrjax.fidelities import outputs
+from mmrjax.missions import mission_batch
+from mmrjax.missions.mission import mission
+from mmrjax.missions.mission_steps import MARKS
+from mmrjax.missions.profile import profile
+from mmrjax.model import channels, paper_robots, params
+from mmrjax.model.signals import STATUSES
 from sweeps import cli
 from tests.commands import rows
 
@@ -29,7 +32,7 @@ KEEP = 4096
 
 @pytest.fixture(scope="module")
 def robot():
-    return params.strong(robots.nominal())
+    return params.strong(paper_robots.nominal())
 
 
 def with_battery(robot, cutoff=3.3, delay=1.0, **changes):
@@ -113,7 +116,7 @@ def random_robot(robot):
 def followed():
     def one(robot, keep=KEEP):
         at = mm.Conditions(configuration=np.array([0]), battery=np.array([1.0]))
-        found = jax.device_get(missions.simulate_batch(robot, at, HOUR, None, keep))
+        found = jax.device_get(mission_batch.simulate_batch(robot, at, HOUR, None, keep))
         return jax.tree.map(lambda x: x[0], found)
 
     return one
@@ -160,7 +163,7 @@ def test_steps_land_on_the_crossing_and_the_delay_counts_from_there(cut, robot):
 @pytest.mark.slow
 def test_endurance_and_range_are_those_of_the_cut_off(cut, robot):
     at = mm.Conditions(configuration=0, battery=1.0)
-    numbers = missions.numbers(with_battery(robot), at, cut)
+    numbers = mission_batch.numbers(with_battery(robot), at, cut)
     assert float(numbers["endurance"]) == float(cut.total.time) and float(numbers["state_of_charge"]) > 0.1
     assert float(numbers["range"]) == float(cut.total.of["path"])
 
@@ -266,7 +269,7 @@ def test_a_name_is_one_quantity_in_every_file_of_a_mission(run_folder):
         assert 2 * duty * float(row["motor_current_A"]) == pytest.approx(float(row["total_current_A"]), rel=1e-6)
     peak = max(2 * abs(float(row["motor_current_A"])) for row in history)
     assert 0.98 * peak < float(run["peak_current_A"]) < 1.02 * peak
-    shared = set(run) & set(segments[0]) & set(missions.names())
+    shared = set(run) & set(segments[0]) & set(mission_batch.names())
     for name in sorted(shared & set(result)):
         if run[name] and result[name] is not None:
             assert float(run[name]) == pytest.approx(result[name], rel=1e-6, abs=1e-9), name
@@ -277,7 +280,7 @@ def test_a_name_is_one_quantity_in_every_file_of_a_mission(run_folder):
 def test_a_column_of_several_registries_has_one_unit_and_one_meaning():
     """Outputs of runs (with every channel), of missions and of what is derived: what shares a name is listed here."""
     several: dict[str, list[tuple[str, float, str]]] = {}
-    for output in (*outputs.table(channels.EVERY), *missions.OUTPUTS, *derived.TABLE):
+    for output in (*outputs.table(channels.EVERY), *mission_batch.OUTPUTS, *derived.TABLE):
         several.setdefault(output.column, []).append((output.unit, output.factor, output.label))
     shared = {column: said for column, said in several.items() if len(said) > 1}
     assert set(shared) == {"peak_current_A"}

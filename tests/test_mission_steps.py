@@ -5,8 +5,8 @@ import dataclasses
 import jax.numpy as jnp
 import pytest
 
-from mmrjax.fidelities.mission_steps import _stayed_below, _top
-from mmrjax.profile import profile
+from mmrjax.missions.mission_steps import _stayed_below, _top
+from mmrjax.missions.profile import profile
 
 
 def test_a_row_holds_until_the_next_or_ramps_to_it():

@@ -9,13 +9,14 @@ import pytest
 import zarr
 
 import mmrjax as mm
-from mmrjax import missions, params
-from mmrjax.fidelities import mission_straight
 from mmrjax.fidelities.drive import drive
-from mmrjax.fidelities.mission import TOLERANCE, Mission, Start, Totals, initial_unknowns, mission
-from mmrjax.fidelities.mission_steps import BREAKS_AWAY, events_of
-from mmrjax.missions import simulate_batch
-from mmrjax.profile import profile
+from mmrjax.missions import mission_batch as missions
+from mmrjax.missions import mission_straight
+from mmrjax.missions.mission import TOLERANCE, Mission, Start, Totals, initial_unknowns, mission
+from mmrjax.missions.mission_batch import simulate_batch
+from mmrjax.missions.mission_steps import BREAKS_AWAY, events_of
+from mmrjax.missions.profile import profile
+from mmrjax.model import params
 
 ROWS = [0.0, 1.0, 4.0, 5.0, 6.0]
 RAMP = dict(demand=[0, 0.3, 0.3, 0, 0], linear=True)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
-from mmrjax import params
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities.half_robot import advance, centre, instant, roll, stand, system
-from mmrjax.fidelities.modes import POSITIONS, Mode, _linearised, _named, modes
-from mmrjax.signals import GRAVITY
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import GRAVITY
+from mmrjax.undercarriage.half_robot import advance, centre, instant, roll, stand, system
+from mmrjax.undercarriage.modes import POSITIONS, Mode, _linearised, _named, modes
 
 PAYLOADS = [0.0, 8.0]
 

@@ -6,7 +6,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from worlds import paper
 
-from mmrjax.motor import Motor
+from mmrjax.model.motor import Motor
 
 RNG = np.random.default_rng(14)
 

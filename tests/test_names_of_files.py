@@ -23,11 +23,14 @@ import test_settle
 from test_resonance_command import SMALL, runs_of
 
 from calibration.data import columns
-from mmrjax import channels, derived, missions, outputs, requirements
-from mmrjax.derived import turn
-from mmrjax.fidelities.climb import LOSSES, SOURCES
-from mmrjax.fidelities.climb_derivatives import OUTPUTS
-from mmrjax.fidelities.resonance import SIGNALS
+from mmrjax import derived
+from mmrjax.climbing.climb_derivatives import OUTPUTS
+from mmrjax.climbing.climb_simulation import LOSSES, SOURCES
+from mmrjax.derived import requirements, turning_figures
+from mmrjax.fidelities import outputs
+from mmrjax.missions import mission_batch
+from mmrjax.model import channels
+from mmrjax.undercarriage.ripple_peaks import SIGNALS
 from sweeps import capabilities, cli, config
 from sweeps.points import export
 
@@ -124,11 +127,11 @@ FOREIGN = {"parameters", "set", "versions", "hashes", "prior", "blocks", "status
 def registries() -> dict[str, list[tuple[str, str]]]:
     """Unit and meaning of every name of the tables that writers use; of each table in which it is."""
     found: dict[str, list[tuple[str, str]]] = {}
-    for row in (*outputs.table(channels.EVERY), *missions.OUTPUTS, *derived.TABLE):
+    for row in (*outputs.table(channels.EVERY), *mission_batch.OUTPUTS, *derived.TABLE):
         found.setdefault(row.column, []).append((row.unit, row.label))
     for c in channels.EVERY:
         found.setdefault(c.sd_column, []).append((c.unit_shown, f"sd of a reading: {c.label}"))
-    for name, label in turn.COLUMNS.items():
+    for name, label in turning_figures.COLUMNS.items():
         found.setdefault(name, []).append((UNITS[END.search(name)[1]], label))
     for name in columns.CONDITIONS:
         found.setdefault(name, []).append((UNITS[END.search(name)[1]], f"condition {name}"))
@@ -315,7 +318,7 @@ def test_columns_that_a_rig_may_lack_and_those_of_exports_are_known():
     of_heat = {
         n
         for n in registries()
-        if re.match(r"(winding|housing)_", n) and n in (*missions.names(), "winding_settled_C")
+        if re.match(r"(winding|housing)_", n) and n in (*mission_batch.names(), "winding_settled_C")
     }
     assert of_heat <= set(capabilities.RESTS_ON)
 

@@ -7,14 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import balances, one_sided, params, robots
-from mmrjax.conditions import Conditions
-from mmrjax.driver import Driver
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady
-from mmrjax.robot import Configurations
-from mmrjax.shaft import Shaft
-from mmrjax.signals import State
+from mmrjax.model import balances, paper_robots, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.driver import Driver
+from mmrjax.model.robot import Configurations
+from mmrjax.model.shaft import Shaft
+from mmrjax.model.signals import State
+from mmrjax.numerics import one_sided
 
 #: Numbers compared [SI].
 OUTPUTS = ("speed", "total_current", "output_torque", "adhesion_used", "efficiency_gear", "efficiency_chassis")
@@ -50,13 +51,13 @@ VARIED = ("voltage", "duty", "payload", "slope_deg", "adhesion")
 
 def tracked():
     effects = (BY_NAME[name](amplitude=0.05) for name in ("gear_load_loss", "tension_friction"))
-    return dataclasses.replace(robots.nominal(), effects=tuple(effects))
+    return dataclasses.replace(paper_robots.nominal(), effects=tuple(effects))
 
 
 def bench():
     free = {f"{part}.friction_{kind}": 0.0 for part in ("motor", "gearbox") for kind in ("coulomb", "viscous")}
     shaft = Shaft(inertia=1e-3, loss_coulomb=0.0)
-    blank = robots.blank(Configurations({"bench": shaft}), sides=1.0)
+    blank = paper_robots.blank(Configurations({"bench": shaft}), sides=1.0)
     return params.replace(
         blank, {**free, "gearbox.ratio": 1.0, "gearbox.efficiency_load": 0.7, "motor.inertia": 1e-6}
     )

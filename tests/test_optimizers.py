@@ -13,13 +13,13 @@ from interval_coverage import coverage
 
 from calibration.data import runs as records
 from calibration.data.columns import Layout
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.inference import blocks as holdout
 from calibration.inference import identifiability, noise, observers, priors, problem, solvers
 from calibration.inference import optimizers as fit
 from calibration.inference.levenberg_marquardt import NEAR, NEARLY_ALL, OneSidedLevenbergMarquardt, counted, stride_of
-from mmrjax import robots
-from mmrjax.signals import CONVERGED, SLIDES
+from mmrjax.model import paper_robots
+from mmrjax.model.signals import CONVERGED, SLIDES
 
 solve = eqx.filter_jit(lambda *args, **options: fit.levenberg_marquardt(*args, **options)[0])
 STATED = "current=2%,motor_speed=0.5%,speed=1%"
@@ -41,7 +41,7 @@ def measured():
 
 @pytest.fixture(scope="module")
 def posed(measured):
-    return pose(measured, robots.nominal())
+    return pose(measured, paper_robots.nominal())
 
 
 @pytest.fixture(scope="module")
@@ -344,7 +344,7 @@ def test_stride_is_the_optimum_beyond_and_along_the_edges_of_penalties():
 def test_search_of_rollouts_ends_at_the_limit_of_adhesion_from_inside(measured):
     """With the noise that is estimated of them the rows pull static friction down to the margin; from just inside of
     it nothing shows the penalty."""
-    posed = pose(measured, robots.nominal(), stated="current=10%,motor_speed=6%,speed=4%")
+    posed = pose(measured, paper_robots.nominal(), stated="current=10%,motor_speed=6%,speed=4%")
     limit = fit.searches(posed, jnp.zeros((1, len(posed.coordinates))), posed.data)[0]
     assert np.any(np.asarray(posed.observation(limit.z[0]).adhesion_used) > 1 - problem.MARGIN)
     inside = limit.z[0].at[posed.coordinates.names.index("6T2A.ground.friction.static")].add(3e-4)
@@ -414,7 +414,7 @@ def test_directions_that_no_data_tell_apart_are_the_same_from_any_basis():
 
 @pytest.mark.slow
 def test_what_only_its_prior_holds_is_said(measured):
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     names = (
         *priors.default_names(measured["configuration"], robot),
         "motor.inductance",
@@ -450,7 +450,7 @@ def test_profile_of_a_linear_problem_is_its_interval(clean, truth):
 
 @pytest.mark.slow
 def test_profile_of_a_parameter_held_by_the_limit_is_one_sided(measured):
-    posed = pose(measured, robots.nominal(), stated="current=9%,motor_speed=6%,speed=4%")
+    posed = pose(measured, paper_robots.nominal(), stated="current=9%,motor_speed=6%,speed=4%")
     best = solve(posed, jnp.zeros(len(posed.coordinates)), posed.data)
     about = identifiability.analyse(posed, best.z)
     profile = identifiability.profile(posed, best.z, float(best.cost), about)
@@ -468,7 +468,7 @@ def test_blocks_left_out_are_not_seen(posed, measured):
     assert held.labels == ("0.0", "5.0", "10.0", "15.0", "20.0") and held.converged.all()
     # the refit without slope 10, done alone, says the same of those rows
     rows = masks["slope"]["10.0"]
-    alone = pose(measured.where(~rows), robots.nominal())
+    alone = pose(measured.where(~rows), paper_robots.nominal())
     z = solve(alone, best, alone.data).z
     np.testing.assert_allclose(held.reading[rows], np.asarray(posed.observation(z).reading)[rows], rtol=1e-4)
     # readings of a block do not change what is predicted for it
@@ -485,7 +485,7 @@ def test_blocks_of_what_does_not_vary_are_none(measured):
 
 @pytest.mark.slow
 def test_drive_and_steady_agree_on_settled_rows(measured, truth, posed):
-    same = pose(measured, robots.nominal(), model="drive")
+    same = pose(measured, paper_robots.nominal(), model="drive")
     np.testing.assert_allclose(same.observation(truth).reading, posed.observation(truth).reading, rtol=2e-4)
 
 
@@ -521,7 +521,7 @@ def history_runs(robot, seed=None, noise_share=0.01):
 @pytest.mark.slow
 def test_histories_calibrate_with_drive():
     """A start tells the inductance and the rotor's inertia, which no steady row can."""
-    base = robots.nominal()
+    base = paper_robots.nominal()
     names = ("motor.inductance", "motor.inertia", "6T2A.track.loss_coulomb", "6T2A.ground.friction.static")
     c = priors.coordinates(base, names)
     truth = jnp.asarray([1.0, -0.8, 1.2, 1.8])
@@ -537,9 +537,9 @@ def test_histories_calibrate_with_drive():
 
 @pytest.mark.slow
 def test_histories_pad_runs_of_different_length():
-    runs = history_runs(robots.nominal())
+    runs = history_runs(paper_robots.nominal())
     kept = (runs["run_id"] != "b") | (runs["time_s"] < 0.3)
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     seen, whole = (observers.Histories.of(r, robot)(robot).reading for r in (runs.where(kept), runs))
     np.testing.assert_allclose(seen, whole[kept], rtol=1e-8)
     # against `drive`, which made them: tests/test_histories.py says how close

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from sweeps import cli, config, config_campaign, flags, options
 
 KINDS = {

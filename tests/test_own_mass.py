@@ -11,16 +11,16 @@ from synthetic import SETTLED, STATED
 
 from calibration.data import own_mass, robot_file
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.discovery import discover, findings
 from calibration.discovery.candidates import Candidate, filled
-from calibration.inference.calibrate import calibrate
+from calibration.inference.calibration import calibrate
 from calibration.inference.linearization import shape_of, shape_scales, shaped
 from calibration.inference.observers import SettledRuns
 from calibration.inference.optimizers import read
-from mmrjax import channels, params, robots
 from mmrjax.effects import ALL, BY_NAME, UNNAMED
 from mmrjax.fidelities.steady import steady_batch
+from mmrjax.model import channels, paper_robots, params
 
 #: Mass without payload that the tables here state [kg]; the nominal robot has 13.1 and 11.5 kg.
 MASSES = {"6T2A": 14.2, "4W2T": 13.1}
@@ -79,7 +79,7 @@ def fits(tmp_path_factory):
     """The loop's fits to a table, by effect, and the robot of each through its file."""
     runs = table()
     stated = {n: (m, 0.2) for n, (m, _) in STATED.items()}
-    robot = robot_file.with_effects(robots.nominal(), UNSEEN)
+    robot = robot_file.with_effects(paper_robots.nominal(), UNSEEN)
     robot = params.replace(robot, {f"effects.{n}.amplitude": 0.3 * _sd(BY_NAME[n]) for n in UNSEEN})
     sd = 0.02 * np.abs(runs.measured())
     space = discover.pose(runs, robot, sd, SETTLED.settings, stated, BY_NAME)
@@ -134,7 +134,7 @@ def test_shape_that_a_fit_reaches_is_one_that_a_file_may_state(effect):
 @pytest.mark.slow
 def test_comparison_can_fail(tmp_path):
     """What was wrong: the mass of the table was fitted with, the robot's own was written."""
-    runs, robot = table(), robots.nominal()
+    runs, robot = table(), paper_robots.nominal()
     written = Written(runs, tmp_path, ())
     conditions = runs.conditions(robot)
     before, _ = jax.device_get(_swept(params.strong(robot), conditions))
@@ -154,7 +154,7 @@ def test_robot_with_a_curve_is_written_as_it_was_fitted(name, curves):
 def curves(tmp_path_factory):
     """Readings of the nominal robot with a discrepancy without a name, and of the same through its file."""
     runs = table()
-    robot = own_mass.with_table_mass(robots.nominal(), runs)
+    robot = own_mass.with_table_mass(paper_robots.nominal(), runs)
     every = tuple(UNNAMED.values())
     written = Written(runs, tmp_path_factory.mktemp("curves"), every)
 
@@ -239,7 +239,7 @@ def test_a_prior_of_a_mass_that_the_table_states_is_refused(robot):
 @pytest.mark.slow
 def test_calibrated_robot_is_its_fit(tmp_path):
     runs = records.read("measured")
-    found = calibrate(runs, robots.nominal(), noise="current=2%,motor_speed=1%,speed=1%", starts=4, profiles=False,
+    found = calibrate(runs, paper_robots.nominal(), noise="current=2%,motor_speed=1%,speed=1%", starts=4, profiles=False,
                       blocks=())  # fmt: skip
     assert any(n.startswith("4W2T: the table states 13.1 kg without payload") for n in found.notes)
     found.save(tmp_path)

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 import mmrjax as mm
-from mmrjax import effects, params, robots
-from mmrjax.tables import TRACKED, WHEELED
+from mmrjax import effects
+from mmrjax.model import paper_robots, params
+from mmrjax.model.paper_tables import TRACKED, WHEELED
 from sweeps.pages import page as frame
-from sweeps.pages import runs as page
+from sweeps.pages import runs_page as page
 from sweeps.pages import sweep_figures, words
 from sweeps.pages.history_figures import Start
-from sweeps.paper import runs as paper_runs
-from sweeps.results.resonance import ResonanceResult
+from sweeps.paper import run_figures as paper_runs
+from sweeps.results.resonance_results import ResonanceResult
 
 
 def run_of(robot, **conditions):
@@ -34,7 +35,7 @@ def judged(robot, run, peak=-95.3):
 def test_a_winding_is_judged_by_what_it_may_warm_up_by():
     """28 of 125 °C in a room of 25 °C were once 23 % used."""
     assert page.warmed(28.0, 125.0, 25.0) == pytest.approx(3.0) and page.warmed(125.0, 125.0, 25.0) == 100.0
-    robot, run = robots.nominal(), run_of(robots.nominal())
+    robot, run = paper_robots.nominal(), run_of(paper_robots.nominal())
     found = judged(robot, run)["winding, long running"]["percent"]
     assert found == pytest.approx(float(run["winding_settled_C"]) - 25.0)  # of 100 K
     warm = params.replace(robot, {"motor.temperature_ambient": np.asarray(75.0)})
@@ -45,7 +46,7 @@ def test_a_winding_is_judged_by_what_it_may_warm_up_by():
 
 
 def test_an_inrush_is_judged_or_it_is_said_that_nobody_stated_its_limit():
-    robot, run = robots.nominal(), run_of(robots.nominal())
+    robot, run = paper_robots.nominal(), run_of(paper_robots.nominal())
     line = judged(robot, run)["largest current of the start, all motors"]
     assert (line["value"], line["limit"], line["percent"]) == ("95.3 A", "not stated", None)
     assert line["unstated"] == "driver.current_limit"
@@ -97,7 +98,7 @@ def test_every_page_warns_of_curves_that_nobody_has_named(robot):
 
 @pytest.mark.slow
 def test_legend_of_the_energy_split_has_what_is_drawn():
-    fig, _ = paper_runs.energy(robots.nominal(), dict.fromkeys((TRACKED, WHEELED), 1.5))
+    fig, _ = paper_runs.energy(paper_robots.nominal(), dict.fromkeys((TRACKED, WHEELED), 1.5))
     shown = {text.get_text() for text in fig.legends[0].get_texts()}
     drawn = {
         bars.get_label() for bars in fig.axes[0].containers if max(bar.get_width() for bar in bars.patches) > 0.05

@@ -4,7 +4,7 @@ import numpy as np
 import paper_rows
 import pytest
 
-from mmrjax import channels
+from mmrjax.model import channels
 
 pytestmark = pytest.mark.slow  # two searches with `steady`, half a minute
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from worlds import paper
 
-from mmrjax import params, robots
-from mmrjax.params import parameter
-from mmrjax.tables import GROUSERS_LEVER, PITCH_GROUSER, PITCH_TOOTH, TEETH_LEVER
+from mmrjax.model import paper_robots, params
+from mmrjax.model.paper_tables import GROUSERS_LEVER, PITCH_GROUSER, PITCH_TOOTH, TEETH_LEVER
+from mmrjax.model.params import parameter
 
 
 def test_nominal_values_are_those_of_the_reference(robot):
@@ -34,9 +34,9 @@ def test_running_gear_is_that_of_tables_6_and_7(robot):
     assert 10.3 * float(robot.running_gear.body_gyration) ** 2 == pytest.approx(0.119, rel=1e-3)
 
 
-@pytest.mark.parametrize("name", sorted(robots.ROBOTS))
+@pytest.mark.parametrize("name", sorted(paper_robots.ROBOTS))
 def test_parameters_lie_within_their_bounds(name):
-    for p in params.walk(robots.ROBOTS[name]()):
+    for p in params.walk(paper_robots.ROBOTS[name]()):
         low, high = p.spec.bounds
         assert low < high and low <= float(p.value) <= high, p.name
 
@@ -110,7 +110,7 @@ def test_spec_is_frozen(robot):
         spec.unit = "kg"
 
 
-@pytest.mark.parametrize(("build", "torque"), [(robots.sm1, 0.108), (robots.sm2, 0.300)])
+@pytest.mark.parametrize(("build", "torque"), [(paper_robots.sm1, 0.108), (paper_robots.sm2, 0.300)])
 def test_simplified_robots_are_table_a4(build, torque):
     robot = build()
     assert float(robot.motor.torque_loss(0.0, 1.0)) == float(robot.motor.torque_loss(1200.0, 1.0)) == 4.2e-3

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 from calibration.data import parts
-from calibration.data.errors import BadData
-from mmrjax.effects.electrical import ThermalDrift
-from mmrjax.gearbox import Gearbox
-from mmrjax.motor import Motor
-from mmrjax.power import Battery
+from calibration.data.input_errors import BadData
+from mmrjax.effects.electrical_effects import ThermalDrift
+from mmrjax.model.gearbox import Gearbox
+from mmrjax.model.motor import Motor
+from mmrjax.model.power import Battery
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLES = {"motors.csv": parts.motors, "gearboxes.csv": parts.gearboxes, "cells.csv": parts.cells}

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import masses, params
-from mmrjax.conditions import Conditions
+from mmrjax.model import masses, params
+from mmrjax.model.conditions import Conditions
 
 OUTSTRETCHED = {"running_gear.lever_front": 0.0, "running_gear.lever_rear": np.pi}
 #: Of one side: everything that has a mass or an inertia of its own, or places it.

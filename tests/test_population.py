@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.inference import identifiability, multistart, noise, observers, population, priors
-from calibration.inference.calibrate import calibrate
-from calibration.inference.notes import (
+from calibration.inference.calibration import calibrate
+from calibration.inference.fit_notes import (
     Edge,
     EndedAtEdge,
     FarFromPrior,
@@ -25,8 +25,8 @@ from calibration.inference.notes import (
 from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.population import Members, Rows
 from calibration.inference.problem import Observation
-from mmrjax import channels, robots
-from mmrjax.signals import FAILED, FLAGS, SLIDES, TIPS
+from mmrjax.model import channels, paper_robots
+from mmrjax.model.signals import FAILED, FLAGS, SLIDES, TIPS
 
 NAMES = ("motor.resistance", "6T2A.track.loss_coulomb", "6T2A.track.loss_viscous", "6T2A.ground.rolling_resistance")
 SIZE = 48
@@ -38,7 +38,7 @@ class Stepped(SettledRuns):
 
     def __call__(self, robot):
         seen = super().__call__(robot)
-        jump = jnp.where(robot.motor.resistance > robots.nominal().motor.resistance, 0.3, 0.0)
+        jump = jnp.where(robot.motor.resistance > paper_robots.nominal().motor.resistance, 0.3, 0.0)
         return Observation(seen.reading.at[:, 0].add(jump), seen.adhesion_used, seen.status, seen.flags)
 
 
@@ -61,7 +61,7 @@ def known(runs):
 @pytest.fixture(scope="module")
 def posed(runs, truth, known):
     """Readings of a robot at `truth`, with priors that are right about it."""
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     problem = observers.pose(runs, robot, priors.coordinates(robot, NAMES), known.sd)
     reading = problem.observation(jnp.asarray(truth)).reading
     return dataclasses.replace(
@@ -199,7 +199,11 @@ def test_damaged_members_are_refused_before_the_first_search(tmp_path, monkeypat
     monkeypatch.setattr(multistart, "search", never)
     with pytest.raises(BadConfiguration, match="not a file of members that can be read"):
         calibrate(
-            records.read("measured"), robots.nominal(), model="track", population=8, members=tmp_path / "kept.npz"
+            records.read("measured"),
+            paper_robots.nominal(),
+            model="track",
+            population=8,
+            members=tmp_path / "kept.npz",
         )
     monkeypatch.setattr("sweeps.commands.loop.discover", never)
     code, _, err = mmrjax("loop", "measured", "--resolve", "--members", "kept.npz", "--out", "x")
@@ -288,7 +292,7 @@ def test_search_that_ends_at_the_edge_of_a_prior_says_so_in_the_result(runs):
     """A prior far from what the rows say, and narrow."""
     name = "6T2A.ground.rolling_resistance"
     found = calibrate(
-        runs, robots.nominal(), model="drive", free=(name,), stated={name: (0.02, 0.004)}, population=6, generations=3,
+        runs, paper_robots.nominal(), model="drive", free=(name,), stated={name: (0.02, 0.004)}, population=6, generations=3,
         noise="current=0.5%,motor_speed=2%,speed=2%", profiles=False, blocks=(),
     )  # fmt: skip
     best = found.searched.found.z[found.searched.at]
@@ -314,7 +318,7 @@ def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch):
     monkeypatch.setattr(population, "_observed", broken)
     name = "6T2A.ground.rolling_resistance"
     with pytest.raises(BadConfiguration, match=r"none of \d+ members can be run in every row .*: \d+ tips"):
-        calibrate(runs, robots.nominal(), model="drive", free=(name,), population=4, generations=1)
+        calibrate(runs, paper_robots.nominal(), model="drive", free=(name,), population=4, generations=1)
 
 
 @pytest.mark.quick(1)
@@ -329,7 +333,7 @@ def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch):
 )
 def test_options_of_a_population_that_cannot_be_are_refused(options, says):
     with pytest.raises(BadConfiguration, match=says):
-        calibrate(records.read("measured"), robots.nominal(), **options)
+        calibrate(records.read("measured"), paper_robots.nominal(), **options)
 
 
 @pytest.mark.nightly
@@ -340,22 +344,22 @@ def test_running_gear_is_found_through_the_track_model(tmp_path):
     table = table.where(
         (table["configuration"] == "6T2A") & (table["supply_voltage_V"] == 15) & (table["slope_deg"] % 10 == 0)
     )
-    from mmrjax import params
     from mmrjax.fidelities.track import track_batch
+    from mmrjax.model import params
 
     changed = {
         "6T2A.ground.friction.static": 0.59, "6T2A.ground.friction.dynamic": 0.52,
         "6T2A.ground.friction.speed_static": 0.02, "6T2A.track.guide_friction": 0.06,
         "running_gear.guide_recess": 3.5e-4, "running_gear.contact_damping": 840.0,
     }  # fmt: skip
-    robot = params.replace(robots.nominal(), changed)
+    robot = params.replace(paper_robots.nominal(), changed)
     shown = track_batch(robot, table.conditions(robot), duration=0.6, step=5e-5, rolling=True).result.reading
     columns = dict(table.columns)
     for channel in channels.usual():
         columns[channel.column] = np.asarray(shown[channel.name]) / channel.factor
     data = dataclasses.replace(table, columns=columns)
     found = calibrate(
-        data, robots.nominal(), model="track", noise="current=2%,motor_speed=0.5%,speed=0.5%", population=48,
+        data, paper_robots.nominal(), model="track", noise="current=2%,motor_speed=0.5%,speed=0.5%", population=48,
         free=("default", "running_gear.guide_recess", "running_gear.contact_damping"), generations=5,
         members=tmp_path / "m.npz",
     )  # fmt: skip

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from synthetic import calibrated
 
-from calibration.data import posterior as room
+from calibration.data import posterior_file as room
 from calibration.data import robot_file
-from calibration.data.errors import BadData
-from calibration.data.posterior import ANGLE, LOG, NORMAL, Posterior
+from calibration.data.input_errors import BadData
+from calibration.data.posterior_file import ANGLE, LOG, NORMAL, Posterior
 from calibration.data.runs import read
 from calibration.inference import priors
-from calibration.inference.posterior import of_coordinates
-from mmrjax import params
+from calibration.inference.fit_posterior import of_coordinates
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.variation import Variation
+from mmrjax.fidelities.variation import Variation
+from mmrjax.model import params
 from sweeps import config
 from sweeps.points import uncertainty
 

@@ -10,15 +10,16 @@ import pytest
 from worlds import posture as world
 
 import mmrjax as mm
-from mmrjax import balances, params, posture, static_limits
+from mmrjax.climbing import resting_posture, static_limits
 from mmrjax.fidelities import steady
+from mmrjax.model import balances, params
 
 #: At which a lever's lower run is in line with the belt [deg].
 FLUSH = -math.degrees(math.asin((world.TRACK - world.ROLLER) / world.LEVER))
 #: By hand: radius over the grousers, half of the wheelbase, centre of mass above the axles without and with 8 kg [m].
 RADIUS, HALF, UP, UP_LOADED = 0.0437, 0.15, 5e-3, (13.1 * 5e-3 + 8 * 73e-3) / 21.1
 
-highest_step, limits, rest = (jax.jit(f) for f in (static_limits.step, static_limits.limits, posture.rest))
+highest_step, limits, rest = (jax.jit(f) for f in (static_limits.step, static_limits.limits, resting_posture.rest))
 
 
 def run(front=None, rear=None, **of):
@@ -27,7 +28,7 @@ def run(front=None, rear=None, **of):
 
 def held(robot, front, rear, up=UP):
     """An outline whose centre of mass is as high as stated, over the middle of the wheelbase."""
-    side = posture.outline(robot, run(front, rear))
+    side = resting_posture.outline(robot, run(front, rear))
     return dataclasses.replace(side, centre_forward=jnp.zeros(()), centre_up=jnp.asarray(up))
 
 
@@ -106,7 +107,7 @@ CASES = [(180, 180, 0), (-30, 180, 0), (180, -50, 8), (-45, -20, 3), (-90, -90, 
 
 @pytest.mark.parametrize(("front", "rear", "payload"), CASES)
 def test_rest_is_that_of_a_world_of_polygons(robot, front, rear, payload):
-    rests = posture.posture(robot, run(front, rear, payload=payload))
+    rests = resting_posture.posture(robot, run(front, rear, payload=payload))
     pitch, centre, height = world.rest(math.radians(front), math.radians(rear), payload)
     assert float(rests.pitch) == pytest.approx(pitch, abs=1e-4)
     assert float(rests.centre_height) == pytest.approx(centre, abs=2e-5)
@@ -122,7 +123,7 @@ def test_highest_step_is_that_of_a_world_of_polygons(robot, front, rear, payload
 
 def test_loads_balance_the_moment_of_gravity(robot):
     """Of the two ends about the centre of mass, on a slope too."""
-    rests = posture.posture(robot, run(-40.0, 180.0, slope_deg=15.0))
+    rests = resting_posture.posture(robot, run(-40.0, 180.0, slope_deg=15.0))
     ends = rests.load_front * rests.front + (1 - rests.load_front) * rests.rear
     assert float(ends) == pytest.approx(float(rests.centre_ahead - rests.centre_height * math.tan(math.radians(15))))
     assert float(rests.line) == 0
@@ -130,7 +131,7 @@ def test_loads_balance_the_moment_of_gravity(robot):
 
 @pytest.mark.slow
 def test_on_wheels_a_robot_rests_on_them(robot):
-    rests = posture.posture(robot, mm.Conditions("4W2T").resolved(robot))
+    rests = resting_posture.posture(robot, mm.Conditions("4W2T").resolved(robot))
     assert (float(rests.pitch), float(rests.height), float(rests.line)) == (0.0, 0.05, 0.0)
     found = limits(robot, mm.Conditions("4W2T").resolved(robot))
     assert float(found.length) == pytest.approx(0.4) and float(found.height) == pytest.approx(0.1)
@@ -145,8 +146,8 @@ def test_derivatives_of_posture_and_step_are_those_of_differences(robot):
     def outputs(x):
         made = params.replace(robot, {name: known[name] * x[k + 2] for k, name in enumerate(names)})
         here = run(-50.0 * x[0], -30.0 * x[1], payload=4.0)
-        rests = posture.posture(made, here)
-        step = static_limits.step(posture.outline(made, here))
+        rests = resting_posture.posture(made, here)
+        step = static_limits.step(resting_posture.outline(made, here))
         return jnp.stack([rests.pitch, rests.height, rests.load_front, rests.inertia, step.height])
 
     start = jnp.ones(6)
@@ -165,7 +166,7 @@ def test_derivative_where_two_parts_decide_the_step(robot, angles):
 
     @jax.jit
     def height(angles):
-        return static_limits.step(posture.outline(robot, run(angles[0], angles[1]))).height
+        return static_limits.step(resting_posture.outline(robot, run(angles[0], angles[1]))).height
 
     exact, at = jax.jit(jax.grad(height))(jnp.array(angles)), np.array(angles)
     for k, step in enumerate(0.02 * np.eye(2)):
@@ -211,9 +212,9 @@ def test_map_over_levers_is_that_of_single_postures(robot):
     assert found.height.shape == (2, 3)
     for i, front in enumerate((-54.0, 180.0)):
         for k, rear in enumerate((-39.0, 0.0, 180.0)):
-            single = highest_step(posture.outline(robot, run(front, rear, payload=2.0)))
+            single = highest_step(resting_posture.outline(robot, run(front, rear, payload=2.0)))
             assert float(found.height[i, k]) == pytest.approx(float(single.height), abs=1e-12)
-            rest = posture.posture(robot, run(front, rear, payload=2.0))
+            rest = resting_posture.posture(robot, run(front, rear, payload=2.0))
             assert float(margin[i, k]) == pytest.approx(float(rest.margin), abs=1e-12)
 
 

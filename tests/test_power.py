@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from worlds import paper
 
-from mmrjax.power import Battery, curve_remark, voltage_source
+from mmrjax.model.power import Battery, curve_remark, voltage_source
 
 RNG = np.random.default_rng(8)
 

@@ -12,8 +12,9 @@ import pytest
 from test_public_api import python
 
 import mmrjax as mm
-from mmrjax import params, precision
-from mmrjax.params import walk
+from mmrjax.compile import precision
+from mmrjax.model import params
+from mmrjax.model.params import walk
 
 #: Numbers that single precision does not hold.
 RUNS = dict(configuration="6T2A", voltage=[24.1, 15.3], slope_deg=5.1)

@@ -13,8 +13,8 @@ from calibration.discovery import findings, prediction
 from calibration.discovery.discover import discover
 from calibration.discovery.prediction import Gain, HeldOutScore, scored, smallest
 from calibration.inference.blocks import distinct, predictable, unpredictable
-from mmrjax import channels, robots
 from mmrjax.fidelities.steady import steady_batch
+from mmrjax.model import channels, paper_robots
 from sweeps.inputs import read_runs
 
 RNG = np.random.default_rng(2)
@@ -147,7 +147,7 @@ def test_nothing_is_chosen_where_nothing_can_be_held_out(runs):
 def test_measured_runs_show_a_voltage_drop_and_a_slip_that_rests_on_a_row(tmp_path):
     """What is written predicts, on the rows that both reach, no worse than this, by kind of block [%]; and swept with
     the mass of its own file it is what was fitted."""
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     runs = read_runs("measured", robot, measured=True)
     found = discover(runs, robot)
     assert found.verdict == "class" and found.written and found.gain.mean > found.gain.se

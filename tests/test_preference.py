@@ -11,16 +11,16 @@ from pages import Tables
 from synthetic import SETTLED, known, table
 from worlds import tables
 
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.data.writing import finite
 from calibration.discovery import discover, preference
-from calibration.discovery.notes import DRAW, Led
+from calibration.discovery.loop_notes import DRAW, Led
 from calibration.discovery.result import HeldOutAlternative, Worse
 from calibration.discovery.settings import HELD_OUT, settings_for
 from calibration.inference.observers import SettledRuns
-from mmrjax import channels, robots
+from mmrjax.model import channels, paper_robots
 from sweeps.commands import loop as room
-from sweeps.pages import loop as loop_page
+from sweeps.pages import loop_page as loop_page
 
 NAMES = channels.USUAL
 
@@ -107,7 +107,7 @@ SETTINGS = dataclasses.replace(SETTLED.settings, prefer=HELD_OUT)
 
 def trace():
     """The stages of a table whose effects have look-alikes, held-out data choosing."""
-    return discover.trace(RUNS, robots.nominal(), known(RUNS), SETTINGS, SETTLED.stated, SETTLED.library)
+    return discover.trace(RUNS, paper_robots.nominal(), known(RUNS), SETTINGS, SETTLED.stated, SETTLED.library)
 
 
 def finished(traced):

@@ -6,12 +6,12 @@ from test_rig_histories import ARM, DRIVE
 
 from calibration.data import robot_file
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
 from calibration.discovery import discover
-from calibration.inference.calibrate import calibrate
+from calibration.inference.calibration import calibrate
 from calibration.inference.foresight import foresee
-from mmrjax import robots
+from mmrjax.model import paper_robots
 
 ALL = {
     "calibrate": lambda runs, robot: calibrate(runs, robot),
@@ -28,12 +28,12 @@ def test_a_table_whose_masses_have_another_unit_is_refused_by_all(who):
     runs = records.read("measured")
     runs = Runs("runs.csv", {**runs.columns, "total_mass_kg": 6 * runs["total_mass_kg"]})
     with pytest.raises(BadData, match=r"runs.csv, total_mass_kg: about 6\.2 times too large for this robot"):
-        ALL[who](runs, robots.nominal())
+        ALL[who](runs, paper_robots.nominal())
 
 
 def test_a_prior_of_a_mass_that_the_table_states_is_refused_by_the_loop_too():
     with pytest.raises(BadConfiguration, match=r"--prior 4W2T\.mass: .* states total_mass_kg"):
-        discover.prepared(records.read("measured"), robots.nominal(), stated={"4W2T.mass": (11.0, 0.5)})
+        discover.prepared(records.read("measured"), paper_robots.nominal(), stated={"4W2T.mass": (11.0, 0.5)})
 
 
 @pytest.mark.slow

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from calibration.data import robot_file
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.inference import priors
+from calibration.inference.fit_notes import InheritedPriors
 from calibration.inference.foreign import inherited_priors
-from calibration.inference.notes import InheritedPriors
-from mmrjax import params, robots
 from mmrjax.effects import ALL
+from mmrjax.model import paper_robots, params
 
-EVERY = [p.name for p in params.walk(dataclasses.replace(robots.nominal(), effects=tuple(e() for e in ALL)))]
+EVERY = [p.name for p in params.walk(dataclasses.replace(paper_robots.nominal(), effects=tuple(e() for e in ALL)))]
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +156,7 @@ def test_coordinates_refuse_stated_priors(robot, names, stated, says):
 def test_coordinates_refuse_a_prior_without_width():
 
     with pytest.raises(BadConfiguration, match=r"motor.friction_viscous: its prior has no width"):
-        priors.coordinates(robots.sm1(), ["motor.friction_viscous"])
+        priors.coordinates(paper_robots.sm1(), ["motor.friction_viscous"])
 
 
 def test_stated_prior_moves_the_centre(robot):
@@ -193,7 +193,7 @@ def test_friction_that_the_file_or_a_prior_states_is_not_another_robots(tmp_path
 
 
 def test_robots_of_the_paper_and_small_changes_are_their_own(tmp_path):
-    assert [inherited_priors(make()) for make in robots.ROBOTS.values()] == [[], [], []]
+    assert [inherited_priors(make()) for make in paper_robots.ROBOTS.values()] == [[], [], []]
     assert inherited_priors(read(tmp_path, "[motor]\nresistance = 0.7\n[4W2T]\nmass = 13.1\n")) == []
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import jax
 import pytest
 
-from mmrjax import programs
-from mmrjax.private import exposure
+from mmrjax.compile import programs
+from mmrjax.compile.private import exposure
 from sweeps import compilation_cache
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from calibration.data import profiles
-from calibration.data.errors import BadConfiguration, BadData
-from mmrjax import channels, robots
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities.mission import mission
-from mmrjax.profile import MODES
-from mmrjax.tables import adhesion_ratio
+from calibration.data.input_errors import BadConfiguration, BadData
+from mmrjax.missions.mission import mission
+from mmrjax.missions.profile import MODES
+from mmrjax.model import channels, paper_robots
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_tables import adhesion_ratio
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def read(tmp_path):
 @pytest.mark.parametrize("name", profiles.PACKAGED)
 def test_packaged_profile_is_read_by_its_name_and_makes_a_profile(name):
     table = profiles.read(name)
-    made = table.profile(robots.nominal(), Conditions(configuration=np.array([0, 1])))
+    made = table.profile(paper_robots.nominal(), Conditions(configuration=np.array([0, 1])))
     assert (made.segments, made.cycles, made.linear) == (table.segments, table.cycles, table.linear)
     assert float(made.duration) == pytest.approx(table.duration)
     assert tuple(MODES[k] for k in made.mode) == table.modes
@@ -55,9 +55,9 @@ def test_packaged_patrol_is_an_hour_with_120_starts():
 
 
 def test_range_of_other_consumers_is_the_batterys():
-    from mmrjax import params
+    from mmrjax.model import params
 
-    (found,) = (p for p in params.walk(robots.nominal()) if p.name == "battery.current_other")
+    (found,) = (p for p in params.walk(paper_robots.nominal()) if p.name == "battery.current_other")
     assert profiles.QUANTITIES["current_other"].range == found.spec.bounds
 
 
@@ -134,7 +134,7 @@ def test_ramp_ends_at_the_cell_of_the_row_that_brakes_or_else_is_held(read):
 
 def test_surface_scales_the_adhesion_of_each_runs_movers(read):
     table = read("time_s,speed_mm_s,surface\n0,400,asphalt\n5,400,linoleum\n9,,\n")
-    made = table.profile(robots.nominal(), Conditions(configuration=np.array([0, 1, 0])))
+    made = table.profile(paper_robots.nominal(), Conditions(configuration=np.array([0, 1, 0])))
     wanted = [[adhesion_ratio(s, t) for s in ("asphalt", "linoleum", "linoleum")] for t in (True, False, True)]
     np.testing.assert_allclose(made.adhesion, wanted)
 
@@ -231,7 +231,10 @@ def test_a_mission_may_begin_in_motion_and_warm(read):
 def test_a_mission_begins_as_its_profile_says(read):
     table = read("# start_speed_mm_s = 400\n# start_winding_C = 60\ntime_s,mode\n0,coast\n1,\n")
     found = mission(
-        robots.nominal(), Conditions(voltage=24.0), table.profile(robots.nominal(), Conditions([0])), table.start
+        paper_robots.nominal(),
+        Conditions(voltage=24.0),
+        table.profile(paper_robots.nominal(), Conditions([0])),
+        table.start,
     )
     assert float(found.total.of["distance"]) > 0.01 and 59.0 < float(found.peaks["temperature"]) <= 60.0
 

@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from mmrjax import effects, programs, robots
-from mmrjax.compiling import for_equations
+from mmrjax import effects
+from mmrjax.compile import programs
+from mmrjax.compile.compiling import for_equations
 from mmrjax.effects import UNNAMED
-from mmrjax.trigonometry import cosine, sine
+from mmrjax.model import paper_robots
+from mmrjax.numerics.trigonometry import cosine, sine
 
 MATRIX = np.array([[4.0, 1.0], [1.0, 3.0]])
 
@@ -66,7 +68,7 @@ def test_a_program_of_this_process_is_not_read_again(folder):
 
 
 def test_results_come_back_with_what_is_no_array(folder):
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     for function in (for_equations, untraceable(for_equations)):
         found = programs.Programs(function).of(((robot,), {}))(((robot,), {}))
         assert found.configurations.names == robot.configurations.names and found.rig == robot.rig
@@ -100,7 +102,7 @@ def test_whole_numbers_floats_and_truths_are_told_apart(folder):
 
 
 def test_another_function_class_or_curve_has_another_program():
-    robot, plain = robots.nominal(), np.eye(2)
+    robot, plain = paper_robots.nominal(), np.eye(2)
     assert named(sine, plain) != named(cosine, plain)
     some = [effects.BY_NAME["churning"](), effects.BY_NAME["windage"](), *(curve() for curve in UNNAMED.values())]
     names = {named(sine, dataclasses.replace(robot, effects=(e,))) for e in some}

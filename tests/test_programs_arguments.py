@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_programs import folder  # noqa: F401 (a fixture)
 
-from mmrjax import programs
+from mmrjax.compile import programs
 
 
 def one_of(numbers, which):

@@ -17,12 +17,14 @@ import pytest
 import test_fidelities
 
 import mmrjax as mm
-from calibration.data.errors import BadConfiguration
-from mmrjax import channels, fidelities, outputs, params, results, robots
+from calibration.data.input_errors import BadConfiguration
+from mmrjax import fidelities
 from mmrjax.effects import ALL
+from mmrjax.fidelities import outputs, results
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.signals import Result
+from mmrjax.model import channels, paper_robots, params
+from mmrjax.model.signals import Result
 
 ROOT = Path(__file__).resolve().parents[1]
 toy = test_fidelities.toy
@@ -72,7 +74,7 @@ def test_layers_above_are_imported_when_they_are_asked_for_and_not_before():
     )
     first, second, third = python(code).splitlines()
     assert first == "[]" and second == "['calibration']" and third.startswith("['calibration', 'pydantic', 'sweeps']")
-    assert third.endswith("calibration.inference.calibrate sweeps.points.door")
+    assert third.endswith("calibration.inference.calibration sweeps.points.door")
     assert set(mm._ABOVE) == set(mm.__all__) - set(mm._HOME) - {"__version__"}
 
 
@@ -376,9 +378,11 @@ def test_derivative_by_conditions_and_through_bad_values_passes_the_door(robot):
 
 
 def test_every_packaged_robot_is_within_its_bounds():
-    for build in robots.ROBOTS.values():
+    for build in paper_robots.ROBOTS.values():
         mm.simulate(build(), mm.Conditions())
-    mm.simulate(dataclasses.replace(robots.nominal(), effects=tuple(effect() for effect in ALL)), mm.Conditions())
+    mm.simulate(
+        dataclasses.replace(paper_robots.nominal(), effects=tuple(effect() for effect in ALL)), mm.Conditions()
+    )
 
 
 def with_value(name, value):

@@ -11,13 +11,13 @@ from worlds import tables
 
 from calibration.data import robot_file
 from calibration.data import runs as records
-from calibration.data.errors import BadData
+from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.inference import ranges
-from calibration.inference.notes import SlopesIn
+from calibration.inference.fit_notes import SlopesIn
 from calibration.inference.ranges import check_ranges
-from mmrjax import params, robots
-from mmrjax.quantities import RPM
+from mmrjax.model import paper_robots, params
+from mmrjax.model.quantities import RPM
 
 #: Column of a table, factor on its readings, and what is said.
 WRONG = {
@@ -84,7 +84,7 @@ def test_a_current_that_one_sign_explains_beside_a_weight_is_doubted(tmp_path, s
 
 @pytest.mark.slow
 def test_right_units_pass_in_silence(runs, histories):
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     assert check_ranges(runs, robot) == check_ranges(histories, robot) == []
     assert check_ranges(records.read("measured"), robot) == []
     assert check_ranges(records.read("simulated_by_paper"), robot) == []
@@ -94,7 +94,7 @@ def test_right_units_pass_in_silence(runs, histories):
 def test_wrong_units_are_refused_with_the_factor_and_the_likely_unit(runs, case):
     column, factor, says = WRONG[case]
     with pytest.raises(BadData, match=f"runs.csv, {says}"):
-        check_ranges(scaled(runs, column, factor), robots.nominal())
+        check_ranges(scaled(runs, column, factor), paper_robots.nominal())
 
 
 @pytest.mark.quick(1)
@@ -102,31 +102,31 @@ def test_wrong_units_are_refused_with_the_factor_and_the_likely_unit(runs, case)
 def test_wrong_units_of_histories_are_refused(histories, case):
     column, factor, says = WRONG[case]
     with pytest.raises(BadData, match=f"runs.csv, {says}"):
-        check_ranges(scaled(histories, column, factor), robots.nominal())
+        check_ranges(scaled(histories, column, factor), paper_robots.nominal())
 
 
 def test_histories_that_never_get_under_way_are_no_matter_of_units(histories):
-    assert check_ranges(scaled(histories, "speed_mm_s", 1 / 150), robots.nominal()) == []
+    assert check_ranges(scaled(histories, "speed_mm_s", 1 / 150), paper_robots.nominal()) == []
     early = histories.where(histories["time_s"] < 0.011)
-    assert check_ranges(early, robots.nominal()) == []
+    assert check_ranges(early, paper_robots.nominal()) == []
 
 
 @pytest.mark.parametrize(("factor", "is_said"), [(3.0, True), (1 / 3.0, True), (1.7, False)])
 def test_smaller_factors_are_said_and_not_refused(runs, factor, is_said):
-    said = check_ranges(scaled(runs, "speed_mm_s", factor), robots.nominal())
+    said = check_ranges(scaled(runs, "speed_mm_s", factor), paper_robots.nominal())
     assert bool(said) == is_said and all(s.column == "speed_mm_s" and (s.factor > 1) == (factor > 1) for s in said)
 
 
 def test_a_factor_that_all_speeds_share_points_to_the_voltage(runs):
     half = scaled(scaled(runs, "speed_mm_s", 1 / 6.5), "motor_speed_rpm", 1 / 6.5)
     with pytest.raises(BadData, match=r"; speed_mm_s alike: check supply_voltage_V and the robot's file"):
-        check_ranges(half, robots.nominal())
+        check_ranges(half, paper_robots.nominal())
 
 
 def test_friction_that_nobody_has_measured_is_no_matter_of_units(runs):
     # three times the friction, as of a robot file that another robot's friction was left in
     others = params.replace(
-        robots.nominal(),
+        paper_robots.nominal(),
         {
             f"{c}.track.loss_{k}": 3.0 * v
             for c in ("6T2A", "4W2T")
@@ -141,7 +141,7 @@ def test_friction_that_nobody_has_measured_is_no_matter_of_units(runs):
 )
 def test_slopes_in_other_units_are_said(runs, unit, of):
     other = Runs("runs.csv", {**runs.columns, "slope_deg": of(runs["slope_deg"])})
-    said = check_ranges(other, robots.nominal())
+    said = check_ranges(other, paper_robots.nominal())
     assert any(isinstance(s, SlopesIn) and s.unit == unit for s in said), said
 
 
@@ -149,7 +149,7 @@ def test_missing_channels_and_readings_pass(runs):
     bare = {k: v for k, v in runs.columns.items() if "current" not in k}
     speed = runs["speed_mm_s"].copy()
     speed[::2] = np.nan
-    assert check_ranges(Runs("runs.csv", {**bare, "speed_mm_s": speed}), robots.nominal()) == []
+    assert check_ranges(Runs("runs.csv", {**bare, "speed_mm_s": speed}), paper_robots.nominal()) == []
 
 
 @pytest.mark.parametrize("command", ["compare", "calibrate", "loop"])

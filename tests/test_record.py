@@ -18,10 +18,10 @@ from calibration.data import runs as tables
 from calibration.discovery.discover import discover
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference import priors
-from calibration.inference.calibrate import calibrate
+from calibration.inference.calibration import calibrate
 from mmrjax import fidelities
-from mmrjax.conditions import Conditions
-from mmrjax.robots import nominal
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_robots import nominal
 
 RECORD = Path(__file__).parent / "record"
 RESULTS = json.loads((RECORD / "results.json").read_text(encoding="utf-8"))

@@ -16,17 +16,19 @@ from pages import Tables, drawn, outside
 
 from calibration.data import runs as records
 from calibration.data.robot_file import RobotFile
-from mmrjax import channels, fidelities, outputs, params
-from mmrjax.conditions import Conditions
+from mmrjax import fidelities
 from mmrjax.effects import BY_NAME
+from mmrjax.fidelities import outputs
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.robots import ROBOTS
-from mmrjax.signals import GRAVITY
+from mmrjax.model import channels, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_robots import ROBOTS
+from mmrjax.model.signals import GRAVITY
 from sweeps.commands import compare
-from sweeps.pages import comparison as comparison_page
+from sweeps.pages import comparison_page as comparison_page
 from sweeps.pages import power_figures, sweep_figures, words
-from sweeps.pages import runs as runs_page
-from sweeps.pages import sweep as sweep_page
+from sweeps.pages import runs_page as runs_page
+from sweeps.pages import sweep_page as sweep_page
 from sweeps.points import run
 
 SWEEP_FIGURES = {f"sweep_{name}" for name in channels.USUAL}

@@ -8,8 +8,8 @@ import xarray as xr
 from pages import Tables, drawn, outside
 from test_sweep_store import CONFIG
 
-from sweeps.pages import campaign as campaign_page
 from sweeps.pages import campaign_figures
+from sweeps.pages import campaign_page as campaign_page
 
 REPORTED = CONFIG.replace("report = false\n", "")
 

@@ -9,13 +9,14 @@ import pytest
 
 from calibration.data import runs as records
 from calibration.data.robot_file import RobotFile
-from mmrjax import fidelities, params
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities.stability import largest_step
-from mmrjax.signals import CONVERGED, FAILED
+from mmrjax import fidelities
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import CONVERGED, FAILED
+from mmrjax.undercarriage.stability import largest_step
 from sweeps.pages import gear_figures
-from sweeps.pages import runs as runs_page
-from sweeps.paper import report, running_gear
+from sweeps.pages import runs_page as runs_page
+from sweeps.paper import report, running_gear_figures
 from sweeps.points import run as simulation
 
 FIGURES = {
@@ -39,10 +40,10 @@ def drawn(text):
 @pytest.fixture(scope="module")
 def written(robot, tmp_path_factory):
     """Folder and text of the paper remade with the track model, and the run that its figures show."""
-    seen, runs = [], running_gear.runs
+    seen, runs = [], running_gear_figures.runs
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(running_gear, "SECONDS", SECONDS)
-        patch.setattr(running_gear, "runs", lambda robot: seen.append(runs(robot)) or seen[0])
+        patch.setattr(running_gear_figures, "SECONDS", SECONDS)
+        patch.setattr(running_gear_figures, "runs", lambda robot: seen.append(runs(robot)) or seen[0])
         folder = tmp_path_factory.mktemp("report")
         text = page(folder, robot)
     return folder, text, seen[0]
@@ -136,7 +137,7 @@ def test_robot_that_does_not_get_under_way_is_said_and_not_drawn(robot, written,
         signals=dataclasses.replace(run.signals, total_current=np.full_like(run.signals.total_current, np.nan)),
         result=dataclasses.replace(run.result, status=np.array([FAILED, CONVERGED])),
     )
-    monkeypatch.setattr(running_gear, "runs", lambda robot: broken)
+    monkeypatch.setattr(running_gear_figures, "runs", lambda robot: broken)
     text = page(tmp_path, robot)
     assert drawn(text) == set()
     assert re.search(r'id="gear-left-out">.*6T2A: failed, 4W2T: settled', text)
@@ -147,8 +148,10 @@ def test_stiff_robot_is_run_with_a_step_that_it_bears(robot, monkeypatch):
     """A sweep of it has been asked for with such a step; the report's own runs must not be refused."""
     stiff = params.replace(robot, {"running_gear.contact_stiffness": np.asarray(1e12)})
     taken = {}
-    monkeypatch.setattr(running_gear, "track_batch", lambda robot, conditions, **keywords: taken.update(keywords))
-    running_gear.runs(stiff)
+    monkeypatch.setattr(
+        running_gear_figures, "track_batch", lambda robot, conditions, **keywords: taken.update(keywords)
+    )
+    running_gear_figures.runs(stiff)
     limit = largest_step(stiff, Conditions(["6T2A", "4W2T"], 33.0).resolved(stiff)).min()
     assert taken["step"] <= limit < 1e-4
     assert (taken["sample"] / taken["step"]) == pytest.approx(round(taken["sample"] / taken["step"]))

@@ -16,12 +16,13 @@ import pytest
 from pages import Tables, drawn, outside
 
 from calibration.data import runs as records
-from calibration.inference import errors as residual
-from mmrjax import channels, outputs, params
+from calibration.inference import simulation_errors as residual
 from mmrjax.effects import BY_NAME
+from mmrjax.fidelities import outputs
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.robots import ROBOTS
-from mmrjax.tables import TRACKED, WHEELED
+from mmrjax.model import channels, params
+from mmrjax.model.paper_robots import ROBOTS
+from mmrjax.model.paper_tables import TRACKED, WHEELED
 from sweeps import cli
 from sweeps.paper import data
 

@@ -14,13 +14,13 @@ from test_loop_command import commanded
 
 from calibration.data import runs as records
 from calibration.data.runs import Runs
-from calibration.inference.calibrate import calibrate
+from calibration.inference.calibration import calibrate
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.observers import Histories
 from calibration.inference.residual_clusters import LEVEL, residual_clusters
-from mmrjax import robots
 from mmrjax.fidelities.steady import steady_batch
-from sweeps.pages import calibration as calibration_page
+from mmrjax.model import paper_robots
+from sweeps.pages import calibration_page as calibration_page
 
 SCHEMAS = Path(__file__).parents[1] / "docs" / "schemas"
 ROWS = 90
@@ -234,7 +234,7 @@ def test_histories_are_compared_by_the_means_of_their_runs():
 def measured_table(seed, shift):
     """Sixty runs of the packaged robot up to 10°, with noise, and two columns without a role; the speed is shown
     `shift` mm/s too high where wheel 1 idles, and half of it too low elsewhere."""
-    rng, robot = np.random.default_rng(seed), robots.nominal()
+    rng, robot = np.random.default_rng(seed), paper_robots.nominal()
     volts, slope, load, name = np.meshgrid([15.0, 18.0, 24.0], [0.0, 5.0, 10.0], [0.0, 3.0, 8.0], ["6T2A", "4W2T"])
     wheel = rng.integers(1, 4, volts.size).astype(float)
     columns = {
@@ -253,7 +253,7 @@ def measured_table(seed, shift):
 
 @pytest.fixture(scope="module")
 def shifted():
-    return calibrate(measured_table(0, 8.0), robots.nominal(), starts=2, profiles=False, blocks=())
+    return calibrate(measured_table(0, 8.0), paper_robots.nominal(), starts=2, profiles=False, blocks=())
 
 
 @pytest.mark.slow
@@ -270,7 +270,7 @@ def test_calibration_says_what_its_residuals_cluster_by(shifted, tmp_path):
 
 @pytest.mark.slow
 def test_clean_table_says_nothing_of_columns_without_a_role(tmp_path):
-    clean = calibrate(measured_table(1, 0.0), robots.nominal(), starts=2, profiles=False, blocks=())
+    clean = calibrate(measured_table(1, 0.0), paper_robots.nominal(), starts=2, profiles=False, blocks=())
     assert clean.residual_clusters == () and "without a role" not in " ".join(clean.notes)
     page = calibration_page.write(tmp_path, clean, robot_name="nominal").read_text("utf-8")
     assert 'id="clusters"' not in page

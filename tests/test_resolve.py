@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import resolve as room
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.notes import Asked
-from mmrjax import robots
+from calibration.discovery.loop_notes import Asked
 from mmrjax.effects import ALL, BY_NAME
+from mmrjax.model import paper_robots
 
 
 def found(unnamed=None, remains=None, effects=(), alternatives=(), scores=("vibration_slip", "series_resistance")):
     table = records.read("measured")
     return SimpleNamespace(
-        unnamed=unnamed, remains=remains, alternatives=alternatives, robot=robots.nominal(), runs=table,
+        unnamed=unnamed, remains=remains, alternatives=alternatives, robot=paper_robots.nominal(), runs=table,
         effects=tuple(SimpleNamespace(name=n, balance=BY_NAME[n].balance) for n in effects),
         scores=tuple(SimpleNamespace(name=n, balance=BY_NAME[n].balance) for n in scores),
         included=np.ones(len(table), bool), noise={},

@@ -6,8 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mmrjax.fidelities.modes import Mode
-from mmrjax.fidelities.resonance import (
+from mmrjax.model.signals import CONVERGED, FAILED, SLIDES
+from mmrjax.undercarriage.modes import Mode
+from mmrjax.undercarriage.ripple import fluctuation
+from mmrjax.undercarriage.ripple_peaks import (
     SIGNALS,
     Peak,
     confirmed,
@@ -18,8 +20,6 @@ from mmrjax.fidelities.resonance import (
     strongest,
     vibrations,
 )
-from mmrjax.fidelities.ripple import fluctuation
-from mmrjax.signals import CONVERGED, FAILED, SLIDES
 
 BOUNCE = Mode("bounce", 90.0, 85.0, 95.0, 91.0, 0.1, 0.9, 1.0)
 TRAVEL = 0.035

@@ -12,9 +12,9 @@ import jsonschema
 import numpy as np
 import pytest
 
-from mmrjax.fidelities.modes import Mode
 from mmrjax.fidelities.track import track_batch
-from mmrjax.signals import CONVERGED
+from mmrjax.model.signals import CONVERGED
+from mmrjax.undercarriage.modes import Mode
 from sweeps import config
 from sweeps.commands import resonance as room
 from sweeps.pages.resonance_figures import resonance_map

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from worlds import paper
 
-from mmrjax import params, robots
-from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.drive import drive
-from mmrjax.fidelities.mission import mission
 from mmrjax.fidelities.steady import steady, steady_batch
-from mmrjax.profile import profile
-from mmrjax.signals import STALLED, STATUSES
+from mmrjax.missions.mission import mission
+from mmrjax.missions.profile import profile
+from mmrjax.model import paper_robots, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import STALLED, STATUSES
 
 WORDS = np.array(STATUSES)
 KINDS = ("6T2A", "4W2T")
@@ -57,7 +57,7 @@ def asked(values, runs):
 
 def simulated(effects=()):
     """`steady` of every run with a robot of its own."""
-    base = dataclasses.replace(robots.nominal(), effects=effects)
+    base = dataclasses.replace(paper_robots.nominal(), effects=effects)
     return jax.jit(jax.vmap(lambda v, c: steady(params.replace(base, v), c)))
 
 
@@ -98,7 +98,7 @@ def test_where_travel_asks_for_too_much_steady_says_what_an_independent_sum_says
 def test_a_robot_that_its_drive_and_the_ground_hold_stands():
     """6T2A on 17 degrees: gravity less rolling is 0.77 of the adhesion, travel would take 1.14 of it."""
     voltage = np.array([0.0, 0.5, 0.9, -0.02, 3.0, 24.0])
-    found = steady_batch(robots.nominal(), Conditions(np.zeros(6, int), voltage, np.full(6, 17.0)))
+    found = steady_batch(paper_robots.nominal(), Conditions(np.zeros(6, int), voltage, np.full(6, 17.0)))
     assert list(WORDS[np.asarray(found.status)]) == ["stalled"] * 4 + ["slides"] * 2
     assert (np.asarray(found.speed)[:4] == 0).all() and (np.asarray(found.motor_speed)[:2] == 0).all()
     used = np.asarray(found.adhesion_used)
@@ -120,7 +120,7 @@ def test_a_robot_that_stands_is_in_static_equilibrium():
     carries what friction between it and the cause does not."""
     voltage, slope, payload = np.array(STANDING).T
     runs = Conditions(np.zeros(len(voltage), int), voltage, slope, payload)
-    found = steady_batch(robots.nominal(), runs)
+    found = steady_batch(paper_robots.nominal(), runs)
     assert (np.asarray(found.status) == STALLED).all()
     normal, pull = ((13.1 + payload) / 2 * paper.G * f(np.radians(slope)) for f in (np.cos, np.sin))
     radius = 48 * 5e-3 / (2 * np.pi)
@@ -143,7 +143,7 @@ def test_a_robot_that_stands_is_in_static_equilibrium():
 
 def agree(values, runs, effects, seconds=12.0):
     """Statuses by `steady`, by `drive` and at the end of a mission, and the speeds of the last two [m/s]."""
-    base = dataclasses.replace(robots.nominal(), effects=effects)
+    base = dataclasses.replace(paper_robots.nominal(), effects=effects)
     cold = {f"motor.resistance_thermal_{part}": 1e-9 for part in ("winding", "housing")}  # windings do not heat
     base, over = params.replace(base, cold), profile([0.0, seconds], duty=1.0)
 

@@ -5,7 +5,7 @@ import pytest
 
 from calibration.data import robot_file, stated
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.inference import bases, observers
 from sweeps.commands import rig_check
 

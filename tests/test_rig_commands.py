@@ -14,9 +14,10 @@ import pytest
 from calibration.data import robot_file
 from calibration.data.columns import Layout
 from calibration.data.runs import Runs
-from calibration.inference.errors import relative_error, sized_error
-from mmrjax import channels, fidelities, params
-from mmrjax.robots import nominal
+from calibration.inference.simulation_errors import relative_error, sized_error
+from mmrjax import fidelities
+from mmrjax.model import channels, params
+from mmrjax.model.paper_robots import nominal
 from sweeps import capabilities
 from sweeps.commands import rig_new
 from sweeps.pages.page import number
@@ -354,7 +355,7 @@ def test_loop_takes_one_channel_both_ways(mmrjax, tmp_path, bench):
 
 
 MOTOR = """
-schema = "mmrjax.robot/2"
+schema = "mmrjax.model.robot/2"
 base = "none"
 sides = 1
 imposed = "voltage"

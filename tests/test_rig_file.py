@@ -12,14 +12,15 @@ import numpy as np
 import pytest
 
 from calibration.data import rig_facts, robot_file
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.inference import priors
-from calibration.sensitivity import inputs
-from mmrjax import effects, params, robots
-from mmrjax.conditions import Conditions
+from calibration.sensitivity import uncertain_inputs
+from mmrjax import effects
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.rig import Instrument
-from mmrjax.signals import FLAGS, GRAVITY
+from mmrjax.model import paper_robots, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.rig import Instrument
+from mmrjax.model.signals import FLAGS, GRAVITY
 from sweeps.commands import rig_check, rig_new
 
 KINDS = tuple(rig_new.KINDS)
@@ -266,7 +267,7 @@ def test_what_is_known_exactly_is_never_freed(tmp_path):
     assert set(freed) - set(held) == {"bench.radius"}
     dry = read(tmp_path, BENCH.replace("0.1 ± 0.05", "0.1 ± 0"))
     assert "bench.loss_coulomb" not in (*priors.default_names(["bench"], dry), *priors.free_names(dry, ["bench"]))
-    assert "bench.radius" not in inputs.default_names(robot, ["bench"], battery=False)
+    assert "bench.radius" not in uncertain_inputs.default_names(robot, ["bench"], battery=False)
     with pytest.raises(BadConfiguration, match=r"--free bench\.radius: the robot's file states it as exact \(± 0\)"):
         priors.coordinates(robot, ["bench.radius"])
     assert len(priors.coordinates(robot, ["bench.radius"], {"bench.radius": (0.02, 0.001)})) == 1
@@ -429,7 +430,7 @@ def test_bad_rigs_are_refused_in_one_sentence(tmp_path, case):
 
 
 def test_packaged_robot_is_as_it_was(tmp_path):
-    robot = robot_file.with_effects(robots.nominal(), tuple(effects.BY_NAME))
+    robot = robot_file.with_effects(paper_robots.nominal(), tuple(effects.BY_NAME))
     assert same(again(tmp_path, robot), robot) and "[rig]" not in (tmp_path / "again.toml").read_text()
 
 

@@ -12,21 +12,21 @@ import pytest
 
 from calibration.data import robot_file
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.inference import noise, observers, priors
-from calibration.inference.calibrate import calibrate
+from calibration.inference.calibration import calibrate
 from calibration.inference.linearization import probe
-from calibration.inference.observers import histories as histories_room
-from calibration.inference.observers.histories import Histories
-from mmrjax import balances, channels, params
-from mmrjax.conditions import Conditions
+from calibration.inference.observers import time_histories as histories_room
+from calibration.inference.observers.time_histories import Histories
 from mmrjax.effects import UNNAMED
 from mmrjax.fidelities import histories as integrator
-from mmrjax.rig import Begin, Begins, Rig
-from mmrjax.signals import State
+from mmrjax.model import balances, channels, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.rig import Begin, Begins, Rig
+from mmrjax.model.signals import State
 
 DRIVE = """
-schema = "mmrjax.robot/2"
+schema = "mmrjax.model.robot/2"
 base = "none"
 imposed = "{imposed}"
 channels = [{channels}]

@@ -8,22 +8,22 @@ import pytest
 
 from calibration.data import instruments, robot_file, surfaces
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.inference import bases, blocks, checks, noise, observers, priors
-from calibration.inference.calibrate import calibrate
-from calibration.inference.notes import Constant
+from calibration.inference.calibration import calibrate
+from calibration.inference.fit_notes import Constant
 from calibration.inference.ranges import check_ranges
-from mmrjax import channels, params, robots
-from mmrjax.chassis import Chassis
-from mmrjax.conditions import Conditions
-from mmrjax.contact import Friction
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.ground import Ground
-from mmrjax.rig import Instrument, Rig
-from mmrjax.robot import Configurations
-from mmrjax.shaft import Shaft
-from mmrjax.signals import STALLED
-from mmrjax.track import Track
+from mmrjax.model import channels, paper_robots, params
+from mmrjax.model.chassis import Chassis
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.contact import Friction
+from mmrjax.model.ground import Ground
+from mmrjax.model.rig import Instrument, Rig
+from mmrjax.model.robot import Configurations
+from mmrjax.model.shaft import Shaft
+from mmrjax.model.signals import STALLED
+from mmrjax.model.track_friction import Track
 from sweeps import config as configuration
 from sweeps.points import run
 
@@ -37,7 +37,7 @@ DRIVE = {
 
 def rig(load, *, sides=1.0, **stated):
     """A rig from nothing with one load, with its channels."""
-    robot = robots.blank(Configurations({"rig": load}), sides, Rig(**stated))
+    robot = paper_robots.blank(Configurations({"rig": load}), sides, Rig(**stated))
     return params.replace(robot, DRIVE)
 
 
@@ -594,7 +594,7 @@ def test_a_vehicle_on_two_surfaces_is_calibrated(tmp_path):
 
 
 RIG = """
-schema = "mmrjax.robot/2"
+schema = "mmrjax.model.robot/2"
 base = "none"
 sides = 1
 imposed = "motor_speed"

@@ -4,15 +4,16 @@ import equinox as eqx
 import pytest
 
 from calibration.data import robot_file
-from calibration.data.errors import BadConfiguration
-from mmrjax import effects, params, robots
+from calibration.data.input_errors import BadConfiguration
+from mmrjax import effects
+from mmrjax.model import paper_robots, params
 
 
 def values(robot):
     return {p.name: float(p.value) for p in params.walk(robot)}
 
 
-@pytest.mark.parametrize("name", robots.ROBOTS)
+@pytest.mark.parametrize("name", paper_robots.ROBOTS)
 def test_robot_written_and_read_is_the_same(tmp_path, name):
     robot = robot_file.with_effects(robot_file.load(name), tuple(effects.BY_NAME))
     robot = robot_file.change(robot, {"effects.churning.amplitude": 1e-4}, where="test")
@@ -23,7 +24,7 @@ def test_robot_written_and_read_is_the_same(tmp_path, name):
 def test_file_states_only_what_differs(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('base = "sm1"\n[motor]\nresistance = 0.9\n[effects.series_resistance]\namplitude = 0.3\n')
-    robot, base = values(robot_file.read(path)), values(robots.sm1())
+    robot, base = values(robot_file.read(path)), values(paper_robots.sm1())
     assert robot.pop("motor.resistance") == 0.9 and robot.pop("effects.series_resistance.amplitude") == 0.3
     assert base.pop("motor.resistance") == 0.611 and robot == base
 
@@ -81,7 +82,7 @@ def test_a_robot_of_another_build_is_written_and_read_the_same(tmp_path, text):
 
 def test_like_starts_from_that_configuration(tmp_path):
     (tmp_path / "mine.toml").write_text(ROVER)
-    robot, base = robot_file.read(tmp_path / "mine.toml"), robots.nominal()
+    robot, base = robot_file.read(tmp_path / "mine.toml"), paper_robots.nominal()
     assert robot.configurations.names == ("rover", "6T2A") and robot.sides == 4 and robot.battery.cells == 4
     rover, wheeled = robot.configurations["rover"], base.configurations["4W2T"]
     assert float(rover.mass) == 6.0 and float(rover.ground.friction.static) == 0.6
@@ -99,7 +100,7 @@ def test_movers_start_from_the_defaults_of_the_fields(tmp_path):
 def test_former_names_load_with_a_note(tmp_path):
     path, notes = tmp_path / "old.toml", []
     path.write_text(
-        'schema = "mmrjax.robot/1"\n[tracked]\nmass = 12.5\n[tracked.ground]\nrolling_resistance = 0.05\n'
+        'schema = "mmrjax.model.robot/1"\n[tracked]\nmass = 12.5\n[tracked.ground]\nrolling_resistance = 0.05\n'
         "[wheeled]\nmass = 11\n"
     )
     robot = robot_file.load(str(path), notes=notes)
@@ -236,10 +237,10 @@ def test_ratings_are_stated_written_and_checked(tmp_path):
     )
     robot = robot_file.read(tmp_path / "mine.toml")
     assert (robot.motor.voltage_limit, robot.motor.speed_limit, robot.gearbox.speed_limit) == (14.4, 900.0, 600.0)
-    assert robots.nominal().motor.voltage_limit is None  # the bench went to 33 V with a motor of 24 V
+    assert paper_robots.nominal().motor.voltage_limit is None  # the bench went to 33 V with a motor of 24 V
     robot_file.write(robot, tmp_path / "again.toml")
     assert robot_file.read(tmp_path / "again.toml").motor == robot.motor
-    robot_file.write(robots.nominal(), tmp_path / "nominal.toml")
+    robot_file.write(paper_robots.nominal(), tmp_path / "nominal.toml")
     assert "voltage_limit" not in (tmp_path / "nominal.toml").read_text()
     with pytest.raises(
         BadConfiguration, match=r"motor.voltage_limit: got -3; expected a number, 0.1 to 1000 V \(highest"
@@ -263,7 +264,7 @@ def test_robot_file_knows_what_it_states(tmp_path):
     assert not found.stated & {"motor.inertia", "screw.mass_kg", "base", "channels"}
     assert values(found.robot) == values(robot_file.load(str(path)))
     packaged = robot_file.find("sm1")
-    assert not packaged.stated and packaged.name == "sm1" and values(packaged.robot) == values(robots.sm1())
+    assert not packaged.stated and packaged.name == "sm1" and values(packaged.robot) == values(paper_robots.sm1())
 
 
 def test_a_stated_curve_is_that_of_the_capacity_beside_it(tmp_path):
@@ -295,8 +296,10 @@ def test_a_curve_that_turns_up_is_said_where_a_file_states_it(tmp_path):
         "up.toml, battery.curvature: with this curvature and slope a cell's voltage rises again once 87.7 % of its "
         "capacity is taken (capacity_curve: 7920 C)"
     ]
-    robot = robot_file.change(robots.nominal(), {"battery.capacity": 30_670.0}, where="--set", notes=(quiet := []))
-    assert quiet == [] and float(robot.battery.voltage_empty) == float(robots.nominal().battery.voltage_empty)
+    robot = robot_file.change(
+        paper_robots.nominal(), {"battery.capacity": 30_670.0}, where="--set", notes=(quiet := [])
+    )
+    assert quiet == [] and float(robot.battery.voltage_empty) == float(paper_robots.nominal().battery.voltage_empty)
 
 
 def test_all_that_is_wrong_with_a_file_is_said_at_once(tmp_path):

@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from sweeps.store import RunFolder
 
 LOOP, SWEEP = {"command": "loop", "seed": 1}, {"command": "sweep", "seed": 1}

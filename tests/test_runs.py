@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from calibration.data import runs as records
-from calibration.data.errors import BadData
+from calibration.data.input_errors import BadData
 from calibration.data.table import Runs
-from mmrjax import channels, robots
-from mmrjax.conditions import Conditions
+from mmrjax.model import channels, paper_robots
+from mmrjax.model.conditions import Conditions
 from sweeps.pages import calibration_figures, loop_figures
 
 HEADER = (
@@ -321,7 +321,7 @@ def test_all_bad_cells_are_said_at_once_the_first_row_first(tmp_path):
 
 def test_capitals_of_columns_and_configurations_are_taken_and_said(tmp_path):
     text = f"{HEADER}\n{ROW}\n".replace("slope_deg", "Slope_Deg").replace("6T2A", "6t2a")
-    found = records.read(written(tmp_path, text), robot=robots.nominal())
+    found = records.read(written(tmp_path, text), robot=paper_robots.nominal())
     assert found["slope_deg"].tolist() == [5.0] and found["configuration"].tolist() == ["6T2A"]
     assert found.notes == (
         "runs.csv: column Slope_Deg is read as slope_deg", "runs.csv: configuration 6t2a is read as 6T2A",
@@ -332,7 +332,7 @@ def test_what_a_table_lacks_is_said_before_it_is_used(tmp_path):
     header = f"{HEADER.replace(',motor_speed_rpm', '')},run_id"
     rows = [ROW.replace(",4800", "").replace("2.75", f"2.7{k}") + f",{run}" for k, run in enumerate("abac")]
     rows[1] = rows[1].replace("2.71", "")
-    found = records.read(written(tmp_path, "\n".join([header, *rows])), robot=robots.nominal())
+    found = records.read(written(tmp_path, "\n".join([header, *rows])), robot=paper_robots.nominal())
     assert found.notes == (
         "runs.csv: 1 of 4 cells of total_current_A are empty, the first in row 2; they weigh nothing",
         "runs.csv: no column motor_speed_rpm; nothing is known of its channel",

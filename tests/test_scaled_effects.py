@@ -14,11 +14,12 @@ from worlds import rigs
 import mmrjax as mm
 from calibration.data import robot_file
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import discover, scales
-from mmrjax import effects, params
+from mmrjax import effects
 from mmrjax.effects.scaled import amplitude_of, scaled, shape_of
-from mmrjax.quantities import RPM
+from mmrjax.model import params
+from mmrjax.model.quantities import RPM
 from sweeps.commands import rig_new
 
 #: Of rigs: kind and what is imposed; the largest and the smallest that a few draws give.

@@ -8,10 +8,10 @@ from test_rig_histories import BENCH, DRIVE, history
 
 from calibration.data import robot_file
 from calibration.inference import multistart, noise, observers, priors, scans
-from calibration.inference.calibrate import calibrate
+from calibration.inference.calibration import calibrate
 from calibration.inference.optimizers import evaluated
 from calibration.inference.scans import Scan
-from mmrjax import params
+from mmrjax.model import params
 
 OPTIONS = {"model": "drive", "starts": 1, "blocks": False, "profiles": False}
 TRUTH = 0.0312

@@ -20,7 +20,7 @@ from calibration.discovery.settings import settings_for
 from calibration.inference.held_out import unseen
 from calibration.inference.observers import Histories
 from calibration.inference.optimizers import Optimum
-from calibration.words import loop as words
+from calibration.words import loop_words as words
 from mmrjax.effects import BY_NAME
 from sweeps.commands import loop as command
 

@@ -15,22 +15,22 @@ import numpy as np
 import pytest
 from test_sensitivity_methods import shapley_of_linear
 
-from calibration.data import posterior as posteriors
+from calibration.data import posterior_file as posteriors
 from calibration.data import robot_file
 from calibration.inference import priors
-from calibration.inference.posterior import of_coordinates
+from calibration.inference.fit_posterior import of_coordinates
 from calibration.sensitivity import information
-from calibration.sensitivity import inputs as room
+from calibration.sensitivity import uncertain_inputs as room
 from calibration.sensitivity.analyse import analyse
 from calibration.sensitivity.local import inert, local
 from calibration.sensitivity.methods import correlated, shapley_effects
 from calibration.sensitivity.model import chosen_outputs
-from calibration.sensitivity.notes import Inert
 from calibration.sensitivity.result import Points
+from calibration.sensitivity.sensitivity_notes import Inert
 from calibration.sensitivity.study import Study
-from mmrjax import params
 from mmrjax.fidelities.steady import steady_batch
-from sweeps.pages import sensitivity as page
+from mmrjax.model import params
+from sweeps.pages import sensitivity_page as page
 from tests.commands import rows as table
 from tests.pages import Tables
 

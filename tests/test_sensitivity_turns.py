@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 import mmrjax as mm
-from calibration.data.errors import BadConfiguration
-from calibration.sensitivity import inputs
+from calibration.data.input_errors import BadConfiguration
+from calibration.sensitivity import uncertain_inputs
 from calibration.sensitivity.model import chosen_outputs
-from mmrjax import params, robots
-from mmrjax.derived import turn
+from mmrjax.derived import turning_figures
+from mmrjax.model import paper_robots, params
 from sweeps import config
 from sweeps.commands import sensitivity as room
 
-ROBOT = robots.nominal()
+ROBOT = paper_robots.nominal()
 TURNS = ROBOT.showing_turns()
 
 
@@ -45,7 +45,9 @@ def test_outputs_of_straight_travel_are_refused_of_turns(name):
 
 
 def test_turns_have_inputs_of_turns():
-    straight, turns = (inputs.default_names(ROBOT, ("6T2A",), False, turns=turns) for turns in (False, True))
+    straight, turns = (
+        uncertain_inputs.default_names(ROBOT, ("6T2A",), False, turns=turns) for turns in (False, True)
+    )
     assert {*turns} - {*straight} == {f"6T2A.turning.{n}" for n in ("width", "lateral", "rule", "inertia")}
 
 
@@ -67,10 +69,10 @@ def test_radius_is_that_of_the_centre_of_mass():
     ahead, aside, rate = np.array(
         [[0.3, 0.4, 1.0], [0.3, 0.0, -0.5], [-0.3, 0.0, 0.5], [0.0, 0.1, 2.0], [0.3, 0, 0]]
     ).T
-    np.testing.assert_allclose(turn.turning_radius(ahead, aside, rate), [0.5, -0.6, -0.6, 0.05, np.inf])
-    slope = jax.grad(lambda v: turn.turning_radius(v, 0.0, 2.0))(0.3)
+    np.testing.assert_allclose(turning_figures.turning_radius(ahead, aside, rate), [0.5, -0.6, -0.6, 0.05, np.inf])
+    slope = jax.grad(lambda v: turning_figures.turning_radius(v, 0.0, 2.0))(0.3)
     assert float(slope) == pytest.approx(0.5) and np.isfinite(
-        jax.grad(lambda w: turn.turning_radius(0.3, 0.0, w))(0.0)
+        jax.grad(lambda w: turning_figures.turning_radius(0.3, 0.0, w))(0.0)
     )
 
 
@@ -79,7 +81,9 @@ def test_radius_of_a_run_and_its_derivative():
     asked = mm.Conditions(0, 24.0, duty_left=0.4, duty_right=1.0)
 
     def of(lateral):
-        return turn.compute(params.replace(ROBOT, {"6T2A.turning.lateral": lateral}), asked)["turning_radius"]
+        return turning_figures.compute(params.replace(ROBOT, {"6T2A.turning.lateral": lateral}), asked)[
+            "turning_radius"
+        ]
 
     found = mm.simulate(ROBOT, asked).reading
     moves = np.hypot(found["speed"], found["lateral_speed"])

@@ -11,7 +11,7 @@ from calibration.data.table import Layout
 from calibration.discovery.score_tests import UNSURE, _factors
 from calibration.inference import noise, series_noise
 from calibration.inference.observers import SettledRuns
-from mmrjax import channels
+from mmrjax.model import channels
 
 SLOPES = np.arange(0.0, 21.0, 5.0)
 

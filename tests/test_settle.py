@@ -16,11 +16,11 @@ from worlds.settled import write_table
 
 from calibration.data import contradictions, rig_facts, robot_file, settling
 from calibration.data import runs as records
-from calibration.data.errors import BadData
+from calibration.data.input_errors import BadData
 from calibration.inference import checks, observers
 from calibration.inference import noise as noises
 from calibration.inference.foresight import Foresight
-from calibration.words import settle as words
+from calibration.words import settle_words as words
 from sweeps.commands import rig_check
 from sweeps.commands.settle import rolling
 

@@ -8,16 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import balances, params, robots
-from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.histories import grid, histories
 from mmrjax.fidelities.steady import steady_batch, steady_outputs
-from mmrjax.rig import Begin, Begins, Instrument, Rig
-from mmrjax.robot import Configurations
-from mmrjax.shaft import Shaft
-from mmrjax.signals import STATUSES, Signals, State
+from mmrjax.model import balances, paper_robots, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.rig import Begin, Begins, Instrument, Rig
+from mmrjax.model.robot import Configurations
+from mmrjax.model.shaft import Shaft
+from mmrjax.model.signals import STATUSES, Signals, State
 
 DRIVE = {
     "gearbox.ratio": 16.0, "gearbox.efficiency_load": 0.8, "motor.torque_constant": 0.05, "motor.resistance": 3.0,
@@ -28,7 +28,7 @@ SPEEDS = np.array([-300.0, -40.0, 25.0, 180.0])
 
 def bench(rig=None, **load):
     shaft = Shaft(**{"inertia": 0.01, "loss_coulomb": 0.2, "loss_viscous": 0.01, **load})
-    return params.replace(robots.blank(Configurations({"bench": shaft}), sides=2.0, rig=rig), DRIVE)
+    return params.replace(paper_robots.blank(Configurations({"bench": shaft}), sides=2.0, rig=rig), DRIVE)
 
 
 def current_of(w, load=0.0, coulomb=0.2, viscous=0.01):
@@ -60,7 +60,7 @@ def test_a_load_that_drives_the_motor_loses_in_the_gearbox_the_other_way():
 
 @pytest.mark.slow
 def test_voltage_and_speed_impose_the_same_point():
-    for robot, more in ((bench(), {}), (robots.nominal(), {"slope_deg": 5.0, "payload": 3.0})):
+    for robot, more in ((bench(), {}), (paper_robots.nominal(), {"slope_deg": 5.0, "payload": 3.0})):
         speeds = np.array([150.0, 300.0, 400.0, 500.0])  # four, here and elsewhere: one program
         by_speed = steady_batch(robot, Conditions(motor_speed=speeds, **more))
         by_voltage = steady_batch(robot, Conditions(voltage=np.asarray(by_speed.motor_voltage), **more))
@@ -188,7 +188,7 @@ def test_power_of_a_shaft_adds_up():
 
 def test_loads_state_what_they_can_do():
     """Each says of the other's what it has none of, so that nobody has to ask which it is."""
-    shaft, vehicle = bench(torque_constant=0.3, torque_gravity=0.2, angle_zero=-np.pi / 2), robots.nominal()
+    shaft, vehicle = bench(torque_constant=0.3, torque_gravity=0.2, angle_zero=-np.pi / 2), paper_robots.nominal()
     load, chassis = shaft.configurations["bench"], vehicle.configurations["6T2A"]
     assert not shaft.has_ground and vehicle.has_ground and balances.absent(shaft) >= {"ground", "slip", "mass"}
     assert load.mass == 0 and load.on_tracks == 0 and load.speed_grip == np.inf  # nothing slides

@@ -14,10 +14,11 @@ from pages import Tables, drawn, outside
 
 import mmrjax as mm
 from calibration.data import profiles
-from mmrjax import energy, missions, params
-from mmrjax.missions import OUTPUTS
-from mmrjax.profile import profile
-from mmrjax.signals import STATUSES
+from mmrjax.missions import mission_batch as missions
+from mmrjax.missions.mission_batch import OUTPUTS
+from mmrjax.missions.profile import profile
+from mmrjax.model import energy, params
+from mmrjax.model.signals import STATUSES
 from sweeps import cli
 from sweeps.commands.missions import thinned
 
@@ -324,7 +325,7 @@ def test_energy_has_forward_derivatives_by_the_robot_and_by_the_profile(robot):
     [
         ({"profile": SHORT, "model": "steady"}, r"model: got steady beside a profile; expected drive"),
         ({"profile": SHORT, "duration": 3.0}, r"duration: got 3.0 beside a profile"),
-        ({"profile": "patrol"}, r"profile: got str; expected mmrjax.profile.profile"),
+        ({"profile": "patrol"}, r"profile: got str; expected mmrjax.profile"),
         ({"start": missions.Start()}, r"start: got one without a profile"),
     ],
 )

@@ -18,16 +18,17 @@ from calibration.data import effect_file
 from calibration.data import runs as records
 from calibration.discovery import setups
 from calibration.inference.noise import Noise
-from mmrjax import channels, effects, robots
+from mmrjax import effects
 from mmrjax.effects import curve
 from mmrjax.effects.scaled import scaled
-from sweeps import stages
+from mmrjax.model import channels, paper_robots
+from sweeps import stage_files
 from sweeps.store import RunFolder
 
 OWN = '''
 import jax.numpy as jnp
 from mmrjax.effects import Effect, amplitude
-from mmrjax.params import Scalar
+from mmrjax.model.params import Scalar
 
 class Mine(Effect):
     """x = a. «Source: a test»"""
@@ -39,8 +40,8 @@ class Mine(Effect):
 
 
 def again(tmp_path, value):
-    stages.write(tmp_path / "x.stage", value)
-    return stages.read(tmp_path / "x.stage")
+    stage_files.write(tmp_path / "x.stage", value)
+    return stage_files.read(tmp_path / "x.stage")
 
 
 def test_values_are_read_as_they_were_written(tmp_path):
@@ -74,7 +75,7 @@ def test_arrays_on_devices_keep_what_programs_are_compiled_for(tmp_path):
 
 
 def test_our_own_classes_come_back_by_name(tmp_path):
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     strong = scaled(effects.BY_NAME["iron_loss"], (2.0, 1.0, 3.0))
     robot = dataclasses.replace(robot, effects=(strong(), next(iter(curve.CURVES.values()))()))
     now = again(tmp_path, (robot, Noise, channels.find("speed"), setups.blocked, records.read("measured")))
@@ -90,14 +91,14 @@ def test_an_effect_of_the_users_own_comes_back_only_once_it_is_loaded(tmp_path, 
     (mine,) = effect_file.read(tmp_path / "own.py")
     assert type(again(tmp_path, mine())) is mine
     monkeypatch.delitem(sys.modules, mine.__module__)
-    with pytest.raises(stages.Unreadable, match="a class of mmrjax_user_effects_"):
-        stages.read(tmp_path / "x.stage")
+    with pytest.raises(stage_files.Unreadable, match="a class of mmrjax_user_effects_"):
+        stage_files.read(tmp_path / "x.stage")
 
 
 @pytest.mark.parametrize("value", [lambda: 1, object(), os.system, np.datetime64("2026-01-01"), subprocess.Popen])
 def test_what_has_no_place_in_a_file_is_refused(tmp_path, value):
-    with pytest.raises((stages.Unwritable, stages.Unreadable)):
-        stages.write(tmp_path / "x", value)
+    with pytest.raises((stage_files.Unwritable, stage_files.Unreadable)):
+        stage_files.write(tmp_path / "x", value)
 
 
 class Harm:
@@ -112,10 +113,10 @@ FORGED = {
     "a function of ours that is no setup": ["function", "calibration.data.writing", "write_text"],
     "a class of another package": ["instance", "subprocess", "Popen", None, {"args": "touch harmed"}],
     "another class as a type": ["type", "builtins", "eval", None],
-    "a module's import": ["type", "mmrjax.programs", "os", None],
+    "a module's import": ["type", "mmrjax.compile.programs", "os", None],
     "a module of another package": ["type", "this", "c", None],
-    "a class that ours import": ["type", "mmrjax.programs", "Path", None],
-    "a class that is no dataclass": ["instance", "mmrjax.programs", "Programs", None, {"function": "x"}],
+    "a class that ours import": ["type", "mmrjax.compile.programs", "Path", None],
+    "a class that is no dataclass": ["instance", "mmrjax.compile.programs", "Programs", None, {"function": "x"}],
     "a field that there is not": ["instance", "calibration.inference.noise", "Noise", None, {"scaled": 1}],
     "an array beyond the bytes": ["array", "<f8", [1000], "C", 0],
     "an array of objects by name": ["array", "|O8", [1], "C", 0],

@@ -15,7 +15,7 @@ from worlds import histories, laws, settled, tables
 from calibration.discovery import discover
 from calibration.discovery.candidates import Candidate, filled, fit_candidates, start
 from calibration.discovery.discrepancy import locate
-from calibration.discovery.notes import CurveOver, NameSupport, NameTest
+from calibration.discovery.loop_notes import CurveOver, NameSupport, NameTest
 from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import augment_with_columns
 from calibration.discovery.search import Search, diagnose
@@ -38,8 +38,8 @@ from calibration.inference import bases
 from calibration.inference.linearization import PROBED
 from calibration.inference.observers import Histories, SettledRuns
 from calibration.inference.observers.settled import SettledLinearization
-from mmrjax import channels
 from mmrjax.effects import BY_NAME
+from mmrjax.model import channels
 
 # --- evidence, on a linear problem ----------------------------------------------------------------------
 

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from worlds import paper
 
-from mmrjax import robots, stages
+from mmrjax.fidelities import start_stages
 from mmrjax.fidelities.base import History, as_tables
-from mmrjax.params import replace
-from mmrjax.quantities import MM
-from mmrjax.rig import Rig
-from mmrjax.signals import Signals
+from mmrjax.model import paper_robots
+from mmrjax.model.params import replace
+from mmrjax.model.quantities import MM
+from mmrjax.model.rig import Rig
+from mmrjax.model.signals import Signals
 from sweeps.commands import simulate
 
 VOLTAGE, V_S = 33.0, 0.02
@@ -34,7 +35,7 @@ def written(mmrjax, tmp_path):
     """Run folder of a start on the flat, with the rig's lines of the robot's file."""
 
     def left(rig=""):
-        (tmp_path / "own.toml").write_text(f'schema = "mmrjax.robot/2"\nbase = "nominal"\n{rig}')
+        (tmp_path / "own.toml").write_text(f'schema = "mmrjax.model.robot/2"\nbase = "nominal"\n{rig}')
         asked = ("--model", "drive", "--robot", "own.toml", "--voltage", VOLTAGE, "--no-report", "--force")
         assert mmrjax("simulate", *asked, "--out", "d")[0] == 0
         return table(tmp_path / "d" / "history.csv"), json.loads((tmp_path / "d" / "result.json").read_text())
@@ -88,12 +89,14 @@ def test_slip_over_the_stages_is_that_of_an_independent_integration(written):
 
 def test_mean_slip_is_the_share_of_the_way_that_is_lost():
     t = np.linspace(0, 2, 201)
-    assert stages.mean_slip(t, 0.8 * t, 1.0 * t, 0.0, 2.0) == pytest.approx(0.2)
-    assert stages.mean_slip(t, t**2 / 4, np.ones_like(t), 0.005, 2.0) == pytest.approx(
+    assert start_stages.mean_slip(t, 0.8 * t, 1.0 * t, 0.0, 2.0) == pytest.approx(0.2)
+    assert start_stages.mean_slip(t, t**2 / 4, np.ones_like(t), 0.005, 2.0) == pytest.approx(
         2 / 3, abs=2e-3
     )  # mean of 1 - t²/4
-    assert stages.mean_slip(t, -0.8 * t, -1.0 * t, 0.35, 1.234) == pytest.approx(0.2)
-    assert np.isnan(stages.mean_slip(t, t, t, 1.0, 1.0)) and np.isnan(stages.mean_slip(t, 0 * t, 0 * t, 0.0, 1.0))
+    assert start_stages.mean_slip(t, -0.8 * t, -1.0 * t, 0.35, 1.234) == pytest.approx(0.2)
+    assert np.isnan(start_stages.mean_slip(t, t, t, 1.0, 1.0)) and np.isnan(
+        start_stages.mean_slip(t, 0 * t, 0 * t, 0.0, 1.0)
+    )
 
 
 def test_stages_are_seen_through_the_ripple_of_a_running_gear():
@@ -102,12 +105,12 @@ def test_stages_are_seen_through_the_ripple_of_a_running_gear():
     rolled = 1 - np.exp(-t / 0.003)
     gone = np.minimum(2 * t, 0.99)
     swing = 0.03 * np.cos(2 * np.pi * t / 0.035)
-    even = stages.stages(t, gone, rolled, rolled - gone, V_S, 0.035)
-    uneven = stages.stages(t, gone + swing, rolled, rolled - gone - swing, V_S, 0.035)
+    even = start_stages.stages(t, gone, rolled, rolled - gone, V_S, 0.035)
+    uneven = start_stages.stages(t, gone + swing, rolled, rolled - gone - swing, V_S, 0.035)
     assert uneven.slipping == pytest.approx(even.slipping, abs=0.012) and 0.47 < uneven.slipping < 0.51
     assert uneven.settled == pytest.approx(even.settled, abs=0.02)
     assert uneven.slip == pytest.approx(even.slip, abs=0.01)
-    blind = stages.stages(t, gone + swing, rolled, rolled - gone - swing, V_S)
+    blind = start_stages.stages(t, gone + swing, rolled, rolled - gone - swing, V_S)
     assert blind.slipping > 1.4 and blind.settled > 1.4
 
 
@@ -151,9 +154,9 @@ def test_the_delay_of_histories_is_the_one_of_fits():
 def test_a_delay_that_is_none_changes_no_number():
     t = jnp.linspace(0, 1, 5)[None]
     signals = Signals(speed=t, speed_theoretical=2 * t, current=t, speed_motor=t, total_current=t)
-    prompt = History.of(robots.nominal(), t, t, signals)
+    prompt = History.of(paper_robots.nominal(), t, t, signals)
     assert prompt.signals is signals and (np.asarray(prompt.time) == np.asarray(t)).all()
-    late = History.of(replace(robots.nominal(), {"rig.delay": 0.25}), t, t, signals)
+    late = History.of(replace(paper_robots.nominal(), {"rig.delay": 0.25}), t, t, signals)
     np.testing.assert_allclose(late.time[0], [0, 0.5, 0.75, 1.0, 1.25])
     np.testing.assert_allclose(late.reading["speed"][0], t[0])
     np.testing.assert_allclose(late.signals.speed_theoretical[0], 2 * t[0])
@@ -173,7 +176,7 @@ def test_a_vehicle_whose_rig_shows_no_speed_has_that_of_the_robot_in_its_history
         speed=0.5 * t, speed_theoretical=t, current=t, speed_motor=t, total_current=t, voltage=t, traction=t,
         speed_sliding=0.5 * t, speed_output=t, angle=t,
     )  # fmt: skip
-    history = History.of(robots.nominal(), t, t, signals)
+    history = History.of(paper_robots.nominal(), t, t, signals)
 
     class Runs:
         def has(self, name):
@@ -182,6 +185,6 @@ def test_a_vehicle_whose_rig_shows_no_speed_has_that_of_the_robot_in_its_history
         def __len__(self):
             return 1
 
-    shown = simulate.history_table(robots.nominal(), history, Runs())
+    shown = simulate.history_table(paper_robots.nominal(), history, Runs())
     np.testing.assert_allclose(shown["speed_mm_s"], np.asarray(0.5 * t[0]) / MM)
     np.testing.assert_allclose(shown["slip"], [0, 0.5, 0.5, 0.5])

@@ -10,10 +10,10 @@ from worlds import rigs
 
 from calibration.data import robot_file
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.inference import foresight, priors, remarks
-from calibration.inference.calibrate import calibrate
-from calibration.inference.notes import FarFromPrior, HeldByPrior
+from calibration.inference.calibration import calibrate
+from calibration.inference.fit_notes import FarFromPrior, HeldByPrior
 
 RIG = """
 base = "none"

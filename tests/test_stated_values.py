@@ -9,9 +9,9 @@ from synthetic import FEW, SETTLED, small, table
 from worlds import laws, settled, tables
 
 from calibration.discovery import discover, findings
-from calibration.discovery.notes import FreedValue
+from calibration.discovery.loop_notes import FreedValue
 from calibration.discovery.stated_values import scores, shifts
-from calibration.words import loop as words
+from calibration.words import loop_words as words
 
 NOMINAL = settled.CLIMBING["motor.resistance"]
 #: χ² that a shift has to explain to be tried.

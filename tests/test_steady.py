@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from worlds import paper
 
-from mmrjax import params
-from mmrjax.conditions import Conditions
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.steady import steady, steady_batch
-from mmrjax.signals import FLAGS, STATUSES
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import FLAGS, STATUSES
 
 CHANNELS = ("total_current", "motor_speed", "speed")
 

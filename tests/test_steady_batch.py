@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from worlds import vectorised
 
-from mmrjax import channels, outputs, params
-from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
+from mmrjax.fidelities import outputs
 from mmrjax.fidelities import steady as room
 from mmrjax.fidelities.steady import steady_batch, steady_outputs
-from mmrjax.signals import STATUSES
+from mmrjax.model import channels, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import STATUSES
 
 EFFECTS = {"series_resistance": 0.3, "churning": 5e-4, "winding_heating": 1.0, "nonlinear_slip": 0.05}
 ALL = tuple(output.name for output in outputs.table(channels.usual()))

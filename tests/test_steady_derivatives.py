@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax.conditions import Conditions
+from mmrjax.model.conditions import Conditions
 
 #: Conditions at which the numbers are smooth: driving, on battery, overhauling, stalled.
 POINTS = {

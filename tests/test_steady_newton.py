@@ -8,9 +8,9 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities.newton import FewUnknowns, root
 from mmrjax.fidelities.steady import steady
+from mmrjax.model.conditions import Conditions
+from mmrjax.numerics.newton import FewUnknowns, root
 
 TOLERANCE = 1e-13
 

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 import mmrjax as mm
-from mmrjax import fidelities, robots
+from mmrjax import fidelities
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities import drive
 from mmrjax.fidelities.drive import rates as rates_of_unknowns
-from mmrjax.robot import Configurations
-from mmrjax.shaft import Shaft
+from mmrjax.model import paper_robots
+from mmrjax.model.robot import Configurations
+from mmrjax.model.shaft import Shaft
 
 DT = 0.01
 RUNS = {
@@ -28,7 +29,7 @@ RUNS = {
 def bench():
     """A motor that lifts a mass on a drum, and is not known further."""
     drum = Shaft(inertia=2e-3, loss_coulomb=0.02, torque_gravity=0.1)
-    robot = robots.blank(Configurations({"winch": drum}), sides=1.0)
+    robot = paper_robots.blank(Configurations({"winch": drum}), sides=1.0)
     motor = {"motor.resistance": 2.0, "motor.torque_constant": 0.05, "motor.inertia": 1e-5, "gearbox.ratio": 10.0}
     return mm.replace(robot, {**motor, "motor.inductance": 1e-3})
 
@@ -169,7 +170,7 @@ def reverse(model, **options):
 
     def speed(volts):
         return mm.simulate(
-            robots.nominal(), mm.Conditions(voltage=volts), model=model, history=False, **options
+            paper_robots.nominal(), mm.Conditions(voltage=volts), model=model, history=False, **options
         ).speed
 
     return jax.eval_shape(jax.grad(speed), 24.0)

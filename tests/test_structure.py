@@ -13,8 +13,8 @@ from pathlib import Path, PurePosixPath
 
 import pytest
 
-from mmrjax import channels
 from mmrjax.errors import counted
+from mmrjax.model import channels
 
 ROOT = Path(__file__).resolve().parents[1]
 LAYERS = ("mmrjax", "calibration", "sweeps")  # each may import those before it
@@ -109,7 +109,7 @@ def rooms_have_names_of_their_own(path: PurePosixPath, tree: ast.Module) -> Iter
 #: The one exception: names of the layers above that `import mmrjax` gives too, imported when they are asked for.
 DOOR = ("mmrjax/__init__.py", "_ABOVE")
 #: Where else their names stand: whose modules a compiled program is named after.
-NAMED = {DOOR, ("mmrjax/programs.py", "OWN")}
+NAMED = {DOOR, ("mmrjax/compile/programs.py", "OWN")}
 
 
 def layers_import_those_before_them(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
@@ -133,7 +133,7 @@ def layers_import_those_before_them(path: PurePosixPath, tree: ast.Module) -> It
 def balances_alone_sum_terms(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
     for node in walked(tree):
         sums = isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "term"
-        if sums and path.as_posix() != "mmrjax/balances.py":
+        if sums and path.as_posix() != "mmrjax/model/balances.py":
             yield node.lineno, "sums an effect's term outside balances"
 
 
@@ -212,7 +212,7 @@ REPRODUCTION = ("sweeps", "paper")
 #: what shows slip.
 SPELLED = {
     ("calibration/discovery/menu.py", "TURNING, STANDING"),
-    ("calibration/words/effects.py", "CHECKED_BY"),  # which act checks which instrument
+    ("calibration/words/effect_words.py", "CHECKED_BY"),  # which act checks which instrument
     ("calibration/inference/bases.py", "VARIABLES"),
     ("calibration/inference/blocks.py", "BLOCKS"),  # what is imposed may be a channel's column
     ("calibration/inference/observers/settled_ends.py", "_sliding"),  # the two that show slip
@@ -239,8 +239,8 @@ def channels_are_counted_in_one_place(path: PurePosixPath, tree: ast.Module) -> 
 #: Who knows the configurations of the paper's robot, beside its reproduction: tables, that robot, and of the reader
 #: of robot files its import and the names that files formerly had.
 CONFIGURED = {
-    "mmrjax/tables.py",
-    "mmrjax/robots.py",
+    "mmrjax/model/paper_tables.py",
+    "mmrjax/model/paper_robots.py",
     "calibration/data/robot_file.py:",
     "calibration/data/robot_file.py:OLD_NAMES",
 }
@@ -293,9 +293,9 @@ def front_door_fits_nothing(path: PurePosixPath, tree: ast.Module) -> Iterator[B
 #: What is kept between calls, with why no answer depends on it.
 KEPT = {
     ("mmrjax/__init__.py", "globals"): "a public name, once it is imported",
-    ("mmrjax/mjcf.py", "_template"): "pure: the topology of the track model",
+    ("mmrjax/undercarriage/mjcf.py", "_template"): "pure: the topology of the track model",
     ("mmrjax/effects/scaled.py", "scaled"): "pure: a class of a class and its factors",
-    ("mmrjax/params.py", "own_spec"): "pure, of hashable arguments",
+    ("mmrjax/model/params.py", "own_spec"): "pure, of hashable arguments",
     ("calibration/data/effect_file.py", "_instants"): "pure: signals of the nominal robot",
     ("calibration/data/effect_file.py", "sys.modules"): "a user's module, by a name that follows from its path",
     ("calibration/data/parts.py", "motors"): "a packaged table",
@@ -309,12 +309,12 @@ KEPT = {
         "_compiled",
     ): "a worker's compiled job, by its name; computes the same when compiled again",
     ("sweeps/points/cluster.py", "_start"): "where jax keeps programs, once a process",
-    ("mmrjax/programs.py", "sources"): "a hash of the files of this program",
-    ("mmrjax/programs.py", "_linear_algebra"): "lets jax find LAPACK, once a process",
-    ("mmrjax/programs.py", "_private"): "that a folder is private, as it is first used",
+    ("mmrjax/compile/programs.py", "sources"): "a hash of the files of this program",
+    ("mmrjax/compile/programs.py", "_linear_algebra"): "lets jax find LAPACK, once a process",
+    ("mmrjax/compile/programs.py", "_private"): "that a folder is private, as it is first used",
     ("sweeps/compilation_cache.py", "os.environ"): "set for jax, before it is imported",
     ("sweeps/compilation_cache.py", "jax.config"): "where jax keeps programs",
-    ("sweeps/points/design.py", "_directions"): "pure, of hashable arguments",
+    ("sweeps/points/sampled_design.py", "_directions"): "pure, of hashable arguments",
     ("sweeps/points/identity.py", "_code"): "hashes of the files of this program",
 }
 #: Methods that change what they are called on, and decorators that remember what a function returned.
@@ -545,7 +545,7 @@ BAD = {
     "spells several channels 4": ("calibration/discovery/menu.py", "RUNNING = ['speed', 'motor_speed']"),
     "knows the configuration 6T2A": ("mmrjax/bad.py", "f = lambda robot: robot.configurations['6T2A']"),
     "knows the configuration 4W2T": ("calibration/bad.py", "X = {'4W2T.mass': 11.5}"),
-    "knows the configuration TRACKED": ("sweeps/bad.py", "from mmrjax.tables import TRACKED"),
+    "knows the configuration TRACKED": ("sweeps/bad.py", "from mmrjax.model.paper_tables import TRACKED"),
     "knows the configuration WHEELED": ("sweeps/bad.py", "def f(tables):\n    return tables.WHEELED"),
     "f takes a CandidateSpace": ("calibration/inference/bad.py", "def f(space: CandidateSpace) -> int: ..."),
     "g takes a Screening": ("sweeps/bad.py", "def g(*, s: 'outliers.Screening | None' = None) -> int: ..."),
@@ -570,15 +570,15 @@ BAD = {
     "keeps state in f.seen": ("calibration/bad.py", "def f(k):\n    f.seen = k"),
     "keeps state in channels.CHANNELS": (
         "sweeps/bad.py",
-        "from mmrjax import channels\ndef f(rows):\n    channels.CHANNELS = rows",
+        "from mmrjax.model import channels\ndef f(rows):\n    channels.CHANNELS = rows",
     ),
     "keeps state in channels.CHANNELS 2": (
         "sweeps/bad.py",
-        "def f(row):\n    from mmrjax import channels\n    channels.CHANNELS.append(row)",
+        "def f(row):\n    from mmrjax.model import channels\n    channels.CHANNELS.append(row)",
     ),
     "keeps state in channels.setattr": (
         "sweeps/bad.py",
-        "from mmrjax import channels\ndef f(rows):\n    setattr(channels, 'CHANNELS', rows)",
+        "from mmrjax.model import channels\ndef f(rows):\n    setattr(channels, 'CHANNELS', rows)",
     ),
     "keeps state in contextvars.ContextVar": (
         "mmrjax/bad.py",
@@ -601,16 +601,16 @@ BAD = {
 }
 #: What no rule may mind.
 GOOD = {
-    "mmrjax/balances.py": "def f(e, r, s):\n    return e.term(r, s)\n",
+    "mmrjax/model/balances.py": "def f(e, r, s):\n    return e.term(r, s)\n",
     "mmrjax/__init__.py": "_ABOVE = {'f': 'calibration'}\nif TYPE_CHECKING:\n    from calibration import f as f\n",
-    "mmrjax/tables.py": "TRACKED, WHEELED = '6T2A', '4W2T'\n",
+    "mmrjax/model/paper_tables.py": "TRACKED, WHEELED = '6T2A', '4W2T'\n",
     "calibration/__init__.py": "",
     "calibration/data/table.py": "'''On 6T2A and 4W2T.'''\ndef f(t):\n    return {'time_s': t['time_s'], 'row': 1}\n",
     "calibration/data/robot_file.py": "from tables import TRACKED\nOLD_NAMES = {'tracked': TRACKED}\n",
     "calibration/sizing/said.py": "def why(x):\n    return f'{x} is one two three four five six'\ndef f(x, y):\n"
     "    '''One two three four five six.'''\n    cure = 'one two three four five six' if y else 'seven'\n"
     "    if x:\n        raise BadData(why(x))\n    return BadConfiguration(f'one two three {x} four five six {cure}')\n",
-    "calibration/words/loop.py": "X = 'one two three four five six seven'\n",
+    "calibration/words/loop_words.py": "X = 'one two three four five six seven'\n",
     "calibration/discovery/menu.py": "TURNING, STANDING = ('total_current', 'motor_speed'), ('total_current',)\n",
     "calibration/discovery/search.py": "def f(space: CandidateSpace) -> int: ...\n",
     "calibration/inference/observers/one.py": "def f(runs, o):\n    return runs.has('time_s') or isinstance(o, Histories)\n",
@@ -678,6 +678,19 @@ CALLED: dict[tuple[str, str], str] = {
 }
 
 
+#: Base names that several modules may have.
+SHARED_NAMES = {"__init__", "result", "base"}
+
+
+def test_modules_have_base_names_of_their_own():
+    """Two modules of one name are told apart by their folders alone, which imports and messages leave out."""
+    files = [p for layer in LAYERS for p in (ROOT / layer).rglob("*.py") if p.stem not in SHARED_NAMES]
+    seen: dict[str, Path] = {}
+    for path in files:
+        assert path.stem not in seen, f"{path.relative_to(ROOT)} and {seen[path.stem].relative_to(ROOT)}"
+        seen[path.stem] = path
+
+
 def inner_calls(source: str) -> Iterator[tuple[int, str]]:
     """Calls of `INNER` functions in a module, but of methods of what `prepared` gives."""
     for node in ast.walk(ast.parse(source)):
@@ -724,7 +737,7 @@ def test_one_preparation_serves_all():
         if name in inner
     }
     assert found == allowed
-    for room in ("inference/calibrate", "inference/foresight", "discovery/discover"):
+    for room in ("inference/calibration", "inference/foresight", "discovery/discover"):
         tree = ast.parse((ROOT / f"calibration/{room}.py").read_text(encoding="utf-8"))
         calls = {ast.unparse(n.func).rpartition(".")[2] for n in walked(tree) if isinstance(n, ast.Call)}
         assert "prepare" in calls, room
@@ -788,7 +801,7 @@ def test_nobody_asks_what_a_load_is():
         if {"Shaft", "Chassis"} & {n.id for n in ast.walk(node.args[1]) if isinstance(n, ast.Name)}
     }
     data = {f"calibration/data/{name}.py" for name in ("configuration_tables", "rig_facts", "robot_file")}
-    assert found == {"mmrjax/balances.py", "sweeps/commands/rig_check.py", *data}
+    assert found == {"mmrjax/model/balances.py", "sweeps/commands/rig_check.py", *data}
 
 
 def test_toml_is_read_in_one_place():

@@ -9,12 +9,13 @@ import pytest
 import zarr
 from pydantic import ValidationError
 
-from calibration.data.errors import BadConfiguration
-from mmrjax import params, terrain
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities.climb import NAMES, OVER, SLIDES, TIPS, climb_batch, still
-from mmrjax.robots import nominal
-from mmrjax.variation import STATUS, Variation
+from calibration.data.input_errors import BadConfiguration
+from mmrjax.climbing import terrain
+from mmrjax.climbing.climb_simulation import NAMES, OVER, SLIDES, TIPS, climb_batch, still
+from mmrjax.fidelities.variation import STATUS, Variation
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_robots import nominal
 from sweeps.config_campaign import Campaign, Obstacle
 from sweeps.pages.campaign_figures import Varied, endings
 from sweeps.points import axes, climbs

@@ -17,8 +17,8 @@ from test_cli import MMRJAX
 from test_effect_file import GOOD
 from test_sweep_store import CONFIG, arrays
 
-from calibration.data.errors import BadConfiguration
-from mmrjax import robots
+from calibration.data.input_errors import BadConfiguration
+from mmrjax.model import paper_robots
 from sweeps.config_campaign import Campaign
 from sweeps.points import axes, cluster, identity, scale
 from sweeps.points.job import prepare
@@ -150,7 +150,7 @@ def test_scheduler_without_workers_is_refused(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_worker_with_another_program_is_refused(two_workers, monkeypatch):
     honest = identity._code()
-    changed = tuple((f, "0" * 16 if f == "mmrjax/motor.py" else h) for f, h in honest)
+    changed = tuple((f, "0" * 16 if f == "mmrjax/model/motor.py" else h) for f, h in honest)
     monkeypatch.setattr(identity, "_code", lambda: changed)
     with pytest.raises(BadConfiguration, match=r"has another program; it differs in code \(mmrjax/motor\.py\)"):
         connect_when_up(two_workers.address)
@@ -190,7 +190,7 @@ def test_users_own_effects_travel_to_the_workers(tmp_path, two_workers):
 def job():
     """Ten chunks of one point each."""
     config = Campaign(axes={"voltage": [*range(15, 25)]}, chunk=1, outputs=("speed",))
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     return prepare(config, robot, axes.plan(config, robot, "x"), "x")
 
 

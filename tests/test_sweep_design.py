@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.inference import priors
-from mmrjax import params, robots
+from mmrjax.model import paper_robots, params
 from sweeps.config_campaign import Campaign
-from sweeps.points import axes, design
-from sweeps.points.design import Blocks, Design
+from sweeps.points import axes
+from sweeps.points import sampled_design as design
+from sweeps.points.sampled_design import Blocks, Design
 
 SCIPY = {
     "uniform": ({"low": 2.0, "high": 6.0}, stats.uniform(2, 4)),
@@ -24,7 +25,7 @@ SCIPY = {
 
 @pytest.fixture(scope="module")
 def nominal():
-    return robots.nominal()
+    return paper_robots.nominal()
 
 
 def planned(robot, **tables):

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from calibration.data.errors import InputError
-from mmrjax import params, robots
+from calibration.data.input_errors import InputError
+from mmrjax.model import paper_robots, params
 from sweeps.config_campaign import Campaign
 from sweeps.points import axes
 
-posteriors = pytest.importorskip("calibration.data.posterior")
+posteriors = pytest.importorskip("calibration.data.posterior_file")
 
 NAMES = ("motor.resistance", "motor.friction_coulomb")
 UNIFORM = {"distribution": "uniform", "low": 0, "high": 8}
@@ -17,7 +17,7 @@ UNIFORM = {"distribution": "uniform", "low": 0, "high": 8}
 @pytest.fixture
 def folder(tmp_path):
     """A run folder with the posterior of two correlated parameters of the nominal robot."""
-    value = {p.name: float(p.value) for p in params.walk(robots.nominal())}
+    value = {p.name: float(p.value) for p in params.walk(paper_robots.nominal())}
     centre, none = np.array([value[n] for n in NAMES]), np.zeros(2)
     found = posteriors.Posterior(
         coordinates=NAMES, units=("Ω", "N·m"), mean=none, covariance=np.array([[1.0, 0.8], [0.8, 1.0]]), location=centre,
@@ -29,7 +29,7 @@ def folder(tmp_path):
 
 def plan(folder, robot=None, **samples):
     stated = {"design": "sobol", "number": 8192, "seed": 2, "posterior": str(folder), **samples}
-    return axes.plan(Campaign(samples=stated), robots.nominal() if robot is None else robot, "plan.toml")
+    return axes.plan(Campaign(samples=stated), paper_robots.nominal() if robot is None else robot, "plan.toml")
 
 
 def test_posterior_is_sampled_with_its_correlation_whatever_the_chunk(folder):
@@ -48,7 +48,7 @@ def test_posterior_is_sampled_with_its_correlation_whatever_the_chunk(folder):
 
 def test_posterior_of_another_robot_and_a_folder_without_one_are_refused(folder, tmp_path):
     with pytest.raises(InputError, match=r"plan\.toml, samples\.posterior: motor\.resistance is"):
-        plan(folder, params.replace(robots.nominal(), {"motor.resistance": 0.9}))
+        plan(folder, params.replace(paper_robots.nominal(), {"motor.resistance": 0.9}))
     with pytest.raises(InputError, match=r"no such file; expected the posterior\.nc"):
         plan(tmp_path / "elsewhere")
     with pytest.raises(InputError, match=r"samples\.posterior: got 3; expected a run folder"):

@@ -19,11 +19,11 @@ import pytest
 import xarray as xr
 from test_cli import MMRJAX
 
-from calibration.data.errors import BadConfiguration, BadData
-from mmrjax import params, robots
-from mmrjax.conditions import Conditions
+from calibration.data.input_errors import BadConfiguration, BadData
 from mmrjax.fidelities.steady import steady
-from mmrjax.signals import STATUSES
+from mmrjax.model import paper_robots, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import STATUSES
 from sweeps import cli
 from sweeps.commands import sweep as command
 from sweeps.config_campaign import Campaign
@@ -111,7 +111,7 @@ def test_store_is_opened_by_xarray_with_units_and_long_names(whole):
     assert units == {
         "total_current": "A", "motor_speed": "rpm", "speed": "mm/s", "status": None, "configuration": None,
         "slope_deg": "deg", "motor.resistance": "Ohm", "voltage": "V",
-    } | {"motor.resistance": next(p.spec.unit for p in params.walk(robots.nominal()) if p.name == "motor.resistance")}  # fmt: skip
+    } | {"motor.resistance": next(p.spec.unit for p in params.walk(paper_robots.nominal()) if p.name == "motor.resistance")}  # fmt: skip
     assert all(found[name].attrs["long_name"] for name in units)
     meanings = dict(zip(found.status.attrs["flag_values"], found.status.attrs["flag_meanings"].split(), strict=True))
     assert [meanings[k] for k in range(len(STATUSES))] == list(STATUSES) and found.status.dtype == np.uint8
@@ -122,7 +122,7 @@ def test_store_holds_each_point_as_it_is_by_itself(whole):
     found = xr.open_zarr(whole / zarr_store.STORE).load()
     for which, slope, sample in [(0, 0, 0), (1, 1, 49), (0, 2, 17)]:
         at = found.isel(configuration=which, slope_deg=slope, sample=sample)
-        robot = params.replace(robots.nominal(), {"motor.resistance": float(at["motor.resistance"])})
+        robot = params.replace(paper_robots.nominal(), {"motor.resistance": float(at["motor.resistance"])})
         alone = steady(robot, Conditions(which, float(at.voltage), float(at.slope_deg), 3.0))
         assert int(at.status) == int(alone.status)
         np.testing.assert_allclose(at.total_current, alone.total_current, rtol=1e-12)
@@ -185,7 +185,7 @@ def test_outputs_of_a_grid_are_chosen_by_an_option(mmrjax, tmp_path):
     assert mmrjax(*grid, "--outputs", "slip, flags", "--out", "s")[0] == 0
     found = xr.open_zarr(tmp_path / "s" / zarr_store.STORE).load()
     assert set(found.data_vars) == {"slip", "flags", "status"}
-    alone = steady(robots.nominal(), Conditions(0, 24.0, 5.0, 0.0))
+    alone = steady(paper_robots.nominal(), Conditions(0, 24.0, 5.0, 0.0))
     np.testing.assert_allclose(
         found.slip.sel(configuration="6T2A", slope_deg=5).values.ravel(), alone.slip, rtol=1e-12
     )
@@ -457,10 +457,10 @@ def test_sweep_of_other_data_code_or_versions_is_refused_saying_which(begun, mon
     assert code == 2 and "differs in data (robot.toml);" in err
     robot.write_text(text)
     honest = identity._code()
-    changed = tuple((f, "0" * 16 if f == "mmrjax/motor.py" else h) for f, h in honest)
+    changed = tuple((f, "0" * 16 if f == "mmrjax/model/motor.py" else h) for f, h in honest)
     monkeypatch.setattr(identity, "_code", lambda: changed)
     code, _, err = begun()
-    assert code == 2 and "differs in code (mmrjax/motor.py);" in err
+    assert code == 2 and "differs in code (mmrjax/model/motor.py);" in err
     monkeypatch.setattr(identity, "_code", lambda: honest)
     real = identity.versions
     monkeypatch.setattr(identity, "versions", lambda packages: {**real(packages), "jax": "0.9.9"})
@@ -591,7 +591,7 @@ def test_share_that_another_process_works_on_is_refused(sweep, monkeypatch, tmp_
 def layout():
     """Three chunks of one point each."""
     config = Campaign(axes={"voltage": [15, 24, 33]}, chunk=1, outputs=("speed",))
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     return laid_out(config, prepare(config, robot, axes.plan(config, robot, "x"), "x"))
 
 
@@ -849,7 +849,7 @@ def test_chunk_is_split_along_the_points_among_all_devices(tmp_path):
         "import numpy as np, jax, mmrjax\n"
         "from sweeps.points import axes, scale\n"
         "from sweeps.config_campaign import Campaign\n"
-        "from sweeps.points.design import Blocks\n"
+        "from sweeps.points.sampled_design import Blocks\n"
         "from sweeps.points.tasks import of_fidelity\n"
         "robot = mmrjax.nominal()\n"
         "plan = axes.plan(Campaign(axes={'voltage': [15, 20, 24, 28, 33]}), robot, 'x')\n"
@@ -940,7 +940,7 @@ def test_somebody_elses_folder_is_left_alone(sweep, tmp_path):
 
 def test_layout_counts_its_bytes_without_writing(whole):
     config = Campaign(axes={"voltage": [15, 24, 33]}, chunk=2, outputs=("speed",))
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     job = prepare(config, robot, axes.plan(config, robot, "x"), "x")
     layout = laid_out(config, job)
     assert layout.size == 2 * 2 * 9 + 3 * 8  # chunks are filled up

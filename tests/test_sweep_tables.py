@@ -5,13 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from calibration.data.posterior import NORMAL, Posterior
+from calibration.data.posterior_file import NORMAL, Posterior
 from calibration.data.runs import Runs
-from mmrjax import fidelities, params, robots
+from mmrjax import fidelities
 from mmrjax.fidelities.steady import steady_batch
+from mmrjax.model import paper_robots, params
 from sweeps import config
 from sweeps.points import run, scale, uncertainty
-from sweeps.points.design import Drawn
+from sweeps.points.sampled_design import Drawn
 from sweeps.store import RunFolder
 
 NAMES = ("motor.resistance", "motor.friction_coulomb")
@@ -20,7 +21,7 @@ DRAWS = 12
 
 @pytest.fixture(scope="module")
 def robot():
-    return robots.nominal()
+    return paper_robots.nominal()
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import belt, loop, terrain
-from mmrjax.robots import nominal
+from mmrjax.climbing import belt_loop, terrain
+from mmrjax.model.paper_robots import nominal
+from mmrjax.undercarriage import belt
 
 NAMED = {
     "flat": (terrain.flat(8), [(-100, 0), (100, 0)]),
@@ -97,7 +98,9 @@ def test_polylines_that_are_none_are_refused(x, z, message):
 def lever():
     gear = nominal().running_gear
     roller = gear.levers.roller - gear.grouser_height
-    return loop.Loop(nominal().radius_pulley, roller, gear.lever_length, gear.grouser_height, gear.grouser_length, 16)
+    return belt_loop.Loop(
+        nominal().radius_pulley, roller, gear.lever_length, gear.grouser_height, gear.grouser_length, 16
+    )
 
 
 def test_levers_track_closes_and_its_pitch_is_that_of_the_main_track():
@@ -109,12 +112,12 @@ def test_levers_track_closes_and_its_pitch_is_that_of_the_main_track():
 def test_belt_of_equal_pulleys_is_the_main_track_of_the_track_model():
     robot = nominal()
     gear = robot.running_gear
-    main = loop.Loop(
+    main = belt_loop.Loop(
         robot.radius_pulley, robot.radius_pulley, gear.wheelbase, gear.grouser_height, gear.grouser_length, 24
     )
     path = belt.Path(robot.radius_pulley, gear)
     place = np.concatenate([np.linspace(0, 0.23, 60), np.linspace(0.61, 0.83, 60)])  # all but the upper run's ends
-    mine = loop.tips(main, jnp.asarray(place))
+    mine = belt_loop.tips(main, jnp.asarray(place))
     theirs = belt.tips(path, jnp.mod(jnp.asarray(place) + gear.wheelbase / 2, path.length))
     assert np.asarray(mine.at[:, 0]) - float(gear.wheelbase) / 2 == pytest.approx(
         np.asarray(theirs.forward), abs=1e-12
@@ -133,5 +136,5 @@ def test_points_project_on_the_belt_where_they_came_from_and_tips_move_as_they_s
     assert np.asarray(height) == pytest.approx(0.004, abs=1e-12)
     off = np.abs(np.asarray(back - place))
     assert np.minimum(off, float(belt_.length) - off) == pytest.approx(0, abs=1e-10)
-    moved = (loop.tips(belt_, place[5:-5] + 1e-7).at - loop.tips(belt_, place[5:-5] - 1e-7).at) / 2e-7
-    assert np.asarray(loop.tips(belt_, place[5:-5]).rate) == pytest.approx(np.asarray(moved), abs=1e-5)
+    moved = (belt_loop.tips(belt_, place[5:-5] + 1e-7).at - belt_loop.tips(belt_, place[5:-5] - 1e-7).at) / 2e-7
+    assert np.asarray(belt_loop.tips(belt_, place[5:-5]).rate) == pytest.approx(np.asarray(moved), abs=1e-5)

@@ -8,16 +8,17 @@ import pytest
 from worlds import rigs
 
 from calibration.data import columns
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.data.thinning import FIRST, thinned
 from calibration.discovery import discover
-from calibration.inference import calibrate, foresight
+from calibration.inference import calibration as calibrate
+from calibration.inference import foresight
+from calibration.inference.fit_notes import Thinned
 from calibration.inference.noise import inferred
-from calibration.inference.notes import Thinned
 from calibration.inference.observers import Histories
-from calibration.words.notes import sentence
-from mmrjax import robots
+from calibration.words.note_words import sentence
+from mmrjax.model import paper_robots
 from sweeps.commands import rig_check
 
 EVERY, ROWS = 0.01, 300
@@ -93,7 +94,7 @@ def test_what_drives_a_run_is_that_of_the_log(drive):
     whole = log(1, voltage=DRIVES[drive])
     some = thinned(whole, 40)
     every, few, alone = (
-        Histories.of(x, robots.nominal()) for x in (whole, some, dataclasses.replace(some, log=None))
+        Histories.of(x, paper_robots.nominal()) for x in (whole, some, dataclasses.replace(some, log=None))
     )
     between = EVERY * (np.arange(ROWS - 1) + 0.5)
     np.testing.assert_array_equal(held(few, between), held(every, between))
@@ -114,7 +115,7 @@ def test_a_slope_that_changes_between_readings_acts_from_its_row_on():
     read = set((thinned(whole, 40)["time_s"] / EVERY).astype(int))
     change = next(k for k in range(100, ROWS) if not read & {k - 1, k, k + 1})
     columns = {**whole.columns, "slope_deg": np.where(row < change, 0.0, 5.0)}
-    few = Histories.of(thinned(dataclasses.replace(whole, columns=columns), 40), robots.nominal())
+    few = Histories.of(thinned(dataclasses.replace(whole, columns=columns), 40), paper_robots.nominal())
     times, slopes, at = np.asarray(few.times[0]), np.asarray(few.conditions.slope[0]), time[row == change]
     np.testing.assert_allclose(np.rad2deg(slopes), np.where(times < at - 1e-9, 0.0, 5.0), atol=1e-9)
     assert np.abs(times - at).min() < 1e-9
@@ -125,7 +126,7 @@ def test_a_slope_that_changes_between_readings_acts_from_its_row_on():
 @pytest.mark.parametrize("drive", DRIVES)
 def test_a_run_shows_what_it_shows_in_the_whole_log(drive):
     """Its readings are those of the whole log at the same rows, to what its longer steps make."""
-    whole, robot = log(1, voltage=DRIVES[drive]), robots.nominal()
+    whole, robot = log(1, voltage=DRIVES[drive]), paper_robots.nominal()
     some = thinned(whole, 40)
     shown = [np.asarray(jax.jit(lambda o: o(robot).reading)(Histories.of(x, robot))) for x in (whole, some)]
     at = [int(np.flatnonzero(whole["time_s"] == t)[0]) for t in some["time_s"]]
@@ -175,10 +176,10 @@ def test_python_takes_as_many_rows_as_the_command_line(monkeypatch, way, rows):
     monkeypatch.setattr(f"{room.__name__}.{before}", prepared)
     call = {calibrate: calibrate.calibrate, discover: discover.discover, foresight: foresight.foresee}[room]
     with pytest.raises(InterruptedError):
-        call(runs, robots.nominal(), **({} if rows is None else {"rows": rows}))
+        call(runs, paper_robots.nominal(), **({} if rows is None else {"rows": rows}))
     (used,) = seen
     wanted = thinned(runs, columns.ROWS if rows is None else rows)
     np.testing.assert_array_equal(used["time_s"], wanted["time_s"])
     assert len(used) < len(runs) == len(used.whole) == len(thinned(used, 50).whole)
     with pytest.raises(BadConfiguration, match="rows: got 0; expected 1 or more"):
-        call(runs, robots.nominal(), rows=0)
+        call(runs, paper_robots.nominal(), rows=0)

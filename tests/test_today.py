@@ -9,12 +9,12 @@ import pytest
 
 import mmrjax as api
 from calibration.data import robot_file, runs
-from calibration.data.errors import BadConfiguration, BadData
-from mmrjax import robots, signals
+from calibration.data.input_errors import BadConfiguration, BadData
 from mmrjax.fidelities.drive import drive_batch
+from mmrjax.model import paper_robots, signals
 from sweeps.commands.simulate import PEAK, remarks
 from sweeps.pages import figure_style, history_figures, words
-from sweeps.pages import runs as runs_page
+from sweeps.pages import runs_page as runs_page
 from tests.commands import rows as table
 
 SPEED_STATIC = 0.02  # V_s of the packaged robot [m/s]: within it contacts creep
@@ -30,7 +30,7 @@ def anywhere():
     slope[:6] = slope[-6:] = 0.0
     kind, payload = np.where(rng.random(count) < 0.5, "6T2A", "4W2T"), rng.uniform(0, 8, count)
     conditions = api.Conditions(kind, voltage, slope, payload)
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     settled = api.simulate(robot, conditions)
     return voltage, slope, settled, api.simulate(robot, conditions, "drive", history=False)
 
@@ -76,7 +76,7 @@ def test_a_status_is_mirrored_with_voltage_and_slope():
     rng, count = np.random.default_rng(3), 400  # whose program is that of `anywhere`
     voltage, slope = rng.uniform(-20, 20, count), rng.uniform(-20, 20, count)
     voltage[:60] = rng.uniform(-2, 2, 60)
-    robot, kind = robots.nominal(), np.where(rng.random(count) < 0.5, "6T2A", "4W2T")
+    robot, kind = paper_robots.nominal(), np.where(rng.random(count) < 0.5, "6T2A", "4W2T")
     one = api.simulate(robot, api.Conditions(kind, voltage, slope))
     other = api.simulate(robot, api.Conditions(kind, -voltage, -slope))
     swapped = {"converged": "reverses", "reverses": "converged"}
@@ -86,7 +86,9 @@ def test_a_status_is_mirrored_with_voltage_and_slope():
 
 @pytest.mark.slow
 def test_a_robot_held_on_a_slope_stands_for_an_hour():
-    kept = drive_batch(robots.nominal(), api.Conditions(0, [0.0, 0.3], [15.0, 15.0]), np.linspace(0.0, 3600.0, 5))
+    kept = drive_batch(
+        paper_robots.nominal(), api.Conditions(0, [0.0, 0.3], [15.0, 15.0]), np.linspace(0.0, 3600.0, 5)
+    )
     assert [signals.STATUSES[k] for k in np.asarray(kept.result.status)] == ["stalled"] * 2
     assert (np.asarray(kept.distance) == 0).all()
     assert float(kept.result.traction[0]) == pytest.approx(13.1 * signals.GRAVITY * np.sin(np.radians(15)), rel=1e-6)
@@ -129,7 +131,7 @@ def test_charging_above_the_charge_voltage_is_flagged_with_the_voltage_of_a_cell
 
 
 def test_a_cell_has_no_voltage_on_the_external_supply():
-    found = api.simulate(robots.nominal(), api.Conditions(0, 24.0, 0.0, battery=[0.0, 1.0]))
+    found = api.simulate(paper_robots.nominal(), api.Conditions(0, 24.0, 0.0, battery=[0.0, 1.0]))
     assert (np.asarray(found.voltage_cell) > 0).tolist() == [False, True]
     assert np.isnan(found.to_dict()["supply_voltage_V"]).tolist() == [False, True]
 
@@ -145,7 +147,7 @@ def test_a_winding_that_no_temperature_settles_says_so(mmrjax, tmp_path):
     notes = json.loads(text)["notes"]
     assert notes[1].startswith(said)
     time = float(row["permissible_time_s"])
-    permissible = jax.jit(lambda current: robots.nominal().motor.time_permissible(current))
+    permissible = jax.jit(lambda current: paper_robots.nominal().motor.time_permissible(current))
     assert time == pytest.approx(float(permissible(float(row["total_current_A"]) / 2)), rel=1e-4)
     assert notes[0].startswith(f"winding_hot: 125 °C are reached after {time:.3g} s at this current")
     assert row["winding_settled_C"] == "" and "winding_hot" in row["flags"]
@@ -154,7 +156,7 @@ def test_a_winding_that_no_temperature_settles_says_so(mmrjax, tmp_path):
 
 
 def test_the_hot_winding_is_flagged_from_the_current_of_the_hot_resistance():
-    motor = robots.nominal().motor
+    motor = paper_robots.nominal().motor
     assert float(motor.current_continuous) == pytest.approx(3.91, abs=0.005)
 
 
@@ -254,14 +256,14 @@ def test_compare_takes_readings_with_their_signs(mmrjax, tmp_path):
 
 @pytest.fixture(scope="module")
 def climb():
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     return robot, api.simulate(robot, api.Conditions(0, [33.0, -33.0], [10.0, -10.0]), "drive", duration=5.0)
 
 
 @pytest.mark.slow
 def test_a_history_has_the_peak_of_the_inrush(climb, mmrjax, tmp_path):
     _, found = climb
-    fine = drive_batch(robots.nominal(), api.Conditions(0, [33.0], 10.0), np.linspace(0.0, 2e-3, 2001))
+    fine = drive_batch(paper_robots.nominal(), api.Conditions(0, [33.0], 10.0), np.linspace(0.0, 2e-3, 2001))
     peak = float(np.max(np.asarray(fine.signals.total_current)))
     assert float(np.max(np.asarray(found.history.signals.total_current[0]))) == pytest.approx(peak, rel=2e-3)
     code, out, _ = mmrjax("simulate", "--model", "drive", "--slope", 10, "--no-report", "--out", "a")
@@ -314,7 +316,7 @@ def test_what_was_reached_is_shown_when_the_battery_ends(mmrjax, tmp_path):
 
 @pytest.mark.slow
 def test_a_run_may_last_a_day(mmrjax):
-    found = api.simulate(robots.nominal(), api.Conditions(0, 33.0), "drive", duration=86_400.0, history=False)
+    found = api.simulate(paper_robots.nominal(), api.Conditions(0, 33.0), "drive", duration=86_400.0, history=False)
     assert found.statuses == "converged"
     code, _, err = mmrjax("simulate", "--model", "drive", "--duration", "86401")
     assert code == 2 and "86400" in err
@@ -323,8 +325,8 @@ def test_a_run_may_last_a_day(mmrjax):
 
 
 def test_remarks_name_the_run_they_are_of():
-    found = api.simulate(robots.nominal(), api.Conditions("4W2T", 33.0, [0.0, 20.0], 200.0, adhesion=3.0))
-    shown = remarks(robots.nominal(), found.to_dict())
+    found = api.simulate(paper_robots.nominal(), api.Conditions("4W2T", 33.0, [0.0, 20.0], 200.0, adhesion=3.0))
+    shown = remarks(paper_robots.nominal(), found.to_dict())
     assert len(shown) == 2 and shown[0].startswith("run 2: winding_hot: 125 °C are reached after ")
     assert shown[1].startswith("run 2: winding, long running: none settles")
 
@@ -336,7 +338,7 @@ RATED = (
 
 
 def test_rated_limits_and_switches_are_read_and_written(tmp_path):
-    nominal = robots.nominal()
+    nominal = paper_robots.nominal()
     assert nominal.gearbox.torque_limit == pytest.approx(3.0 * 25 / 12)
     (tmp_path / "mine.toml").write_text(RATED)
     robot = robot_file.read(tmp_path / "mine.toml")
@@ -369,7 +371,7 @@ def test_rated_limits_and_switches_are_read_and_written(tmp_path):
 )
 def test_bad_limits_and_switches_are_refused(values, sentence):
     with pytest.raises(BadConfiguration, match=sentence):
-        robot_file.change(robots.nominal(), values, where="mine.toml")
+        robot_file.change(paper_robots.nominal(), values, where="mine.toml")
 
 
 @pytest.mark.slow
@@ -382,7 +384,7 @@ def test_a_switch_can_be_set_on_the_command_line(mmrjax, tmp_path):
 
 
 def test_rated_limits_stand_in_the_report():
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     found = api.simulate(robot, api.Conditions("6T2A", 33.0, 10.0, 8.0, battery=1.0))
     run = {name: np.atleast_1d(values)[0] for name, values in found.to_dict().items()}
     shown = {line["words"]: line for line in runs_page.limits(robot, run)}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from worlds import paper
 
-from mmrjax.track import Track
+from mmrjax.model.track_friction import Track
 
 RNG = np.random.default_rng(24)
 

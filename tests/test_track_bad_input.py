@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibration.data.errors import BadConfiguration
-from mmrjax import params
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities import stability
-from mmrjax.fidelities.half_robot import margin, stand, system
-from mmrjax.fidelities.stability import _whole, largest_step
+from calibration.data.input_errors import BadConfiguration
 from mmrjax.fidelities.track import _batch, track_batch
-from mmrjax.signals import CONVERGED, FAILED, FLAGS, TIPS
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import CONVERGED, FAILED, FLAGS, TIPS
+from mmrjax.undercarriage import stability
+from mmrjax.undercarriage.half_robot import margin, stand, system
+from mmrjax.undercarriage.stability import _whole, largest_step
 from sweeps import config as configuration
 from sweeps.points import run
 from sweeps.points.grid import grid
@@ -119,7 +119,7 @@ def test_posture_that_cannot_stand_has_a_negative_margin(robot):
 
 def test_standing_robot_is_in_balance(robot):
     """Weight and moment to 1e-9, on a slope with a payload off centre; then no force is left over."""
-    from mmrjax.fidelities.half_robot import instant
+    from mmrjax.undercarriage.half_robot import instant
 
     loaded = params.replace(robot, {"running_gear.payload_offset": jnp.asarray(0.05)})
     for wheeled in (0.0, 1.0):

@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import balances, params, undercarriage
-from mmrjax.belt import POLYGON, Path, runs, tension_along, tips, travel
-from mmrjax.conditions import Conditions
-from mmrjax.running_gear import GROUSERS, TEETH_BELT
-from mmrjax.signals import State
+from mmrjax.model import balances, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import State
+from mmrjax.undercarriage import side_contacts
+from mmrjax.undercarriage.belt import POLYGON, Path, runs, tension_along, tips, travel
+from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT
 
 
 @pytest.fixture(scope="module")
@@ -115,14 +116,14 @@ def test_generalized_forces_do_the_work_of_the_contacts(path, robot, wheeled):
     q, v = _posture(path, wheeled, robot)
     run = Conditions(configuration=wheeled)
     chassis = robot.chassis(run.configuration)
-    at = undercarriage.touch(path, chassis, q, v)
+    at = side_contacts.touch(path, chassis, q, v)
     signals = balances.begin(robot, run, State(jnp.asarray(3.0), 48 * v[3], v[0], jnp.asarray(0.0)))
     signals = dataclasses.replace(signals, resistance=jnp.asarray(5.0), speed_slip_terms=jnp.asarray(0.0))
-    done = undercarriage.pull(path, chassis, signals, at, q[1])
+    done = side_contacts.pull(path, chassis, signals, at, q[1])
     assert float(at.normal) > 10.0 and float(jnp.abs(done.traction)) > 0.1
 
     def point(q):  # of each contact in the world
-        now = undercarriage.touch(path, chassis, q, v)
+        now = side_contacts.touch(path, chassis, q, v)
         return q[0] + now.lever_x, q[1] + now.lever_z
 
     slope_x, slope_z = jax.jacfwd(point)(q)
@@ -144,10 +145,10 @@ def test_contact_pairs_are_720_on_tracks_and_4_on_wheels(path, robot):
         q = q.at[1].add(-1.0).at[2].set(0.0)  # under the ground, so that every contact that can bear does
         run = Conditions(configuration=wheeled)
         chassis = robot.chassis(run.configuration)
-        at = undercarriage.touch(path, chassis, q, 0 * v)
+        at = side_contacts.touch(path, chassis, q, 0 * v)
         signals = balances.begin(robot, run, State(*(jnp.asarray(0.0) for _ in range(4))))
-        done = undercarriage.pull(path, chassis, signals, at, q[1])
-        teeth = undercarriage.reactions(path, at, done).teeth(path)
+        done = side_contacts.pull(path, chassis, signals, at, q[1])
+        teeth = side_contacts.reactions(path, at, done).teeth(path)
         ground = int(jnp.sum(at.force > 0))
         guides = sum(t.size for t in teeth) if wheeled == 0.0 else 0
         assert robot.sides * (ground + guides) == pairs
@@ -155,10 +156,10 @@ def test_contact_pairs_are_720_on_tracks_and_4_on_wheels(path, robot):
 
 def test_teeth_carry_what_the_guide_carries(path, robot):
     q, v = _posture(path, 0.0, robot)
-    at = undercarriage.touch(path, robot.configurations["6T2A"], q, v)
+    at = side_contacts.touch(path, robot.configurations["6T2A"], q, v)
     signals = balances.begin(robot, Conditions(), State(*(jnp.asarray(0.0) for _ in range(4))))
-    loads = undercarriage.reactions(
-        path, at, undercarriage.pull(path, robot.configurations["6T2A"], signals, at, q[1])
+    loads = side_contacts.reactions(
+        path, at, side_contacts.pull(path, robot.configurations["6T2A"], signals, at, q[1])
     )
     lower, upper = loads.teeth(path)
     assert lower.shape == upper.shape == (168,)

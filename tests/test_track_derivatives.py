@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import params
-from mmrjax.conditions import Conditions
 from mmrjax.fidelities.track import track
-from mmrjax.signals import CONVERGED
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import CONVERGED
 
 PARAMETERS = (
     "track.guide_friction",

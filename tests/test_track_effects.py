@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import params, robots
-from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL
 from mmrjax.fidelities.steady import steady
 from mmrjax.fidelities.track import track
+from mmrjax.model import paper_robots, params
+from mmrjax.model.conditions import Conditions
 
 pytestmark = pytest.mark.slow  # compiles for a minute
 
@@ -31,7 +31,7 @@ RUNS = Conditions(
 def slopes():
     """Derivatives of the outputs by every amplitude at zero, in the track and in the steady model."""
     names = [f"effects.{effect.name}.amplitude" for effect in SETTLED]
-    bare = dataclasses.replace(robots.nominal(), effects=tuple(effect() for effect in SETTLED))
+    bare = dataclasses.replace(paper_robots.nominal(), effects=tuple(effect() for effect in SETTLED))
     sizes = [dict((p.name, p.spec) for p in params.walk(bare))[n].prior_sd(0.0) for n in names]
 
     def robot(theta, share):
@@ -71,7 +71,7 @@ def test_effect_acts_as_in_the_steady_model(slopes, k):
 @pytest.fixture(scope="module")
 def start_slopes():
     """Derivatives of a start's history by the amplitudes of the effects that only a series shows."""
-    bare = dataclasses.replace(robots.nominal(), effects=tuple(effect() for effect in TRANSIENT))
+    bare = dataclasses.replace(paper_robots.nominal(), effects=tuple(effect() for effect in TRANSIENT))
     sizes = [
         dict((p.name, p.spec) for p in params.walk(bare))[f"effects.{e.name}.amplitude"].prior_sd(0.0)
         for e in TRANSIENT

@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import params
-from mmrjax.belt import travel
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities.half_robot import advance, centre, instant, stand, system
 from mmrjax.fidelities.track import track
-from mmrjax.signals import GRAVITY
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import GRAVITY
+from mmrjax.undercarriage.belt import travel
+from mmrjax.undercarriage.half_robot import advance, centre, instant, stand, system
 
 RUNS = Conditions(
     voltage=jnp.asarray([33.0, 15.0, 24.0, 33.0]),

@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import params
-from mmrjax.belt import Path
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities.ripple import period_pitch, ripple, stages, touchdowns
 from mmrjax.fidelities.track import _batch, track_batch
-from mmrjax.signals import FLAGS, STATUSES
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import FLAGS, STATUSES
+from mmrjax.undercarriage.belt import Path
+from mmrjax.undercarriage.ripple import period_pitch, ripple, stages, touchdowns
 
 pytestmark = pytest.mark.slow
 
@@ -206,9 +206,9 @@ def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
     What is left is ripple: friction is not linear in the load and the sliding speed that fluctuate.
     `drive` ends on `steady` (test_drive).
     """
-    from mmrjax import params
     from mmrjax.fidelities.steady import steady
     from mmrjax.fidelities.track import _batch
+    from mmrjax.model import params
 
     rows = grid[grid[:, 1] <= np.where(grid[:, 0] > 0.5, 15.0, 10.0)]
     wheeled, slope, payload, voltage = rows.T

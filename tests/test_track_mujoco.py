@@ -6,10 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from mmrjax import balances, mjcf, params
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities.half_robot import advance, generalized, instant, resistance, stand, system
-from mmrjax.signals import State
+from mmrjax.model import balances, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import State
+from mmrjax.undercarriage import mjcf
+from mmrjax.undercarriage.half_robot import advance, generalized, instant, resistance, stand, system
 
 RUNS = {
     "tracked": dict(voltage=33.0, slope_deg=5.0, payload=3.0),

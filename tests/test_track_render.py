@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mmrjax.conditions import Conditions
 from mmrjax.fidelities.track import _batch
-from mmrjax.render import render, scene
+from mmrjax.model.conditions import Conditions
+from mmrjax.undercarriage.rendering import render, scene
 
 RUNS = Conditions(voltage=jnp.asarray([33.0, 24.0, np.nan]), slope_deg=np.degrees(0.1), configuration=[0, 1, 0])
 

@@ -6,15 +6,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from mmrjax import balances, mjcf, params, render_above
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities import both_sides, half_robot
-from mmrjax.fidelities.half_robot import system
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.fidelities.track import track_batch
-from mmrjax.masses import masses
-from mmrjax.signals import CONVERGED, GRAVITY, State
-from mmrjax.turning import SIDES, Law
+from mmrjax.model import balances, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.masses import masses
+from mmrjax.model.signals import CONVERGED, GRAVITY, State
+from mmrjax.turning.two_sides import SIDES, Law
+from mmrjax.undercarriage import both_sides, half_robot, mjcf, rendering_from_above
+from mmrjax.undercarriage.half_robot import system
 
 STEP, STEPS = 1e-4, 3000
 #: Two turns that mirror one another, one on the spot across a slope, one of wheels under load, and sides alike.
@@ -262,7 +262,7 @@ def test_a_turn_is_seen_from_above(contacts):
     v[:, [0, 3]] = 0.2, 1.0
     along = np.broadcast_to(np.linspace(0.15, -0.15, contacts), load.shape)
     time, belt = np.array([0.1, 0.2]), np.array([[0.2 - 0.1215, 0.5]] * 2)
-    view = render_above.Above("6T2A", 0.1, 0.3, 0.243, time, q, v, np.ones((2, 2)), belt, along, load)
+    view = rendering_from_above.Above("6T2A", 0.1, 0.3, 0.243, time, q, v, np.ones((2, 2)), belt, along, load)
     axes = view.sheet(0).axes[0]
     assert "slope 6°, t = 0.100 s" in axes.get_title()
     bars = [line for line in axes.lines if line.get_zorder() == 4]

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import params
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities import both_sides
 from mmrjax.fidelities.track import track
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.undercarriage import both_sides
 
 PARAMETERS = ("6T2A.ground.friction.static", "6T2A.turning.lateral", "6T2A.turning.width", "6T2A.track.loss_coulomb")
 VOLTAGES = ("duty_left", "duty_right")

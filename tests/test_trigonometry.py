@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax.trigonometry import cosine, sine, sine_third
+from mmrjax.numerics.trigonometry import cosine, sine, sine_third
 
 FUNCTIONS = {
     "sine": (sine, np.sin, np.cos),

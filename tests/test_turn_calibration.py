@@ -11,12 +11,12 @@ from worlds import turning as world
 
 import mmrjax as mm
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.inference import blocks, identifiability, observers, priors
 from calibration.inference import optimizers as fit
-from calibration.inference.calibrate import calibrate
+from calibration.inference.calibration import calibrate
 from calibration.inference.observers.turns import SettledTurns
-from mmrjax import balances, channels, params, robots
+from mmrjax.model import balances, channels, paper_robots, params
 
 CURRENTS = ("motor_current_left", "motor_current_right")
 MOTION = ("motor_speed_left", "motor_speed_right", "yaw_rate")
@@ -173,7 +173,7 @@ def test_truth_of_a_second_implementation_is_found(robot, of_world):
 @pytest.mark.slow
 def test_truth_of_a_simulated_table_is_found_from_the_command_line(tmp_path, mmrjax):
     friction = {f"4W2T.ground.friction.{k}": v for k, v in (("static", 0.45), ("dynamic", 0.36))}
-    true = params.replace(robots.nominal(), {f"4W2T.{LATERAL}": 0.9, **friction})
+    true = params.replace(paper_robots.nominal(), {f"4W2T.{LATERAL}": 0.9, **friction})
     duties = dict(zip(("duty_left", "duty_right"), np.array(DUTIES).T, strict=True))
     runs = mm.Conditions(["4W2T"] * len(DUTIES), voltage=33.0, **duties)
     seen = mm.simulate(true, runs).reading

@@ -10,20 +10,21 @@ import pytest
 
 import mmrjax as mm
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration, BadData
-from mmrjax import requirements, robots
-from mmrjax.channels import HEAT, SIDES
-from mmrjax.derived import turn as derived
+from calibration.data.input_errors import BadConfiguration, BadData
+from mmrjax.derived import requirements
+from mmrjax.derived import turning_figures as derived
 from mmrjax.errors import UsageError
-from mmrjax.profile import profile
+from mmrjax.missions.profile import profile
+from mmrjax.model import paper_robots
+from mmrjax.model.channels import HEAT, SIDES
 from sweeps import config, inputs
 from sweeps.commands import simulate
 from sweeps.commands import turn as turn_room
-from sweeps.pages import mission_figures, turn, turn_words
+from sweeps.pages import mission_figures, turn_page, turn_words
 from sweeps.pages.figure_style import svg
 from sweeps.points.imposed import UNLIMITED
 from sweeps.points.job import showing_turns
-from sweeps.results import check
+from sweeps.results import check_results
 from tests.commands import rows
 
 
@@ -134,7 +135,7 @@ def test_a_turn_beyond_the_supply_is_refused_with_what_it_reaches(monkeypatch, s
         return types.SimpleNamespace(result=types.SimpleNamespace(reading=reading)), asked
 
     monkeypatch.setattr(turn_room, "_with_others", rolling)
-    robot, demand = robots.nominal(), config.Simulate(speed_m_s=speed, yaw_rate_rad_s=rate)
+    robot, demand = paper_robots.nominal(), config.Simulate(speed_m_s=speed, yaw_rate_rad_s=rate)
     runs = inputs.one_run(robot, {"supply_voltage_V": 24.0, **turn_room.cells(demand, {})})
     with pytest.raises(BadConfiguration, match=f"{speed:g} m/s and {rate:g} rad/s .*{says}"):
         turn_room._demanded(robot, runs.conditions(robot), runs, demand)
@@ -142,9 +143,9 @@ def test_a_turn_beyond_the_supply_is_refused_with_what_it_reaches(monkeypatch, s
 
 def test_a_required_turn_without_a_steady_state_is_not_told_of_options_of_runs():
     asked = types.SimpleNamespace(quantity=requirements.QUANTITIES["turning_radius_mm"])
-    said = check.reached(types.SimpleNamespace(requirement=asked, value=None, status="not_settled"))
+    said = check_results.reached(types.SimpleNamespace(requirement=asked, value=None, status="not_settled"))
     assert "no settled turn" in said and "--duration" not in said
-    assert said != check.reached(types.SimpleNamespace(requirement=asked, value=None, status="stalled"))
+    assert said != check_results.reached(types.SimpleNamespace(requirement=asked, value=None, status="stalled"))
 
 
 def test_a_turn_that_is_not_found_though_it_is_within_reach_is_friction_s():
@@ -221,7 +222,7 @@ def test_radius_is_that_of_the_circle_on_which_the_centre_of_mass_moves():
     """Beside a braked side it moves aside by a third of how it moves ahead, so its circle is the larger one."""
     reading = {"yaw_rate": [-2.0, 2.0, 0.0], "speed": [0.3, -0.3, 0.3], "lateral_speed": [0.1, 0.1, 0.0]}
     reading |= {f"motor_{what}_{side}": np.ones(3) for what in ("speed", "current", "voltage") for side in SIDES}
-    found = derived.columns(robots.nominal(), reading, np.full(3, 0.04))
+    found = derived.columns(paper_robots.nominal(), reading, np.full(3, 0.04))
     size = 1000 * np.hypot(0.3, 0.1) / 2
     np.testing.assert_allclose(found["turning_radius_mm"], [-size, -size, np.inf], rtol=1e-12)
     away = np.hypot(found["centre_x_mm"][:2], found["centre_y_mm"][:2])
@@ -242,7 +243,7 @@ def test_runs_of_a_table_whose_sides_are_driven_apart_show_both_sides(tmp_path, 
         assert mmrjax("simulate", "--runs", path)[0] == 4
         assert ({"yaw_rate", "motor_current_left", "motor_current_right"} <= set(shown)) == turns
     table = {"total_current_A": [1.8], "motor_current_left_A": [-1.8], "motor_current_right_A": [0.1]}
-    assert simulate.amperes(robots.nominal(), table) == pytest.approx([1.8])
+    assert simulate.amperes(paper_robots.nominal(), table) == pytest.approx([1.8])
 
 
 def test_options_of_one_run_are_refused_beside_a_table(tmp_path, mmrjax):
@@ -277,7 +278,7 @@ def test_a_robot_that_cannot_turn_is_refused_wherever_it_is_asked_to(tmp_path, m
 
 def test_results_of_turns_show_both_sides():
     """Nothing is computed before it is asked for; who travels straight has the columns of before."""
-    robot, sides = robots.nominal(), {"duty_left": 1.0, "duty_right": [0.5, -1.0]}
+    robot, sides = paper_robots.nominal(), {"duty_left": 1.0, "duty_right": [0.5, -1.0]}
     turns, straight = (mm.simulate(robot, mm.Conditions("6T2A", voltage=33.0, **x)) for x in (sides, {}))
     assert {"yaw_rate", "motor_current_left", "motor_current_right"} <= {c.name for c in turns.channels}
     assert straight.channels == robot.channels
@@ -291,7 +292,7 @@ def test_a_surface_of_which_nothing_is_known_is_refused(mmrjax):
 
 def test_one_imposed_speed_of_two_sides_is_refused():
     with pytest.raises(mm.UsageError, match="motor_speed_left: got it without motor_speed_right; state both"):
-        mm.simulate(robots.nominal(), mm.Conditions("6T2A", motor_speed_left=800.0))
+        mm.simulate(paper_robots.nominal(), mm.Conditions("6T2A", motor_speed_left=800.0))
 
 
 def test_a_sweep_refuses_turns_on_a_slope_which_have_no_steady_state(tmp_path, mmrjax):
@@ -302,9 +303,9 @@ def test_a_sweep_refuses_turns_on_a_slope_which_have_no_steady_state(tmp_path, m
 
 
 def test_turns_are_told_in_plain_words():
-    from mmrjax import params, robots
+    from mmrjax.model import paper_robots, params
 
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
 
     def said(ended=None, **changes):
         found = turn_words.turn(robot, row(**changes), ended)
@@ -348,7 +349,7 @@ PLAN = '[conditions]\nconfiguration = "6T2A"\nvoltage = 24\nduty_right = 1\n[axe
 
 
 def test_a_sweep_over_duties_of_sides_shows_both_and_one_of_straight_travel_as_before():
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     assert showing_turns(robot, {"voltage", "slope_deg"}) is robot
     shown = showing_turns(robot, {"voltage", "duty_left"}).channels
     assert {"yaw_rate", "motor_current_left", "speed"} <= {c.name for c in shown}
@@ -406,14 +407,14 @@ def test_a_duty_written_beside_both_sides_is_refused_whatever_it_is(duty):
 
 
 TURNING = profile([0.0, 1.0], duty_left=[0.5, 0.5], duty_right=[1.0, 1.0])
-ONE_SIDE = dataclasses.replace(robots.nominal(), sides=jnp.asarray(1.0))
+ONE_SIDE = dataclasses.replace(paper_robots.nominal(), sides=jnp.asarray(1.0))
 
 
 @pytest.mark.parametrize(
     ("robot", "told", "says"),
     [
         (ONE_SIDE, {"profile": TURNING}, "profile: got a robot of 1 side; expected sides = 2"),
-        (mm.nominal(), {"profile": "patrol"}, "profile: got str; expected mmrjax.profile.profile"),
+        (mm.nominal(), {"profile": "patrol"}, "profile: got str; expected mmrjax.profile"),
         (mm.nominal(), {"profile": TURNING, "model": "steady"}, "model: got steady beside a profile; expected drive"),
         (mm.nominal(), {"profile": TURNING, "duration": 3.0}, "duration: got 3.0 beside a profile, whose last row"),
         (mm.nominal(), {"start": "rest"}, "start: got one without a profile"),
@@ -430,14 +431,14 @@ def test_tables_have_no_negative_zero(monkeypatch):
     said = []
     monkeypatch.setattr(simulate, "say", said.append)
     table = {"slope_deg": [-0.0], "speed_mm_s": [-0.01], "status": ["converged"]}
-    simulate.print_runs({name: np.array(values) for name, values in table.items()}, robots.nominal().channels)
+    simulate.print_runs({name: np.array(values) for name, values in table.items()}, paper_robots.nominal().channels)
     assert [list(c.cells) for c in said[0].columns][1] == ["0", "0.0", "converged"]
 
 
 def test_a_path_between_places_that_turn_is_an_arc():
     """A quarter of a circle of 2 m, and a metre straight on, from three rows."""
     x, y, yaw = np.array([0.0, 2.0, 2.0]), np.array([0.0, 2.0, 3.0]), np.array([0.0, np.pi / 2, np.pi / 2])
-    ahead, aside = turn.arcs(x, y, yaw)
+    ahead, aside = turn_page.arcs(x, y, yaw)
     np.testing.assert_allclose(np.hypot(ahead[:-1], aside[:-1] - 2.0), 2.0, rtol=1e-12)
     assert np.max(np.diff(aside[:-1])) < 0.11 and (ahead[-1], aside[-1], len(ahead)) == (2.0, 3.0, 34)
 

@@ -13,10 +13,11 @@ from worlds import turning as world
 import mmrjax as mm
 from calibration.data import robot_file
 from calibration.data import runs as records
-from calibration.inference.calibrate import calibrate
-from mmrjax import balances, effects, energy, params, robots
-from mmrjax.fidelities import turning
-from mmrjax.signals import PlaneMotion, State
+from calibration.inference.calibration import calibrate
+from mmrjax import effects
+from mmrjax.model import balances, energy, paper_robots, params
+from mmrjax.model.signals import PlaneMotion, State
+from mmrjax.turning import circling
 
 OF_SIDES = ("side_friction", "side_torque", "side_voltage", "side_radius")
 #: In units of the prior sd.
@@ -33,13 +34,13 @@ def with_amplitudes(robot, values):
     return dataclasses.replace(robot, effects=present)
 
 
-RUN = mm.Conditions("6T2A", voltage=33.0, duty_left=0.9, duty_right=-0.2).resolved(robots.nominal())
-MIRRORED = mm.Conditions("6T2A", voltage=33.0, duty_left=-0.2, duty_right=0.9).resolved(robots.nominal())
+RUN = mm.Conditions("6T2A", voltage=33.0, duty_left=0.9, duty_right=-0.2).resolved(paper_robots.nominal())
+MIRRORED = mm.Conditions("6T2A", voltage=33.0, duty_left=-0.2, duty_right=0.9).resolved(paper_robots.nominal())
 
 
 @jax.jit
 def rates(values, run, y):
-    return turning.rates(with_amplitudes(robots.nominal(), values), run, y)
+    return circling.rates(with_amplitudes(paper_robots.nominal(), values), run, y)
 
 
 def amplitudes(**some):
@@ -50,7 +51,7 @@ def amplitudes(**some):
 @pytest.mark.parametrize("name", effects.OF_TURNS)
 def test_effect_moves_the_turn_and_mirrors(name):
     y = flat(MOTION)
-    plain = turning.rates(robots.nominal(), RUN, y)
+    plain = circling.rates(paper_robots.nominal(), RUN, y)
     np.testing.assert_allclose(rates(amplitudes(), RUN, y), plain, rtol=1e-12, atol=1e-12)
     size = amplitude(name)
     moved = np.asarray(rates(amplitudes(**{name: size}), RUN, y))
@@ -64,15 +65,15 @@ def test_effect_moves_the_turn_and_mirrors(name):
 
 @pytest.mark.slow
 def test_friction_of_a_side_is_that_of_a_second_implementation():
-    robot, more = robots.nominal(), 0.002
+    robot, more = paper_robots.nominal(), 0.002
     dry = float(robot.motor.friction_coulomb)
     constants = [{"motor.friction_coulomb": dry + more}, {"motor.friction_coulomb": dry - more}]
     other = of_world(robot, "6T2A", left=constants[0], right=constants[1])
     y = np.asarray(flat(MOTION))
     theirs = world.rates(
-        other, world.Inputs(0.9, -0.2, kind="duty", supply=33.0), 0.0, (y * np.asarray(turning._UNITS))[PLACES]
+        other, world.Inputs(0.9, -0.2, kind="duty", supply=33.0), 0.0, (y * np.asarray(circling._UNITS))[PLACES]
     )
-    mine = np.asarray(rates(amplitudes(side_friction=more), RUN, jnp.asarray(y))) * np.asarray(turning._UNITS)
+    mine = np.asarray(rates(amplitudes(side_friction=more), RUN, jnp.asarray(y))) * np.asarray(circling._UNITS)
     np.testing.assert_allclose(mine[PLACES][:10], theirs[:10], rtol=1e-8, atol=1e-8)
 
 
@@ -81,7 +82,7 @@ PLACES = [8, 9, 7, 4, 5, 6, 0, 1, 2, 3, 10]
 
 
 def test_terms_are_their_equations():
-    robot, values = robots.nominal(), {name: amplitude(name) for name in effects.OF_TURNS}
+    robot, values = paper_robots.nominal(), {name: amplitude(name) for name in effects.OF_TURNS}
     travel = jax.jit(lambda m: balances.turning(robot, RUN, m))(MOTION)
     signals, grip = travel.signals, travel.grip
     terms = {}
@@ -105,21 +106,21 @@ def test_terms_are_their_equations():
 
 @pytest.mark.slow
 def test_energy_is_kept_and_resistance_to_turning_takes_it():
-    robot = with_amplitudes(robots.nominal(), {name: amplitude(name) for name in effects.OF_TURNS})
+    robot = with_amplitudes(paper_robots.nominal(), {name: amplitude(name) for name in effects.OF_TURNS})
 
     def stored(m):
         return energy.stored_turning(robot, balances.turning(robot, RUN, m), m)
 
     @jax.jit
     def powers(m):
-        rate = turning.motion_of(robot, turning.rates(robot, RUN, flat(m)))
+        rate = circling.motion_of(robot, circling.rates(robot, RUN, flat(m)))
         travel = balances.turning(robot, RUN, m)
         source = jnp.mean(jax.vmap(lambda c, s: energy.source(robot, c, s))(RUN.of_sides(), travel.signals))
         return source, energy.sinks_turning(robot, RUN, travel), jax.jvp(stored, (m,), (rate,))[1]
 
     source, sinks, change = powers(MOTION)
     assert float(sum(sinks.values()) + change) == pytest.approx(float(source), rel=1e-9)
-    rolls = with_amplitudes(robots.nominal(), {"side_radius": amplitude("side_radius")})  # slides as much
+    rolls = with_amplitudes(paper_robots.nominal(), {"side_radius": amplitude("side_radius")})  # slides as much
     plain = energy.sinks_turning(rolls, RUN, balances.turning(rolls, RUN, MOTION))
     seen = balances.turning(robot, RUN, MOTION)
     load, moment = float(jnp.sum(seen.signals.normal)), float(jnp.sum(seen.grip.moment))
@@ -128,7 +129,7 @@ def test_energy_is_kept_and_resistance_to_turning_takes_it():
 
 
 def test_straight_travel_shows_none_of_them():
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     run = mm.Conditions("6T2A", slope_deg=3.0).resolved(robot)
     state = State(*(jnp.asarray(x) for x in (2.0, 900.0, 0.7, 0.0)))
     plain = balances.settled(robot, run, state, 1.0)[0]
@@ -151,7 +152,7 @@ def test_robot_files_know_them_and_the_library_of_straight_travel_does_not(tmp_p
 @pytest.mark.slow
 def test_sides_that_are_not_alike_are_found(tmp_path):
     """A table of a robot whose left side rubs more, calibrated with that effect's amplitude free."""
-    true = with_amplitudes(robots.nominal(), {"side_friction": jnp.asarray(0.0025)})
+    true = with_amplitudes(paper_robots.nominal(), {"side_friction": jnp.asarray(0.0025)})
     duties = dict(zip(("duty_left", "duty_right"), np.array(DUTIES).T, strict=True))
     seen = mm.simulate(true, mm.Conditions(["6T2A"] * len(DUTIES), voltage=33.0, **duties)).reading
     path = tmp_path / "robot.toml"

@@ -15,8 +15,9 @@ from calibration.data import runs as records
 from calibration.discovery.discover import discover, pose, prepared
 from calibration.inference import bases as bases_room
 from calibration.inference.observers.turns import TurnLinearization
-from mmrjax import effects, params
+from mmrjax import effects
 from mmrjax.effects.curve import weights
+from mmrjax.model import params
 
 pytestmark = pytest.mark.slow
 

@@ -6,13 +6,13 @@ import pytest
 
 import mmrjax as mm
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.instruments import with_inferred_instruments
-from calibration.inference.calibrate import calibrate
+from calibration.inference.calibration import calibrate
 from calibration.inference.ranges import check_ranges
-from mmrjax import balances
-from mmrjax.quantities import RPM
-from mmrjax.signals import State
+from mmrjax.model import balances
+from mmrjax.model.quantities import RPM
+from mmrjax.model.signals import State
 from sweeps.inputs import read_runs
 
 #: A robot on four wheels whose sides' speeds are imposed; the numbers are nobody's.
@@ -344,7 +344,7 @@ def test_width_or_ratio_of_a_kinematic_robot_is_calibrated(rig, table):
         (900, 0),
     ]
     left, right = RPM * np.array(speeds).T
-    true = mm.params.replace(robot, {"rover.turning.lateral": jnp.asarray(0.9)})
+    true = mm.replace(robot, {"rover.turning.lateral": jnp.asarray(0.9)})
     seen = mm.simulate(
         true, mm.Conditions(["rover"] * len(speeds), motor_speed=0.0, motor_speed_left=left, motor_speed_right=right)
     ).reading

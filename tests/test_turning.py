@@ -10,12 +10,13 @@ from scipy.optimize import brentq
 from worlds import turning as world
 
 import mmrjax as mm
-from mmrjax import balances, energy, params, robots
-from mmrjax import turning as room
-from mmrjax.contact import Friction
-from mmrjax.fidelities import drive, turning
-from mmrjax.signals import STATUSES
-from mmrjax.turning import SIDES, Stance
+from mmrjax.fidelities import drive
+from mmrjax.model import balances, energy, paper_robots, params
+from mmrjax.model.contact import Friction
+from mmrjax.model.signals import STATUSES
+from mmrjax.turning import circling as turning
+from mmrjax.turning import two_sides as room
+from mmrjax.turning.two_sides import SIDES, Stance
 
 grip = jax.jit(room.grip)
 CONFIGURATIONS = ("6T2A", "4W2T")
@@ -35,7 +36,7 @@ def of_world(robot, configuration, payload=0.0, **changes):
 
 @pytest.fixture(scope="module")
 def robot():
-    return robots.nominal()
+    return paper_robots.nominal()
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +61,7 @@ def test_turns_are_found_past_kinks_of_friction_and_gears():
 
     @jax.jit
     def circled(values, stated):
-        robot = params.replace(robots.nominal(), values)
+        robot = params.replace(paper_robots.nominal(), values)
         run = mm.Conditions(**stated, open_right=0.0)
         unknowns, solved = turning._unknowns(robot, run)
         motion, loads = turning._motion(robot, run, unknowns)

@@ -7,10 +7,10 @@ import pytest
 
 from calibration.data import robot_file
 from calibration.data import runs as records
-from calibration.data.errors import BadData
+from calibration.data.input_errors import BadData
 from calibration.discovery import discover
 from calibration.inference import noise, observers, ranges, uninformative
-from calibration.words.notes import sentence
+from calibration.words.note_words import sentence
 
 RIG = """
 base = "none"

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from mmrjax import channels, quantities
+from mmrjax.model import channels, quantities
 
 #: One of each unit, in SI.
 BY_HAND = {

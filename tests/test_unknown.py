@@ -9,13 +9,13 @@ import pytest
 
 import mmrjax as mm
 from calibration.data import rig_facts, robot_file
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.sensitivity.model import chosen_outputs, default_outputs
-from mmrjax import params
-from mmrjax.channels import HEAT, WARMING
 from mmrjax.fidelities.base import History
-from mmrjax.profile import profile
-from mmrjax.signals import Signals
+from mmrjax.missions.profile import profile
+from mmrjax.model import params
+from mmrjax.model.channels import HEAT, WARMING
+from mmrjax.model.signals import Signals
 from sweeps.config import Simulate
 from sweeps.config_campaign import Campaign
 from sweeps.inputs import load_robot

@@ -9,10 +9,11 @@ import pytest
 
 import mmrjax as mm
 from calibration.data import effect_file
-from calibration.data.errors import BadConfiguration
-from mmrjax import effects, robots
-from mmrjax.derived import turn
+from calibration.data.input_errors import BadConfiguration
+from mmrjax import effects
+from mmrjax.derived import turning_figures
 from mmrjax.effects.base import THE_SIDE
+from mmrjax.model import paper_robots
 from sweeps import config, inputs
 from sweeps.pages import page
 from tests.test_turn_effects import OF_SIDES, amplitude, with_amplitudes
@@ -40,7 +41,7 @@ def of_file(tmp_path, text, **options):
 
 
 def test_effects_of_the_side_make_sides_unlike():
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     assert robot.unlike == with_amplitudes(robot, dict.fromkeys(OF_SIDES, 0.0)).unlike == ()
     assert with_amplitudes(robot, {name: amplitude(name) for name in effects.OF_TURNS}).unlike == OF_SIDES
     curve = effects.CURVES_ROUND["curve_track_side"](amplitude=0.1)
@@ -51,12 +52,12 @@ def test_effects_of_the_side_make_sides_unlike():
 
 @pytest.mark.parametrize("conditions", [{}, {"duty": -0.5}])
 def test_straight_travel_of_unlike_sides_is_said_to_be_that(conditions):
-    unlike = with_amplitudes(robots.nominal(), {"side_friction": 0.001})
+    unlike = with_amplitudes(paper_robots.nominal(), {"side_friction": 0.001})
     with pytest.warns(UserWarning, match=r"^side_friction: the robot's sides differ, .* duty_left=1, duty_right=1"):
         mm.simulate(unlike, mm.Conditions(**conditions))
     with warnings.catch_warnings():  # which are errors
         mm.simulate(unlike, mm.Conditions(duty_left=1.0, duty_right=1.0))  # computed when it is asked for
-        mm.simulate(with_amplitudes(robots.nominal(), {"side_friction": 0.0}), mm.Conditions(**conditions))
+        mm.simulate(with_amplitudes(paper_robots.nominal(), {"side_friction": 0.0}), mm.Conditions(**conditions))
 
 
 SIDE_RADIUS = 'base = "nominal"\n[effects.side_radius]\namplitude = 0.01\nconfigurations = ["4W2T"]\n'
@@ -89,7 +90,9 @@ def test_unlike_sides_turn_as_those_that_are_driven_alike(tmp_path):
     file = of_file(tmp_path, SIDE_RADIUS)
     asked = mm.Conditions(["6T2A", "4W2T"], voltage=33.0, duty_left=1.0, duty_right=1.0)
     rates = mm.simulate(file.robot, asked).reading["yaw_rate"]
-    np.testing.assert_allclose(turn.by_itself(file.robot, 33.0).reading["yaw_rate"], rates, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        turning_figures.by_itself(file.robot, 33.0).reading["yaw_rate"], rates, rtol=1e-9, atol=1e-12
+    )
     assert abs(rates[0]) < 1e-9 and rates[1] > 0.01  # the left side's radius is the smaller
     assert f"4W2T by {rates[1]:.3g} rad/s to the left" in file.remarks[0]
 

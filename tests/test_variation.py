@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import fidelities, params, quantities, robots
-from mmrjax.conditions import Conditions
+from mmrjax import fidelities
 from mmrjax.errors import UsageError
 from mmrjax.fidelities.steady import steady
-from mmrjax.variation import CONDITIONS, Variation, evaluate
+from mmrjax.fidelities.variation import CONDITIONS, Variation, evaluate
+from mmrjax.model import paper_robots, params, quantities
+from mmrjax.model.conditions import Conditions
 
 NAMES = ("motor.resistance", "6T2A.ground.friction.static", "slope_deg", "voltage")
 VALUES = np.array([[0.7, 0.5, 0.0, 24.0], [0.9, 0.6, 5.0, 33.0], [0.611, 0.2, 20.0, 15.0]])
@@ -21,7 +22,7 @@ VALUES = np.array([[0.7, 0.5, 0.0, 24.0], [0.9, 0.6, 5.0, 33.0], [0.611, 0.2, 20
 
 @pytest.fixture(scope="module")
 def variation():
-    return Variation(robots.nominal(), NAMES)
+    return Variation(paper_robots.nominal(), NAMES)
 
 
 def one_by_one(robot, row):
@@ -38,11 +39,11 @@ def test_point_is_the_robot_and_conditions_that_its_values_state(variation):
 
 
 def test_configuration_is_an_index_and_total_mass_may_be_none_before():
-    variation = Variation(robots.nominal(), ("configuration", "total_mass"))
+    variation = Variation(paper_robots.nominal(), ("configuration", "total_mass"))
     _, conditions = variation.at(jnp.array([1.0, 12.5]), Conditions())
     assert int(conditions.configuration) == 1 and jnp.issubdtype(conditions.configuration.dtype, jnp.integer)
     assert float(conditions.total_mass) == 12.5
-    assert Variation(robots.nominal(), ("total_mass",)).axes["total_mass"].value is None
+    assert Variation(paper_robots.nominal(), ("total_mass",)).axes["total_mass"].value is None
 
 
 @pytest.mark.slow
@@ -60,7 +61,7 @@ def test_evaluate_steady_is_each_point_by_itself(variation):
 @pytest.mark.slow
 @pytest.mark.parametrize("names", [NAMES, ("slope_deg", "voltage")])
 def test_evaluate_drive_is_the_run_of_each_robot(names):
-    robot, chosen = robots.nominal(), [NAMES.index(n) for n in names]
+    robot, chosen = paper_robots.nominal(), [NAMES.index(n) for n in names]
     values, options = jnp.asarray(VALUES[:2, chosen]), {"duration": 0.5}
     found = evaluate(Variation(robot, names), "drive", values, Conditions(), options, ("total_current",))
     for k, row in enumerate(values):
@@ -110,11 +111,11 @@ def test_axes_know_unit_bounds_prior_and_meaning(variation):
 def test_every_condition_has_words_and_limits():
     fields = {f.name for f in dataclasses.fields(Conditions)} - {"begin"}  # which of the beginnings is a run's
     assert set(CONDITIONS) == fields == {*quantities.CONDITIONS, "configuration"}
-    assert all(axis.meaning for axis in Variation(robots.nominal(), tuple(CONDITIONS)).axes.values())
+    assert all(axis.meaning for axis in Variation(paper_robots.nominal(), tuple(CONDITIONS)).axes.values())
 
 
 def test_unknown_and_repeated_names_are_refused_with_those_that_are_near():
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     with pytest.raises(
         UsageError, match=r"motor\.resistanse: .*did you mean motor\.resistance.*allowed: .*slope_deg"
     ):

@@ -11,24 +11,24 @@ from synthetic import Analyst
 
 from calibration.data import runs as records
 from calibration.data.courses import applied, courses, stretches, varies
-from calibration.data.errors import BadData
+from calibration.data.input_errors import BadData
 from calibration.data.runs import DRIVEN, Runs
 from calibration.discovery.reach import reach
 from calibration.discovery.settings import settings_for
 from calibration.inference import checks
 from calibration.inference.blocks import blocks, distinct
-from calibration.inference.calibrate import calibrate
+from calibration.inference.calibration import calibrate
+from calibration.inference.fit_notes import StopsOnSlope
 from calibration.inference.linearization import probe
 from calibration.inference.noise import Noise
-from calibration.inference.notes import StopsOnSlope
 from calibration.inference.observers import Histories, settled_ends
-from mmrjax import params, robots
-from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.histories import CHANGE, LONGEST, START, grid, histories
-from mmrjax.fidelities.mission import mission
-from mmrjax.profile import MODES, profile
-from mmrjax.quantities import MM, RPM
+from mmrjax.missions.mission import mission
+from mmrjax.missions.profile import MODES, profile
+from mmrjax.model import paper_robots, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.quantities import MM, RPM
 
 #: Four segments a run: supply voltage [V] and mode; and the slope [deg] of the run.
 SEGMENTS = (0.0, 0.42, 0.84, 1.26, 1.6)
@@ -40,7 +40,7 @@ EVERY = 0.02
 SD = {"total_current_A": 0.05, "motor_speed_rpm": 15.0, "speed_mm_s": 4.0}
 #: What the robot that is measured has in place of the nominal values.
 TRUTH = {"motor.resistance": 0.68, "6T2A.track.loss_coulomb": 0.30, "6T2A.ground.rolling_resistance": 0.05}
-NOMINAL = {p.name: float(p.value) for p in params.walk(robots.nominal()) if p.name in TRUTH}
+NOMINAL = {p.name: float(p.value) for p in params.walk(paper_robots.nominal()) if p.name in TRUTH}
 UNDECLARED = "series_resistance"
 #: Largest difference of a derivative from differences of runs, over its largest.
 DERIVATIVES, DIFFERENCE = 1e-6, 3e-6
@@ -52,9 +52,9 @@ def engine():
 
     @jax.jit
     def course(values, modes, voltage, slope):
-        known = {p.name: p for p in params.walk(robots.nominal())}
+        known = {p.name: p for p in params.walk(paper_robots.nominal())}
         cold = {"motor.time_constant_winding": jnp.asarray(known["motor.time_constant_winding"].spec.bounds[1])}
-        robot = dataclasses.replace(robots.nominal(), effects=(BY_NAME[UNDECLARED](),))
+        robot = dataclasses.replace(paper_robots.nominal(), effects=(BY_NAME[UNDECLARED](),))
         robot = params.replace(robot, {f"effects.{UNDECLARED}.amplitude": jnp.asarray(0.0), **cold, **values})
         asked = profile(np.asarray(SEGMENTS), voltage=np.zeros(5))
         asked = dataclasses.replace(asked, mode=modes, voltage=voltage)
@@ -134,7 +134,7 @@ def runs():
 
 @pytest.fixture(scope="module")
 def observer(runs):
-    return Histories.of(runs, robots.nominal())
+    return Histories.of(runs, paper_robots.nominal())
 
 
 def changed(runs, **columns):
@@ -167,7 +167,7 @@ def test_grid_is_fine_after_every_change_and_bounded():
 
 @pytest.mark.slow
 def test_constant_values_at_every_instant_are_those_of_a_constant_run():
-    robot, g = robots.nominal(), jnp.asarray(grid(np.arange(0.02, 0.3, 0.02)))
+    robot, g = paper_robots.nominal(), jnp.asarray(grid(np.arange(0.02, 0.3, 0.02)))
     one = Conditions(0, 24.0, 5.0, 2.0)
     many = Conditions(0, jnp.full(len(g), 24.0), 5.0, 2.0)
     a, b = (histories(robot, c, g) for c in (one, many))
@@ -178,8 +178,8 @@ def test_constant_values_at_every_instant_are_those_of_a_constant_run():
 @pytest.mark.slow
 def test_runs_are_those_of_missions(simulated):
     """Of an engine with steps, events and friction at rest of its own; its noise is all that remains."""
-    runs, observer = simulated, Histories.of(simulated, robots.nominal())
-    truth = params.replace(robots.nominal(), {k: jnp.asarray(v) for k, v in TRUTH.items()})
+    runs, observer = simulated, Histories.of(simulated, paper_robots.nominal())
+    truth = params.replace(paper_robots.nominal(), {k: jnp.asarray(v) for k, v in TRUTH.items()})
     seen = np.asarray(eqx.filter_jit(observer)(truth).reading)
     sigma = (seen - runs.measured()) / runs.deviations()
     assert np.sum(sigma**2) < sigma.size + 4 * np.sqrt(2 * sigma.size)
@@ -190,11 +190,11 @@ def test_runs_are_those_of_missions(simulated):
 @pytest.fixture(scope="module")
 def of_values(observer):
     """Names of parameters, their values, the readings by values, and those of several values, compiled."""
-    known = {p.name: float(p.value) for p in params.walk(robots.nominal())}
+    known = {p.name: float(p.value) for p in params.walk(paper_robots.nominal())}
     names = [*TRUTH, "motor.inertia", "motor.inductance", "6T2A.ground.friction.static"]
 
     def readings(x):
-        return observer(params.replace(robots.nominal(), dict(zip(names, x, strict=True)))).reading
+        return observer(params.replace(paper_robots.nominal(), dict(zip(names, x, strict=True)))).reading
 
     several = jax.jit(lambda xs: jax.lax.map(readings, xs))
     return names, jnp.asarray([TRUTH.get(n, known[n]) for n in names]), readings, several
@@ -255,7 +255,7 @@ def test_only_what_changes_has_a_value_an_instant(observer, runs):
 @pytest.mark.slow
 def test_defects_of_all_knots_are_a_constant_defect(observer):
     """Their linear response, through changes of conditions, against the derivative by an amplitude."""
-    robot, effects = robots.nominal(), tuple(probe(balance) for balance in ("electrical", "track"))
+    robot, effects = paper_robots.nominal(), tuple(probe(balance) for balance in ("electrical", "track"))
 
     def readings(amplitudes):
         put = tuple(dataclasses.replace(e, amplitude=a) for e, a in zip(effects, amplitudes, strict=True))
@@ -313,13 +313,13 @@ def test_ends_are_those_of_stretches_driven_forwards(runs):
 def test_reach_takes_what_the_motors_were_given(observer):
     driven = observer.driven
     assert driven.shape[0] > 4 and (np.asarray(driven.voltage) > 0).all() and (np.asarray(driven.duty) == 1).all()
-    found = reach(robots.nominal(), driven, ("speed",))
+    found = reach(paper_robots.nominal(), driven, ("speed",))
     assert found.voltages == (12.0, 15.0, 18.0, 24.0, 33.0) and found.used[0].slopes == (-4.0, -3.0, 0.0, 3.0, 4.0)
 
 
 def test_conditions_that_change_between_many_levels_are_few(observer, runs):
     noisy = changed(runs, supply_voltage_V=runs["supply_voltage_V"] + 0.001 * np.arange(len(runs)))
-    varying = Histories.of(noisy, robots.nominal())
+    varying = Histories.of(noisy, paper_robots.nominal())
     assert len(np.unique(varying.driven.voltage)) <= 6
     assert varying.times.shape[1] < 1.5 * observer.times.shape[1]  # changes of a thousandth need no short steps
 
@@ -327,7 +327,7 @@ def test_conditions_that_change_between_many_levels_are_few(observer, runs):
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_calibration_finds_the_truth_within_its_intervals(simulated):
-    found = calibrate(simulated, robots.nominal(), free=tuple(TRUTH), model="drive", starts=3, profiles=False, blocks=False,
+    found = calibrate(simulated, paper_robots.nominal(), free=tuple(TRUTH), model="drive", starts=3, profiles=False, blocks=False,
                       stated={n: (v, 0.3 * v) for n, v in NOMINAL.items()})  # fmt: skip
     assert found.adequacy.adequate and found.converged
     for name, truth in TRUTH.items():
@@ -371,7 +371,7 @@ def test_columns_of_the_driver_are_read(tmp_path):
     rows = ("a,0,6T2A,24,0,0,0,11,0.5,voltage", "a,1,6T2A,-12,0,0,5,11,-1,voltage", "a,2,6T2A,0,0,0,5,11,,brake",
             "a,3,6T2A,24,0,0,5,11,,coast")  # fmt: skip
     read = records.read(written(tmp_path, f"{HEADER},duty,mode", *rows))
-    found = read.conditions(robots.nominal())
+    found = read.conditions(paper_robots.nominal())
     assert found.duty.tolist() == [0.5, -1.0, 0.0, 0.0] and found.open.tolist() == [0, 0, -1, 1]
     assert found.voltage.tolist() == [24, -12, 0, 24] and applied(read).tolist() == [12, 12, 0, 0]
     assert set(DRIVEN) <= set(MODES)
@@ -427,11 +427,11 @@ def test_a_rig_may_turn_on_forward_while_it_is_driven_backward(runs):
 @pytest.mark.slow
 def test_payload_that_changes_acts_from_its_sample_on(runs):
     payload = runs["payload_kg"] + 6.0 * (runs["time_s"] >= 1.25)
-    heavier = Histories.of(changed(runs, payload_kg=payload), robots.nominal())
+    heavier = Histories.of(changed(runs, payload_kg=payload), paper_robots.nominal())
     assert heavier.conditions.payload.shape == heavier.times.shape
     seen, before = (
-        np.asarray(eqx.filter_jit(o)(robots.nominal()).reading[:, 0])
-        for o in (heavier, Histories.of(runs, robots.nominal()))
+        np.asarray(eqx.filter_jit(o)(paper_robots.nominal()).reading[:, 0])
+        for o in (heavier, Histories.of(runs, paper_robots.nominal()))
     )
     early = runs["time_s"] <= 1.25
     np.testing.assert_allclose(seen[early], before[early], rtol=1e-9, atol=1e-12)

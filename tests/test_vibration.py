@@ -11,12 +11,12 @@ import vibration
 
 from calibration.data.runs import Runs
 from calibration.discovery.discover import discover
-from mmrjax import channels, params, robots
-from mmrjax.conditions import Conditions
-from mmrjax.contact import Friction
-from mmrjax.effects.slip import VibrationSlip
+from mmrjax.effects.slip_effects import VibrationSlip
 from mmrjax.fidelities.track import track_batch
-from mmrjax.signals import CONVERGED, NOT_SETTLED, Signals
+from mmrjax.model import channels, paper_robots, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.contact import Friction
+from mmrjax.model.signals import CONVERGED, NOT_SETTLED, Signals
 
 LAW = Friction(static=0.6, dynamic=0.5, speed_static=0.01, speed_dynamic=0.1)
 
@@ -30,7 +30,7 @@ def fig7(speed):
     return np.sign(speed) * np.where(size < 0.01, rising, 0.6 - 0.1 * y**2 * (3 - 2 * y))
 
 
-@pytest.mark.parametrize("place", ["docs/vibration.md", "docs/effects.md", "mmrjax/effects/slip.py"])
+@pytest.mark.parametrize("place", ["docs/vibration.md", "docs/effects.md", "mmrjax/effects/slip_effects.py"])
 def test_the_equation_that_is_written_is_the_one_that_runs(place):
     """The equation of vibration_slip, read off the page and evaluated, up to the limit and beyond."""
     text = (Path(__file__).parents[1] / place).read_text("utf-8")
@@ -42,7 +42,9 @@ def test_the_equation_that_is_written_is_the_one_that_runs(place):
     known = {"u": used, "p": exponent, "V_teor": speed, "V_1": first, "sqrt": np.sqrt, "abs": np.abs}
     expected = 0.03 * eval(said, {"__builtins__": {}}, known)
     effect = VibrationSlip(amplitude=0.03, exponent=exponent, speed_reference=first)
-    got = effect.term(robots.nominal(), Signals(demand=20.0 * used, adhesion_limit=20.0, speed_theoretical=speed))
+    got = effect.term(
+        paper_robots.nominal(), Signals(demand=20.0 * used, adhesion_limit=20.0, speed_theoretical=speed)
+    )
     np.testing.assert_allclose(got, expected, rtol=1e-12)
     assert expected[6] / (0.03 * (speed / first) ** exponent * 19) < 0.72  # rounded off
 
@@ -109,7 +111,7 @@ def shaken():
             "6T2A.ground.friction.speed_static": speed, "6T2A.ground.friction.speed_dynamic": 10 * speed,
             "6T2A.track.guide_friction": 0.06,
         }  # fmt: skip
-        robot = params.replace(robots.nominal(), {k: jnp.asarray(v) for k, v in values.items()})
+        robot = params.replace(paper_robots.nominal(), {k: jnp.asarray(v) for k, v in values.items()})
         seen = vibration.compared(robot, *rows)
         found[name] = [np.asarray(seen[x]) for x in ("slip", "law", "without ripple", "normal")]
     return found
@@ -143,7 +145,7 @@ def test_loop_finds_the_effect_in_what_the_track_model_made():
     values = {f"running_gear.{k}": v for k, v in gear.items()} | {"6T2A.track.guide_friction": 0.06}
     values |= {f"6T2A.ground.friction.{k}": v for k, v in ground.items()}
     values |= {"4W2T.ground.friction.static": 0.57, "4W2T.ground.friction.dynamic": 0.5}
-    robot = params.replace(robots.nominal(), {k: jnp.asarray(v) for k, v in values.items()})
+    robot = params.replace(paper_robots.nominal(), {k: jnp.asarray(v) for k, v in values.items()})
     axes = np.meshgrid((0, 1), (15.0, 24.0, 33.0), (0.0, 5.0, 10.0, 15.0), (0.0, 4.0, 8.0), indexing="ij")
     kind, voltage, slope, payload = (x.ravel() for x in axes)
     conditions = Conditions(kind, voltage=voltage, slope_deg=slope, payload=payload)
@@ -157,7 +159,7 @@ def test_loop_finds_the_effect_in_what_the_track_model_made():
         noise = 1 + sd * rng.standard_normal(len(kind))
         columns[channel.column] = np.asarray(shown.reading[channel.name]) / channel.factor * noise
     table = Runs("made by the track model", columns).where(goes_on)
-    found = discover(table, robots.nominal(), noise="current=1%,motor_speed=0.3%,speed=0.3%")
+    found = discover(table, paper_robots.nominal(), noise="current=1%,motor_speed=0.3%,speed=0.3%")
     assert found.verdict in ("named", "class") and [e.name for e in found.effects] == ["vibration_slip"]
     before, after = found.errors_held_out["voltage"]
     assert after["speed"]["rms_percent"] < 0.5 * before["speed"]["rms_percent"]

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from calibration.discovery import notes as of_loop
-from calibration.discovery.notes import (
+from calibration.discovery import loop_notes as of_loop
+from calibration.discovery.loop_notes import (
     CurveOver,
     FreedValue,
     Mechanism,
@@ -21,15 +21,15 @@ from calibration.discovery.notes import (
     Summary,
 )
 from calibration.discovery.result import Formula, Sensitivity, Worse
-from calibration.inference import notes as of_fit
+from calibration.inference import fit_notes as of_fit
+from calibration.inference.fit_notes import Note, Shown, Step
 from calibration.inference.lack_of_fit import Adequacy
-from calibration.inference.notes import Note, Shown, Step
 from calibration.inference.residual_clusters import LevelMean, ResidualCluster
 from calibration.inference.series_noise import SeriesNoise
-from calibration.sensitivity import notes as of_study
-from calibration.words import fits, loop, steps, tables
-from calibration.words.notes import SAID, in_words, sentence
-from mmrjax import channels
+from calibration.sensitivity import sensitivity_notes as of_study
+from calibration.words import fit_words, loop_words, step_words, table_words
+from calibration.words.note_words import SAID, in_words, sentence
+from mmrjax.model import channels
 from sweeps import console
 from sweeps.pages.words import FILES
 
@@ -446,7 +446,7 @@ def test_a_sentence_is_its_own_words_and_what_is_no_note_says_so():
 
 @pytest.mark.parametrize(
     ("kind", "rows"),
-    [("Step", steps.STEPS), ("Fact", fits.FACTS), ("RuledOut", loop.RULED_OUT)],
+    [("Step", step_words.STEPS), ("Fact", fit_words.FACTS), ("RuledOut", loop_words.RULED_OUT)],
 )
 def test_names_of_rows_are_those_of_the_code(kind, rows):
     """A name without a row would fail only where it is said, and a row without a name is never said."""
@@ -462,21 +462,21 @@ def test_names_of_rows_are_those_of_the_code(kind, rows):
 
 def test_every_reason_and_every_doubt_has_its_words():
     text = (ROOT / "calibration" / "discovery" / "standing.py").read_text(encoding="utf-8")
-    assert all(f'"{why}"' in text for why in loop.REASONS if why)
+    assert all(f'"{why}"' in text for why in loop_words.REASONS if why)
     whys = {a.value for c in ast.walk(ast.parse(text)) if isinstance(c, ast.Call) for a in c.args[1:2]
             if ast.unparse(c.func) == "NameSupport" and isinstance(a, ast.Constant)}  # fmt: skip
-    assert whys <= set(loop.REASONS)
+    assert whys <= set(loop_words.REASONS)
     worst = NameTest("a", 0.0, 3.0, (), -99.0, 1, 0.0, 0.0, ("b",), True, varies=4.0, over="speed")
     schema = (ROOT / "docs" / "schemas" / "loop.schema.json").read_text(encoding="utf-8")
-    assert all(f'"{doubt}"' in schema for doubt in loop.DOUBTS)
+    assert all(f'"{doubt}"' in schema for doubt in loop_words.DOUBTS)
     rests = dataclasses.replace(worst, root=4.0)  # below chance with all its rows it rests on none
-    assert {*worst.fails, *rests.fails} == set(loop.DOUBTS) and not NameTest("a", 4.0, 3.0, (), 0.0).fails
+    assert {*worst.fails, *rests.fails} == set(loop_words.DOUBTS) and not NameTest("a", 4.0, 3.0, (), 0.0).fails
 
 
 @pytest.mark.parametrize(("unit", "said"), [("-", "-0.0154 ± 0.00014"), ("ohm", "-0.0154 ± 0.00014 ohm")])
 def test_a_size_has_a_unit_where_there_is_one(unit, said):
     amplitude = SimpleNamespace(value=-0.01541, sd=0.000141, unit=unit)
-    assert loop.size(SimpleNamespace(parameters={"amplitude": amplitude})) == said
+    assert loop_words.size(SimpleNamespace(parameters={"amplitude": amplitude})) == said
 
 
 # --- verdicts -------------------------------------------------------------------------------------------
@@ -530,22 +530,22 @@ OVER = CurveOver("slip", ("slope",))
     ],
 )
 def test_why_names_stand_or_not(support, said):
-    assert loop.reason(support) == said
+    assert loop_words.reason(support) == said
 
 
 def test_verdict_of_a_complete_model():
     off = of_fit.NoiseOff("", 2.0, "stated")
     said = "Nothing is missing: what the fitted model leaves is what noise leaves (family-wise p = 0.4)."
-    assert loop.statement(Summary("none", 0.4, None)) == said
-    assert loop.statement(Summary("none", 0.4, None, noise=(off,))) == f"{said} But {sentence(off)}"
-    aside = loop.statement(Summary("none", 0.4, None, aside=10, of=100))
+    assert loop_words.statement(Summary("none", 0.4, None)) == said
+    assert loop_words.statement(Summary("none", 0.4, None, noise=(off,))) == f"{said} But {sentence(off)}"
+    aside = loop_words.statement(Summary("none", 0.4, None, aside=10, of=100))
     assert aside == f"10 of 100 rows (10 %) lie off alone and are set aside. {said}"
 
 
 def test_verdict_tells_what_is_tentative():
     test = NameTest("b", 5.0, 3.4, (), 9.0, 10, 2.0)
     sure, tentative = Missing(("a",), (), ("drop",)), Missing(("b",), (), ("slip",), False, test)
-    assert loop.statement(Summary("named", 0.001, None, (sure, tentative))) == (
+    assert loop_words.statement(Summary("named", 0.001, None, (sure, tentative))) == (
         "Missing: a (family-wise p ≤ 0.001). Tentative, in the model since it predicts better: b, which rests on row 10."
     )
     # where no name stands and it was not tested by itself, what speaks against all of them
@@ -554,7 +554,7 @@ def test_verdict_tells_what_is_tentative():
         place="slip", variable="slope", alike=("slip",), variables_alike=(), family="slip", by_duty=False
     )
     only = Missing(("b",), (), ("slip",), False)
-    said = loop.statement(Summary("place", 0.001, place, (only,), support=curve))
+    said = loop_words.statement(Summary("place", 0.001, place, (only,), support=curve))
     assert "no effect of the library is established" in said
     assert said.endswith("predicts better: b (one smooth curve in the slip balance over slope leaves nothing).")
 
@@ -564,18 +564,18 @@ def test_a_mechanism_is_stated_with_what_it_explains_and_predicts():
     place = SimpleNamespace(
         place="track", variable="speed_motor", alike=("track",), variables_alike=(), family="x", by_duty=False
     )
-    said = loop.statement(Summary("mechanism", 0.001, place, mechanism=found))
+    said = loop_words.statement(Summary("mechanism", 0.001, place, mechanism=found))
     assert said.startswith(
         "Missing: a loss torque that changes with speed or a slip, established as a mechanism: it "
     )
     assert "explains 99 % of the excess misfit, gains 0.8 nat" in said and "8.0 standard errors" in said
     weak = dataclasses.replace(found, families=("slip",), share=0.3, gain=0.1)
-    said = loop.statement(Summary("place", 0.001, place, mechanism=weak))
+    said = loop_words.statement(Summary("place", 0.001, place, mechanism=weak))
     assert (
         "No mechanism is established: the best one is a slip, but it explains only 30 % of the excess misfit and"
         in said
     )
-    assert loop.brief(Summary("mechanism", 0.001, place, mechanism=weak)) == "mechanism: slip"
+    assert loop_words.brief(Summary("mechanism", 0.001, place, mechanism=weak)) == "mechanism: slip"
 
 
 def test_a_mechanism_is_stated_with_its_window_and_why_no_name_stands():
@@ -587,29 +587,30 @@ def test_a_mechanism_is_stated_with_its_window_and_why_no_name_stands():
     mechanism = Mechanism((here.family,), (), 0.99, 0.8, 0.1, 1.0)
     summary = Summary("mechanism", 0.001, here, mechanism=mechanism)
     within = "order, in runs 30 to 44 (as well in runs 31 to 44)"
-    assert loop.statement(summary).startswith(
+    assert loop_words.statement(summary).startswith(
         f"Missing: a slip that changes with {within}, established as a mechanism"
     )
     other = dataclasses.replace(mechanism, families=("slip that changes with load",))
-    assert "in runs" not in loop.statement(dataclasses.replace(summary, mechanism=other))
+    assert "in runs" not in loop_words.statement(dataclasses.replace(summary, mechanism=other))
     support = NameSupport(False, "none by itself", tests=(NameTest("a", 1.2, 3.41, (), 0.0),))
     found = SimpleNamespace(
         verdict="mechanism", summary=summary, effects=(), unnamed=here, support=support, after=SimpleNamespace(adequate=True)
     )  # fmt: skip
     assert (
-        loop.answer(found) == f"No: missing is a slip that changes with {within}. Its exact law is not established."
+        loop_words.answer(found)
+        == f"No: missing is a slip that changes with {within}. Its exact law is not established."
     )
     said = (
         "one constant in the slip balance in runs 30 to 44 leaves nothing; a explains 1.2 σ, and chance reaches 3.4"
     )
-    assert loop.why(found) == said
+    assert loop_words.why(found) == said
     found.after.adequate = False
-    assert loop.why(found) == loop.reason(support)
+    assert loop_words.why(found) == loop_words.reason(support)
 
 
 def test_every_doubt_about_a_mechanism_has_words():
     none = Mechanism(tuple(f"loss torque that changes with {x}" for x in "abcd"), (), 0.1, 0.0, np.inf, 0.0)
-    assert set(none.fails) == set(loop.NO_MECHANISM) and all(loop.no_mechanism(none).split())
+    assert set(none.fails) == set(loop_words.NO_MECHANISM) and all(loop_words.no_mechanism(none).split())
 
 
 @pytest.mark.parametrize(
@@ -622,8 +623,8 @@ def test_every_doubt_about_a_mechanism_has_words():
 def test_the_course_of_a_curve_is_told_by_its_ends(value, said):
     at = np.array([10.0, 20.0, 100.0])
     curve = SimpleNamespace(window=None, variable="speed_motor", at=at, value=np.array(value), unit="N·m")
-    assert loop.course(curve) == said
-    assert loop.course(SimpleNamespace(**vars(curve) | {"window": {}})) == ""
+    assert loop_words.course(curve) == said
+    assert loop_words.course(SimpleNamespace(**vars(curve) | {"window": {}})) == ""
 
 
 def test_verdicts_at_other_noise_are_one_sentence():
@@ -631,11 +632,11 @@ def test_verdicts_at_other_noise_are_one_sentence():
         return Sensitivity(factor, verdict, Summary(verdict, 0.01, None, missing), (), True)
 
     sure, weak = Missing(("a", "c"), (), ("x",)), Missing(("b",), (), ("y",), False)
-    assert loop.at_other_noise(()) == ""
-    assert loop.at_other_noise([other(0.7, "class", sure, weak), other(1.4, "class", sure, weak)]) == (
+    assert loop_words.at_other_noise(()) == ""
+    assert loop_words.at_other_noise([other(0.7, "class", sure, weak), other(1.4, "class", sure, weak)]) == (
         "with 0.7 and with 1.4 times that noise the verdict is class: a established, b tentative"
     )
-    assert loop.at_other_noise([other(0.5, "place", weak), other(2, "none")]) == (
+    assert loop_words.at_other_noise([other(0.5, "place", weak), other(2, "none")]) == (
         "with 0.5 times that noise the verdict is place: b tentative; with 2 times that noise the verdict is none"
     )
 
@@ -644,11 +645,11 @@ def test_verdict_lists_what_cannot_be_told_apart():
     value = FreedValue("motor.resistance", 1.9377, "ohm")
     one = Missing(("a",), (value,), ("losses",))
     two = Missing(("b", "c"), (), ("leads", "supply"))
-    assert loop.statement(Summary("class", 0.0004, None, (one, two))) == (
+    assert loop_words.statement(Summary("class", 0.0004, None, (one, two))) == (
         "Missing: losses, a, or motor.resistance is 1.94 ohm (these data cannot tell which); one of b, c (these data "
         "cannot tell which) (family-wise p ≤ 0.0004)."
     )
-    assert loop.statement(Summary("named", 0.002, None, (Missing(("a",), (), ("x",)),))) == (
+    assert loop_words.statement(Summary("named", 0.002, None, (Missing(("a",), (), ("x",)),))) == (
         "Missing: a (family-wise p ≤ 0.002)."
     )
 
@@ -660,7 +661,7 @@ def test_verdict_lists_what_cannot_be_told_apart():
 def test_what_settled_runs_cannot_tell_from_an_effect_is_said_of_them_alone(sampled, said):
     members = {"directional_friction": SimpleNamespace(size=0.1), "angle_friction": SimpleNamespace(size=1.5)}
     effect = SimpleNamespace(members=members, stated={})
-    assert loop.alike(SimpleNamespace(runs=SimpleNamespace(sampled=sampled)), effect) == said
+    assert loop_words.alike(SimpleNamespace(runs=SimpleNamespace(sampled=sampled)), effect) == said
 
 
 def test_a_formula_without_terms_says_so():
@@ -670,7 +671,7 @@ def test_a_formula_without_terms_says_so():
 
 def test_why_an_effect_is_ruled_out():
     reasons = (RuledOut("a", "power"), RuledOut("b", "size", 2.94, ("x", "y")), RuledOut("c", "edge"))
-    assert loop.why_ruled_out(reasons) == (
+    assert loop_words.why_ruled_out(reasons) == (
         "a would make its balance supply power; b at 2.9 times its largest plausible size; check x and y; c is within an sd of the "
         "largest plausible size"
     )
@@ -684,12 +685,12 @@ def test_names_say_what_would_explain_more_than_they():
         return SimpleNamespace(effects=dict.fromkeys(names, 1.0), rise_chi2=rise, why="too large")
 
     near, better = candidate(-2.0, "a"), candidate(-30.4, "b", "c")
-    assert loop.ruled_out(of("named", candidate(6.5, "a"))) == "" == loop.ruled_out(of("place"))
-    assert loop.ruled_out(of("named", near)).startswith("a would explain as much as what is proposed, but is")
-    assert loop.ruled_out(of("class", near, better)) == (
+    assert loop_words.ruled_out(of("named", candidate(6.5, "a"))) == "" == loop_words.ruled_out(of("place"))
+    assert loop_words.ruled_out(of("named", near)).startswith("a would explain as much as what is proposed, but is")
+    assert loop_words.ruled_out(of("class", near, better)) == (
         "b and c would explain 30 σ² more than what is proposed, but are ruled out by size or sign alone: too large."
     )
-    assert loop.ruled_out(of("place", better, near)).startswith("a would explain as much as the curve, but is")
+    assert loop_words.ruled_out(of("place", better, near)).startswith("a would explain as much as the curve, but is")
 
 
 @pytest.mark.parametrize(
@@ -706,7 +707,7 @@ def test_names_say_what_would_explain_more_than_they():
 def test_what_is_predicted_worse_is_said_with_its_rows(found, predicted, said):
     worse = () if found is None else (Worse("voltage", "motor_speed", *found),)
     whole = f"Held out, what was found predicts worse: by voltage {said}."
-    assert loop.worse(worse, {"voltage": predicted}) == (whole if said else "")
+    assert loop_words.worse(worse, {"voltage": predicted}) == (whole if said else "")
 
 
 @pytest.mark.parametrize(
@@ -718,7 +719,7 @@ def test_what_is_predicted_worse_is_said_with_its_rows(found, predicted, said):
     ],
 )
 def test_what_the_track_model_is_asked_about(about, said):
-    assert loop.asked(of_loop.Asked(*about)) == said
+    assert loop_words.asked(of_loop.Asked(*about)) == said
 
 
 # --- whether a fit is adequate --------------------------------------------------------------------------
@@ -755,7 +756,7 @@ def test_what_the_track_model_is_asked_about(about, said):
 )
 def test_adequacy_is_said(found, said):
     assert found.statement == said and found.to_json()["statement"] == said
-    assert found.to_json()["shown_by"] == fits.shown_by(found.shown_by)
+    assert found.to_json()["shown_by"] == fit_words.shown_by(found.shown_by)
 
 
 def clustered(levels, **other):
@@ -804,13 +805,13 @@ def test_tests_that_are_as_improbable_are_named_in_the_order_of_their_words():
     every = [Shown(what="stated"), Shown(what="repeats")]
     every += [Shown(c, "follow", v) for c in ("total_current", "speed") for v in ("the fitted speed", "slope_deg")]
     every += [Shown(c, "remember") for c in ("motor_speed", "total_current")]
-    assert sorted(every) == sorted(every, key=fits.shown_by)
+    assert sorted(every) == sorted(every, key=fit_words.shown_by)
 
 
 def test_what_would_measure_is_found_by_either_end_of_a_name():
-    assert tables.would_measure("motor.inductance").startswith("a time history of the start-up current")
-    assert re.search("slippery slope", tables.would_measure("6T2A.ground.friction.dynamic"))
-    assert tables.would_measure("x.y") == "runs under conditions in which it acts"
+    assert table_words.would_measure("motor.inductance").startswith("a time history of the start-up current")
+    assert re.search("slippery slope", table_words.would_measure("6T2A.ground.friction.dynamic"))
+    assert table_words.would_measure("x.y") == "runs under conditions in which it acts"
 
 
 def test_lines_of_a_terminal_have_80_columns_and_those_of_a_file_are_whole(monkeypatch, capsys):

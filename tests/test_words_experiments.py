@@ -6,9 +6,17 @@ import pytest
 
 from calibration.discovery import menu
 from calibration.discovery.experiments import more_runs
-from calibration.discovery.notes import CarryOut, Heat, NothingPossible, NothingTells, Overspeed, Overvoltage, TooWeak
+from calibration.discovery.loop_notes import (
+    CarryOut,
+    Heat,
+    NothingPossible,
+    NothingTells,
+    Overspeed,
+    Overvoltage,
+    TooWeak,
+)
 from calibration.discovery.reach import Reach, Used
-from calibration.words import experiments as words
+from calibration.words import experiment_words as words
 
 TRACKED = Used("6T2A", 0, (15.0, 24.0, 33.0), (0.0, 10.0, 20.0), (0.0, 8.0), 21.1)
 WHEELED = dataclasses.replace(TRACKED, configuration="4W2T", index=1)

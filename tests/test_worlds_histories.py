@@ -13,10 +13,10 @@ from worlds.tables import READINGS
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.inference import noise, observers
-from mmrjax import params, robots
-from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.drive import drive_batch
+from mmrjax.model import paper_robots, params
+from mmrjax.model.conditions import Conditions
 
 RUNS = histories.starts(CLIMBING)
 DURATION, EVERY = 0.6, 0.01
@@ -40,7 +40,7 @@ def driven(robot, run, times):
 @pytest.fixture(scope="module")
 def package():
     """Histories of `drive` for amplitudes of PASSING, shape (3, runs, instants)."""
-    base = params.replace(robots.nominal(), CLIMBING)
+    base = params.replace(paper_robots.nominal(), CLIMBING)
     full = dataclasses.replace(base, effects=tuple(BY_NAME[n]() for n in PASSING))
     times = np.arange(round(DURATION / EVERY) + 1) * EVERY
     every = {p.name: p.value for p in params.walk(full)}
@@ -219,7 +219,7 @@ def test_table_of_histories_passes_the_input_checks(quick, tmp_path):
         kind = observers.kind(runs)
         known = noise.from_table(runs, kind.sizes(runs))
         assert runs.has("time_s") and len(runs) == made.label["rows"]
-        assert kind.check(runs, known) == kind.check_start(runs, known, robots.nominal()) == []
+        assert kind.check(runs, known) == kind.check_start(runs, known, paper_robots.nominal()) == []
         assert np.isnan(runs.measured()).sum() == made.label["missing"]
         assert set(runs["configuration"]) <= set(w.machine.names.values())
         assert (made.label["missing"] > 0) == (w.missing > 0) and (made.label["outliers"] > 0) == (w.outliers > 0)

@@ -12,10 +12,10 @@ from worlds.settled import remainder
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.inference import bases, noise, observers, ranges
-from calibration.inference.observers.histories import _common
+from calibration.inference.observers.time_histories import _common
 from calibration.inference.ranges import check_ranges
-from mmrjax import params
 from mmrjax.effects import BY_NAME
+from mmrjax.model import params
 
 #: Of the sds of the readings, rms: both methods' own errors, and the windings', of which the file says nothing.
 ERROR = 0.3

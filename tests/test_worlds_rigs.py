@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from worlds import laws, rigs
 
-from mmrjax import params, robots
-from mmrjax.chassis import Chassis
-from mmrjax.conditions import Conditions
-from mmrjax.contact import Friction
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.ground import Ground
-from mmrjax.rig import Rig
-from mmrjax.robot import Configurations
-from mmrjax.shaft import Shaft
-from mmrjax.signals import STATUSES
-from mmrjax.track import Track
+from mmrjax.model import paper_robots, params
+from mmrjax.model.chassis import Chassis
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.contact import Friction
+from mmrjax.model.ground import Ground
+from mmrjax.model.rig import Rig
+from mmrjax.model.robot import Configurations
+from mmrjax.model.shaft import Shaft
+from mmrjax.model.signals import STATUSES
+from mmrjax.model.track_friction import Track
 
 ROWS = 64  # of all tables once padded, so that few programs are compiled
 
@@ -47,7 +47,7 @@ def robot(w):
     else:
         load = Shaft(inertia=0.0, loss_coulomb=0.0)
     rig = Rig(imposed="motor_speed" if r.wide else "voltage")
-    blank = robots.blank(Configurations({"load": load}), float(r.sides), rig)
+    blank = paper_robots.blank(Configurations({"load": load}), float(r.sides), rig)
     values = {n if n.startswith(("motor.", "gearbox.")) else f"load.{n}": jnp.asarray(v) for n, v in p.items()}
     return params.replace(blank, values)
 

@@ -16,12 +16,12 @@ from worlds.tables import READINGS, narrow
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.inference import priors
-from mmrjax import params, robots
-from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.steady import steady_batch
+from mmrjax.model import paper_robots, params
+from mmrjax.model.conditions import Conditions
 
-GRID = settled.table8(payloads=robots.PAYLOADS_KG)
+GRID = settled.table8(payloads=paper_robots.PAYLOADS_KG)
 CLEAN = readings(GRID, CLIMBING)[0]
 #: What the worlds call a shape parameter, and what the library does.
 SHAPES = {
@@ -34,7 +34,7 @@ BUILDS = ((TRACKS,), (WHEELS,), ROLES)
 @pytest.fixture(scope="module")
 def package():
     """Readings of `steady` on GRID, shape (3, rows), for constants and a term of the library."""
-    base = params.replace(robots.nominal(), CLIMBING)
+    base = params.replace(paper_robots.nominal(), CLIMBING)
     full = dataclasses.replace(base, effects=tuple(BY_NAME[name]() for name in laws.LIBRARY))
     run = Conditions(GRID.wheeled, GRID.U, np.degrees(GRID.slope), GRID.payload, total_mass=GRID.mass)
     every = {p.name: p.value for p in params.walk(full)}

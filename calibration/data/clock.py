@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from calibration.data import delimited
 from calibration.data.columns import Meaning
-from calibration.data.errors import number
+from calibration.data.input_errors import number
 
 #: What follows a day where a cell holds a time alone, and how long a day lasts [s].
 _SOME_DAY, _DAY = "1970-01-01T", 86400.0

@@ -7,14 +7,14 @@ import difflib
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
-from calibration.data.errors import BadData
-from mmrjax import channels, quantities
-from mmrjax.channels import Channel
-from mmrjax.quantities import BY_COLUMN, RPM, Quantity
+from calibration.data.input_errors import BadData
+from mmrjax.model import channels, quantities
+from mmrjax.model.channels import Channel
+from mmrjax.model.quantities import BY_COLUMN, RPM, Quantity
 
 if TYPE_CHECKING:
-    from mmrjax.rig import Instrument
-    from mmrjax.robot import Robot
+    from mmrjax.model.rig import Instrument
+    from mmrjax.model.robot import Robot
 
 #: Column of what is imposed (`rig.IMPOSED`), and the SI value of its unit.
 SUPPLY, SPEED, CURRENT = "supply_voltage_V", "motor_speed_rpm", "motor_current_A"

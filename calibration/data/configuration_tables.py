@@ -10,14 +10,14 @@ from typing import Any
 import equinox as eqx
 
 from calibration.data import rig_file
-from calibration.data.errors import BadConfiguration, choices
-from mmrjax import params
-from mmrjax.chassis import Chassis
-from mmrjax.contact import Friction
-from mmrjax.ground import Ground
-from mmrjax.robot import Load, Robot
-from mmrjax.shaft import Shaft
-from mmrjax.track import Track
+from calibration.data.input_errors import BadConfiguration, choices
+from mmrjax.model import params
+from mmrjax.model.chassis import Chassis
+from mmrjax.model.contact import Friction
+from mmrjax.model.ground import Ground
+from mmrjax.model.robot import Load, Robot
+from mmrjax.model.shaft import Shaft
+from mmrjax.model.track_friction import Track
 
 #: What a configuration moves on, and its `on_tracks`.
 MOVERS = {"tracks": 1.0, "wheels": 0.0}

@@ -7,12 +7,12 @@ import numpy as np
 
 from calibration.data import sides
 from calibration.data.columns import HEADING, LEVERS, SPEED, SUPPLY
-from calibration.data.errors import BadData, number
+from calibration.data.input_errors import BadData, number
 from calibration.data.table import Runs
-from mmrjax import params
-from mmrjax.channels import CURRENT, VOLTAGE
-from mmrjax.quantities import RPM
-from mmrjax.robot import Robot, cannot_turn
+from mmrjax.model import params
+from mmrjax.model.channels import CURRENT, VOLTAGE
+from mmrjax.model.quantities import RPM
+from mmrjax.model.robot import Robot, cannot_turn
 
 #: Share of the motors' back-EMF below which no voltage turns them at an imposed speed [-], and least back-EMF that
 #: tells [V].

@@ -8,7 +8,7 @@ import math
 import re
 from collections.abc import Sequence
 
-from calibration.data.errors import BadData, parsed
+from calibration.data.input_errors import BadData, parsed
 
 #: What may separate cells beside a comma, and how it is called.
 SEPARATORS = {";": "semicolons", "\t": "tabs"}

@@ -20,14 +20,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from calibration.data.errors import BadConfiguration, choices, is_number
-from mmrjax import channels, effects, params, robots
-from mmrjax.balances import BALANCES, ROUND, added, moving
-from mmrjax.conditions import Conditions
+from calibration.data.input_errors import BadConfiguration, choices, is_number
+from mmrjax import effects
 from mmrjax.effects import Effect
 from mmrjax.effects.base import THE_SIDE
 from mmrjax.effects.contract import readable
-from mmrjax.signals import Signals, State
+from mmrjax.model import channels, paper_robots, params
+from mmrjax.model.balances import BALANCES, ROUND, added, moving
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import Signals, State
 
 #: Effects by name, as robot files and the command line know them.
 Library = Mapping[str, type[Effect]]
@@ -178,7 +179,7 @@ def _check(path: Path, effect: type[Effect]) -> None:
 def _instants(balance: str, channel: str, configuration: int) -> tuple[Signals, Signals, Signals]:
     """Of the nominal robot on its battery: what a term of the left side may read while it climbs and turns to the
     left, all signals of that instant, and what a term may read at rest."""
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     run = Conditions(configuration, slope_deg=6.0, payload=2.0, battery=1.0, discharge=100.0)
     zero = jnp.zeros(())
     climbing = State(jnp.asarray(1.5), jnp.asarray(800.0), jnp.asarray(0.6), jnp.asarray(100.0))
@@ -191,7 +192,7 @@ def _instants(balance: str, channel: str, configuration: int) -> tuple[Signals, 
 
 
 def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect], size: float) -> None:
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     memory = {} if effect.memory_size is None else {effect.name: jnp.asarray(0.3 * effect.memory_size)}
 
     def term(amplitude: jax.Array, signals: Signals) -> jax.Array:

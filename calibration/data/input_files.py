@@ -8,7 +8,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from calibration.data.errors import BadConfiguration, BadData, InputError
+from calibration.data.input_errors import BadConfiguration, BadData, InputError
 from mmrjax.errors import counted
 
 #: First bytes of formats that are no text, and what they are.

@@ -5,17 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mmrjax import channels
-from mmrjax.channels import Channel
-from mmrjax.rig import Instrument
-from mmrjax.robot import Robot
-
-if TYPE_CHECKING:
-    from calibration.data.table import Runs
+from calibration.data.table import Runs
+from mmrjax.model import channels
+from mmrjax.model.channels import Channel
+from mmrjax.model.rig import Instrument
+from mmrjax.model.robot import Robot
 
 #: Smallest step that counts as one, and what of a difference is rounding, as shares of the largest difference.
 SMALLEST, ROUNDING = 1e-5, 1e-9

@@ -13,12 +13,12 @@ from collections.abc import Iterable
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data.errors import BadConfiguration, BadData, number
+from calibration.data.input_errors import BadConfiguration, BadData, number
 from calibration.data.runs import Runs
 from calibration.data.surfaces import scaled
-from mmrjax import params
-from mmrjax.robot import Robot
-from mmrjax.tables import BENCH
+from mmrjax.model import params
+from mmrjax.model.paper_tables import BENCH
+from mmrjax.model.robot import Robot
 
 #: Masses that differ by less are the same: the rounding of a sum [kg].
 ROUNDING = 1e-6

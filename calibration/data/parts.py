@@ -16,8 +16,8 @@ from fractions import Fraction
 from importlib import resources
 from typing import Any, TypeVar
 
-from calibration.data.errors import BadData
-from mmrjax.quantities import RPM
+from calibration.data.input_errors import BadData
+from mmrjax.model.quantities import RPM
 
 MILLI = 1e-3
 GRAM_CM2 = 1e-7  # kg·m²

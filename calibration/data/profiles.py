@@ -10,7 +10,7 @@ import tomllib
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,19 +18,16 @@ from jaxtyping import Array
 
 from calibration.data import delimited, input_files
 from calibration.data.columns import LOAD, SUPPLY
-from calibration.data.errors import BadConfiguration, BadData, choices, is_number, number
-from mmrjax import channels, quantities
-from mmrjax.channels import Channel
+from calibration.data.input_errors import BadConfiguration, BadData, choices, is_number, number
 from mmrjax.errors import counted
-from mmrjax.fidelities.mission import Start
-from mmrjax.profile import APART, MODES, MOTOR_SPEED, PAIRS, SPEED, VOLTAGE, profile, sides_refused
-from mmrjax.quantities import Quantity
-from mmrjax.tables import SURFACES, adhesion_ratio, lateral_ratio
-
-if TYPE_CHECKING:
-    from mmrjax.conditions import Conditions
-    from mmrjax.profile import Profile
-    from mmrjax.robot import Robot
+from mmrjax.missions.mission import Start
+from mmrjax.missions.profile import APART, MODES, MOTOR_SPEED, PAIRS, SPEED, VOLTAGE, Profile, profile, sides_refused
+from mmrjax.model import channels, quantities
+from mmrjax.model.channels import Channel
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_tables import SURFACES, adhesion_ratio, lateral_ratio
+from mmrjax.model.quantities import Quantity
+from mmrjax.model.robot import Robot
 
 #: Profiles that come with the package, in `calibration/data/profiles/`.
 PACKAGED = ("stair", "stop_and_go", "shuttle", "patrol")
@@ -39,7 +36,7 @@ CONTROLLED = tuple(mode for mode in MODES if mode in channels.USUAL)
 BETWEEN = ("held", "linear")
 #: Most rows in all, cycles included.
 LONGEST = 1_000_000
-#: What columns can hold, by the field of `mmrjax.profile.Profile` that it becomes; the demands become `demand`.
+#: What columns can hold, by the field of `mmrjax.missions.profile.Profile` that it becomes; demands become `demand`.
 QUANTITIES: dict[str, Quantity] = {
     "time": quantities.named("time"),
     "voltage": quantities.CONDITIONS["voltage"],
@@ -81,9 +78,9 @@ class ProfileTable:
         source: name of the file or of the packaged profile, for messages.
         time: of the rows [s]; modes: of `MODES`, one a row.
         demand: motor speed [rad/s] or speed [m/s], shape (rows,).
-        values: fields of `mmrjax.profile.Profile` that it states, by name, shape (rows,).
+        values: fields of `mmrjax.missions.profile.Profile` that it states, by name, shape (rows,).
         surface: of Table 5, one a row; None where it states none.
-        linear, cycles: as of `mmrjax.profile.Profile`.
+        linear, cycles: as of `mmrjax.missions.profile.Profile`.
         digest: SHA-256 of the file.
         begins: fields of `Start` that it states [SI, °C]; rolling speed, temperatures of winding and housing.
         notes: sentences on how the file was read.

@@ -11,16 +11,16 @@ import numpy as np
 from calibration.data import rig_file
 from calibration.data.columns import CURRENT, LOAD, SPEED, SUPPLY
 from calibration.data.courses import applied, changing, stretches
-from calibration.data.errors import rounded
+from calibration.data.input_errors import rounded
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
-from mmrjax import params
-from mmrjax.channels import VOLTAGE
 from mmrjax.errors import counted
-from mmrjax.quantities import RPM
-from mmrjax.robot import Robot
-from mmrjax.shaft import Shaft
-from mmrjax.signals import GRAVITY
+from mmrjax.model import params
+from mmrjax.model.channels import VOLTAGE
+from mmrjax.model.quantities import RPM
+from mmrjax.model.robot import Robot
+from mmrjax.model.shaft import Shaft
+from mmrjax.model.signals import GRAVITY
 
 BATTERY = "battery"
 #: From this ratio a gearbox has three stages or more; and the efficiency that makers state for those at most.

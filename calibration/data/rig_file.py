@@ -10,12 +10,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from calibration.data.columns import Layout
-from calibration.data.errors import BadConfiguration, choices, is_number
-from mmrjax import channels, params
-from mmrjax.rig import BETWEEN, IMPOSED, STARTS, Instrument, Rig
-from mmrjax.robot import Robot
-from mmrjax.robots import DYNAMIC_SHARE
-from mmrjax.signals import GRAVITY
+from calibration.data.input_errors import BadConfiguration, choices, is_number
+from mmrjax.model import channels, params
+from mmrjax.model.paper_robots import DYNAMIC_SHARE
+from mmrjax.model.rig import BETWEEN, IMPOSED, STARTS, Instrument, Rig
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import GRAVITY
 
 #: Base of a robot that starts from nothing.
 NONE = "none"

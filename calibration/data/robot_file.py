@@ -15,23 +15,24 @@ import jax.numpy as jnp
 from calibration.data import rig_file, stated
 from calibration.data.configuration_tables import loads, resolved_likes
 from calibration.data.effect_file import Library
-from calibration.data.errors import BadConfiguration, choices, is_number, number
+from calibration.data.input_errors import BadConfiguration, choices, is_number, number
 from calibration.data.input_files import toml_content, toml_text
 from calibration.data.writing import write_text
-from mmrjax import effects, params, power, robots
-from mmrjax.driver import DECAYS
+from mmrjax import effects
+from mmrjax.compile.precision import in_double
 from mmrjax.effects import Effect
 from mmrjax.effects.scaled import scaled
-from mmrjax.precision import in_double
-from mmrjax.robot import Configurations, Robot
-from mmrjax.shaft import Shaft
-from mmrjax.tables import TRACKED, WHEELED
+from mmrjax.model import paper_robots, params, power
+from mmrjax.model.driver import DECAYS
+from mmrjax.model.paper_tables import TRACKED, WHEELED
+from mmrjax.model.robot import Configurations, Robot
+from mmrjax.model.shaft import Shaft
 
 T = TypeVar("T")
 
-SCHEMA = "mmrjax.robot/2"
+SCHEMA = "mmrjax.model.robot/2"
 #: Schemas that are read; in the first, configurations had the names of OLD_NAMES.
-SCHEMAS = ("mmrjax.robot/1", SCHEMA)
+SCHEMAS = ("mmrjax.model.robot/1", SCHEMA)
 #: Former name of a configuration's parameters, and the configuration.
 OLD_NAMES = {"tracked": TRACKED, "wheeled": WHEELED}
 #: Whole numbers of a robot, which no fit can free: least, greatest, meaning.
@@ -121,12 +122,13 @@ def find(name_or_path: str, library: Library = effects.BY_NAME, notes: list[str]
     Raises:
         BadConfiguration: no such name or file, or what `parse` raises.
     """
-    if name_or_path in robots.ROBOTS:
-        return RobotFile(robots.ROBOTS[name_or_path](), name_or_path)
+    if name_or_path in paper_robots.ROBOTS:
+        return RobotFile(paper_robots.ROBOTS[name_or_path](), name_or_path)
     path = Path(name_or_path)
     if not path.is_file():
         raise BadConfiguration(
-            f"--robot: got {name_or_path}, no such file and no known robot; {choices(name_or_path, robots.ROBOTS)}"
+            f"--robot: got {name_or_path}, no such file and no known robot; "
+            f"{choices(name_or_path, paper_robots.ROBOTS)}"
         )
     return parse(path, library, notes)
 
@@ -165,12 +167,12 @@ def parse(path: Path, library: Library = effects.BY_NAME, notes: list[str] | Non
     if schema not in SCHEMAS:
         raise BadConfiguration(f"{path.name}, schema: got {schema}; expected {SCHEMA}")
     base = content.pop("base", "nominal")
-    if base not in (*robots.ROBOTS, rig_file.NONE):
+    if base not in (*paper_robots.ROBOTS, rig_file.NONE):
         raise BadConfiguration(
-            f"{path.name}, base: got {base}; {choices(str(base), (*robots.ROBOTS, rig_file.NONE))}"
+            f"{path.name}, base: got {base}; {choices(str(base), (*paper_robots.ROBOTS, rig_file.NONE))}"
         )
     robot, sds, linear = _without_parameters(
-        None if base == rig_file.NONE else robots.ROBOTS[base](), content, path.name
+        None if base == rig_file.NONE else paper_robots.ROBOTS[base](), content, path.name
     )
     present = content.get("effects", {})
     if not isinstance(present, dict):
@@ -205,7 +207,7 @@ def _without_parameters(
     rig = rig_file.rig(content, where, list(found.by_name), travels=found.travels, inherits=base is not None)
     if base is not None:
         return dataclasses.replace(base, configurations=Configurations(found.by_name), rig=rig), sds, found.linear
-    robot = robots.blank(Configurations(found.by_name), rig=rig)
+    robot = paper_robots.blank(Configurations(found.by_name), rig=rig)
     robot = params.replace(robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
     given = dict(_flatten(content))
     known = {p.name: p for p in params.walk(robot)}
@@ -550,8 +552,8 @@ def _lines_of_ratings(robot: Robot, nothing: Robot, stated: set[str]) -> Iterato
 def _start(robot: Robot) -> Robot:
     """What the file of a robot starts from."""
     if robot.rig.inherits:
-        return robots.nominal()
-    nothing = robots.blank(robot.configurations)
+        return paper_robots.nominal()
+    nothing = paper_robots.blank(robot.configurations)
     return params.replace(nothing, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
 
 

@@ -33,14 +33,14 @@ from calibration.data.columns import (
     Layout,
     Meaning,
 )
-from calibration.data.errors import BadConfiguration, BadData, InputError, choices, number, parsed
+from calibration.data.input_errors import BadConfiguration, BadData, InputError, choices, number, parsed
 from calibration.data.table import Runs, driven_on
-from mmrjax import channels, quantities
-from mmrjax.channels import Channel
 from mmrjax.errors import counted
-from mmrjax.quantities import MM, RPM
-from mmrjax.rig import Instrument
-from mmrjax.robot import NO_BRAKE, Robot
+from mmrjax.model import channels, quantities
+from mmrjax.model.channels import Channel
+from mmrjax.model.quantities import MM, RPM
+from mmrjax.model.rig import Instrument
+from mmrjax.model.robot import NO_BRAKE, Robot
 
 __all__ = ["CONDITIONS", "MM", "RPM", "Runs", "read", "single"]
 

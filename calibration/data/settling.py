@@ -7,22 +7,19 @@ import functools
 import math
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calibration.data.columns import LOAD, SPEED, TIME
 from calibration.data.contradictions import GAP
 from calibration.data.courses import applied, differs
-from calibration.data.errors import BadData, number
+from calibration.data.input_errors import BadData, number
 from calibration.data.instruments import step_of
 from calibration.data.runs import Runs
-from mmrjax import channels
-from mmrjax.channels import Channel
 from mmrjax.errors import counted
-
-if TYPE_CHECKING:
-    from mmrjax.robot import Robot
+from mmrjax.model import channels
+from mmrjax.model.channels import Channel
+from mmrjax.model.robot import Robot
 
 #: Share of a signal's largest size below which it counts as none: the motors are not driven, the output stands.
 STILL = 0.02

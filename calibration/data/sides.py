@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.data.columns import DUTY, SIDES, SUPPLY, VOLTS, Layout
-from calibration.data.errors import BadData, number
-from mmrjax import channels
-from mmrjax.rig import Instrument
+from calibration.data.input_errors import BadData, number
+from mmrjax.model import channels
+from mmrjax.model.rig import Instrument
 
 if TYPE_CHECKING:
     from calibration.data.table import Runs

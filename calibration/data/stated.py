@@ -6,7 +6,7 @@ import math
 import re
 from typing import Any
 
-from calibration.data.errors import BadConfiguration, parsed
+from calibration.data.input_errors import BadConfiguration, parsed
 
 FORM = 'expected a number, or one with its standard deviation as "0.61 ± 0.03" or "0.61 ± 5 %"'
 _SIGNS = r"(?:±|\+/-|\+-)"

@@ -14,14 +14,13 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from calibration.data.columns import Layout
 from mmrjax.errors import choices
-from mmrjax.robot import Configurations
-from mmrjax.tables import SURFACES
+from mmrjax.model.paper_tables import SURFACES
+from mmrjax.model.robot import Configurations, Robot
 
 if TYPE_CHECKING:
-    from calibration.data.columns import Layout
     from calibration.data.table import Runs
-    from mmrjax.robot import Robot
 
 #: Beginning of the parameters of a configuration that are its surface's.
 GROUND = "ground."

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calibration.data import sides, surfaces
 from calibration.data.columns import CIRCUITS, DRIVEN, DUTY, HEADING, IMPOSED, LEVERS, LOAD, SUPPLY, TIME, Layout
-from calibration.data.errors import BadData, choices
-from mmrjax import channels
-from mmrjax.channels import Channel
-from mmrjax.tables import adhesion_ratio, lateral_ratio
-
-if TYPE_CHECKING:
-    from mmrjax.conditions import Conditions
-    from mmrjax.robot import Robot
+from calibration.data.input_errors import BadData, choices
+from mmrjax.model import channels
+from mmrjax.model.channels import Channel
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_tables import adhesion_ratio, lateral_ratio
+from mmrjax.model.robot import Robot
 
 
 def driven_on(columns: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray:
@@ -224,7 +221,7 @@ class Runs:
         Raises:
             BadData: as `configurations`.
         """
-        from mmrjax.conditions import Conditions
+        from mmrjax.model.conditions import Conditions
 
         which = self.configurations(robot)
         held = self["mode"] != DRIVEN[0] if self.has("mode") else np.zeros(len(self), bool)

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import delimited, input_files
-from calibration.data.errors import BadConfiguration, BadData
-from mmrjax import terrain
-from mmrjax.fidelities.climb import ON_GROUND, Sequence, clearance
-from mmrjax.robot import Robot
-from mmrjax.terrain import Terrain
+from calibration.data.input_errors import BadConfiguration, BadData
+from mmrjax.climbing import terrain
+from mmrjax.climbing.climb_simulation import ON_GROUND, Sequence, clearance
+from mmrjax.climbing.terrain import Terrain
+from mmrjax.model.robot import Robot
 
 #: A polyline longer or higher than the first, smaller than the second, or with a wall higher than the third is taken
 #: for one in other units [m].

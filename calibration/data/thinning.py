@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.data.columns import ROWS
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 
 if TYPE_CHECKING:
     from calibration.data.table import Runs

@@ -23,10 +23,10 @@ from calibration.inference.linearization import (
 )
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem
-from mmrjax import params
-from mmrjax.compiling import SELDOM, compiled
+from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.effects import Effect
-from mmrjax.robot import Robot
+from mmrjax.model import params
+from mmrjax.model.robot import Robot
 
 
 class ActiveSet(eqx.Module):

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data.errors import BadData
+from calibration.data.input_errors import BadData
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.dissipation import supplying
 from calibration.discovery.score_tests import ScoreTable
@@ -19,7 +19,7 @@ from calibration.inference.held_out import search_each
 from calibration.inference.linearization import amplitude_of
 from calibration.inference.optimizers import Optimum, observation
 from calibration.inference.problem import Observation
-from mmrjax.signals import SLIDES
+from mmrjax.model.signals import SLIDES
 
 #: Prior sds above its mean up to which an adhesion is plausible.
 ADHESION = 2.5

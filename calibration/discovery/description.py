@@ -6,7 +6,7 @@ import numpy as np
 
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
-from calibration.discovery.notes import Missed
+from calibration.discovery.loop_notes import Missed
 from calibration.inference import unused as unused_room
 from calibration.inference.lack_of_fit import EXPLAINED, UNDESCRIBED
 from calibration.inference.linearization import Linearization

@@ -18,7 +18,7 @@ import numpy as np
 from calibration.data import own_mass
 from calibration.data.columns import ROWS, SIDES, WHEN
 from calibration.data.effect_file import Library
-from calibration.data.errors import BadData
+from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.data.thinning import thinned
 from calibration.discovery import findings, kept, menu, prediction, preference, scales
@@ -32,8 +32,7 @@ from calibration.discovery.experiments import Proposal, denser, no_menu, separat
 from calibration.discovery.hidden import hidden
 from calibration.discovery.kept import Keep
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
-from calibration.discovery.mechanism import mechanism
-from calibration.discovery.notes import (
+from calibration.discovery.loop_notes import (
     AssumedNoise,
     Copies,
     FreedValue,
@@ -56,8 +55,9 @@ from calibration.discovery.notes import (
     TooFewReplicates,
     Unwritten,
 )
+from calibration.discovery.loop_posterior import of_curve, of_fit
+from calibration.discovery.mechanism import mechanism
 from calibration.discovery.outliers import Screening, ahead, same_rows, screen, screen_beside
-from calibration.discovery.posterior import of_curve, of_fit
 from calibration.discovery.prediction import Predicted
 from calibration.discovery.result import (
     DiscoveryResult,
@@ -79,11 +79,7 @@ from calibration.inference import blocks as blocks_room
 from calibration.inference import noise as noise_room
 from calibration.inference import observers, preparation, priors, series_noise
 from calibration.inference.bases import Bases
-from calibration.inference.lack_of_fit import Residuals
-from calibration.inference.linearization import Linearization
-from calibration.inference.noise import Noise
-from calibration.inference.noise_factor import common_factors, noise_remarks
-from calibration.inference.notes import (
+from calibration.inference.fit_notes import (
     Copied,
     FarFromPrior,
     HeldByPrior,
@@ -94,14 +90,19 @@ from calibration.inference.notes import (
     OnlyTogether,
     Step,
 )
-from calibration.inference.posterior import undetermined
+from calibration.inference.fit_posterior import undetermined
+from calibration.inference.lack_of_fit import Residuals
+from calibration.inference.linearization import Linearization
+from calibration.inference.noise import Noise
+from calibration.inference.noise_factor import common_factors, noise_remarks
 from calibration.inference.residual_clusters import residual_clusters
-from calibration.words.notes import in_words, sentence
-from mmrjax import channels, effects
+from calibration.words.note_words import in_words, sentence
+from mmrjax import effects
+from mmrjax.compile.precision import Threads, in_double
 from mmrjax.effects import Effect
 from mmrjax.errors import counted
-from mmrjax.precision import Threads, in_double
-from mmrjax.robot import Robot
+from mmrjax.model import channels
+from mmrjax.model.robot import Robot
 
 #: Factors on a noise that nobody states at which the verdict is looked at too: on what is assumed, and on what the
 #: table shows.

@@ -31,11 +31,11 @@ from calibration.inference.held_out import search_each
 from calibration.inference.linearization import Linearization
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem
-from mmrjax import params
-from mmrjax.compiling import compiled
+from mmrjax.compile.compiling import compiled
 from mmrjax.effects import UNNAMED
 from mmrjax.effects.curve import PLACES
-from mmrjax.robot import Robot
+from mmrjax.model import params
+from mmrjax.model.robot import Robot
 
 #: Starts of the curve's fit, from what the linear analysis says to none.
 STARTS = 8

@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 
 from calibration.discovery.active_set import CandidateSpace
 from calibration.inference.observers import Observer
-from mmrjax.compiling import SELDOM, compiled
-from mmrjax.energy import sinks
-from mmrjax.robot import Robot
+from mmrjax.compile.compiling import SELDOM, compiled
+from mmrjax.model.energy import sinks
+from mmrjax.model.robot import Robot
 
 #: The sink of `energy.SINKS` that holds all that a balance takes.
 SINK = {

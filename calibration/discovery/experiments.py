@@ -29,7 +29,7 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import Classes
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.notes import (
+from calibration.discovery.loop_notes import (
     CarryOut,
     Instruction,
     MoreRuns,
@@ -43,12 +43,12 @@ from calibration.discovery.settings import Settings
 from calibration.inference import bases, priors
 from calibration.inference.optimizers import informing
 from calibration.inference.problem import Problem
-from mmrjax import channels
-from mmrjax.compiling import SELDOM, compiled
-from mmrjax.fidelities.newton import implicit_slopes
+from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.fidelities.steady import IMPLICIT
-from mmrjax.linear_equations import half_solved
-from mmrjax.robot import Robot
+from mmrjax.model import channels
+from mmrjax.model.robot import Robot
+from mmrjax.numerics.linear_equations import half_solved
+from mmrjax.numerics.newton import implicit_slopes
 
 #: Alternatives are foreseen in batches of a multiple of this, so that most classes share what is compiled.
 PAD = 4

@@ -19,8 +19,8 @@ from calibration.discovery.discrepancy import Discrepancy
 from calibration.discovery.experiments import Proposal
 from calibration.discovery.hidden import Hidden
 from calibration.discovery.location import DiscrepancyLocation
+from calibration.discovery.loop_notes import RuledOut
 from calibration.discovery.mechanism import excess_misfit, share_of_excess
-from calibration.discovery.notes import RuledOut
 from calibration.discovery.projection import Defect, defect
 from calibration.discovery.result import (
     Alternative,
@@ -50,14 +50,14 @@ from calibration.discovery.stated_values import Shift
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
 from calibration.inference import priors
-from calibration.inference.errors import channel_errors
 from calibration.inference.held_out import unseen
 from calibration.inference.identifiability import held_by_prior
 from calibration.inference.linearization import Linearization, amplitude_of, shape_of, shape_scales, shaped
 from calibration.inference.problem import Observation, Problem
-from mmrjax.balances import BALANCES
+from calibration.inference.simulation_errors import channel_errors
 from mmrjax.effects import Effect
-from mmrjax.robot import Robot
+from mmrjax.model.balances import BALANCES
+from mmrjax.model.robot import Robot
 
 
 def size_of(effect: Effect) -> float:

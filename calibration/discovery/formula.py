@@ -11,8 +11,8 @@ from calibration.discovery.projection import Projection
 from calibration.discovery.smooth import Smooth
 from calibration.inference.bases import ORDERS, signature
 from calibration.inference.linearization import Linearization
-from mmrjax import channels
 from mmrjax.effects.curve import PLACES, READINGS
+from mmrjax.model import channels
 
 #: What a formula is called, in the symbols of the paper.
 SYMBOL = {"electrical": "ΔU", "track": "ΔM_t", "ground": "ΔF_f", "slip": "ΔV", "yaw": "ΔM_ψ"} | {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from calibration.discovery.notes import Headline, Summary
+from calibration.discovery.loop_notes import Headline, Summary
 from calibration.discovery.settings import WITHOUT_NAME
 
 

@@ -18,7 +18,7 @@ from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, fit_candidates
 from calibration.discovery.discrepancy import CurveBeside
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.notes import AGAIN, HALF, Mechanism
+from calibration.discovery.loop_notes import AGAIN, HALF, Mechanism
 from calibration.discovery.prediction import Gain, HeldOutScore, Predicted
 from calibration.discovery.score_tests import family_columns
 from calibration.discovery.settings import Settings

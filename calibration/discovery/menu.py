@@ -12,16 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from calibration.data.errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, choices
 from calibration.discovery import setups
-from calibration.discovery.notes import Heat, Overspeed, Overvoltage, Watch
+from calibration.discovery.loop_notes import Heat, Overspeed, Overvoltage, Watch
 from calibration.discovery.reach import SLOPE, Reach, Used
 from calibration.discovery.setups import Setup
-from mmrjax import balances, channels
-from mmrjax.conditions import Conditions
-from mmrjax.quantities import RPM
-from mmrjax.robot import Robot
-from mmrjax.signals import Signals, State
+from mmrjax.model import balances, channels
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.quantities import RPM
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals, State
 
 #: What a user may forbid, beside configurations: every experiment is of one or more of these kinds.
 KINDS = (

@@ -24,7 +24,7 @@ from calibration.discovery.settings import Settings
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.held_out import search_each
-from mmrjax.precision import Threads
+from mmrjax.compile.precision import Threads
 
 
 @dataclasses.dataclass(frozen=True)

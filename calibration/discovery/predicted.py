@@ -16,11 +16,11 @@ from jaxtyping import Array, Bool, Float
 from calibration.discovery import setups
 from calibration.discovery.menu import Act, Experiment, Run
 from calibration.discovery.setups import Setup
-from mmrjax import channels
-from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import IMPLICIT
-from mmrjax.robot import Robot
-from mmrjax.signals import STALLED, done
+from mmrjax.model import channels
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import STALLED, done
 
 T = TypeVar("T")
 #: Mass of a robot whose weight is carried by stands [kg]: none, but for the sake of ratios to its load.

@@ -12,7 +12,7 @@ from calibration.discovery import experiments
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate, fit_candidates, start
 from calibration.discovery.classes import Classes, families
-from calibration.discovery.notes import DRAW, Led
+from calibration.discovery.loop_notes import DRAW, Led
 from calibration.discovery.result import Errors, HeldOutAlternative, Worse
 from calibration.discovery.search import Search, diagnose
 from calibration.discovery.settings import HELD_OUT, Settings

@@ -8,9 +8,9 @@ import numpy as np
 
 from calibration.discovery.active_set import CandidateSpace
 from calibration.inference.operating import operating_readings
-from mmrjax import channels
-from mmrjax.conditions import Conditions
-from mmrjax.robot import Robot
+from mmrjax.model import channels
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.robot import Robot
 
 #: How much more than the table's a payload and a slope may be: as factors, and of the payload also as a share of the
 #: largest total mass [-]. Voltages are never more, unless the robot states what its motors are good for.

@@ -13,20 +13,20 @@ from pathlib import Path
 import numpy as np
 from scipy.special import chdtrc
 
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
-from calibration.discovery.notes import Asked
+from calibration.discovery.loop_notes import Asked
 from calibration.discovery.result import PLAUSIBLE, DiscoveryResult, Estimate, Resolved
 from calibration.inference import noise as noise_room
 from calibration.inference import observers
-from calibration.inference.calibrate import calibrate
-from calibration.inference.notes import Step
+from calibration.inference.calibration import calibrate
+from calibration.inference.fit_notes import Step
 from calibration.inference.population import saved_members
 from calibration.inference.result import CalibrationResult
-from calibration.words.notes import in_words
-from mmrjax import channels
+from calibration.words.note_words import in_words
 from mmrjax.effects import UNNAMED
-from mmrjax.robot import Robot
+from mmrjax.model import channels
+from mmrjax.model.robot import Robot
 
 #: Balances that the resolved running gear has a say in.
 BALANCES = ("slip", "track", "ground")

@@ -8,29 +8,30 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import posterior, robot_file
+from calibration.data import posterior_file as posterior
+from calibration.data import robot_file
 from calibration.data.columns import DRIVING
-from calibration.data.posterior import Posterior
+from calibration.data.posterior_file import Posterior
 from calibration.data.runs import WHEN, Runs
 from calibration.data.writing import write_json, write_table
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.headline import headline
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.notes import Asked, Headline, Instruction, Mechanism, NameSupport, RuledOut, Summary
+from calibration.discovery.loop_notes import Asked, Headline, Instruction, Mechanism, NameSupport, RuledOut, Summary
 from calibration.discovery.prediction import Gain
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
-from calibration.inference.errors import OF_SIZE
-from calibration.inference.notes import HeldByPrior, Notes, Pair
-from calibration.inference.posterior import determined_together
+from calibration.inference.fit_notes import HeldByPrior, Notes, Pair
+from calibration.inference.fit_posterior import determined_together
 from calibration.inference.residual_clusters import ResidualCluster
-from calibration.words import experiments, fits
-from calibration.words import loop as words
-from calibration.words.notes import sentence, sentences
-from mmrjax.channels import Channel
-from mmrjax.robot import Robot
+from calibration.inference.simulation_errors import OF_SIZE
+from calibration.words import experiment_words, fit_words
+from calibration.words import loop_words as words
+from calibration.words.note_words import sentence, sentences
+from mmrjax.model.channels import Channel
+from mmrjax.model.robot import Robot
 
-SCHEMA = "mmrjax.loop/3"
+SCHEMA = "mmrjax.climbing.belt_loop/3"
 #: The robot whose running gear the track model found.
 TRACK_FILE = "robot_track.toml"
 #: The robot fitted with nothing added.
@@ -312,7 +313,7 @@ class NextExperiment:
     @property
     def description(self) -> str:
         """What to do and what to read."""
-        return experiments.instruction(self.instruction)
+        return experiment_words.instruction(self.instruction)
 
     def to_json(self) -> dict[str, Any]:
         """As in result.json."""
@@ -673,7 +674,7 @@ class DiscoveryResult:
                 "of_readings": dict(zip(("before", "after"), self.chi2_of_readings, strict=True)),
             },
             "base_shift": {name: dataclasses.asdict(p) for name, p in self.base_shift.items()},
-            "together": [fits.pair(pair) for pair in self.together],
+            "together": [fit_words.pair(pair) for pair in self.together],
             "scores": [dataclasses.asdict(s) for s in self.scores],
             "bootstrap": {
                 "replicates": self.replicates,

@@ -23,16 +23,16 @@ import numpy as np
 from calibration.data.effect_file import Library
 from calibration.data.runs import Runs
 from calibration.discovery.reach import LOADED, RUNNING
-from mmrjax import channels, params, robots
-from mmrjax.balances import BALANCES, absent, added
-from mmrjax.compiling import OVER_TIME, compiled
-from mmrjax.conditions import Conditions
+from mmrjax.compile.compiling import OVER_TIME, compiled
+from mmrjax.compile.precision import in_double
 from mmrjax.effects import Effect
 from mmrjax.effects.scaled import amplitude_of, scaled, shape_of
 from mmrjax.fidelities.steady import operating_signals, shown_batch
-from mmrjax.precision import in_double
-from mmrjax.robot import Robot
-from mmrjax.signals import Signals
+from mmrjax.model import channels, paper_robots, params
+from mmrjax.model.balances import BALANCES, absent, added
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals
 
 #: What the terms of a balance are a share of.
 WHOLE: dict[str, Callable[[Robot, Signals], object]] = {
@@ -150,8 +150,10 @@ def _travelling(robot: Robot, conditions: Conditions) -> Signals:
 @functools.cache
 def _nominal() -> tuple[Robot, Signals]:
     """The nominal robot and its signals over Table 8."""
-    robot = params.strong(robots.nominal())
-    axes = np.meshgrid(robots.VOLTAGES_V, robots.SLOPES_DEG, robots.PAYLOADS_KG, (0, 1), indexing="ij")
+    robot = params.strong(paper_robots.nominal())
+    axes = np.meshgrid(
+        paper_robots.VOLTAGES_V, paper_robots.SLOPES_DEG, paper_robots.PAYLOADS_KG, (0, 1), indexing="ij"
+    )
     volts, slopes, payloads, which = (a.ravel() for a in axes)
     return robot, _signals(robot, Conditions(which.astype(int), volts, slopes, payloads))
 

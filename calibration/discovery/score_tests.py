@@ -23,9 +23,9 @@ from calibration.inference.bases import Bases, signature
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.optimizers import CORES, rooted
 from calibration.inference.problem import Problem
-from mmrjax.compiling import SELDOM, SMALL, compiled
-from mmrjax.linear_equations import half_solved
-from mmrjax.precision import Threads
+from mmrjax.compile.compiling import SELDOM, SMALL, compiled
+from mmrjax.compile.precision import Threads
+from mmrjax.numerics.linear_equations import half_solved
 
 #: Share of a signature's norm below which the free parameters explain it all.
 ABSORBED = 1e-3

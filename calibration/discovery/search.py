@@ -16,7 +16,7 @@ from calibration.discovery.score_tests import ScoreTable, Statistics, diagnosed
 from calibration.discovery.screening import Confirmed, confirmed, ranked
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import Bases
-from calibration.inference.notes import Step
+from calibration.inference.fit_notes import Step
 
 #: Pairs of instances that are looked through for pairs of effects.
 PAIRS = 4000

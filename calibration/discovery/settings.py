@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from calibration.data.errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, choices
 from calibration.inference.observers import Observer
 
 #: Family-wise error of «something is missing», shared out among the kinds of evidence: single effects, curves, pairs,

@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 
 import jax.numpy as jnp
 
-from mmrjax import params
-from mmrjax.params import Scalar
-from mmrjax.robot import Robot
+from mmrjax.model import params
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
 
 #: Friction of a shaft that is held in a vice [N·m].
 BLOCKED = 1e3

@@ -13,7 +13,7 @@ from numpy.polynomial import legendre
 from calibration.discovery.projection import Projection
 from calibration.inference.bases import ORDERS, scaled, signature, window
 from calibration.inference.linearization import Linearization
-from mmrjax.compiling import compiled
+from mmrjax.compile.compiling import compiled
 from mmrjax.effects.curve import ORDINATES, weights
 
 #: Priors that are tried for the ordinates: correlation lengths [spacings], sizes [σ that an ordinate makes].

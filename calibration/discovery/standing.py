@@ -20,7 +20,7 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.discrepancy import CurveBeside, locate
-from calibration.discovery.notes import CurveOver, NameSupport, NameTest
+from calibration.discovery.loop_notes import CurveOver, NameSupport, NameTest
 from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import ABSORBED, augment_with_columns, beside_columns, family_columns
 from calibration.discovery.search import Search, diagnose, without_each

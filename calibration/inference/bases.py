@@ -16,11 +16,11 @@ from numpy.polynomial import legendre
 
 from calibration.data.columns import CURRENT, LOAD, SPEED, Layout
 from calibration.inference.linearization import Linearization
-from mmrjax import channels
-from mmrjax.balances import absent
-from mmrjax.channels import Channel
 from mmrjax.effects.curve import DRIFT, READ_BY, WAYS, acts_along, counted_by, in_travel
-from mmrjax.robot import Robot
+from mmrjax.model import channels
+from mmrjax.model.balances import absent
+from mmrjax.model.channels import Channel
+from mmrjax.model.robot import Robot
 
 #: Balances that carry curves: one for each equation that the channels close, and the ground's, whose defect
 #: also loads the contact; and those for which they stand, as what these lack has the same shape in them.

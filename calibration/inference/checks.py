@@ -8,18 +8,18 @@ import numpy as np
 
 from calibration.data.columns import SUPPLY
 from calibration.data.courses import applied
-from calibration.data.errors import BadConfiguration, BadData, number
+from calibration.data.input_errors import BadConfiguration, BadData, number
 from calibration.data.runs import Runs
 from calibration.inference import observers
 from calibration.inference.conduct import conduct
+from calibration.inference.fit_notes import Constant, Note, StiffSupply, Unmeasured
 from calibration.inference.noise import Noise
-from calibration.inference.notes import Constant, Note, StiffSupply, Unmeasured
 from calibration.inference.ranges import check_ranges
 from calibration.inference.uninformative import copied, nothing_varies
 from calibration.inference.unused import no_load_gives, unused
 from mmrjax.errors import counted
-from mmrjax.robot import Robot
-from mmrjax.signals import SLIDES, STATUSES
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import SLIDES, STATUSES
 
 
 def check(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[Note | str]:

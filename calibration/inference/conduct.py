@@ -7,11 +7,11 @@ import numpy as np
 from calibration.data.courses import varies
 from calibration.data.runs import Runs
 from calibration.inference import observers
-from calibration.inference.notes import EndsEarly, Fact, NeverGrips, Note
+from calibration.inference.fit_notes import EndsEarly, Fact, NeverGrips, Note
 from calibration.inference.operating import operating_readings
 from calibration.inference.ranges import UNDER_WAY
-from mmrjax import channels
-from mmrjax.robot import Robot
+from mmrjax.model import channels
+from mmrjax.model.robot import Robot
 
 #: Share of the speed of steady travel below which a short run is not under way, and of that of its movers below which
 #: a long one does not grip [-].

@@ -10,7 +10,6 @@ from calibration.data.columns import DRIVING
 from calibration.data.runs import Runs
 from calibration.inference import blocks as holdout
 from calibration.inference import priors
-from calibration.inference.errors import channel_errors, sized_error
 from calibration.inference.identifiability import Z95, Identifiability, Profile
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Observer
@@ -30,9 +29,10 @@ from calibration.inference.result import (
     Tie,
 )
 from calibration.inference.scans import Scan
-from mmrjax import channels
-from mmrjax.channels import Channel
-from mmrjax.robot import Robot
+from calibration.inference.simulation_errors import channel_errors, sized_error
+from mmrjax.model import channels
+from mmrjax.model.channels import Channel
+from mmrjax.model.robot import Robot
 
 #: How many data sds one prior sd has to move the readings to be measured by them at all.
 SENSITIVE = 1e-6

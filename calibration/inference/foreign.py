@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from calibration.inference.notes import InheritedPriors
+from calibration.inference.fit_notes import InheritedPriors
 from calibration.inference.priors import FRICTION, GUIDE_FRICTION, GUIDE_SHARE, known
-from mmrjax import robots
-from mmrjax.robot import Robot
+from mmrjax.model import paper_robots
+from mmrjax.model.robot import Robot
 
 #: What makers and scales state of a part, and what of its friction was measured on the nominal robot.
 DRIVE = {
@@ -31,9 +31,9 @@ def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[Inherit
     """
     if not robot.rig.inherits:
         return []
-    mine, nominal = ({name: float(p.value) for name, p in known(r).items()} for r in (robot, robots.nominal()))
+    mine, nominal = ({name: float(p.value) for name, p in known(r).items()} for r in (robot, paper_robots.nominal()))
     pairs = [(part, part, *DRIVE[part]) for part in DRIVE]
-    pairs += [(c, other, *CHASSIS) for c in robot.configurations for other in robots.nominal().configurations]
+    pairs += [(c, other, *CHASSIS) for c in robot.configurations for other in paper_robots.nominal().configurations]
     found: dict[str, InheritedPriors] = {}
     for part, other, sheet, friction in pairs:
         on_tracks = part in robot.configurations and float(robot.configurations[part].on_tracks) > 0.5

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data.columns import ROWS
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.data.thinning import thinned
 from calibration.inference import identifiability, observers, priors
 from calibration.inference import optimizers as fit
-from calibration.inference.notes import (
+from calibration.inference.fit_notes import (
     Copied,
     LargerNoise,
     NoLoadGives,
@@ -27,11 +27,11 @@ from calibration.inference.notes import (
     Turned,
     Unused,
 )
-from calibration.inference.posterior import determined_together, of_coordinates
+from calibration.inference.fit_posterior import determined_together, of_coordinates
 from calibration.inference.preparation import prepare
 from mmrjax import fidelities
-from mmrjax.robot import Robot
-from mmrjax.signals import STATUSES
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import STATUSES
 
 #: What is to be looked at in a table before it is used.
 DOUBTS = (

@@ -12,7 +12,7 @@ from jaxtyping import Array
 from calibration.inference import optimizers as fit
 from calibration.inference.optimizers import Pin
 from calibration.inference.problem import Data, Problem
-from mmrjax.compiling import compiled
+from mmrjax.compile.compiling import compiled
 
 #: Two-sided 95 % of the standard normal distribution.
 Z95 = 1.959963984540054

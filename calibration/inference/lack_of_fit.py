@@ -18,10 +18,10 @@ from scipy.special import chdtrc, fdtrc, ndtr
 
 from calibration.data.courses import courses
 from calibration.data.runs import DUTY, Runs
-from calibration.inference.errors import share_of_measured
-from calibration.inference.notes import Shown
+from calibration.inference.fit_notes import Shown
 from calibration.inference.observers import Observer
-from calibration.words import fits
+from calibration.inference.simulation_errors import share_of_measured
+from calibration.words import fit_words
 
 #: Family-wise error of «not adequate».
 LEVEL = 0.05
@@ -79,11 +79,15 @@ class Adequacy:
     @property
     def statement(self) -> str:
         """In one sentence; opens a calibration's output."""
-        return fits.adequacy(self)
+        return fit_words.adequacy(self)
 
     def to_json(self) -> dict[str, object]:
         """As in `adequate` of result.json."""
-        return {**dataclasses.asdict(self), "shown_by": fits.shown_by(self.shown_by), "statement": self.statement}
+        return {
+            **dataclasses.asdict(self),
+            "shown_by": fit_words.shown_by(self.shown_by),
+            "statement": self.statement,
+        }
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from mmrjax.linear_equations import solved
+from mmrjax.numerics.linear_equations import solved
 
 #: Rejected steps in a row after which a search ends.
 PATIENCE = 12

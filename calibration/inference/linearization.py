@@ -13,16 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mmrjax import balances, params
-from mmrjax.compiling import compiled
+from mmrjax.compile.compiling import compiled
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import in_travel
 from mmrjax.effects.scaled import amplitude_of as amplitude_of
 from mmrjax.effects.scaled import shape_of as shape_of
-from mmrjax.one_sided import clip
-from mmrjax.params import Parameter, Scalar, parameter
-from mmrjax.robot import Robot
-from mmrjax.signals import Signals
+from mmrjax.model import balances, params
+from mmrjax.model.params import Parameter, Scalar, parameter
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals
+from mmrjax.numerics.one_sided import clip
 
 #: Balances whose defect moves the readings of settled travel. Those of a line act alike on the readings, but
 #: for what they depend on: three channels close three equations.

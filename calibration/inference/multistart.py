@@ -15,12 +15,12 @@ import numpy as np
 from calibration.inference import identifiability, scans, series_noise
 from calibration.inference import noise as noise_room
 from calibration.inference import optimizers as fit
+from calibration.inference.fit_notes import Agreement, Step
 from calibration.inference.noise import Noise
-from calibration.inference.notes import Agreement, Step
 from calibration.inference.population import Population, Searched, most_probable
 from calibration.inference.problem import Data, Observation, Problem
-from calibration.words import fits
-from mmrjax.robot import Robot
+from calibration.words import fit_words
+from mmrjax.model.robot import Robot
 
 #: Costs closer than this to the best [½σ²] are the same optimum.
 AGREE = 1e-3
@@ -67,7 +67,7 @@ class Starts:
 
     def statement(self) -> str:
         """Whether the starts agree, as a sentence."""
-        return fits.agreement(self.agreement)
+        return fit_words.agreement(self.agreement)
 
 
 @dataclasses.dataclass(frozen=True)

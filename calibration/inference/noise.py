@@ -10,12 +10,12 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from jaxtyping import Float
 
-from calibration.data.errors import BadConfiguration, BadData, choices
+from calibration.data.input_errors import BadConfiguration, BadData, choices
 from calibration.data.runs import Runs
 from calibration.inference import series_noise
 from calibration.inference.series_noise import SeriesNoise
-from mmrjax import channels
-from mmrjax.channels import Channel
+from mmrjax.model import channels
+from mmrjax.model.channels import Channel
 
 #: Share of the reading that the estimate starts from [-].
 START = 0.02

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import chdtr, chdtrc
 
+from calibration.inference.fit_notes import NoiseOff
 from calibration.inference.lack_of_fit import LEVEL, Residuals, structure
-from calibration.inference.notes import NoiseOff
 
 #: Factor on the sds from which it is said, either way; probability under right sds below which it is.
 OFF, IMPROBABLE = 1.25, 0.001

@@ -9,12 +9,12 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from mmrjax import channels, params
-from mmrjax.compiling import SELDOM, compiled
-from mmrjax.conditions import Conditions
+from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.fidelities.steady import shown_batch, steady
-from mmrjax.robot import Robot
-from mmrjax.signals import Result, done
+from mmrjax.model import channels, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Result, done
 
 #: Conditions are padded to a multiple of this, so that tables of about one size share what is compiled.
 PAD = 16

@@ -27,10 +27,10 @@ from calibration.inference.levenberg_marquardt import (
     with_slope,
 )
 from calibration.inference.problem import MISSING, Data, Observation, Problem
-from mmrjax.compiling import OVER_TIME, SELDOM, SMALL, compiled
-from mmrjax.linear_equations import half_solved
-from mmrjax.precision import Threads
-from mmrjax.robot import Robot
+from mmrjax.compile.compiling import OVER_TIME, SELDOM, SMALL, compiled
+from mmrjax.compile.precision import Threads
+from mmrjax.model.robot import Robot
+from mmrjax.numerics.linear_equations import half_solved
 
 #: Predicted decrease of the objective below which a point is an optimum: in ½σ² (the step left is then below
 #: a twentieth of a posterior sd, about what the integrator's tolerance leaves of a rollout), and as a share.

@@ -22,11 +22,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.inference import noise as noise_room
 from calibration.inference import series_noise
-from calibration.inference.noise import Noise
-from calibration.inference.notes import (
+from calibration.inference.fit_notes import (
     Edge,
     EndedAtEdge,
     Generations,
@@ -36,11 +35,12 @@ from calibration.inference.notes import (
     ReadFromMembers,
     Step,
 )
+from calibration.inference.noise import Noise
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import MISSING, Observation, Problem
-from calibration.words import fits
-from mmrjax.compiling import compiled
-from mmrjax.signals import FLAGS, STATUSES
+from calibration.words import fit_words
+from mmrjax.compile.compiling import compiled
+from mmrjax.model.signals import FLAGS, STATUSES
 
 #: Members that are run together: on processors, and on an accelerator.
 TOGETHER = (16, 512)
@@ -401,7 +401,7 @@ class Searched:
             "settled": self.found.settled,
             "generations": [dataclasses.asdict(g) for g in self.found.generations],
             "outcomes": self.outcomes(),
-            "at_edge": {name: fits.edge(at) for name, at in self.edge.items()},
+            "at_edge": {name: fit_words.edge(at) for name, at in self.edge.items()},
             "derivatives_apart": list(self.apart),
             "regression_rms_sd": self.left if np.isfinite(self.left) else None,
         }

@@ -14,11 +14,11 @@ from calibration.data import instruments, own_mass, rig_facts, robot_file, surfa
 from calibration.data.runs import Runs
 from calibration.inference import checks, observers, repeats
 from calibration.inference import noise as noise_room
+from calibration.inference.fit_notes import Notes
 from calibration.inference.foreign import inherited_priors
 from calibration.inference.noise import Noise
-from calibration.inference.notes import Notes
 from calibration.inference.observers import Observer
-from mmrjax.robot import Robot
+from mmrjax.model.robot import Robot
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,12 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from calibration.data.errors import BadConfiguration, choices, number
+from calibration.data.input_errors import BadConfiguration, choices, number
 from calibration.data.surfaces import GROUND
-from mmrjax import params
-from mmrjax.compiling import SELDOM, compiled
-from mmrjax.params import Parameter
-from mmrjax.robot import Robot
+from mmrjax.compile.compiling import SELDOM, compiled
+from mmrjax.model import params
+from mmrjax.model.params import Parameter
+from mmrjax.model.robot import Robot
 
 #: Freed by default of each configuration that has rows: friction, with the makers' electrics, the gearbox and
 #: motor losses of Table 2, the ratio, radii and masses held where their tables put them.

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mmrjax.channels import Channel
-from mmrjax.fidelities.newton import implicit_slopes
-from mmrjax.robot import Robot
-from mmrjax.signals import Signals
+from mmrjax.model.channels import Channel
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals
+from mmrjax.numerics.newton import implicit_slopes
 
 if TYPE_CHECKING:
     from calibration.inference.observers import Observer

@@ -7,15 +7,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from calibration.data.errors import BadData, number
+from calibration.data.input_errors import BadData, number
 from calibration.data.runs import Runs
 from calibration.inference import observers
-from calibration.inference.notes import Note, OffBy, SlopesIn, Turned
+from calibration.inference.fit_notes import Note, OffBy, SlopesIn, Turned
 from calibration.inference.operating import operating_readings
-from calibration.words import tables
-from mmrjax import channels, params
-from mmrjax.channels import Channel
-from mmrjax.robot import Robot
+from calibration.words import table_words
+from mmrjax.model import channels, params
+from mmrjax.model.channels import Channel
+from mmrjax.model.robot import Robot
 
 #: Factors between readings and robot beyond which a table is refused, and beyond which that is said.
 REFUSED, SAID = 5.0, 2.0
@@ -90,7 +90,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
             runs.layout.imposed_column,
         )
         if off > REFUSED:
-            raise BadData(f"{runs.source}, {tables.off_by(found)}")
+            raise BadData(f"{runs.source}, {table_words.off_by(found)}")
         said.append(found)
     return [*said, *_turned(runs, measured, possible), *_slopes(runs, measured, possible[1], robot)]
 

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from calibration.inference import priors
-from calibration.inference.identifiability import Z95
-from calibration.inference.notes import (
+from calibration.inference.fit_notes import (
     AtBound,
     BesideSteady,
     BlockNotConverged,
@@ -23,10 +22,11 @@ from calibration.inference.notes import (
     ProductAlone,
     SamePredictions,
 )
+from calibration.inference.identifiability import Z95
 from calibration.inference.population import EDGE
 from calibration.inference.problem import MARGIN
 from calibration.inference.result import CalibrationResult
-from mmrjax.signals import DONE, STATUSES
+from mmrjax.model.signals import DONE, STATUSES
 
 #: Shift from the prior above which the prior or the model is called wrong [prior sd].
 FAR = 3.0

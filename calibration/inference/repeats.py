@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Int
 
 from calibration.data.runs import Runs
+from calibration.inference.fit_notes import LargerNoise, Note
 from calibration.inference.noise import UNSTATED, Noise
-from calibration.inference.notes import LargerNoise, Note
 
 #: Fewest differences between repeats that tell a noise: one of two readings may be wrong.
 FEWEST = 3

@@ -9,21 +9,22 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import posterior, writing
-from calibration.data.posterior import Posterior
-from calibration.inference.errors import OF_SIZE
+from calibration.data import posterior_file as posterior
+from calibration.data import writing
+from calibration.data.posterior_file import Posterior
+from calibration.inference.fit_notes import HeldByPrior, Notes, Pair
+from calibration.inference.fit_posterior import determined_together, undetermined
 from calibration.inference.identifiability import Identifiability
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.multistart import Starts
-from calibration.inference.notes import HeldByPrior, Notes, Pair
 from calibration.inference.population import Searched
-from calibration.inference.posterior import determined_together, undetermined
 from calibration.inference.residual_clusters import ResidualCluster
-from calibration.words import fits as words
-from calibration.words.notes import sentence, sentences
-from mmrjax.channels import Channel
-from mmrjax.robot import Robot
-from mmrjax.signals import STATUSES
+from calibration.inference.simulation_errors import OF_SIZE
+from calibration.words import fit_words as words
+from calibration.words.note_words import sentence, sentences
+from mmrjax.model.channels import Channel
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import STATUSES
 
 SCHEMA = "mmrjax.calibrate/1"
 METHOD = "Levenberg-Marquardt"

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from calibration.inference.fit_notes import InPieces, Step
 from calibration.inference.identifiability import Z95, Identifiability
-from calibration.inference.notes import InPieces, Step
 from calibration.inference.optimizers import Optimum, evaluated
 from calibration.inference.priors import known
 from calibration.inference.problem import Data, Observation, Problem

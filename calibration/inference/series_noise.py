@@ -16,7 +16,7 @@ from jaxtyping import Float
 from calibration.data.columns import DRIVEN
 from calibration.data.instruments import display_step
 from calibration.data.runs import Runs
-from mmrjax.channels import Channel
+from mmrjax.model.channels import Channel
 
 #: The axis whose series are taken where they are enough; else the one of most degrees of freedom.
 FIRST = "slope_deg"

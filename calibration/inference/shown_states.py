@@ -17,10 +17,10 @@ from jaxtyping import Array, Float
 
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import Problem
-from mmrjax import balances, channels
-from mmrjax.channels import Channel
-from mmrjax.conditions import Conditions
-from mmrjax.signals import State
+from mmrjax.model import balances, channels
+from mmrjax.model.channels import Channel
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.signals import State
 
 #: Times between rows that a window is long, within limits [s]; its fewest rows; and how far the next one begins after
 #: it, as a share of its length.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from calibration.data.errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, choices
 
 if TYPE_CHECKING:
     import optimistix as optx

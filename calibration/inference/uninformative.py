@@ -8,12 +8,12 @@ import numpy as np
 
 from calibration.data.instruments import step_of
 from calibration.data.runs import Runs
+from calibration.inference.fit_notes import Copied, NothingVaries
 from calibration.inference.noise import Noise
-from calibration.inference.notes import Copied, NothingVaries
 from calibration.inference.operating import operating_readings
 from calibration.inference.unused import unused_columns
-from mmrjax.channels import Channel
-from mmrjax.robot import Robot
+from mmrjax.model.channels import Channel
+from mmrjax.model.robot import Robot
 
 #: Fewest rows and different readings from which a line through all of them is no chance.
 ROWS, LEVELS = 8, 4

@@ -8,9 +8,9 @@ from scipy.optimize import nnls
 from calibration.data.columns import LOAD, SPEED
 from calibration.data.courses import applied
 from calibration.data.runs import Runs
-from calibration.inference.notes import NoLoadGives, Unused
+from calibration.inference.fit_notes import NoLoadGives, Unused
 from calibration.inference.residual_clusters import TIMES
-from mmrjax import channels
+from mmrjax.model import channels
 
 #: Share of a torque's variation that no load of a shaft explains from which a brake may set it, and share of its size
 #: that varies at least.

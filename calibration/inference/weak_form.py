@@ -27,13 +27,13 @@ from scipy.optimize import least_squares
 from calibration.inference.linearization import ScoredEffect, each_shape, probe, terms_of
 from calibration.inference.problem import Problem
 from calibration.inference.shown_states import Plan, Rows, Windows, plan_of, rates_of, rows_of, windows_of
-from mmrjax import balances, channels
-from mmrjax.compiling import SELDOM, compiled
-from mmrjax.conditions import Conditions
+from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.effects import Effect
-from mmrjax.params import Scalar
-from mmrjax.robot import Robot
-from mmrjax.signals import Signals, State
+from mmrjax.model import balances, channels
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals, State
 
 #: Windows a base parameter, from which on a regression is trusted.
 ENOUGH = 4

@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
+from calibration.inference.fit_notes import Note, Step
 from calibration.inference.identifiability import Z95
-from calibration.inference.notes import Note, Step
-from calibration.sensitivity.inputs import Inputs
 from calibration.sensitivity.local import Local, directions, inert, local
 from calibration.sensitivity.methods import (
     Part,
@@ -21,9 +20,10 @@ from calibration.sensitivity.methods import (
 )
 from calibration.sensitivity.model import OutputRow
 from calibration.sensitivity.next_runs import Candidates, next_runs
-from calibration.sensitivity.notes import Inert, PointsLeftOut, SampleLeftOut, Sampling, Tied
 from calibration.sensitivity.result import METHODS, Input, OutputStudy, SensitivityResult
+from calibration.sensitivity.sensitivity_notes import Inert, PointsLeftOut, SampleLeftOut, Sampling, Tied
 from calibration.sensitivity.study import Study
+from calibration.sensitivity.uncertain_inputs import Inputs
 from mmrjax import fidelities
 from mmrjax.derived import Derived
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from calibration.inference.identifiability import Z95
 from calibration.sensitivity import derivative
-from calibration.sensitivity.inputs import Inputs
 from calibration.sensitivity.study import Study, source_words
+from calibration.sensitivity.uncertain_inputs import Inputs
 
 #: Random robots at which derivatives are looked at before an input is taken for inert, and at how many points.
 LOOKS, PLACES = 4, 12

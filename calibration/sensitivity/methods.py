@@ -11,9 +11,9 @@ from scipy.special import ndtr
 
 from calibration.inference.identifiability import Z95
 from calibration.sensitivity import derivative, morris, shapley, sobol
-from calibration.sensitivity.inputs import Inputs
 from calibration.sensitivity.replicates import REPLICATES, Estimate
 from calibration.sensitivity.study import Study
+from calibration.sensitivity.uncertain_inputs import Inputs
 
 #: Largest share of base points that may be without numbers for a point to be studied.
 MOST_LOST = 0.5

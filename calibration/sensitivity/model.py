@@ -12,16 +12,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.data.contradictions import cannot_stand
-from calibration.data.errors import BadConfiguration, choices
-from mmrjax import channels, derived, fidelities
-from mmrjax import outputs as table_of_outputs
-from mmrjax.compiling import compiled
-from mmrjax.conditions import OF_SIDES, Conditions
+from calibration.data.input_errors import BadConfiguration, choices
+from mmrjax import derived, fidelities
+from mmrjax.compile.compiling import compiled
 from mmrjax.derived import Derived
-from mmrjax.outputs import Output
-from mmrjax.robot import Robot
-from mmrjax.signals import STATUSES, done
-from mmrjax.variation import STATUS, Variation, evaluate
+from mmrjax.fidelities import outputs as table_of_outputs
+from mmrjax.fidelities.outputs import Output
+from mmrjax.fidelities.variation import STATUS, Variation, evaluate
+from mmrjax.model import channels
+from mmrjax.model.conditions import OF_SIDES, Conditions
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import STATUSES, done
 
 #: Points of one call of few, and of many: solves, runs over time, and the derivatives of both. All calls have one of
 #: these shapes, so that every study of the same inputs and outputs shares what is compiled.

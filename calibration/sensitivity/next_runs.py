@@ -11,7 +11,7 @@ from calibration.sensitivity.local import Local
 from calibration.sensitivity.model import known_outputs
 from calibration.sensitivity.result import NextRuns, Points
 from calibration.sensitivity.study import Study
-from mmrjax.conditions import Conditions
+from mmrjax.model.conditions import Conditions
 
 #: Runs proposed.
 RUNS = 5

@@ -9,11 +9,11 @@ import numpy as np
 from scipy import stats
 
 from calibration.data.runs import Runs
-from calibration.inference.notes import Note
+from calibration.inference.fit_notes import Note
 from calibration.sensitivity.model import OutputRow
 from calibration.sensitivity.replicates import LEVEL, REPLICATES, Estimate
-from calibration.words import sensitivity as words
-from calibration.words.notes import sentences
+from calibration.words import sensitivity_words as words
+from calibration.words.note_words import sentences
 
 SCHEMA = "mmrjax.sensitivity/1"
 #: Methods.

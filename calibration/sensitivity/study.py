@@ -10,16 +10,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.inference.notes import Step
-from calibration.sensitivity.inputs import Inputs
+from calibration.inference.fit_notes import Step
 from calibration.sensitivity.model import Answer, Model, OutputRow, counted
 from calibration.sensitivity.result import Points
-from calibration.words.notes import in_words
+from calibration.sensitivity.uncertain_inputs import Inputs
+from calibration.words.note_words import in_words
 from mmrjax import fidelities
-from mmrjax.conditions import Conditions
-from mmrjax.quantities import RPM
-from mmrjax.robot import Robot
-from mmrjax.signals import STATUSES
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.quantities import RPM
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import STATUSES
 
 Tell = Callable[[str], None]
 #: After so long a time it says how far it is [s].

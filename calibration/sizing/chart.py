@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from calibration.data.requirements import Requirement, Requirements
+from calibration.data.requirements_file import Requirement, Requirements
 from calibration.sizing import sheet
-from mmrjax import params
-from mmrjax.compiling import compiled
-from mmrjax.requirements import Point, Ratings, heat_left, ratings, travel
-from mmrjax.robot import Robot
+from mmrjax.compile.compiling import compiled
+from mmrjax.derived.requirements import Point, Ratings, heat_left, ratings, travel
+from mmrjax.model import params
+from mmrjax.model.robot import Robot
 
 #: What can end a use, in the order of the chart.
 LIMITS = (

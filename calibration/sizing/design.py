@@ -12,14 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from calibration.data.requirements import Envelope, Requirement, Requirements
+from calibration.data.requirements_file import Envelope, Requirement, Requirements
 from calibration.sizing import sheet
-from calibration.sizing.options import Options
-from mmrjax import params
-from mmrjax.requirements import CHARGE, NODES, QUANTITIES, SLOPE, Point, Ratings, heat_left, travel
-from mmrjax.requirements import evaluate as requirement
-from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED
+from calibration.sizing.part_options import Options
+from mmrjax.derived.requirements import CHARGE, NODES, QUANTITIES, SLOPE, Point, Ratings, heat_left, travel
+from mmrjax.derived.requirements import evaluate as requirement
+from mmrjax.model import params
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import CONVERGED
 
 #: Continuous numbers of a design, of which the search takes logarithms: total ratio, rolling radius [m], cells in
 #: parallel.

@@ -13,15 +13,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.data.contradictions import cannot_stand
-from calibration.data.errors import BadConfiguration, choices
-from calibration.data.requirements import STAIRS, TREAD, Envelope, Requirement, Requirements
-from mmrjax import params
-from mmrjax.compiling import compiled
-from mmrjax.quantities import MM
-from mmrjax.requirements import AMBIENT, AXES, CHARGE, PAYLOAD, SLOPE, Point, Ratings, evaluate, ratings
-from mmrjax.robot import Robot, cannot_turn
-from mmrjax.signals import CONVERGED, STATUSES
-from mmrjax.tables import adhesion_ratio, lateral_ratio
+from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.requirements_file import STAIRS, TREAD, Envelope, Requirement, Requirements
+from mmrjax.compile.compiling import compiled
+from mmrjax.derived.requirements import AMBIENT, AXES, CHARGE, PAYLOAD, SLOPE, Point, Ratings, evaluate, ratings
+from mmrjax.model import params
+from mmrjax.model.paper_tables import adhesion_ratio, lateral_ratio
+from mmrjax.model.quantities import MM
+from mmrjax.model.robot import Robot, cannot_turn
+from mmrjax.model.signals import CONVERGED, STATUSES
 
 #: Values along each axis of an envelope: its ends, and between them where an output may turn.
 VALUES = {PAYLOAD: 3, SLOPE: 5, CHARGE: 5, AMBIENT: 2}

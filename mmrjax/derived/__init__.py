@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from mmrjax.channels import CURRENT, VOLTAGE
+from mmrjax.model.channels import CURRENT, VOLTAGE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,8 +40,8 @@ class Derived:
     rests_on: tuple[str, ...] = ()
 
 
-_SLOPE, _START = "mmrjax.derived.steepest_slope", "mmrjax.derived.start"
-_POSTURE, _TURN = "mmrjax.derived.posture", "mmrjax.derived.turn"
+_SLOPE, _START = "mmrjax.derived.steepest_slope", "mmrjax.derived.start_figures"
+_POSTURE, _TURN = "mmrjax.derived.pitch_and_step", "mmrjax.derived.turning_figures"
 
 #: Read through the module, so that a line more is an output more everywhere.
 TABLE: tuple[Derived, ...] = (

@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax.compiling import compiled
-from mmrjax.conditions import Conditions
+from mmrjax.compile.compiling import compiled
 from mmrjax.fidelities.steady import operating, operating_point
-from mmrjax.params import Scalar
-from mmrjax.quantities import CONDITIONS
-from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED, Signals
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.quantities import CONDITIONS
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import CONVERGED, Signals
 
 #: The steepest slope that is looked at [deg]; a robot that holds it is said to hold this.
 STEEPEST = CONDITIONS["slope_deg"].range[1]

@@ -14,10 +14,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mmrjax.conditions import Conditions
-from mmrjax.params import Scalar, parameter
-from mmrjax.robot import Robot
-from mmrjax.signals import Signals
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar, parameter
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals
 
 #: What the balances of one equation add up to, in words: those of a line act alike on the readings.
 EQUATION = {

@@ -5,9 +5,9 @@ from __future__ import annotations
 import equinox as eqx
 
 from mmrjax.effects.base import Effect
-from mmrjax.params import Scalar, parameter
-from mmrjax.robot import Robot
-from mmrjax.signals import Signals
+from mmrjax.model.params import Scalar, parameter
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals
 
 
 def breakaway_parameter() -> Scalar:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 
-from mmrjax import balances
-from mmrjax.conditions import Conditions
 from mmrjax.effects.base import Effect
-from mmrjax.params import Scalar
-from mmrjax.robot import Robot
-from mmrjax.signals import Signals, State
+from mmrjax.model import balances
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals, State
 
 
 def _witness(place: str, whose: str, seen: list[Signals]) -> Effect:

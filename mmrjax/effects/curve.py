@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mmrjax import channels
 from mmrjax.effects.base import THE_SIDE, Effect, amplitude, made
 from mmrjax.effects.periodic import Periodic, phase_parameter
-from mmrjax.params import Index, Scalar, parameter
-from mmrjax.robot import Robot
-from mmrjax.signals import Signals
+from mmrjax.model import channels
+from mmrjax.model.params import Index, Scalar, parameter
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals
 
 #: Balances that a curve may enter: unit, amplitude that is plausible, and which direction it acts along.
 BALANCES = {

@@ -7,12 +7,12 @@ import abc
 import equinox as eqx
 import jax.numpy as jnp
 
-from mmrjax import power
-from mmrjax.conditions import Conditions
 from mmrjax.effects.base import Effect
-from mmrjax.params import Index, Scalar, parameter
-from mmrjax.robot import Robot
-from mmrjax.signals import Signals
+from mmrjax.model import power
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Index, Scalar, parameter
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals
 
 STEPS = 12  # integration steps in a period: derivatives at amplitude 0 are then right to 1e-5
 

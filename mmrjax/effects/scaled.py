@@ -7,9 +7,9 @@ import functools
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from mmrjax import params
 from mmrjax.effects.base import Effect
-from mmrjax.params import Parameter
+from mmrjax.model import params
+from mmrjax.model.params import Parameter
 
 #: Factors of a class: of the sd of its amplitude, of its shape parameter, and of the limits of its amplitude.
 Factors = tuple[float, float, float]

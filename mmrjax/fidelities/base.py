@@ -11,15 +11,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax import balances, channels, fidelities
-from mmrjax.compiling import compiled
-from mmrjax.conditions import Conditions
+from mmrjax import fidelities
+from mmrjax.compile.compiling import compiled
 from mmrjax.fidelities import Facts
-from mmrjax.params import Scalar
-from mmrjax.rig import Rig
-from mmrjax.robot import Robot
-from mmrjax.signals import Result, Signals
-from mmrjax.undercarriage import Reactions
+from mmrjax.model import balances, channels
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.rig import Rig
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Result, Signals
+from mmrjax.undercarriage.side_contacts import Reactions
 
 T = TypeVar("T")
 

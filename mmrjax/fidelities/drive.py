@@ -11,19 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mmrjax import balances
-from mmrjax.compiling import compiled
-from mmrjax.conditions import Conditions
-from mmrjax.driver import FAST
-from mmrjax.fidelities import turning
+from mmrjax.compile.compiling import compiled
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
 from mmrjax.fidelities.rest import HELD, holds, standing, status_moving, voltage_at_rest
 from mmrjax.fidelities.result import result, withhold
-from mmrjax.fidelities.rosenbrock import norm, step_longest
 from mmrjax.fidelities.steady import operating_signals
-from mmrjax.params import Scalar
-from mmrjax.robot import Robot
-from mmrjax.signals import (
+from mmrjax.model import balances
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.driver import FAST
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import (
     BATTERY_EMPTY,
     CONVERGED,
     FAILED,
@@ -32,6 +30,8 @@ from mmrjax.signals import (
     Signals,
     State,
 )
+from mmrjax.numerics.rosenbrock import norm, step_longest
+from mmrjax.turning import circling
 
 # Units of the unknowns (current, motor speed, speed, distance, discharge), all then of the order of one.
 # The memories of those effects that have one follow, each in its own unit.
@@ -241,7 +241,7 @@ def _integrated(
     """
     import diffrax  # only now: it takes half a second
 
-    from mmrjax.fidelities.rodas import Rodas4
+    from mmrjax.numerics.rodas import Rodas4
 
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda _, y, run: law(run[0], run[1], y) * run[2]),
@@ -267,16 +267,16 @@ def _turning(
     robot: Robot, conditions: Conditions, times: Array, tolerance: float, max_steps: int, rolling: bool
 ) -> Trajectory:
     """`drive` of a robot whose sides are driven apart; its signals have a last axis of left and right side."""
-    y0 = turning.start(robot, conditions, rolling)
-    parked = jnp.asarray(False) if rolling else turning.holds(robot, conditions)
-    moves = jnp.where(parked, turning.at_rest(y0), 1.0)
-    ys, went = _integrated(turning.rates, turning.norm, robot, conditions, moves, y0, times, tolerance, max_steps)
-    motion = jax.vmap(lambda y: turning.motion_of(robot, y))(ys)
+    y0 = circling.start(robot, conditions, rolling)
+    parked = jnp.asarray(False) if rolling else circling.holds(robot, conditions)
+    moves = jnp.where(parked, circling.at_rest(y0), 1.0)
+    ys, went = _integrated(circling.rates, circling.norm, robot, conditions, moves, y0, times, tolerance, max_steps)
+    motion = jax.vmap(lambda y: circling.motion_of(robot, y))(ys)
     travel = jax.vmap(lambda m: balances.turning(robot, conditions, m))(motion)
     end = jax.tree.map(lambda x: x[-1], (travel, motion))
-    status = jnp.where(parked, STALLED, turning.status_moving(robot, conditions, *end))
+    status = jnp.where(parked, STALLED, circling.status_moving(robot, conditions, *end))
     status = jnp.where(went, status, FAILED)
-    away, answer = jnp.hypot(motion.place_x, motion.place_y), turning.result_of(robot, end[0], status)
+    away, answer = jnp.hypot(motion.place_x, motion.place_y), circling.result_of(robot, end[0], status)
     return _kept(robot, conditions, times, away, travel.signals, motion.discharge, answer)
 
 

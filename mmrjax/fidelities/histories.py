@@ -26,15 +26,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mmrjax.conditions import Conditions
 from mmrjax.fidelities.drive import CURRENT, GROUND, MOTOR, moving, rates, start, state_of, units, winding
 from mmrjax.fidelities.rest import HELD, standing, turning_way
-from mmrjax.linear_equations import inverted, solved
-from mmrjax.params import Scalar
-from mmrjax.rarely import rarely
-from mmrjax.rig import on_line
-from mmrjax.robot import Robot
-from mmrjax.signals import Signals
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.rig import on_line
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals
+from mmrjax.numerics.linear_equations import inverted, solved
+from mmrjax.numerics.rarely import rarely
 
 T = TypeVar("T")
 

@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from mmrjax import balances, one_sided
-from mmrjax.conditions import Conditions
 from mmrjax.fidelities.result import slips, travels
-from mmrjax.params import Scalar
-from mmrjax.rarely import rarely
-from mmrjax.robot import Robot
-from mmrjax.signals import NOT_SETTLED, SLIDES, STALLED, Signals, State
+from mmrjax.model import balances
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import NOT_SETTLED, SLIDES, STALLED, Signals, State
+from mmrjax.numerics import one_sided
+from mmrjax.numerics.rarely import rarely
 
 #: Torque at the driving wheel that counts as much as the whole weight of a side [N·m].
 TORQUE = 1.0

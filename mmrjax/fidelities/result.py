@@ -10,12 +10,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from mmrjax import balances, channels, ground, outputs
-from mmrjax.motor import UNLIMITED
-from mmrjax.one_sided import magnitude
-from mmrjax.params import Scalar
-from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED, FLAGS, REVERSES, ROLLS_BACK, Result, Signals, quotient
+from mmrjax.fidelities import outputs
+from mmrjax.model import balances, channels, ground
+from mmrjax.model.motor import UNLIMITED
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import CONVERGED, FLAGS, REVERSES, ROLLS_BACK, Result, Signals, quotient
+from mmrjax.numerics.one_sided import magnitude
 
 #: Current into a supply that is none [A]: what rounding and a settled search leave.
 CURRENT_SMALL = 1e-3

@@ -13,19 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mmrjax import balances, channels, ground, outputs, params
-from mmrjax.compiling import SELDOM, compiled
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities import turning
+from mmrjax.compile.compiling import SELDOM, compiled
+from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import Fidelity, Implicit, Progress, Run
-from mmrjax.fidelities.newton import root
 from mmrjax.fidelities.rest import creeps, direction, slides_in_place, standing, voltage_at_rest
 from mmrjax.fidelities.result import result, travels, turned, withhold
-from mmrjax.linear_equations import Vector
-from mmrjax.params import Scalar
-from mmrjax.rarely import rarely
-from mmrjax.robot import Robot
-from mmrjax.signals import (
+from mmrjax.model import balances, channels, ground, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import (
     BATTERY_EMPTY,
     CODES,
     CONVERGED,
@@ -36,6 +33,10 @@ from mmrjax.signals import (
     Signals,
     State,
 )
+from mmrjax.numerics.linear_equations import Vector
+from mmrjax.numerics.newton import root
+from mmrjax.numerics.rarely import rarely
+from mmrjax.turning import circling as turning
 
 # Units of the unknowns and of the torque residual, so that all are of the order of one.
 _SPEED, _CURRENT, _SPEED_MOTOR, _VOLTAGE, _TORQUE = 1.0, 10.0, 1000.0, 10.0, 100.0

@@ -16,25 +16,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mmrjax import balances, contact, fidelities, masses
-from mmrjax.balances import signals_of
-from mmrjax.compiling import compiled
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities import both_sides, half_robot
+from mmrjax import fidelities
+from mmrjax.compile.compiling import compiled
+from mmrjax.compile.programs import has_tracer
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
-from mmrjax.fidelities.half_robot import Changes, Motion, Steady, System, system
 from mmrjax.fidelities.result import mask, withhold
-from mmrjax.fidelities.stability import largest_step, refuse
-from mmrjax.params import Scalar
-from mmrjax.programs import has_tracer
-from mmrjax.robot import Robot
-from mmrjax.signals import (
+from mmrjax.model import balances, contact, masses
+from mmrjax.model.balances import signals_of
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import (
     FAILED,
     TIPS,
     Result,
     Signals,
 )
-from mmrjax.undercarriage import Reactions
+from mmrjax.undercarriage import both_sides, half_robot
+from mmrjax.undercarriage.half_robot import Changes, Motion, Steady, System, system
+from mmrjax.undercarriage.side_contacts import Reactions
+from mmrjax.undercarriage.stability import largest_step, refuse
 
 STEP = fidelities.facts("track").resolved()["step"]  # [s]
 SAMPLE = 1e-3  # [s]

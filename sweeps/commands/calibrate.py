@@ -8,9 +8,9 @@ from rich.table import Table
 
 from calibration.data.columns import Layout
 from calibration.inference import blocks, priors
-from calibration.inference.calibrate import calibrate as run
-from calibration.inference.errors import OF_SIZE
+from calibration.inference.calibration import calibrate as run
 from calibration.inference.result import CalibrationResult
+from calibration.inference.simulation_errors import OF_SIZE
 from mmrjax.errors import counted
 from sweeps import config as configuration
 from sweeps.console import pulse, say, tell

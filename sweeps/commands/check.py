@@ -8,20 +8,20 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
-from calibration.data import requirements, robot_file
-from calibration.data.errors import BadConfiguration, rounded
+from calibration.data import requirements_file, robot_file
+from calibration.data.input_errors import BadConfiguration, rounded
 from calibration.sizing import sheet
-from mmrjax.channels import HEAT
-from mmrjax.requirements import CHARGE, OF_HEAT
-from mmrjax.robot import Robot
+from mmrjax.derived.requirements import CHARGE, OF_HEAT
+from mmrjax.model.channels import HEAT
+from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import say
 from sweeps.inputs import load_robot
 from sweeps.pages import words
 from sweeps.points import imposed
-from sweeps.results import posture
-from sweeps.results.check import CheckResult, changed, corner, label, limit, reached, wanted
+from sweeps.results import posture_results
+from sweeps.results.check_results import CheckResult, changed, corner, label, limit, reached, wanted
 from sweeps.skeleton import leave, page
 from sweeps.store import RunFolder, open_folder
 
@@ -34,7 +34,7 @@ def check(config: configuration.Check, out: Path | None, force: bool) -> int:
 
     0 done, with what is missed said; 3 where the solver failed at a worst corner.
     """
-    asked = requirements.load(Path(config.requirements))
+    asked = requirements_file.load(Path(config.requirements))
     file = load_robot(config)
     robot = file.robot
     imposed.check_on_ground(robot, "check")
@@ -43,7 +43,7 @@ def check(config: configuration.Check, out: Path | None, force: bool) -> int:
     _check_heat(robot, asked)
     with open_folder("check", config, robot, out, force) as folder:
         outcomes = sheet.check(robot, asked, changes=config.changes)
-        found = CheckResult(asked, robot, outcomes, posture.of_requirements(robot, outcomes))
+        found = CheckResult(asked, robot, outcomes, posture_results.of_requirements(robot, outcomes))
         _write(folder, config, found)
         print_check(found, changes=config.changes)
         manifest = {"seed": None, **sheet.counts(found.outcomes)}
@@ -56,7 +56,7 @@ def check(config: configuration.Check, out: Path | None, force: bool) -> int:
         )
 
 
-def _check_charge(robot: Robot, asked: requirements.Requirements) -> None:
+def _check_charge(robot: Robot, asked: requirements_file.Requirements) -> None:
     """Refuse requirements on a battery that the robot's file does not state."""
     for r in asked.each:
         depends = CHARGE in r.quantity.axes or r.quantity.group == "endurance"
@@ -67,7 +67,7 @@ def _check_charge(robot: Robot, asked: requirements.Requirements) -> None:
             )
 
 
-def _check_heat(robot: Robot, asked: requirements.Requirements) -> None:
+def _check_heat(robot: Robot, asked: requirements_file.Requirements) -> None:
     """Refuse requirements on a winding after long running of which the robot's file does not state how warm it
     becomes."""
     lacking = robot.unknown(HEAT)

@@ -14,25 +14,26 @@ from rich.table import Table
 
 from calibration.data import robot_file, terrains
 from calibration.data.contradictions import without_levers
-from calibration.data.errors import BadConfiguration
-from mmrjax import params, terrain
-from mmrjax.conditions import Conditions
+from calibration.data.input_errors import BadConfiguration
+from mmrjax.climbing import climb_simulation as fidelity
+from mmrjax.climbing import terrain
+from mmrjax.climbing.climb_derivatives import Derivatives, Given, climb_derivatives
+from mmrjax.climbing.climb_simulation import Climb, Sequence, climb_batch
+from mmrjax.climbing.terrain import Terrain
 from mmrjax.errors import near
-from mmrjax.fidelities import climb as fidelity
-from mmrjax.fidelities.climb import Climb, Sequence, climb_batch
-from mmrjax.fidelities.climb_derivatives import Derivatives, Given, climb_derivatives
-from mmrjax.params import Scalar
-from mmrjax.robot import Robot
-from mmrjax.tables import adhesion_ratio
-from mmrjax.terrain import Terrain
-from mmrjax.variation import Variation
+from mmrjax.fidelities.variation import Variation
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_tables import adhesion_ratio
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
 from sweeps import config as configuration
 from sweeps.config_campaign import SIZE
 from sweeps.console import progress, say
 from sweeps.inputs import check_configurations, load_robot
 from sweeps.points import imposed, scale
 from sweeps.points.climbs import NEAR, SLOW, SOUGHT, refused
-from sweeps.results.climb import VERDICTS, Along, ClimbResult
+from sweeps.results.climb_results import VERDICTS, Along, ClimbResult
 from sweeps.skeleton import leave, page
 from sweeps.store import open_folder
 

@@ -12,15 +12,15 @@ from rich.table import Table
 
 from calibration.data import instruments
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
-from calibration.inference import errors as residual
 from calibration.inference import preparation
+from calibration.inference import simulation_errors as residual
 from calibration.inference.ranges import check_ranges
-from calibration.words.notes import sentences
+from calibration.words.note_words import sentences
 from mmrjax import fidelities
-from mmrjax.channels import Channel
-from mmrjax.robot import Robot
+from mmrjax.model.channels import Channel
+from mmrjax.model.robot import Robot
 from sweeps import config as configuration
 from sweeps.console import say
 from sweeps.inputs import beside_robot, load_robot, read_runs

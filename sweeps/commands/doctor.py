@@ -60,11 +60,11 @@ def _run() -> str:
     """A drive without losses on the flat turns at U / C_E and draws nothing: an answer known by hand."""
     import jax.numpy as jnp
 
-    from mmrjax import params, robots
-    from mmrjax.conditions import Conditions
     from mmrjax.fidelities.steady import steady_batch
+    from mmrjax.model import paper_robots, params
+    from mmrjax.model.conditions import Conditions
 
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     words = ("friction_", "loss_", "rolling", "guide_share")
     losses = [p.name for p in params.walk(robot) if any(word in p.name for word in words)]
     ideal = params.replace(robot, dict.fromkeys(losses, jnp.asarray(0.0)))
@@ -79,11 +79,11 @@ def _run() -> str:
 def _derivative() -> str:
     import jax
 
-    from mmrjax import params, robots
-    from mmrjax.conditions import Conditions
     from mmrjax.fidelities.steady import steady
+    from mmrjax.model import paper_robots, params
+    from mmrjax.model.conditions import Conditions
 
-    robot, run = robots.nominal(), Conditions()
+    robot, run = paper_robots.nominal(), Conditions()
 
     def current(friction: params.Scalar) -> jax.Array:
         return steady(params.replace(robot, {"motor.friction_coulomb": friction}), run).total_current

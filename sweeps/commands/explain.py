@@ -11,22 +11,25 @@ from typing import Any
 import numpy as np
 
 from calibration.data import effect_file
-from calibration.data.errors import BadConfiguration, number
-from calibration.words import effects as words_of
-from mmrjax import channels, derived, effects, missions, outputs, params, quantities, robots
+from calibration.data.input_errors import BadConfiguration, number
+from calibration.words import effect_words as words_of
+from mmrjax import derived, effects
 from mmrjax.effects import Effect
 from mmrjax.errors import near
-from mmrjax.params import Parameter, Spec
-from mmrjax.signals import Result
+from mmrjax.fidelities import outputs
+from mmrjax.missions import mission_batch
+from mmrjax.model import channels, paper_robots, params, quantities
+from mmrjax.model.params import Parameter, Spec
+from mmrjax.model.signals import Result
 from sweeps.console import say
 from sweeps.pages import words
-from sweeps.results.climb import VERDICTS
+from sweeps.results.climb_results import VERDICTS
 
 #: A line of an explanation: heading and text.
 Line = tuple[str, str]
 WIDTH, INDENT = 80, 16
 #: Of a run, solved for, and of a mission.
-EVERY_OUTPUT: tuple[Any, ...] = (*outputs.FURTHER, *derived.TABLE, *missions.OUTPUTS, *missions.OF_TURNS)
+EVERY_OUTPUT: tuple[Any, ...] = (*outputs.FURTHER, *derived.TABLE, *mission_batch.OUTPUTS, *mission_batch.OF_TURNS)
 
 
 def explain(name: str | None, files: tuple[str, ...] = ()) -> int:
@@ -78,7 +81,7 @@ def names(library: dict[str, type[Effect]]) -> dict[str, list[str]]:
         "channels": [c.name for c in channels.EVERY],
         "conditions": [c.field for c in quantities.SET if c.field],
         "outputs": list(dict.fromkeys(o.name for o in EVERY_OUTPUT)),
-        "parameters": [p.name for p in params.walk(robots.nominal())],
+        "parameters": [p.name for p in params.walk(paper_robots.nominal())],
     }
 
 
@@ -124,7 +127,7 @@ def _changes(effect: Effect) -> Iterator[str]:
 
     import mmrjax as mm
 
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     spec = next(p.spec for p in params.walk(effect) if p.spec.amplitude)
     within = dataclasses.replace(robot, effects=(effect,))
     run = mm.Conditions(
@@ -207,7 +210,7 @@ def _output(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
         yield "is", f"{o.label} [{o.unit}]"
         if (said := _attribute(Result, o.name)) and o in outputs.FURTHER:
             yield "equation", said
-        where = "missions (--profile)" if o in (*missions.OUTPUTS, *missions.OF_TURNS) else "every run"
+        where = "missions (--profile)" if o in (*mission_batch.OUTPUTS, *mission_batch.OF_TURNS) else "every run"
         yield "column", f"{o.column}, of {'--outputs' if o in derived.TABLE else where}"
 
 
@@ -219,7 +222,7 @@ def _attribute(kind: type, name: str) -> str:
 
 
 def _parameter(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
-    robot = robots.nominal()
+    robot = paper_robots.nominal()
     found = next((p for p in params.walk(robot) if p.name == name), None)
     if found is None:
         return

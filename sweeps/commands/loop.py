@@ -22,9 +22,9 @@ from calibration.discovery.resolve import check_resolvable, resolve
 from calibration.discovery.result import REFIT_FILE, DiscoveryResult, Ranking
 from calibration.discovery.settings import fewest_replicates
 from calibration.inference import blocks, observers, priors
-from calibration.inference.errors import OF_SIZE
-from calibration.words import loop as said_of
-from calibration.words.steps import expected
+from calibration.inference.simulation_errors import OF_SIZE
+from calibration.words import loop_words as said_of
+from calibration.words.step_words import expected
 from sweeps import config as configuration
 from sweeps.console import pulse, say, tell
 from sweeps.inputs import load_robot, read_runs

@@ -14,26 +14,28 @@ from rich.table import Table
 from calibration.data import profiles
 from calibration.data import runs as records
 from calibration.data.columns import LOAD, ON_SHAFT, SUPPLY
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.data.profiles import ProfileTable
-from mmrjax import balances, channels, ground, missions, outputs
-from mmrjax.conditions import Conditions
 from mmrjax.errors import counted
-from mmrjax.fidelities.mission import Mission
-from mmrjax.fidelities.mission_steps import MARKS
-from mmrjax.missions import JOULE_PER_WH
-from mmrjax.power import COULOMB_PER_MAH
-from mmrjax.profile import PAIRS
-from mmrjax.robot import Robot
-from mmrjax.signals import FLAGS, STATUSES
-from mmrjax.tables import lateral_ratio
+from mmrjax.fidelities import outputs
+from mmrjax.missions import mission_batch as missions
+from mmrjax.missions.mission import Mission
+from mmrjax.missions.mission_batch import JOULE_PER_WH
+from mmrjax.missions.mission_steps import MARKS
+from mmrjax.missions.profile import PAIRS
+from mmrjax.model import balances, channels, ground
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_tables import lateral_ratio
+from mmrjax.model.power import COULOMB_PER_MAH
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import FLAGS, STATUSES
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import progress, say, tell
 from sweeps.inputs import OPTIONS, load_robot, one_run, read_runs
 from sweeps.pages import words
 from sweeps.points import imposed, run
-from sweeps.results.missions import Missions
+from sweeps.results.mission_results import Missions
 from sweeps.skeleton import page
 from sweeps.store import open_folder
 

@@ -8,18 +8,18 @@ from typing import Any
 
 import jax
 
-from calibration.data.errors import BadConfiguration
-from mmrjax import render as pictures
-from mmrjax import render_above
+from calibration.data.input_errors import BadConfiguration
 from mmrjax.fidelities.track import track_batch
-from mmrjax.signals import STATUSES
+from mmrjax.model.signals import STATUSES
+from mmrjax.undercarriage import rendering as pictures
+from mmrjax.undercarriage import rendering_from_above
 from sweeps import config as configuration
 from sweeps.commands import turn
 from sweeps.console import progress, say
 from sweeps.inputs import load_robot, one_run
 from sweeps.pages import words
 from sweeps.points import imposed, run, scale
-from sweeps.results.climb import Seen
+from sweeps.results.climb_results import Seen
 from sweeps.store import DONE, SOLVER_FAILED
 
 
@@ -51,7 +51,7 @@ def render(
     trajectory, conditions = jax.tree.map(lambda x: x[0], (trajectory, conditions))
 
     def draw(aside: Path) -> None:
-        view = (render_above if config.turns else pictures).scene(robot, conditions, trajectory)
+        view = (rendering_from_above if config.turns else pictures).scene(robot, conditions, trajectory)
         pictures.render(view, aside, begin, end, slow)
 
     _write(file, draw)

@@ -7,7 +7,7 @@ from pathlib import Path
 from calibration.data import robot_file
 from calibration.data import runs as records
 from mmrjax import fidelities
-from mmrjax.tables import CONFIGURATIONS
+from mmrjax.model.paper_tables import CONFIGURATIONS
 from sweeps import config as configuration
 from sweeps.console import tell
 from sweeps.inputs import load_robot

@@ -11,11 +11,16 @@ import numpy as np
 from rich.table import Table
 
 from calibration.data import robot_file
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities.modes import Mode, modes
-from mmrjax.fidelities.resonance import (
+from mmrjax.fidelities.track import track_batch
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_tables import PAYLOADS_KG, VOLTAGES_V
+from mmrjax.model.quantities import MM
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import STATUSES
+from mmrjax.undercarriage.modes import Mode, modes
+from mmrjax.undercarriage.ripple_peaks import (
     PERIODS,
     SIGNALS,
     Passing,
@@ -26,11 +31,6 @@ from mmrjax.fidelities.resonance import (
     peaks,
     vibrations,
 )
-from mmrjax.fidelities.track import track_batch
-from mmrjax.quantities import MM
-from mmrjax.robot import Robot
-from mmrjax.signals import STATUSES
-from mmrjax.tables import PAYLOADS_KG, VOLTAGES_V
 from sweeps import config as configuration
 from sweeps.config import GridPart
 from sweeps.console import progress, say
@@ -38,7 +38,7 @@ from sweeps.inputs import check_configurations, load_robot
 from sweeps.pages import words
 from sweeps.points import imposed, run, scale
 from sweeps.points.grid import grid
-from sweeps.results.resonance import SLOW, ResonanceResult, span
+from sweeps.results.resonance_results import SLOW, ResonanceResult, span
 from sweeps.skeleton import leave, page
 from sweeps.store import RunFolder, open_folder
 

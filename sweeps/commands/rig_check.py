@@ -12,23 +12,23 @@ from rich.table import Table
 
 from calibration.data import rig_facts, settling
 from calibration.data.columns import SUPPLY, Layout
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.data.rig_facts import Fact, Origin
 from calibration.data.rig_file import FREE
 from calibration.data.runs import Runs
 from calibration.data.writing import finite
 from calibration.inference import foresight, identifiability, priors
+from calibration.inference.fit_posterior import undetermined
 from calibration.inference.foresight import Determined, Foresight
-from calibration.inference.posterior import undetermined
-from calibration.words import fits
-from calibration.words.notes import sentences
-from mmrjax import channels
-from mmrjax.channels import HEAT, Channel
-from mmrjax.driver import FAST
+from calibration.words import fit_words
+from calibration.words.note_words import sentences
 from mmrjax.errors import counted
-from mmrjax.motor import UNLIMITED
-from mmrjax.robot import Robot
-from mmrjax.shaft import Shaft
+from mmrjax.model import channels
+from mmrjax.model.channels import HEAT, Channel
+from mmrjax.model.driver import FAST
+from mmrjax.model.motor import UNLIMITED
+from mmrjax.model.robot import Robot
+from mmrjax.model.shaft import Shaft
 from sweeps.config import RobotPart
 from sweeps.console import say
 from sweeps.inputs import load_robot, read_runs
@@ -189,7 +189,7 @@ class RigCheck:
         held = undetermined([p.name for p in self.foresight.parameters if p.held], pairs)
         traded = {name for pair in pairs for name in (pair.one, pair.other)}
         told = [p.name for p in self.foresight.parameters if not p.held and p.name not in traded]
-        told += [fits.combination(p) for p in pairs]
+        told += [fit_words.combination(p) for p in pairs]
         parts = [f"These data determine {', '.join(told)}" if told else "These data determine no parameter"]
         parts += [f"{', '.join(held)} would not be determined by these runs"] * bool(held)
         return "; ".join(parts) + "."
@@ -197,7 +197,7 @@ class RigCheck:
     def determined(self, parameter: Determined) -> str:
         """`yes`, `no`, or with which parameters together the table determines one."""
         assert self.foresight is not None
-        return fits.determined(parameter.name, parameter.held, self.foresight.together)
+        return fit_words.determined(parameter.name, parameter.held, self.foresight.together)
 
     def to_json(self) -> dict[str, Any]:
         """The whole, for machines."""
@@ -215,7 +215,7 @@ class RigCheck:
                     {**dataclasses.asdict(p), "determined": self.determined(p)} for p in self.foresight.parameters
                 ],
                 "alike": [list(pair) for pair in self.foresight.alike],
-                "together": [fits.pair(pair) for pair in self.foresight.together],
+                "together": [fit_words.pair(pair) for pair in self.foresight.together],
             }
         return {
             "schema": "mmrjax.rig_check/1",

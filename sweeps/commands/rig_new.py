@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import resources
 from pathlib import Path
 
-from calibration.data.errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, choices
 from sweeps.console import say
 
 #: Kinds of rig, in words.

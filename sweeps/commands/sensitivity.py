@@ -11,23 +11,23 @@ from rich.table import Table
 
 from calibration.data import robot_file
 from calibration.data.columns import Layout
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from calibration.inference import noise
-from calibration.sensitivity import inputs as room
+from calibration.sensitivity import uncertain_inputs as room
 from calibration.sensitivity.analyse import analyse
-from calibration.sensitivity.inputs import Inputs
 from calibration.sensitivity.model import chosen_outputs
 from calibration.sensitivity.next_runs import Candidates
 from calibration.sensitivity.result import METHODS, NEGLIGIBLE, Points, SensitivityResult
 from calibration.sensitivity.study import Study, Supply
-from calibration.words import sensitivity as words
-from mmrjax.conditions import OF_TURNS
-from mmrjax.power import COULOMB_PER_MAH
-from mmrjax.quantities import RPM
-from mmrjax.robot import Robot
-from mmrjax.tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
+from calibration.sensitivity.uncertain_inputs import Inputs
+from calibration.words import sensitivity_words as words
+from mmrjax.model.conditions import OF_TURNS
+from mmrjax.model.paper_tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
+from mmrjax.model.power import COULOMB_PER_MAH
+from mmrjax.model.quantities import RPM
+from mmrjax.model.robot import Robot
 from sweeps import config as configuration
 from sweeps.config import GridPart
 from sweeps.console import say, tell

@@ -14,13 +14,13 @@ from calibration.data import robot_file, settling
 from calibration.data.settling import Inertia, Settled
 from calibration.inference import ranges
 from calibration.inference.observers import SettledRuns
-from calibration.words import settle as words
-from calibration.words.notes import sentences
-from mmrjax import balances
-from mmrjax.channels import Channel
-from mmrjax.conditions import Conditions
-from mmrjax.robot import Robot
-from mmrjax.signals import State
+from calibration.words import settle_words as words
+from calibration.words.note_words import sentences
+from mmrjax.model import balances
+from mmrjax.model.channels import Channel
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import State
 from sweeps import config as configuration
 from sweeps.console import say
 from sweeps.inputs import load_robot, read_runs

@@ -15,17 +15,19 @@ from jaxtyping import Array, Float
 from rich.table import Table
 
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration
-from mmrjax import channels, fidelities, ground, outputs, stages
-from mmrjax.channels import Channel
-from mmrjax.compiling import SELDOM, compiled
-from mmrjax.derived.start import peak
+from calibration.data.input_errors import BadConfiguration
+from mmrjax import fidelities
+from mmrjax.compile.compiling import SELDOM, compiled
+from mmrjax.derived.start_figures import peak
+from mmrjax.fidelities import outputs, start_stages
 from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.result import result
-from mmrjax.motor import Motor
-from mmrjax.params import Scalar
-from mmrjax.robot import Robot
-from mmrjax.signals import BATTERY_EMPTY, STATUSES
+from mmrjax.model import channels, ground
+from mmrjax.model.channels import Channel
+from mmrjax.model.motor import Motor
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import BATTERY_EMPTY, STATUSES
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import progress, say
@@ -33,7 +35,7 @@ from sweeps.inputs import beside_robot, load_robot, one_run, read_runs
 from sweeps.pages import posture_words, words
 from sweeps.points import run, scale, uncertainty
 from sweeps.points.job import showing_turns
-from sweeps.results import posture
+from sweeps.results import posture_results
 from sweeps.skeleton import page
 from sweeps.store import RunFolder, open_folder
 
@@ -75,7 +77,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         seen = showing_turns(robot, runs.axes)
         table, histories = _simulated(folder, seen, runs, config)
         table[PERMISSIBLE] = permissible(robot, table)
-        stands = posture.postures(robot, runs, run.commanded(robot, runs, config))
+        stands = posture_results.postures(robot, runs, run.commanded(robot, runs, config))
         notes = remarks(robot, table) + capabilities.unknown(robot)
         found = None
         if drawn is not None and config.posterior is not None:
@@ -254,7 +256,7 @@ def starts(robot: Robot, batch: Run, runs: records.Runs) -> list[dict[str, Any]]
     """Of each run from standstill its stages, their slip (33) and the acceleration time; no stages where it does not
     get under way."""
     assert batch.history is not None  # the fidelity was asked for it
-    found = stages.of_histories(robot, batch.history, runs.configurations(robot))
+    found = start_stages.of_histories(robot, batch.history, runs.configurations(robot))
     nothing: dict[str, Any] = {"stages": [], "acceleration_time_s": None, "slip_over_acceleration": None}
     under_way = [STATUSES[int(s)] in words.UNDER_WAY for s in np.asarray(batch.result.status)]
     return [

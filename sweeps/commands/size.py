@@ -7,20 +7,20 @@ from pathlib import Path
 
 from rich.table import Table
 
-from calibration.data import requirements, robot_file
-from calibration.data.errors import BadConfiguration, choices
+from calibration.data import requirements_file, robot_file
+from calibration.data.input_errors import BadConfiguration, choices
 from calibration.data.parts import motors
 from calibration.sizing import sheet
 from calibration.sizing.design import OBJECTIVES
-from calibration.sizing.search import size as search
+from calibration.sizing.design_search import size as search
 from mmrjax.errors import counted
 from sweeps import config as configuration
 from sweeps.console import say
 from sweeps.inputs import load_robot
 from sweeps.pages import words
 from sweeps.points import imposed
-from sweeps.results import check as check_result
-from sweeps.results.size import SizeResult, described, missed, objective, verdict
+from sweeps.results import check_results as check_result
+from sweeps.results.size_results import SizeResult, described, missed, objective, verdict
 from sweeps.skeleton import leave, page
 from sweeps.store import RunFolder, open_folder
 
@@ -30,7 +30,7 @@ def size(config: configuration.Size, out: Path | None, force: bool) -> int:
 
     0 done, whether or not a design meets everything; 3 where the solver failed at a worst corner of the best.
     """
-    asked = requirements.load(Path(config.requirements))
+    asked = requirements_file.load(Path(config.requirements))
     file = load_robot(config)
     robot = file.robot
     imposed.check_on_ground(robot, "size")

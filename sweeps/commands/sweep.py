@@ -15,10 +15,10 @@ import numpy as np
 from rich.table import Table
 
 from calibration.data import profiles, robot_file
-from calibration.data.errors import BadConfiguration, InputError
+from calibration.data.input_errors import BadConfiguration, InputError
 from calibration.data.robot_file import RobotFile
 from mmrjax.errors import counted
-from mmrjax.signals import STATUSES
+from mmrjax.model.signals import STATUSES
 from sweeps import config_campaign, skeleton
 from sweeps.config import Sweep
 from sweeps.config_campaign import Campaign, How
@@ -26,9 +26,9 @@ from sweeps.console import progress, say, tell
 from sweeps.inputs import beside_robot, load_robot
 from sweeps.pages import words
 from sweeps.points import axes, grid, run, scale, uncertainty
-from sweeps.points.design import Blocks
 from sweeps.points.identity import Identity, identity
 from sweeps.points.job import laid_out, prepare, showing_turns
+from sweeps.points.sampled_design import Blocks
 from sweeps.points.tasks import task_of
 from sweeps.points.zarr_store import STORE, Done, Layout, SweepStore
 from sweeps.skeleton import page

@@ -13,22 +13,24 @@ from rich.table import Table
 
 from calibration.data import sides
 from calibration.data.columns import SIDES, SUPPLY
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.data.table import Runs
-from mmrjax import channels, fidelities, outputs
-from mmrjax.channels import Channel
-from mmrjax.conditions import Conditions
-from mmrjax.derived import turn as derived
+from mmrjax import fidelities
+from mmrjax.derived import turning_figures as derived
+from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.rest import voltage_at_rest
-from mmrjax.robot import Robot
+from mmrjax.model import channels
+from mmrjax.model.channels import Channel
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import progress, say
 from sweeps.inputs import load_robot, one_run
 from sweeps.pages import posture_words, turn_words
 from sweeps.points import imposed, run, scale
-from sweeps.results import posture
+from sweeps.results import posture_results
 from sweeps.skeleton import page
 from sweeps.store import open_folder
 
@@ -82,7 +84,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
             print_sides(facts.sides)
         for note in facts.notes:
             say(f"- {note}")
-        if (stands := posture.postures(robot, runs, asked)) is not None:
+        if (stands := posture_results.postures(robot, runs, asked)) is not None:
             folder.write_table("posture.csv", stands.table)
             say(posture_words.stands(stands))
         result = run.SimulationResult("simulate", config.model, robot, runs, table, {"turn": turn})

@@ -12,7 +12,7 @@ from calibration.data.table import Runs
 from calibration.inference import blocks
 from calibration.inference.identifiability import Z95
 from calibration.inference.result import CalibrationResult
-from mmrjax.channels import Channel
+from mmrjax.model.channels import Channel
 from sweeps.pages.figure_style import BLUE, FAINT, INK, ORANGE, VERMILION, axis_label, figure
 from sweeps.pages.words import short_name
 

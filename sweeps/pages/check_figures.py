@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sweeps.pages.figure_style import FAINT, GREEN, INK, VERMILION, figure
-from sweeps.results.check import CheckResult, label, limit, reached, wanted
+from sweeps.results.check_results import CheckResult, label, limit, reached, wanted
 
 #: Margins beyond are drawn so far [%]; their number says how large they are.
 LONGEST = 100.0

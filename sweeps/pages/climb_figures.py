@@ -10,13 +10,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from mmrjax import footing, loop
-from mmrjax import render as pictures
-from mmrjax.footing import PITCH, SHAFT
-from mmrjax.tables import BODY_HEIGHT
+from mmrjax.climbing import belt_loop, footing
+from mmrjax.climbing.footing import PITCH, SHAFT
+from mmrjax.model.paper_tables import BODY_HEIGHT
+from mmrjax.undercarriage import rendering as pictures
 from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, figure, style
-from sweeps.results.climb import SHOWN as IN_TITLE
-from sweeps.results.climb import ClimbResult, Seen, coordinates
+from sweeps.results.climb_results import SHOWN as IN_TITLE
+from sweeps.results.climb_results import ClimbResult, Seen, coordinates
 
 #: What can be drawn.
 Drawable = ClimbResult | Seen
@@ -38,7 +38,7 @@ def _outlines(found: Drawable, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarr
     drawn = []
     for belt, frame, turned in belts:
         path = frame.world(belt.point(jnp.linspace(0.0, belt.length, 120)[:-1]))
-        tips = frame.world(loop.tips(belt, belt.places(belt.first * turned)).at)
+        tips = frame.world(belt_loop.tips(belt, belt.places(belt.first * turned)).at)
         drawn.append((np.asarray(path), np.asarray(tips)))
     if np.asarray(chassis.on_tracks) < 0.5:
         round_ = np.linspace(0, 2 * np.pi, 60)
@@ -152,7 +152,7 @@ def search(found: ClimbResult) -> Figure:
 
 
 class Film(NamedTuple):
-    """A climb as `mmrjax.render` draws it."""
+    """A climb as `mmrjax.undercarriage.rendering` draws it."""
 
     found: Drawable
 

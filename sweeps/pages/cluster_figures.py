@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.inference.residual_clusters import ResidualCluster
-from mmrjax import channels
+from mmrjax.model import channels
 from sweeps.pages.figure_style import BLUE, FAINT, INK, figure
 
 #: Clusters shown, panels in a row, width of a strip.

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mmrjax.channels import Channel
+from mmrjax.model.channels import Channel
 from sweeps.pages.figure_style import axis_label, figure, looks, note
 
 

@@ -21,7 +21,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.text import Text
 from matplotlib.ticker import LogFormatter, NullFormatter, ScalarFormatter
 
-from mmrjax.channels import Channel
+from mmrjax.model.channels import Channel
 
 if TYPE_CHECKING:
     from matplotlib.typing import RcKeyType

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from mmrjax.fidelities import ripple
-from mmrjax.signals import STATUSES
-from mmrjax.tables import PITCH_GROUSER, PITCH_TOOTH
+from mmrjax.model.paper_tables import PITCH_GROUSER, PITCH_TOOTH
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import STATUSES
+from mmrjax.undercarriage import ripple
 from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, figure, label_end, looks, note
-
-if TYPE_CHECKING:
-    from mmrjax.robot import Robot
 
 TAIL = 0.3  # of a run at its end that is looked at for ripple [s]
 SHOWN = 0.15  # and drawn [s]

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mmrjax import channels
-from mmrjax.channels import Channel
-from mmrjax.derived.start import peak
-from mmrjax.quantities import MM
-from mmrjax.stages import Stages, ending, numbers, of_histories
+from mmrjax.derived.start_figures import peak
+from mmrjax.fidelities.start_stages import Stages, ending, numbers, of_histories
+from mmrjax.model import channels
+from mmrjax.model.channels import Channel
+from mmrjax.model.quantities import MM
+from mmrjax.model.robot import Robot
 from sweeps.pages import words
 from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, axis_label, figure, looks, note
-
-if TYPE_CHECKING:
-    from mmrjax.robot import Robot
 
 INRUSH = 0.04  # s, shown enlarged
 _STAGES = (("I", "#fdebd0", "starting"), ("II", "#e3eef7", "slipping"), ("III", "#eaf5ea", "uniform"))
@@ -96,7 +94,7 @@ def starts(robot: Robot, history: Any, status: np.ndarray, which: Sequence[int],
         history: time and signals of the batch; status: codes of how its members ended.
         which: index of each member's configuration in `robot`; names: headings of the members.
     """
-    from mmrjax.signals import STATUSES
+    from mmrjax.model.signals import STATUSES
 
     answer = []
     for k, (name, found) in enumerate(zip(names, of_histories(robot, history, which[: len(names)]), strict=True)):
@@ -317,7 +315,7 @@ def courses(read: Iterable[Channel], history: Any, status: np.ndarray, names: Se
         read: channels of the robot; history: of the batch; status: codes of how its members ended.
         names: headings of the members.
     """
-    from mmrjax.signals import STATUSES
+    from mmrjax.model.signals import STATUSES
 
     answer, shown = [], tuple(c for c in read if c.over_time)
     for k, name in enumerate(names):

@@ -14,8 +14,8 @@ from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import blocks
 from calibration.inference.bases import in_words
 from calibration.inference.details import TimeStatistics
-from mmrjax.channels import EVERY, SIDES, Channel
-from mmrjax.quantities import MM, RPM
+from mmrjax.model.channels import EVERY, SIDES, Channel
+from mmrjax.model.quantities import MM, RPM
 from sweeps.pages.figure_style import (
     BLUE,
     FAINT,
@@ -31,7 +31,7 @@ from sweeps.pages.sweep_figures import UNITS, imposed
 from sweeps.pages.words import short_name
 
 if TYPE_CHECKING:
-    from sweeps.pages.loop import Change
+    from sweeps.pages.loop_page import Change
 
 #: Effects on the ladder and on the map of look-alikes.
 RUNGS, ALIKE = 20, 14

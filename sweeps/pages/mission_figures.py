@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mmrjax.channels import SIDES
-from mmrjax.energy import SINKS
+from mmrjax.model.channels import SIDES
+from mmrjax.model.energy import SINKS
 from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, note
 from sweeps.points.imposed import UNLIMITED
 

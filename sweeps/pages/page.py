@@ -7,23 +7,22 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jinja2
 import numpy as np
 from markupsafe import Markup, escape
 
+from calibration.data.robot_file import RobotFile
 from calibration.data.writing import write_text
-from mmrjax import __version__, channels, effects, params
-from mmrjax.channels import Channel
-from mmrjax.quantities import SET, Condition
+from mmrjax import __version__, effects
+from mmrjax.model import channels, params
+from mmrjax.model.channels import Channel
+from mmrjax.model.quantities import SET, Condition
+from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
 from sweeps.pages.figure_style import style, svg
-
-if TYPE_CHECKING:
-    from calibration.data.robot_file import RobotFile
-    from mmrjax.robot import Robot
 
 ROWS = 200  # of a table on a page
 _PAPERS_NAMES = {"nominal": "nominal (PM)", "sm1": "SM-1", "sm2": "SM-2"}
@@ -62,7 +61,7 @@ def named(file: RobotFile) -> dict[str, Any]:
     Of a rig that starts from nothing its `own`, with where each comes from. A changed packaged robot is said to be
     one.
     """
-    from mmrjax.robots import ROBOTS
+    from mmrjax.model.paper_robots import ROBOTS
 
     robot, name = file.robot, file.name
     known: dict[str, Any] = {"robot": name, "changed": [], "own": [], "curves": curves(robot)}

@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from scipy.spatial import ConvexHull
 
-from mmrjax.posture import BELTS, FRONT_AXLE, REAR_AXLE, Outline
-from mmrjax.quantities import MM
+from mmrjax.climbing.resting_posture import BELTS, FRONT_AXLE, REAR_AXLE, Outline
+from mmrjax.model.quantities import MM
 from sweeps.pages.figure_style import BLUE, INK, ORANGE, VERMILION, figure
-from sweeps.results.posture import Drawn, Postures, StepMap
+from sweeps.results.posture_results import Drawn, Postures, StepMap
 
 _GROUND = "#d9cfbf"
 _ROUND = np.linspace(0.0, 2 * np.pi, 181)

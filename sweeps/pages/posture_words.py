@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sweeps.results.posture import Postures
+from sweeps.results.posture_results import Postures
 
 #: Columns of the page's table: heading, format.
 COLUMNS = {

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from matplotlib import colors
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from mmrjax.fidelities.resonance import MATTERS, SIGNALS, strongest
-from mmrjax.quantities import MM
+from mmrjax.model.quantities import MM
+from mmrjax.undercarriage.ripple_peaks import MATTERS, SIGNALS, strongest
 from sweeps.pages import words
 from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure
-from sweeps.results.resonance import percent
-
-if TYPE_CHECKING:
-    from sweeps.results.resonance import ResonanceResult
+from sweeps.results.resonance_results import ResonanceResult, percent
 
 ORDERS = 8  # lines of the Campbell diagram
 MAPS = ("reaction", "current", "speed")

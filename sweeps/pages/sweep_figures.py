@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from mmrjax.channels import Channel
+from mmrjax.model.channels import Channel
 from sweeps.pages import words
 from sweeps.pages.figure_style import FAINT, INK, axis_label, figure, note
 from sweeps.pages.page import reading

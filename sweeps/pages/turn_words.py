@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from mmrjax.channels import SIDES
-from mmrjax.derived.turn import NONE
-from mmrjax.quantities import MM
-from mmrjax.robot import Robot
-from mmrjax.signals import NOT_SETTLED, STATUSES, Result
-from mmrjax.simulation import STRAIGHT
-from mmrjax.turning import BETWEEN, OVER
+from mmrjax.derived.turning_figures import NONE
+from mmrjax.fidelities.simulation import STRAIGHT
+from mmrjax.model.channels import SIDES
+from mmrjax.model.quantities import MM
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import NOT_SETTLED, STATUSES, Result
+from mmrjax.turning.two_sides import BETWEEN, OVER
 from sweeps import capabilities
 from sweeps.pages import words
 

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mmrjax.tables import TRACKED, WHEELED
+from mmrjax.model.paper_tables import TRACKED, WHEELED
+from mmrjax.model.robot import Robot
 from sweeps.pages.figure_style import FAINT, INK, PURPLE, figure, label_end, note
 from sweeps.pages.page import words_shown
 from sweeps.paper import data
 from sweeps.paper.look import CONFIGURATION, MODEL
-
-if TYPE_CHECKING:
-    from mmrjax.robot import Robot
 
 #: No load of the maker's sheet of RE30 310007: speed [rpm], current [A].
 SHEET_NO_LOAD = (8810.0, 0.165)
@@ -119,7 +115,7 @@ def _mark_rows(axes: Axes, robot: Robot, rows: data.Rows) -> None:
 
 def battery(robots: dict[str, Robot]) -> Figure:
     """Fig. 10: cell voltage over load current (a), no-load voltage over discharge (b) with the capacity."""
-    from mmrjax.power import COULOMB_PER_MAH
+    from mmrjax.model.power import COULOMB_PER_MAH
 
     fig, grid = figure(1, 2, 3.7)
     name, robot = next(iter(robots.items()))

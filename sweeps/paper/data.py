@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import runs as records
-from calibration.inference import errors as residual
-from mmrjax import outputs
-from mmrjax.channels import Channel
-from mmrjax.conditions import Conditions
+from calibration.inference import simulation_errors as residual
+from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import History
-from mmrjax.quantities import MM, RPM
-from mmrjax.tables import CONFIGURATIONS, SURFACES, TRACKED, adhesion_ratio
+from mmrjax.model.channels import Channel
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_tables import CONFIGURATIONS, SURFACES, TRACKED, adhesion_ratio
+from mmrjax.model.quantities import MM, RPM
+from mmrjax.model.robot import Robot
 from sweeps.pages import history_figures
 from sweeps.pages.history_figures import Start
-
-if TYPE_CHECKING:
-    from mmrjax.robot import Robot
 
 Columns = dict[str, np.ndarray]
 
@@ -168,7 +166,7 @@ def gear_efficiency(robot: Robot, speed_rpm: float, torque_input: np.ndarray) ->
 
 def cell_voltage(robot: Robot, current: np.ndarray, discharge_mah: float) -> np.ndarray:
     """Voltage of one cell [V] over its load current I_b [A] (12), after a discharge [mAh]."""
-    from mmrjax.power import COULOMB_PER_MAH
+    from mmrjax.model.power import COULOMB_PER_MAH
 
     battery = robot.battery
     total = battery.voltage(jnp.asarray(current) - battery.current_other, discharge_mah * COULOMB_PER_MAH)
@@ -177,7 +175,7 @@ def cell_voltage(robot: Robot, current: np.ndarray, discharge_mah: float) -> np.
 
 def cell_no_load(robot: Robot, discharge_mah: np.ndarray) -> np.ndarray:
     """No-load voltage of one cell [V], eq. (13), over discharge [mAh]."""
-    from mmrjax.power import COULOMB_PER_MAH
+    from mmrjax.model.power import COULOMB_PER_MAH
 
     discharge = jnp.asarray(discharge_mah * COULOMB_PER_MAH)
     return np.asarray(robot.battery.voltage_no_load(discharge)) * np.ones_like(discharge_mah)
@@ -194,8 +192,8 @@ def idle_current(robot: Robot, configuration: str, speed_wheel: np.ndarray) -> n
     No ground, no weight on the guides: the balances are asked with zero normal load and traction. Their
     net torque is linear in the current while the motor drives, so two currents give the root.
     """
-    from mmrjax import balances
-    from mmrjax.signals import State
+    from mmrjax.model import balances
+    from mmrjax.model.signals import State
 
     asked = conditions(robot, np.full(speed_wheel.shape, configuration))
     chassis = robot.configurations[configuration]
@@ -298,8 +296,8 @@ def energy_split(robot: Robot, asked: Conditions) -> tuple[Columns, Columns]:
     """
     import equinox as eqx
 
-    from mmrjax import balances
-    from mmrjax.signals import State
+    from mmrjax.model import balances
+    from mmrjax.model.signals import State
 
     points = operating_points(robot, asked)
     wheel = points["theoretical_speed_mm_s"] * MM / np.asarray(robot.chassis(asked.configuration).radius)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mmrjax.tables import TRACKED, WHEELED
+from mmrjax.model.paper_tables import TRACKED, WHEELED
 from sweeps.pages.figure_style import BLUE, GREEN, ORANGE, VERMILION
 
 CONFIGURATION = {TRACKED: BLUE, WHEELED: VERMILION}

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from calibration.inference import errors as residual
-from mmrjax.robots import ROBOTS
-from mmrjax.tables import TRACKED
+from calibration.data.robot_file import RobotFile
+from calibration.inference import simulation_errors as residual
+from mmrjax.model.paper_robots import ROBOTS
+from mmrjax.model.paper_tables import TRACKED
+from mmrjax.model.robot import Robot
 from sweeps.pages import history_figures, page
 from sweeps.pages.page import words_shown
-from sweeps.paper import components, data, runs, tables
-
-if TYPE_CHECKING:
-    from calibration.data.robot_file import RobotFile
-    from mmrjax.robot import Robot
+from sweeps.paper import components, data, error_tables, run_figures
 
 
 def write(folder: Path, file: RobotFile, *, model: str, gear: bool) -> tuple[Path, data.Rows | None]:
@@ -45,17 +43,17 @@ def write(folder: Path, file: RobotFile, *, model: str, gear: bool) -> tuple[Pat
     starts = data.starts(robot)
     album.add("fig23_24_from_standstill", lambda: history_figures.from_standstill(starts, data.FIG_23, data.FIG_24))
     if gear:
-        from sweeps.paper import running_gear
+        from sweeps.paper import running_gear_figures
 
-        known["gear"] = running_gear.draw(album, robot)
-    known["energy"] = album.add("energy_split", lambda: runs.energy(robot, ratio))
+        known["gear"] = running_gear_figures.draw(album, robot)
+    known["energy"] = album.add("energy_split", lambda: run_figures.energy(robot, ratio))
     album.add("fig05a_gearbox_efficiency", lambda: components.gearbox_efficiency(robots, mine))
     album.add("fig10_battery", lambda: components.battery(robots))
     album.add("fig11_motor_friction", lambda: components.motor_friction(robots))
     known["idle"] = album.add("fig18_idle_track", lambda: components.idle_track(robots))
     known |= {
-        "rows": tables.row_by_row(nominal, rows["nominal"]),
-        "facts": tables.facts(nominal, rows["nominal"]),
+        "rows": error_tables.row_by_row(nominal, rows["nominal"]),
+        "facts": error_tables.facts(nominal, rows["nominal"]),
         "raised_nominal": data.raised_words(nominal, rows["nominal"].ratio),
         "starts": starts,
         "split": data.SPLIT,
@@ -70,13 +68,13 @@ def _against_the_bench(
     album: page.Album, robots: dict[str, Robot], rows: dict[str, data.Rows], name: str
 ) -> dict[str, Any]:
     mine, robot = rows[name], robots[name]
-    album.add("rows", lambda: runs.row_parity(mine, name))
-    certainty = album.add("fig28_current_over_slope", lambda: runs.current_over_slope(robot, mine))
+    album.add("rows", lambda: run_figures.row_parity(mine, name))
+    certainty = album.add("fig28_current_over_slope", lambda: run_figures.current_over_slope(robot, mine))
     if TRACKED in mine.ratio:
-        album.add("fig29_model_errors", lambda: runs.model_errors(robots, rows))
+        album.add("fig29_model_errors", lambda: run_figures.model_errors(robots, rows))
     return {
         "certainty": certainty,
-        "errors": tables.errors(_variants(name, rows), mine),
+        "errors": error_tables.errors(_variants(name, rows), mine),
         "raised": data.raised_words(robot, mine.ratio),
         "sliding": list(zip(*_sliding_rows(mine), strict=True)),
         "measured": len(mine.conditions),

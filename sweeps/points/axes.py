@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -14,20 +14,18 @@ from jaxtyping import Float
 from calibration.data.columns import IMPOSED as OF_IMPOSED
 from calibration.data.columns import LEVERS
 from calibration.data.contradictions import without_levers
-from calibration.data.errors import BadConfiguration, choices, stated_number
-from mmrjax import variation
-from mmrjax.rig import IMPOSED
-from mmrjax.robot import Robot
-from mmrjax.tables import SURFACES, adhesion_ratio
-from mmrjax.variation import Axis
+from calibration.data.input_errors import BadConfiguration, choices, stated_number
+from mmrjax.fidelities import variation
+from mmrjax.fidelities.variation import Axis
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_tables import SURFACES, adhesion_ratio
+from mmrjax.model.rig import IMPOSED
+from mmrjax.model.robot import Robot
 from sweeps import config as configuration
 from sweeps.config_campaign import Campaign
 from sweeps.points import imposed
-from sweeps.points.design import DESIGNS, ROW, Design, Drawn, Joint, Samples, in_blocks
+from sweeps.points.sampled_design import DESIGNS, ROW, Design, Drawn, Joint, Samples, in_blocks
 from sweeps.points.tasks import task_of
-
-if TYPE_CHECKING:
-    from mmrjax.conditions import Conditions
 
 CONFIGURATION, SURFACE = "configuration", "surface"
 #: Condition that is imposed, by `rig.IMPOSED`; those that act on a vehicle alone, and on a load on a shaft alone.
@@ -72,7 +70,7 @@ class Plan:
 
     def fixed(self) -> Conditions:
         """The conditions that do not vary, of shape ()."""
-        from mmrjax.conditions import Conditions
+        from mmrjax.model.conditions import Conditions
 
         which = int(self.conditions.get(CONFIGURATION, 0))
         return Conditions(which, **{k: v for k, v in self.conditions.items() if k != CONFIGURATION})
@@ -296,13 +294,13 @@ def _samples(stated: Mapping[str, Any], robot: Robot, where: str, data: list[str
 
 
 def _posterior(stated: Any, robot: Robot, where: str, data: list[str]) -> Joint:
-    from calibration.data import posterior
+    from calibration.data import posterior_file
 
     if not isinstance(stated, str):
         raise BadConfiguration(f"{where}: got {stated!r}; expected a run folder of calibrate or loop")
     path = Path(stated)
-    path = path / posterior.FILE if path.is_dir() else path
-    found = posterior.read(path)
+    path = path / posterior_file.FILE if path.is_dir() else path
+    found = posterior_file.read(path)
     found.check(robot, where)
     data.append(str(path))
     return found

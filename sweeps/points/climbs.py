@@ -12,16 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import terrains
-from calibration.data.errors import BadConfiguration
-from mmrjax import masses, terrain
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities.climb import FAILED, NAMES, OVER, UNFINISHED, Climb, Sequence, climb_batch, still
-from mmrjax.footing import PITCH
-from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED, NOT_SETTLED
-from mmrjax.signals import FAILED as FAILED_POINT
-from mmrjax.terrain import Terrain
-from mmrjax.variation import STATUS, Axis, Variation
+from calibration.data.input_errors import BadConfiguration
+from mmrjax.climbing import terrain
+from mmrjax.climbing.climb_simulation import FAILED, NAMES, OVER, UNFINISHED, Climb, Sequence, climb_batch, still
+from mmrjax.climbing.footing import PITCH
+from mmrjax.climbing.terrain import Terrain
+from mmrjax.fidelities.variation import STATUS, Axis, Variation
+from mmrjax.model import masses
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import CONVERGED, NOT_SETTLED
+from mmrjax.model.signals import FAILED as FAILED_POINT
 from sweeps.config_campaign import SIZE, Obstacle
 
 #: Sizes [mm] between which a search begins, and how near its ends come.

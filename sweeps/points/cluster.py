@@ -15,16 +15,14 @@ import pickle
 import sys
 import threading
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from calibration.data.errors import BadConfiguration, InputError
+from calibration.data.input_errors import BadConfiguration, InputError
 from sweeps.points.identity import code, differences, versions
+from sweeps.points.scale import Job, Produced
 from sweeps.store import PACKAGES
-
-if TYPE_CHECKING:
-    from sweeps.points.scale import Job, Produced
 
 #: Longest wait for a scheduler to answer, and for it to have a worker [s].
 ANSWER, WORKER = 4.0, 60.0
@@ -289,7 +287,7 @@ def compute(work: bytes, name: str, chunk: int, expected: dict[str, Any]) -> dic
     differ = differences(expected, {**host, "device": {"device": device}})
     if differ:
         raise BadConfiguration(f"--scheduler: a worker that came later has another program or device: {differ}")
-    from mmrjax.precision import double_precision
+    from mmrjax.compile.precision import double_precision
     from sweeps.points.scale import Compiled, fetched
 
     with _lock, double_precision():  # of a worker that may have other work, in its user's own precision

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from mmrjax.results import Results
-from mmrjax.robot import Robot
-from mmrjax.simulation import simulate
+from mmrjax.fidelities.results import Results
+from mmrjax.fidelities.simulation import simulate
+from mmrjax.model.robot import Robot
 from sweeps.config import GridPart
 from sweeps.points.grid import grid
 

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from mmrjax import channels, outputs
-from mmrjax.power import COULOMB_PER_MAH
-from mmrjax.signals import FLAGS, STATUSES
-from mmrjax.variation import STATUS
+from mmrjax.fidelities import outputs
+from mmrjax.fidelities.variation import STATUS
+from mmrjax.model import channels
+from mmrjax.model.power import COULOMB_PER_MAH
+from mmrjax.model.signals import FLAGS, STATUSES
 from sweeps.points.zarr_store import STORE, Layout
 
 #: Columns of conditions, as tables of runs and options have them, and the value of a unit of each in that of the

@@ -9,10 +9,10 @@ from typing import TypeVar
 import numpy as np
 
 from calibration.data.columns import LOAD, Layout
-from calibration.data.errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, choices
 from calibration.data.runs import Runs
-from mmrjax.robot import Robot
-from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES
+from mmrjax.model.paper_tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES
+from mmrjax.model.robot import Robot
 from sweeps.config import GridPart
 from sweeps.inputs import check_configurations
 from sweeps.points import imposed

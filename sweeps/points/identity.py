@@ -7,15 +7,13 @@ import importlib.metadata
 import platform
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from calibration.data.errors import BadConfiguration
-from mmrjax import params
+from calibration.data.input_errors import BadConfiguration
+from mmrjax.model import params
+from mmrjax.model.robot import Robot
+from sweeps.config import Part
 from sweeps.store import PACKAGES, digest
-
-if TYPE_CHECKING:
-    from mmrjax.robot import Robot
-    from sweeps.config import Part
 
 #: Packages besides those of every result whose version is part of a sweep's identity.
 FURTHER = ("scipy", "zarr")

@@ -9,11 +9,11 @@ from collections.abc import Collection, Iterable
 import numpy as np
 
 from calibration.data.columns import Layout
-from calibration.data.errors import BadConfiguration
-from mmrjax.conditions import OF_TURNS, sides_contradict
-from mmrjax.quantities import RPM
-from mmrjax.robot import NO_BRAKE, Robot, cannot_turn
-from mmrjax.tables import VOLTAGES_V
+from calibration.data.input_errors import BadConfiguration
+from mmrjax.model.conditions import OF_TURNS, sides_contradict
+from mmrjax.model.paper_tables import VOLTAGES_V
+from mmrjax.model.quantities import RPM
+from mmrjax.model.robot import NO_BRAKE, Robot, cannot_turn
 from sweeps import capabilities
 
 #: A limit from which on there is none (`robots.blank`).

@@ -11,18 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import profiles
-from calibration.data.errors import BadConfiguration, choices
-from mmrjax import __version__, fidelities, outputs
-from mmrjax.conditions import OF_TURNS
-from mmrjax.profile import Profile
-from mmrjax.robot import Robot
-from mmrjax.signals import STATUSES
-from mmrjax.variation import STATUS, Variation
+from calibration.data.input_errors import BadConfiguration, choices
+from mmrjax import __version__, fidelities
+from mmrjax.fidelities import outputs
+from mmrjax.fidelities.variation import STATUS, Variation
+from mmrjax.missions.profile import Profile
+from mmrjax.model.conditions import OF_TURNS
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import STATUSES
 from sweeps import capabilities
 from sweeps.config_campaign import Campaign
 from sweeps.console import tell
 from sweeps.points import axes, scale
-from sweeps.points.design import Blocks
+from sweeps.points.sampled_design import Blocks
 from sweeps.points.tasks import Task, task_of
 from sweeps.points.zarr_store import ABSENT, Layout, Variable
 

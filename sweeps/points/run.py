@@ -10,19 +10,21 @@ import jax
 import numpy as np
 
 from calibration.data import robot_file
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import observers
 from calibration.inference.problem import Observation
-from mmrjax import fidelities, outputs, params
-from mmrjax.compiling import compiled
-from mmrjax.conditions import Conditions
+from mmrjax import fidelities
+from mmrjax.compile.compiling import compiled
+from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import Run
-from mmrjax.power import COULOMB_PER_MAH
-from mmrjax.robot import Robot
-from mmrjax.signals import FLAGS, STATUSES
-from mmrjax.variation import FLAGS as FLAGS_CODE
-from mmrjax.variation import STATUS
+from mmrjax.fidelities.variation import FLAGS as FLAGS_CODE
+from mmrjax.fidelities.variation import STATUS
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.power import COULOMB_PER_MAH
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import FLAGS, STATUSES
 from sweeps import capabilities, skeleton
 from sweeps import config as configuration
 from sweeps.config import FidelityPart, Part, SupplyPart
@@ -30,7 +32,7 @@ from sweeps.console import progress as bar
 from sweeps.pages import words
 from sweeps.points import scale
 from sweeps.points.axes import Plan
-from sweeps.points.design import Blocks, Drawn
+from sweeps.points.sampled_design import Blocks, Drawn
 from sweeps.points.scale import Job
 from sweeps.points.tasks import of_fidelity
 from sweeps.skeleton import Page

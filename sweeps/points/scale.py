@@ -14,7 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,19 +23,18 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
-from mmrjax import fidelities, outputs
-from mmrjax.compiling import compiled
-from mmrjax.conditions import Conditions
-from mmrjax.precision import Threads
-from mmrjax.profile import Profile
-from mmrjax.variation import FLAGS, STATUS, Variation, evaluate, pick
+from mmrjax import fidelities
+from mmrjax.compile.compiling import compiled
+from mmrjax.compile.precision import Threads
+from mmrjax.fidelities import outputs
+from mmrjax.fidelities.variation import FLAGS, STATUS, Variation, evaluate, pick
+from mmrjax.missions.profile import Profile
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.robot import Robot
 from sweeps.points.axes import Plan, adhesions
 from sweeps.points.climbs import VERDICT
-from sweeps.points.design import ROW, Blocks
+from sweeps.points.sampled_design import ROW, Blocks
 from sweeps.points.tasks import Task
-
-if TYPE_CHECKING:
-    from mmrjax.robot import Robot
 
 POINTS = "points"
 #: Chunks of more points on a device are filled up to a multiple, so that designs of all sizes share few programs.

@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from mmrjax import channels, fidelities, outputs
-from mmrjax.robot import Robot
-from mmrjax.signals import FLAGS as LIMITS
-from mmrjax.variation import FLAGS, Axis
+from mmrjax import fidelities
+from mmrjax.fidelities import outputs
+from mmrjax.fidelities.variation import FLAGS, Axis
+from mmrjax.model import channels
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import FLAGS as LIMITS
 from sweeps.config_campaign import SIZE, Campaign
 from sweeps.points import climbs
 
@@ -69,10 +71,10 @@ def of_fidelity(
     rows: dict[str, tuple[str, str]] = {r.name: (r.unit, r.label) for r in outputs.table(robot.channels)}
     rows |= {name: ("", name.replace("_", " ")) for name in own}
     if profiled:
-        from mmrjax import missions  # which imports an integrator
+        from mmrjax.missions import mission_batch  # which imports an integrator
 
-        every = (*missions.OUTPUTS, *(missions.OF_TURNS if turns else ()))
-        rows, usual = {r.column: (r.unit, r.label) for r in every}, missions.USUAL
+        every = (*mission_batch.OUTPUTS, *(mission_batch.OF_TURNS if turns else ()))
+        rows, usual = {r.column: (r.unit, r.label) for r in every}, mission_batch.USUAL
     flags = {"flag_masks": [1 << k for k in range(len(LIMITS))], "flag_meanings": " ".join(LIMITS)}
     known: Attributes = {n: {"units": unit, "long_name": label} for n, (unit, label) in rows.items()}
     known[FLAGS] = {"long_name": "limits exceeded", **flags}

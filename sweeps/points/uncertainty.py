@@ -6,17 +6,18 @@ import dataclasses
 
 import numpy as np
 
-from calibration.data.posterior import Posterior
+from calibration.data.posterior_file import Posterior
 from calibration.data.runs import Runs
-from mmrjax import fidelities, outputs
-from mmrjax.channels import Channel
-from mmrjax.robot import Robot
-from mmrjax.signals import DONE
-from mmrjax.variation import STATUS
+from mmrjax import fidelities
+from mmrjax.fidelities import outputs
+from mmrjax.fidelities.variation import STATUS
+from mmrjax.model.channels import Channel
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import DONE
 from sweeps.config import FidelityPart
 from sweeps.console import progress, say
 from sweeps.points import run
-from sweeps.points.design import Drawn
+from sweeps.points.sampled_design import Drawn
 from sweeps.store import RunFolder
 
 #: What is added to the column of an output: standard deviation, ends of the 95 % interval.

@@ -23,12 +23,12 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from calibration.data.errors import BadConfiguration, BadData
-from mmrjax.signals import STATUSES
-from mmrjax.variation import STATUS
+from calibration.data.input_errors import BadConfiguration, BadData
+from mmrjax.fidelities.variation import STATUS
+from mmrjax.model.signals import STATUSES
 from sweeps.console import tell
-from sweeps.points.design import SAMPLE, Blocks, Design
 from sweeps.points.identity import Identity, differences
+from sweeps.points.sampled_design import SAMPLE, Blocks, Design
 from sweeps.store import LOCK, Folder, contents, lockable, marked, share_at_work, unfinished
 
 STORE = "results.zarr"

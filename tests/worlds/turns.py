@@ -15,7 +15,7 @@ import numpy as np
 from worlds import turning as world
 from worlds.paper import NOMINAL
 
-from mmrjax import channels
+from mmrjax.model import channels
 
 SHOWN = ("motor_current_left", "motor_current_right", "motor_speed_left", "motor_speed_right", "yaw_rate")
 #: Sds of the instruments, in the units of the columns.

@@ -7,17 +7,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.data.errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, choices
 from calibration.data.runs import Runs
 from calibration.inference.observers.base import Observer
-from calibration.inference.observers.histories import Histories
 from calibration.inference.observers.settled import SettledRuns
+from calibration.inference.observers.time_histories import Histories
 from calibration.inference.observers.turns import SettledTurns
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem, data_of
-from mmrjax import fidelities, params
+from mmrjax import fidelities
 from mmrjax.fidelities import Facts
-from mmrjax.robot import Robot
+from mmrjax.model import params
+from mmrjax.model.robot import Robot
 
 __all__ = ["Histories", "Observer", "SettledRuns", "SettledTurns", "facts", "kind", "pose"]
 

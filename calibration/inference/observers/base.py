@@ -15,15 +15,15 @@ from jaxtyping import Array, Bool, Float
 from calibration.data.runs import Runs
 from calibration.inference.bases import Bases
 from calibration.inference.details import Detail
+from calibration.inference.fit_notes import Note
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.noise import Noise
-from calibration.inference.notes import Note
 from calibration.inference.optimizers import Numbers, Optimum, linearised, read
 from calibration.inference.problem import Data, Observation, Problem
-from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
-from mmrjax.robot import Robot
-from mmrjax.signals import Signals
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals
 
 if TYPE_CHECKING:
     from calibration.discovery.adequacy import Diagnosis

@@ -15,31 +15,32 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.data.columns import CURRENT
-from calibration.data.errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.details import EquationDefects
-from calibration.inference.errors import root_mean_square
+from calibration.inference.fit_notes import Note, Repeats
 from calibration.inference.linearization import Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
-from calibration.inference.notes import Note, Repeats
 from calibration.inference.observers.base import Observer, SearchPolicy
 from calibration.inference.optimizers import Member, Numbers, Optimum, counted, penalties, searches_refilled
 from calibration.inference.problem import Data, Observation, Problem
 from calibration.inference.repeats import same_conditions
-from calibration.words import tables
-from mmrjax import balances, channels, fidelities
-from mmrjax.compiling import SELDOM, compiled
-from mmrjax.conditions import Conditions
+from calibration.inference.simulation_errors import root_mean_square
+from calibration.words import table_words
+from mmrjax import fidelities
+from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import WAYS, acts_along
 from mmrjax.fidelities.base import Implicit
 from mmrjax.fidelities.rest import direction
 from mmrjax.fidelities.steady import SIZES, operating_signals
-from mmrjax.params import Scalar
-from mmrjax.robot import Robot
-from mmrjax.signals import FAILED, SLIDES, TIPS, Result, Signals
+from mmrjax.model import balances, channels
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import FAILED, SLIDES, TIPS, Result, Signals
 
 if TYPE_CHECKING:
     from calibration.discovery.adequacy import Diagnosis
@@ -175,7 +176,7 @@ class SettledRuns(Observer):
                 near = runs.layout.nearest(others[0], runs.columns) if others else ""
                 found.append(Repeats(runs.source, (first + 1, second + 1), column, values, known, others, near=near))
         if found and len(alike) == 1:
-            raise BadData(f"{tables.repeats(found[0])}; no condition varies, so nothing can be fitted")
+            raise BadData(f"{table_words.repeats(found[0])}; no condition varies, so nothing can be fitted")
         return [dataclasses.replace(found[0], more=len(found) - 1)] if found else []
 
     @classmethod

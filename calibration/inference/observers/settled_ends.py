@@ -24,13 +24,13 @@ from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.optimizers import CORES, Optimum, Pin, levenberg_marquardt
 from calibration.inference.priors import TIED
 from calibration.inference.problem import Problem, data_of
-from mmrjax import channels
-from mmrjax.compiling import compiled
-from mmrjax.conditions import Conditions
-from mmrjax.precision import Threads
+from mmrjax.compile.compiling import compiled
+from mmrjax.compile.precision import Threads
+from mmrjax.model import channels
+from mmrjax.model.conditions import Conditions
 
 if TYPE_CHECKING:
-    from calibration.inference.observers.histories import Histories
+    from calibration.inference.observers.time_histories import Histories
 
 #: Adhesions that are tried [-].
 ADHESIONS = (0.06, 0.1, 0.15, 0.2, 0.27, 0.36, 0.48, 0.64, 0.85, 1.1)

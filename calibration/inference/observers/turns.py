@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from calibration.data.errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
 from calibration.inference import priors
@@ -18,18 +18,18 @@ from calibration.inference.bases import Bases
 from calibration.inference.blocks import TURN
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect
 from calibration.inference.observers.base import SearchPolicy
-from calibration.inference.observers.histories import Histories
 from calibration.inference.observers.settled import SettledLinearization, SettledRuns, shares
+from calibration.inference.observers.time_histories import Histories
 from calibration.inference.optimizers import roots_of
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax import effects, fidelities
-from mmrjax.balances import ROUND
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import IN_TURNS, VARIABLES_ROUND, WAYS
 from mmrjax.fidelities.steady import shown_batch
-from mmrjax.params import Scalar
-from mmrjax.robot import Robot
-from mmrjax.signals import NOT_SETTLED, Result, Signals
+from mmrjax.model.balances import ROUND
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import NOT_SETTLED, Result, Signals
 
 #: Variables of curves in turns; the order of runs is the table's.
 VARIABLES = (*(v for v in IN_TURNS if v != "order"), *VARIABLES_ROUND)

@@ -1,0 +1,256 @@
+"""The posterior of a calibrated robot: what a fit leaves open, and the file `posterior.nc` that holds it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calibration.data.input_errors import BadData, choices
+
+if TYPE_CHECKING:
+    from mmrjax.model.robot import Robot
+
+SCHEMA = "mmrjax.posterior/1"
+FILE = "posterior.nc"
+#: How a coordinate u becomes a parameter: as it is, its exponential, or as an angle within half a turn.
+NORMAL, LOG, ANGLE = "normal", "log-normal", "angle"
+#: Largest difference, in posterior sds, between the centre of a posterior and the robot beside it.
+APART = 0.05
+
+
+@dataclasses.dataclass(frozen=True)
+class Posterior:
+    """A normal distribution of coordinates z, and what parameters they are.
+
+    u = location + spread · z, held within low and high (softly over `softness` of the spread, as in
+    `calibration.inference.priors.Coordinates`; 0 cuts), and θ = u, exp u, or u within half a turn.
+
+    Attributes:
+        coordinates: names of the parameters that have a coordinate each; units: of them.
+        mean, covariance: of z, shape (coordinates,) and (coordinates, coordinates).
+        location, spread, low, high: of u, in the parameter's unit or its logarithm; softness: [-].
+        kinds: `NORMAL`, `LOG` or `ANGLE`, of each.
+        tied: (follower, index of the coordinate that it follows, ratio).
+    """
+
+    coordinates: tuple[str, ...]
+    units: tuple[str, ...]
+    mean: np.ndarray
+    covariance: np.ndarray
+    location: np.ndarray
+    spread: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    softness: np.ndarray
+    kinds: tuple[str, ...]
+    tied: tuple[tuple[str, int, float], ...] = ()
+
+    def __len__(self) -> int:
+        """How many coordinates there are: columns of normal scores."""
+        return len(self.coordinates)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Every parameter that it sets: those of its coordinates, then those tied to one."""
+        return (*self.coordinates, *(follower for follower, _, _ in self.tied))
+
+    @property
+    def root(self) -> np.ndarray:
+        """L with L Lᵀ = covariance, also where a coordinate does not vary."""
+        values, vectors = np.linalg.eigh((self.covariance + self.covariance.T) / 2)
+        return vectors * np.sqrt(np.maximum(values, 0.0))
+
+    def at(self, z: Any) -> Any:
+        """Parameters [SI] in the order of `names` at coordinates z, shape (..., coordinates): in NumPy of an array of
+        NumPy, which compiles nothing, else traceable."""
+        import jax.numpy as jnp
+
+        from calibration.inference.priors import held_within
+
+        xp = np if isinstance(z, np.ndarray) else jnp
+        u = xp.asarray(self.location) + xp.asarray(self.spread) * z
+        u = held_within(u, self.low, self.high, self.softness * self.spread)
+        kinds = np.asarray(self.kinds)
+        theta = xp.where(xp.asarray(kinds == LOG), xp.exp(xp.where(kinds == LOG, u, 0.0)), u)
+        theta = xp.where(xp.asarray(kinds == ANGLE), xp.remainder(u + np.pi, 2 * np.pi) - np.pi, theta)
+        followers = [ratio * theta[..., k] for _, k, ratio in self.tied]
+        return xp.concatenate([theta, xp.stack(followers, -1)], -1) if followers else theta
+
+    def values(self, normal_scores: Any) -> Any:
+        """Parameters [SI] of draws.
+
+        Args:
+            normal_scores: independent standard normal numbers, shape (draws, coordinates).
+
+        Returns:
+            Shape (draws, names).
+        """
+        return self.at(np.asarray(self.mean) + normal_scores @ self.root.T)
+
+    def draw(self, draws: int, seed: int) -> np.ndarray:
+        """Parameters [SI] of so many random draws, shape (draws, names)."""
+        return self.values(np.random.default_rng(seed).standard_normal((draws, len(self))))
+
+    def check(self, robot: Robot, where: str) -> None:
+        """Refuse a posterior that is not this robot's.
+
+        Args:
+            where: opens the message.
+
+        Raises:
+            BadData: a parameter that the robot does not have, or whose value is not where the posterior is.
+        """
+        from mmrjax.model import params
+
+        known = {p.name: float(p.value) for p in params.walk(robot)}
+        for name in self.names:
+            if name not in known:
+                raise BadData(
+                    f"{where}: a posterior of {name}, which this robot does not have, so it is of another robot; "
+                    f"{choices(name, [n for n in known if n.rpartition('.')[2] == name.rpartition('.')[2]] or known)}"
+                )
+        with np.errstate(invalid="ignore"):  # of a file with NaN, refused below
+            at = self.at(np.asarray(self.mean))
+        sd = np.asarray(self.sd)
+        for name, value, width in zip(self.names, at, sd, strict=True):
+            if not abs(known[name] - value) <= APART * width + 1e-6 * abs(value):  # also where one is NaN
+                raise BadData(
+                    f"{where}: {name} is {known[name]:.6g} in the robot; expected {value:.6g}, the centre of its "
+                    "posterior: take the robot.toml beside it, without changes to what was fitted"
+                )
+
+    @property
+    def sd(self) -> np.ndarray:
+        """Standard deviation of each parameter of `names` to first order [SI]."""
+        import jax
+
+        slopes = np.asarray(jax.jit(jax.jacfwd(self.at))(np.asarray(self.mean)))
+        return np.sqrt(np.einsum("ij,jk,ik->i", slopes, self.covariance, slopes))
+
+
+def write(posterior: Posterior, path: Path | str) -> None:
+    """Write a posterior as NetCDF 3, which `xarray.open_dataset` reads with units and long names."""
+    from scipy.io import netcdf_file
+
+    p, square = posterior, ("coordinate", "coordinate_2")
+    numbers = {
+        "mean": (p.mean, "of z"),
+        "location": (p.location, "u at z = 0, the parameter or its logarithm"),
+        "spread": (p.spread, "du/dz"),
+        "low": (p.low, "least u"),
+        "high": (p.high, "greatest u"),
+        "softness": (p.softness, "width over which bounds are rounded off, as a share of the spread"),
+        "value": (p.at(p.mean)[: len(p)], "parameter at the mean [SI]"),
+        "sd": (p.sd[: len(p)], "standard deviation of the parameter, to first order [SI]"),
+        "covariance": (p.covariance, "covariance of z"),
+    }
+    with netcdf_file(path, "w", version=2) as file:
+        file.schema = SCHEMA
+        file.title = "posterior of a calibrated robot, normal in z: u = location + spread z"
+
+        def put(name: str, values: Any, kind: str, dimensions: tuple[str, ...], words: str | None) -> None:
+            texts = kind == "S"  # rows of letters
+            values = np.asarray([x.encode() for x in values] if texts else values, kind)
+            if texts:
+                dimensions = (*dimensions, f"string{values.itemsize}")
+                values = values.view("S1").reshape(len(values), -1)
+            for dimension, size in zip(dimensions, values.shape, strict=True):
+                if dimension not in file.dimensions:
+                    file.createDimension(dimension, size)
+            variable = file.createVariable(name, values.dtype, dimensions)
+            variable[:] = values
+            if words is not None:
+                variable.long_name = words
+
+        put("coordinate", p.coordinates, "S", square[:1], None)
+        for name, (values, words) in numbers.items():
+            put(name, values, "f8", square[: np.ndim(values)], words)
+        put("kind", p.kinds, "S", square[:1], "transformation of u")
+        put("units", p.units, "S", square[:1], "of the parameter")
+        if p.tied:
+            put("tied", [t[0] for t in p.tied], "S", ("follower",), "follows another")
+            put("tied_to", [t[1] for t in p.tied], "i4", ("follower",), "its index")
+            put("tied_ratio", [t[2] for t in p.tied], "f8", ("follower",), "ratio to that")
+
+
+def read(path: Path | str) -> Posterior:
+    """Read `posterior.nc`.
+
+    Raises:
+        BadData: no such file, not a posterior, or one that is damaged.
+    """
+    import xarray as xr
+
+    path = Path(path)
+    if not path.is_file():
+        raise BadData(f"{path}: no such file; expected the {FILE} that calibrate and loop leave beside robot.toml")
+    try:
+        with xr.open_dataset(path, engine="scipy") as data:
+            data.load()
+        found = _of(data)
+    except Exception as error:  # whatever a damaged file makes the reader raise
+        why = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise BadData(f"{path}: not a posterior that can be read ({why})") from error
+    size = len(found)
+    sound = (
+        found.covariance.shape == (size, size)
+        and all(np.isfinite(x).all() for x in (found.covariance, found.mean, found.location, found.spread))
+        and np.isfinite(found.softness).all()
+        and not (np.isnan(found.low).any() or np.isnan(found.high).any())
+        and all(0 <= k < size and np.isfinite(ratio) for _, k, ratio in found.tied)
+        and np.linalg.eigvalsh(found.covariance).min() >= -1e-9 * max(np.abs(found.covariance).max(), 1e-300)
+        and set(found.kinds) <= {NORMAL, LOG, ANGLE}
+    )
+    if not sound:
+        raise BadData(
+            f"{path}: the covariance is not one, or a number is missing or out of range; write the file anew"
+        )
+    return found
+
+
+def _words(values: Any) -> tuple[str, ...]:
+    return tuple(v.decode() if isinstance(v, bytes) else str(v) for v in np.asarray(values).tolist())
+
+
+def _of(data: Any) -> Posterior:
+    if data.attrs.get("schema") != SCHEMA:
+        raise ValueError(f"schema {data.attrs.get('schema')}, expected {SCHEMA}")
+    tied: tuple[tuple[str, int, float], ...] = ()
+    if "tied" in data:
+        parts = (_words(data["tied"]), data["tied_to"].values.tolist(), data["tied_ratio"].values.tolist())
+        tied = tuple(zip(*parts, strict=True))
+    columns = ("mean", "location", "spread", "low", "high", "softness")
+    numbers = {k: np.asarray(data[k].values, float) for k in columns}
+    return Posterior(
+        coordinates=_words(data["coordinate"]),
+        units=_words(data["units"]),
+        covariance=np.asarray(data["covariance"].values, float),
+        kinds=_words(data["kind"]),
+        tied=tied,
+        **numbers,
+    )
+
+
+def joined(parts: Sequence[Posterior], covariance: np.ndarray) -> Posterior:
+    """Several sets of coordinates as one, of which `covariance` is that of all."""
+    fields = {
+        f: np.concatenate([getattr(p, f) for p in parts])
+        for f in ("mean", "location", "spread", "low", "high", "softness")
+    }
+    tied: list[tuple[str, int, float]] = []
+    first = 0
+    for p in parts:
+        tied += [(name, first + k, ratio) for name, k, ratio in p.tied]
+        first += len(p)
+    return Posterior(
+        coordinates=tuple(n for p in parts for n in p.coordinates),
+        units=tuple(u for p in parts for u in p.units),
+        covariance=covariance,
+        kinds=tuple(k for p in parts for k in p.kinds),
+        tied=tuple(tied),
+        **fields,
+    )

@@ -1,0 +1,342 @@
+"""Requirements as TOML files: what a robot has to do, over which envelope of use, units in the names."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from importlib import resources
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+from calibration.data.input_errors import BadConfiguration, choices, stated_number
+from calibration.data.input_files import toml_content, toml_text
+from mmrjax.derived.requirements import AXES, QUANTITIES, Quantity
+from mmrjax.model.paper_tables import BENCH, SURFACES
+from mmrjax.model.quantities import CONDITIONS
+
+SCHEMA = "mmrjax.derived.requirements/1"
+#: The packaged file: the paper's aims.
+PAPER = "paper"
+
+Range = tuple[float, float]
+
+#: Ranges of an envelope: least and greatest value, and unit.
+RANGES: dict[str, tuple[float, float, str]] = {
+    "payload_kg": (*CONDITIONS["payload"].range, "kg"),
+    "slope_deg": (0.0, CONDITIONS["slope_deg"].range[1], "deg"),
+    "state_of_charge": (0.0, 1.0, ""),
+    "supply_voltage_V": (1.0, CONDITIONS["voltage"].range[1], "V"),
+    "ambient_C": (-50.0, 80.0, "°C"),
+}
+#: Keys of an envelope.
+KEYS = ("configuration", "surface", "battery", *RANGES)
+#: How the battery is used, for the endurance.
+DUTIES = ("standing", "driving")
+#: Least and greatest that a requirement may state, in the unit of its name.
+STATED = (0.0, 1e6)
+#: Stairs have a rise and a tread, whose least and greatest are stated [mm].
+STAIRS, TREAD, TREADS = "stairs_rise_mm", "tread_mm", (10.0, 5000.0)
+#: In place of a number: what the part in question permits; and the quantities of which parts state that.
+RATED = "rated"
+RATINGS = ("winding_C", "motor_speed_rpm", "gearbox_speed_rpm", "gearbox_Nm")
+
+
+@dataclasses.dataclass(frozen=True)
+class Envelope:
+    """Where a requirement has to be met: ranges, each from its least to its greatest value.
+
+    Attributes:
+        configuration: of the robot, by name; empty: its first.
+        surface: of Table 5. battery: on the battery; else on the external supply.
+        payload_kg, slope_deg, state_of_charge, supply_voltage_V: as named.
+        ambient_C: None: the robot's own ambient temperature.
+    """
+
+    configuration: str = ""
+    surface: str = BENCH
+    battery: bool = True
+    payload_kg: Range = (0.0, 0.0)
+    slope_deg: Range = (0.0, 0.0)
+    state_of_charge: Range = (1.0, 1.0)
+    supply_voltage_V: Range | None = None
+    ambient_C: Range | None = None
+
+    @property
+    def charge(self) -> Range:
+        """State of charge, or the voltage of the external supply."""
+        return self.state_of_charge if self.battery else (self.supply_voltage_V or (0.0, 0.0))
+
+    @property
+    def charge_end(self) -> float:
+        """State of charge at which the battery's use ends: the least of its range, 0 where that is one number."""
+        low, high = self.state_of_charge
+        return low if low < high else 0.0
+
+    def meets(self, other: Envelope) -> bool:
+        """Whether some use is in both."""
+        if (self.configuration, self.surface, self.battery) != (other.configuration, other.surface, other.battery):
+            return False
+        pairs = [(getattr(self, key), getattr(other, key)) for key in RANGES]
+        return all(a is None or b is None or (a[0] <= b[1] and b[0] <= a[1]) for a, b in pairs)
+
+
+@dataclasses.dataclass(frozen=True)
+class Requirement:
+    """One requirement.
+
+    Attributes:
+        name: of `QUANTITIES`; limit: in the unit of the name, None: as the part is rated; least: that it has to be at
+            least; else at most.
+        envelope: over which.
+        share: of the time that the robot drives, for the endurance; 0: it stands.
+        tread_mm: of stairs, for their rise.
+        source: where the requirement comes from.
+    """
+
+    name: str
+    limit: float | None
+    least: bool
+    envelope: Envelope
+    share: float = 0.0
+    source: str = ""
+    tread_mm: float = 0.0
+
+    @property
+    def quantity(self) -> Quantity:
+        """What it is about."""
+        return QUANTITIES[self.name]
+
+    @property
+    def sense(self) -> str:
+        """`least` or `most`."""
+        return "least" if self.least else "most"
+
+
+@dataclasses.dataclass(frozen=True)
+class Requirements:
+    """A file of requirements.
+
+    Attributes:
+        source: its name; envelope: that it states; each: its requirements, in order; text: of the file.
+    """
+
+    source: str
+    envelope: Envelope
+    each: tuple[Requirement, ...]
+    text: str = ""
+
+
+def load(path: Path | None) -> Requirements:
+    """The requirements of a file, or without one the paper's aims.
+
+    Raises:
+        BadConfiguration: no such file, and what `read` raises.
+    """
+    if path is None or str(path) == PAPER:
+        packaged = resources.files("calibration") / "data" / "aims" / f"{PAPER}.toml"
+        return read(packaged.read_text("utf-8"), f"{PAPER}.toml")
+    if not path.is_file():
+        raise BadConfiguration(f"{path}: no such file; expected a TOML file of requirements (docs/requirements.md)")
+    return read(toml_text(path, path), path.name)
+
+
+def read(text: str, where: str) -> Requirements:
+    """Requirements from the text of a file.
+
+    The file states quantities by name, each a number (the least or the most that it may be, by its usual sense), of
+    some "rated" (what the part permits), a
+    table with `least` and `most`, keys of the envelope that hold for it alone and `source`, or a list of such tables;
+    of the endurance a table also states `duty` (standing, or driving at full voltage for a `share` of the time).
+    `[envelope]` states for all of them payload_kg, slope_deg, state_of_charge or supply_voltage_V, ambient_C (a
+    number or [least, greatest]), surface, configuration, and battery.
+
+    Raises:
+        BadConfiguration: not TOML; no requirement; an unknown key, or one without its unit; no finite number; an
+            empty range; requirements that contradict one another or the envelope.
+    """
+    content = toml_content(text, where)
+    schema = content.pop("schema", SCHEMA)
+    if schema != SCHEMA:
+        raise BadConfiguration(f"{where}, schema: got {schema!r}; expected {SCHEMA}")
+    stated = content.pop("envelope", {})
+    if not isinstance(stated, dict):
+        raise BadConfiguration(f"{where}, envelope: got {stated!r}; expected a table of {', '.join(KEYS)}")
+    envelope = _envelope(Envelope(), stated, f"{where}, envelope")
+    each: list[Requirement] = []
+    for name, value in content.items():
+        if name not in QUANTITIES:
+            raise BadConfiguration(f"{where}, {_unknown(name, (*QUANTITIES, 'envelope'))}")
+        tables = value if isinstance(value, list) else [value]
+        if not tables:
+            raise BadConfiguration(
+                f"{where}, {name}: got an empty list; expected a number or tables with least or most"
+            )
+        for k, table in enumerate(tables):
+            place = f"{where}, {name}" + (f" {k + 1}" if len(tables) > 1 else "")
+            each += _requirements(name, table, envelope, place)
+    if not each:
+        raise BadConfiguration(f"{where}: states no requirement; expected one of {', '.join(QUANTITIES)}")
+    _contradictions(each, envelope, where)
+    return Requirements(where, envelope, tuple(each), text)
+
+
+def _stem(name: str) -> str:
+    """A name without its unit."""
+    units = ("_m_s", "_mm", "_deg", "_kg", "_min", "_C", "_Nm", "_rpm", "_A", "_Wh", "_V")
+    return next((name.removesuffix(u) for u in units if name.endswith(u)), name)
+
+
+def _unknown(name: str, known: Iterable[str]) -> str:
+    """What is wrong with a name that is none of the known."""
+    known = tuple(known)
+    stems = {_stem(k): k for k in known if _stem(k) != k}
+    if name in stems:
+        return f"{name}: no unit in its name; write {stems[name]}"
+    head = max((s for s in stems if name.startswith(f"{s}_")), key=len, default="")
+    if head:
+        return f"{name}: unit {name[len(head) + 1 :]} is not read; write {stems[head]}"
+    return f"{name}: no such key; {choices(name, known)}"
+
+
+def _range(value: Any, where: str, low: float, high: float, unit: str) -> Range:
+    ends = value if isinstance(value, list) else [value, value]
+    if len(ends) != 2:
+        raise BadConfiguration(f"{where}: got {value}; expected a number or [least, greatest]")
+    first, last = (stated_number(x, where, low, high, unit) for x in ends)
+    if first > last:
+        raise BadConfiguration(f"{where}: got {value}, an empty range; expected [least, greatest]")
+    return first, last
+
+
+def _envelope(base: Envelope, stated: Mapping[str, Any], where: str) -> Envelope:
+    """`base` with what is stated in its place."""
+    found: dict[str, Any] = {}
+    for key, value in stated.items():
+        place = f"{where}.{key}"
+        if key not in KEYS:
+            raise BadConfiguration(f"{where}, {_unknown(key, KEYS)}")
+        if key in RANGES:
+            found[key] = _range(value, place, *RANGES[key])
+        elif key == "battery":
+            if not isinstance(value, bool):
+                raise BadConfiguration(f"{place}: got {value!r}; expected true or false")
+            found[key] = value
+        elif key == "surface" and value not in SURFACES:
+            raise BadConfiguration(f"{place}: got {value!r}; {choices(str(value), SURFACES)}")
+        elif not isinstance(value, str):
+            raise BadConfiguration(f"{place}: got {value!r}; expected the name of a configuration")
+        else:
+            found[key] = value
+    if "supply_voltage_V" in found:
+        if found.setdefault("battery", False):
+            raise BadConfiguration(f"{where}: battery and supply_voltage_V contradict each other; state one of them")
+        if "state_of_charge" in found:
+            raise BadConfiguration(
+                f"{where}: state_of_charge and supply_voltage_V contradict each other; state one of them"
+            )
+    elif "state_of_charge" in found and not found.setdefault("battery", True):
+        raise BadConfiguration(f"{where}: state_of_charge needs the battery; got battery = false")
+    merged = dataclasses.replace(base, **found)
+    if not merged.battery and merged.supply_voltage_V is None:
+        raise BadConfiguration(f"{where}: battery = false needs supply_voltage_V, which is not stated")
+    return merged
+
+
+def _requirements(name: str, value: Any, envelope: Envelope, where: str) -> list[Requirement]:
+    """The one or two requirements (least, most) of one entry."""
+    quantity = QUANTITIES[name]
+    table = dict(value) if isinstance(value, dict) else {quantity_key(quantity): value}
+    limits = {s: _limit(table.pop(s), where, quantity) for s in ("least", "most") if s in table}
+    source, duty, share = table.pop("source", ""), table.pop("duty", None), table.pop("share", None)
+    tread = table.pop(TREAD) if TREAD in table and name == STAIRS else None
+    own_keys = {"endurance_min": ("duty", "share"), STAIRS: (TREAD,)}.get(name, ())
+    known = ("least", "most", "source", *KEYS, *own_keys)
+    for key in table:
+        if key not in known:
+            raise BadConfiguration(f"{where}, {_unknown(key, known)}")
+    for key in table:
+        if key in AXES and key not in quantity.axes:
+            raise BadConfiguration(f"{where}, {key}: {quantity.label} does not depend on it; leave it out")
+    if not limits:
+        raise BadConfiguration(f"{where}: states neither least nor most; expected one of them [{quantity.unit}]")
+    if not isinstance(source, str):
+        raise BadConfiguration(f"{where}, source: got {source!r}; expected text")
+    if name != "endurance_min" and (duty is not None or share is not None):
+        raise BadConfiguration(f"{where}: duty and share are of endurance_min alone")
+    if name == STAIRS and tread is None:
+        raise BadConfiguration(
+            f"{where}: stairs without a tread; expected a table such as {{ least = 170, {TREAD} = 290 }}"
+        )
+    depth = 0.0 if tread is None else stated_number(tread, f"{where}, {TREAD}", *TREADS, "mm")
+    own = _envelope(envelope, table, where)
+    if name == "endurance_min" and not own.battery:
+        raise BadConfiguration(f"{where}: endurance needs the battery, and the envelope states supply_voltage_V")
+    if name == "speed_end_of_charge_m_s":
+        if not own.battery:
+            raise BadConfiguration(
+                f"{where}: an end of charge needs the battery, and the envelope states another supply"
+            )
+        own = dataclasses.replace(own, state_of_charge=(own.charge_end, own.charge_end))
+    driven = _share(duty, share, where)
+    return [Requirement(name, limit, sense == "least", own, driven, source, depth) for sense, limit in limits.items()]
+
+
+def _limit(value: Any, where: str, quantity: Quantity) -> float | None:
+    if value == RATED:
+        if quantity.name not in RATINGS:
+            raise BadConfiguration(
+                f"{where}: got {RATED!r}; expected a number, only {', '.join(RATINGS)} have a rating"
+            )
+        return None
+    limits = RANGES["slope_deg"][:2] if quantity.unit == "deg" else STATED
+    return stated_number(value, where, *limits, quantity.unit)
+
+
+def quantity_key(quantity: Quantity) -> str:
+    """`least` or `most`: what a number alone is."""
+    return "least" if quantity.least else "most"
+
+
+def _share(duty: Any, share: Any, where: str) -> float:
+    if duty is not None and duty not in DUTIES:
+        raise BadConfiguration(f"{where}, duty: got {duty!r}; {choices(str(duty), DUTIES)}")
+    if share is None:
+        return 1.0 if duty == "driving" else 0.0
+    found = stated_number(share, f"{where}, share", 0.0, 1.0, "")
+    if duty == "standing" and found > 0:
+        raise BadConfiguration(f"{where}: duty standing and a share of {found:g} contradict each other")
+    return found
+
+
+#: Quantities that are the same one elsewhere in the envelope.
+_SAME = {"speed_end_of_charge_m_s": "speed_m_s", "gearbox_speed_rpm": "motor_speed_rpm"}
+
+
+def _contradictions(each: list[Requirement], envelope: Envelope, where: str) -> None:
+    for a, b in combinations(each, 2):
+        least, most = (a, b) if a.least else (b, a)
+        same = _SAME.get(a.name, a.name) == _SAME.get(b.name, b.name)
+        same = same and (a.share, a.tread_mm) == (b.share, b.tread_mm)
+        if least.limit is None or most.limit is None:
+            continue
+        if same and least.least and not most.least and least.limit > most.limit and a.envelope.meets(b.envelope):
+            unit = a.quantity.unit
+            raise BadConfiguration(
+                f"{where}: {least.name} at least {least.limit:g} {unit} and {most.name} at most {most.limit:g} "
+                f"{unit} contradict each other"
+            )
+    for r in each:
+        if r.limit is None:
+            continue
+        ends = {"payload_kg": envelope.payload_kg, "slope_deg": envelope.slope_deg}.get(r.name)
+        if ends is not None and r.least and r.limit < ends[1]:
+            raise BadConfiguration(
+                f"{where}: {r.name} of at least {r.limit:g} contradicts the envelope, whose {r.name} goes up to "
+                f"{ends[1]:g}"
+            )
+        if r.name == "winding_C" and r.envelope.ambient_C is not None and r.limit < r.envelope.ambient_C[1]:
+            raise BadConfiguration(
+                f"{where}: winding_C of at most {r.limit:g} contradicts the envelope, whose ambient_C goes up to "
+                f"{r.envelope.ambient_C[1]:g}"
+            )

@@ -1,0 +1,103 @@
+"""The posterior of what the loop found: base parameters, effects' amplitudes and shapes, curves' ordinates."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from calibration.data.posterior_file import ANGLE, LOG, NORMAL, Posterior, joined
+from calibration.discovery.active_set import ActiveSet, CandidateSpace
+from calibration.discovery.discrepancy import Discrepancy, Shaped
+from calibration.inference.fit_posterior import of_coordinates
+from calibration.inference.linearization import Linearization, amplitude_of, shape_of, shape_scales
+from calibration.inference.optimizers import informing
+from calibration.inference.priors import Coordinates
+from mmrjax.model import params
+from mmrjax.model.params import Spec
+
+
+def of_fit(space: CandidateSpace, active: tuple[str, ...], z: np.ndarray, linear: Linearization) -> Posterior:
+    """The posterior of a fit of the base with the active effects, from its linearization.
+
+    Args:
+        active: effect in each slot, "" where empty; z: its coordinates, those of the base alone or of all.
+        linear: of that fit.
+    """
+    jacobian = np.asarray(linear.jacobian)
+    size = jacobian.shape[1]
+    problem = space.bare if size == space.free else space.equipped
+    informed = jacobian[informing(problem.data)]
+    covariance = np.linalg.inv(informed.T @ informed)
+    return _of(problem.coordinates, space, active, np.asarray(z)[:size], covariance)
+
+
+def of_curve(space: CandidateSpace, active: tuple[str, ...], curve: Discrepancy) -> Posterior:
+    """The posterior of a fit with a curve: the ordinates, which are linear in their coordinates, come last."""
+    shaped: Shaped = curve.problem.coordinates
+    inner = len(shaped.base)
+    turn = np.eye(len(shaped))
+    turn[inner:, inner:] = np.asarray(shaped.root)
+    base, kept = _parts(shaped.base, space, active, curve.z[:inner])
+    spec = {p.name: p.spec for p in params.walk(curve.problem.base)}
+    ordinates = _cut(shaped.names, [spec[n] for n in shaped.names], np.asarray(shaped.root) @ curve.z[inner:])
+    places = [*kept, *range(inner, len(shaped))]
+    covariance = (turn @ curve.covariance @ turn.T)[np.ix_(places, places)]
+    return joined([*base, ordinates], covariance)
+
+
+def _of(
+    coordinates: Coordinates | ActiveSet,
+    space: CandidateSpace,
+    active: tuple[str, ...],
+    z: np.ndarray,
+    covariance: np.ndarray,
+) -> Posterior:
+    parts, kept = _parts(coordinates, space, active, z)
+    return joined(parts, covariance[np.ix_(kept, kept)])
+
+
+def _parts(
+    coordinates: Coordinates | ActiveSet, space: CandidateSpace, active: tuple[str, ...], z: np.ndarray
+) -> tuple[list[Posterior], list[int]]:
+    """Sets of coordinates of a fit, and where in z they are; empty slots and effects without shape have none."""
+    if not isinstance(coordinates, ActiveSet):
+        return [of_coordinates(coordinates, z, np.eye(len(z)))], list(range(len(z)))
+    p, slots = len(coordinates.base), coordinates.slots
+    parts, kept = [of_coordinates(coordinates.base, z[:p], np.eye(p))], list(range(p))
+    for slot, name in enumerate(active):
+        if not name:
+            continue
+        effect = space.library[name]
+        amplitude = amplitude_of(effect)
+        sd = float(coordinates.sd[coordinates.names.index(name)])
+        of_amplitude = _cut((f"effects.{name}.amplitude",), [amplitude.spec], np.array([sd * z[p + slot]]))
+        parts.append(dataclasses.replace(of_amplitude, mean=z[p + slot, None], spread=np.array([sd])))
+        kept.append(p + slot)
+        shape = shape_of(effect)
+        if shape is None:
+            continue
+        value, spread, turned, low, high = shape_scales(shape)
+        log = spread > 0
+        of_shape = _cut((f"effects.{name}.{shape.name}",), [shape.spec], np.zeros(1))
+        bounds = (math.log(low) if low > 0 else -math.inf, math.log(high)) if log else (-math.inf, math.inf)
+        parts.append(
+            dataclasses.replace(
+                of_shape, mean=z[p + slots + slot, None], location=np.array([math.log(value) if log else value]),
+                spread=np.array([spread if log else turned]), low=np.array([bounds[0]]), high=np.array([bounds[1]]),
+                kinds=(LOG if log else ANGLE,),
+            )
+        )  # fmt: skip
+        kept.append(p + slots + slot)
+    return parts, kept
+
+
+def _cut(names: tuple[str, ...], specs: list[Spec], mean: np.ndarray) -> Posterior:
+    """Parameters that are their own coordinates, cut at their bounds."""
+    size = len(names)
+    return Posterior(
+        coordinates=names, units=tuple(s.unit for s in specs), mean=mean, covariance=np.eye(size),
+        location=np.zeros(size), spread=np.ones(size), low=np.array([s.bounds[0] for s in specs], float),
+        high=np.array([s.bounds[1] for s in specs], float), softness=np.zeros(size), kinds=(NORMAL,) * size,
+    )  # fmt: skip

@@ -1,0 +1,1244 @@
+"""Time histories: one run from standstill for each `run_id`, one row a sample.
+
+The conditions of a run may change from sample to sample; each value holds from its sample until the next, but what is
+imposed where the rig's file says that it goes on straight lines (`Rig.between_rows`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import operator
+import re
+import threading
+import warnings
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from calibration.data.columns import SUPPLY
+from calibration.data.courses import Stretch, applied, changing, differs, divided, stretches
+from calibration.data.input_errors import BadConfiguration, BadData, number
+from calibration.data.runs import Runs
+from calibration.inference import bases as bases_room
+from calibration.inference import scans
+from calibration.inference.bases import Bases
+from calibration.inference.details import Memory, Strongest, TimeSide, TimeStatistics
+from calibration.inference.fit_notes import CoarseSteps, Note, StopsOnSlope, Thinned
+from calibration.inference.linearization import (
+    PROBED,
+    Linearization,
+    ScoredEffect,
+    each_shape,
+    finite,
+    probe,
+    shaped_as_in,
+    terms_of,
+)
+from calibration.inference.noise import Noise
+from calibration.inference.observers import settled_ends
+from calibration.inference.observers.base import Observer, SearchPolicy
+from calibration.inference.optimizers import (
+    CORES,
+    Evaluate,
+    Numbers,
+    Optimum,
+    counted,
+    linearised,
+    linearised_signed,
+    penalties,
+    searches_long,
+)
+from calibration.inference.priors import DELAY
+from calibration.inference.problem import MISSING, Data, Observation, Problem
+from calibration.inference.weak_form import weak_form
+from mmrjax import fidelities
+from mmrjax.compile.compiling import OVER_TIME, SELDOM, compiled
+from mmrjax.compile.precision import Threads
+from mmrjax.effects import Effect
+from mmrjax.effects.curve import WAYS
+from mmrjax.fidelities.drive import moving, rates, state_of
+from mmrjax.fidelities.histories import (
+    CHANGE,
+    LONGEST,
+    LOOSE,
+    START,
+    STEPS,
+    Followed,
+    Step,
+    Within,
+    at_first,
+    followed,
+    grid,
+    histories,
+    respond,
+    steps_of,
+    within,
+)
+from mmrjax.model import balances, channels
+from mmrjax.model.channels import Channel
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.rig import Begin, Begins, Rig
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import CONVERGED, FAILED, Signals, State
+from mmrjax.numerics.linear_equations import solved
+
+if TYPE_CHECKING:
+    from calibration.discovery.adequacy import Diagnosis
+
+#: Most knots of a run's defect in time, and most of knots times steps of all runs: 2 GB while they are computed.
+KNOTS, KNOT_STEPS = 256, 1e7
+#: Lags of a run's residual that are looked at, at most a quarter of its samples.
+LAGS = 12
+#: Values of a delay at which the misfit is looked at, fewest and most; and of what else is scanned, a run each.
+DELAYS, SCANNED = (256, 2048), 32
+#: A first sample so early shows a robot at rest [s]; how much of its largest speed, and how many sds, it may show.
+EARLY, RESTING, RESTING_SD = 0.005, 0.2, 5.0
+#: Members of a search that one call of its program evaluates.
+TOGETHER = 2
+#: Differences between neighbouring residuals, over their median, beyond which they are jumps and no noise [-].
+JUMP = 7.0
+#: Fields of `Conditions` that may change within a run.
+CHANGING = (
+    "voltage", "motor_current", "slope_deg", "payload", "adhesion", "total_mass", "duty", "open", "load_torque",
+)  # fmt: skip
+#: Of these what is imposed, and a brake's torque, which is measured as it is.
+ON_LINES = ("voltage", "motor_current", "duty", "load_torque")
+#: A stretch of unchanged conditions so long may show steady travel [s].
+LASTING = 0.25
+#: Fewest steps from sample to sample of a run that is driven both ways as it passes through rest, where shafts and
+#: load do not move as one: while a speed is below a share of its largest, and before that for so long [s], by what is
+#: imposed (when a current brings a shaft to rest depends more on what is calibrated), and for so many of the delay.
+FINE, DELAYED = 16, 2.0
+SLOW, EARLIER = {"voltage": 0.1, "motor_current": 0.3}, {"voltage": 0.03, "motor_current": 0.06}
+#: How many of the usual longest steps one may be elsewhere.
+FAST = 2
+#: Of a log that is thinned: how many steps there are at least between readings, and by how much they grow with the
+#: time since a condition changed, at most [1/s · s]; a supply by more than a share of its largest value.
+BETWEEN, LATER, SMALL = 4, 0.05, 0.05
+#: The same of one whose speed is imposed, and how many of the usual longest steps one of its steps may be.
+COARSELY, SLOWLY = 2, 4
+#: Change of a speed from the third to the last quarter of a stretch, as a share, from which on it has not settled.
+#: From rest a speed that nears steady travel exponentially and has reached half of it still changes by 0.23.
+STILL = 0.2
+#: Most levels of a condition that are told apart where it changes within runs.
+LEVELS = 6
+#: By how much a stated mass may change within a run beside the payload [kg].
+ROUNDING = 1e-3
+
+
+def _by_row(
+    of_runs: Float[Array, "runs samples ..."], rows_of: Int[Array, "runs samples"], rows: int
+) -> Float[Array, "rows ..."]:
+    """What is known of each sample of the runs, by the table's rows; beyond the last row of a run it is dropped."""
+    place = jnp.where(rows_of < 0, rows, rows_of)
+    return jnp.zeros((rows, *of_runs.shape[2:]), of_runs.dtype).at[place].set(of_runs, mode="drop")
+
+
+class HistoriesLinearization(Linearization):
+    """Of histories: `defects` has shape (balances, runs, knots, samples, channels), a defect at each knot of a run.
+
+    Attributes:
+        rows_of: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
+        knots: rows between which a defect is linear, shape (runs, knots).
+        time: of every row since the start of its run [s]; angle: of the driving shaft since then [rad].
+    """
+
+    rows_of: Int[Array, "runs samples"]
+    knots: Int[Array, "runs knots"]
+    time: Float[Array, " rows"]
+    angle: Float[Array, " rows"]
+
+    def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
+        moved = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.knots])
+        return _by_row(moved, self.rows_of, self.rows).reshape(-1, shapes.shape[1])
+
+    def places(self) -> np.ndarray:
+        return np.unique(np.asarray(self.knots))
+
+    def runs(self) -> list[np.ndarray]:
+        return [rows[rows >= 0] for rows in np.asarray(self.rows_of)]
+
+    def variable(self, name: str) -> np.ndarray:
+        if name in bases_room.ORDERS:
+            return bases_room.ORDERS[name][0] * np.asarray(self.angle)
+        return np.asarray(self.time) if name == "time" else super().variable(name)
+
+    def turned(self) -> np.ndarray | None:
+        return np.asarray(self.angle)
+
+    def series(self) -> Float[Array, "runs samples channels"]:
+        """Whitened residuals of the readings of each run in the order of time, 0 beyond its last."""
+        return jnp.where(self.rows_of[:, :, None] < 0, 0.0, self.by_row()[self.rows_of])
+
+    def memory(self) -> Array:
+        """Ljung and Box's (1978) statistic over all runs, as a normal deviate, the largest of the channels."""
+        x, rows = self.series(), self.rows_of
+        count = jnp.sum(rows >= 0, 1)[:, None]
+        power = jnp.sum(x**2, 1)
+        lags = min(LAGS, rows.shape[1] // 4)
+        statistic = jnp.zeros(x.shape[-1])
+        for k in range(1, lags + 1):
+            r = jnp.sum(x[:, k:] * x[:, :-k], 1) / jnp.maximum(power, 1e-9)
+            weight = jnp.where(count > k, count * (count + 2) / jnp.maximum(count - k, 1), 0.0)
+            statistic = statistic + jnp.sum(weight * r**2, 0)
+        freedom = jnp.maximum(jnp.sum(jnp.minimum(lags, count - 1)), 1)
+        return jnp.max((statistic - freedom) / (2 * freedom) ** 0.5)
+
+
+class Histories(Observer):
+    """Observer of time histories: one run of `drive` from standstill for each `run_id`, one row a sample.
+
+    Sliding during a start is part of the run, so adhesion is not penalised. Histories have hundreds of readings a
+    parameter, and refits of a bootstrap stay where the model is linear: there the refit is the linear one.
+
+    Attributes:
+        conditions: of each run; a field that changes within one has shape (runs, instants), else (runs,).
+        times: the grid of each run from 0 on, its last instant repeated to one length, shape (runs, instants) [s].
+        run: index of each row's run; instant: of its sample in `times`; shape (rows,).
+        rows_of: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
+        knots: rows between which a defect is taken to be linear, a run's last repeated, shape (runs, knots).
+        delayed: whether what is imposed may act later than its column says (`Rig.delay`), so that readings are read
+            that much earlier between the instants.
+        known: the runs of the robot that is observed; None: not known.
+    """
+
+    word: ClassVar[str] = "sample"
+    fewest: ClassVar[int] = 24
+    axis: ClassVar[str] = "time_s"
+    blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage", "run")
+    policy: ClassVar[SearchPolicy] = SearchPolicy(batch=8, steps=30, searches=8, one_by_one=False)
+    rows_tell: ClassVar[bool] = False
+    evidence: ClassVar[tuple[str, ...]] = ("single", "curve", "pair", "chi2", "white")
+    searches: ClassVar[int | None] = 8
+
+    conditions: Conditions
+    times: Float[Array, "runs instants"]
+    run: Int[Array, " rows"]
+    instant: Int[Array, " rows"]
+    rows_of: Int[Array, "runs samples"]
+    knots: Int[Array, "runs knots"]
+    delayed: bool = eqx.field(default=False, static=True)
+    known: Followed | None = None
+
+    @classmethod
+    def observes(cls, runs: Runs) -> bool:
+        return runs.has("time_s")
+
+    @classmethod
+    def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> Histories:
+        """Rows may come in any order; what does not change within a run is that of its first row."""
+        if fidelity is not None and fidelities.get(fidelity).name != "drive":
+            raise BadConfiguration(f"--model {fidelity}: {runs.source} holds time histories; they need --model drive")
+        if runs.turns:
+            raise BadConfiguration(
+                f"{runs.source}: time histories of a robot that turns are simulated, and not fitted; make a "
+                f"table of its settled turns: mmrjax settle {runs.source} --robot FILE"
+            )
+        whole, exact = runs.whole, robot.rig.imposed == "motor_speed"
+        linear = robot.rig.between_rows == "linear"
+        names, run = np.unique(runs.run_names, return_inverse=True)
+        mine, every = ([table.in_order(name) for name in names] for table in (runs, whole))
+        given = [runs["time_s"][m] for m in mine]
+        # Of rows of the log without a reading here those count at which what drives a run changes.
+        noted = [
+            np.isin(whole["time_s"][rows], t) | exact | linear | _changed(whole, rows)
+            for rows, t in zip(every, given, strict=True)
+        ]
+        steps = [
+            np.minimum.reduceat(h, np.flatnonzero(n)[:-1]) for h, n in zip(_longest(runs, robot), noted, strict=True)
+        ]
+        change = LOOSE if robot.loose else CHANGE
+        grids = [
+            grid(whole["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change)
+            for rows, n, c, h in zip(every, noted, _changes(whole, every, robot.rig), steps, strict=True)
+        ]
+        # The last instant begins a step, of no length, as every other does.
+        longest, samples = _common(max(map(len, grids)) + 1), max(map(len, mine))
+        times = np.stack([np.concatenate([g, np.repeat(g[-1], longest - len(g))]) for g in grids])
+        instant = np.array([np.searchsorted(grids[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
+        rows = np.stack([np.concatenate([m, np.full(samples - len(m), -1)]) for m in mine])
+        most = min(samples, KNOTS, max(8, int(KNOT_STEPS / times.size)))
+        knots = np.stack([_knots(m, most) for m in mine])
+        conditions = _in_time(whole.conditions(robot), every, whole["time_s"], times, ON_LINES if linear else ())
+        if robot.rig.begins is not None:
+            order = [robot.rig.begins.names.index(begin_name(str(n))) for n in names]
+            conditions = eqx.tree_at(lambda c: c.begin, conditions, jnp.asarray(order), is_leaf=lambda x: x is None)
+        index = [jnp.asarray(x) for x in (run, instant, rows, knots)]
+        rig = robot.rig
+        delayed = not rig.inherits or DELAY in rig.stated or not rig.prompt
+        return cls(conditions, jnp.asarray(times), index[0], index[1], index[2], index[3], delayed=delayed)
+
+    @classmethod
+    def sizes(cls, runs: Runs) -> np.ndarray:
+        """The channel's root mean square: histories pass through zero while their instruments stay as they are."""
+        measured = runs.measured()
+        finite = np.isfinite(measured)
+        power = np.sum(np.where(finite, measured, 0.0) ** 2, 0) / np.maximum(finite.sum(0), 1)
+        return np.broadcast_to(np.sqrt(power), measured.shape)
+
+    @classmethod
+    def check(cls, runs: Runs, noise: Noise) -> list[Note | str]:
+        names = runs.run_names
+        for name in np.unique(names):
+            mine = names == name
+            if len(np.unique(runs["configuration"][mine])) > 1:
+                raise BadData(
+                    f"{runs.source}, configuration: run {name or '(no run_id)'} has several values; "
+                    "a run has one configuration, so give each its own run_id"
+                )
+            if runs.has("total_mass_kg"):
+                own = runs["total_mass_kg"][mine] - runs["payload_kg"][mine]
+                if np.ptp(own) > ROUNDING:
+                    raise BadData(
+                        f"{runs.source}, total_mass_kg: run {name or '(no run_id)'} changes by "
+                        f"{number(np.ptp(own))} kg beside its payload; within a run it may change as payload_kg does"
+                    )
+        _check_signs(runs)
+        thinned: list[Note | str] = []
+        if runs.log is not None:
+            thinned.append(Thinned(runs.source, len(runs.log), len(runs)))
+        return [*thinned, *_stops(runs)]
+
+    @classmethod
+    def with_initial_states(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
+        return with_begins(robot, runs, noise)
+
+    @classmethod
+    def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Note | str]:
+        """Histories begin at their first row, mostly at rest, and show one sample at a time."""
+        names, measured = runs.run_names, runs.measured()
+        # Current rises within a millisecond; what moves does not.
+        resting = robot.rig.start == "rest" and robot.rig.imposed != "motor_speed"
+        moving = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and resting]
+        for channel in (c for c in runs.channels if not c.over_time and runs.has(c.column)):
+            raise BadData(
+                f"{runs.source}, {channel.column}: histories do not follow it; remove the column, or give settled "
+                "runs without time_s"
+            )
+        for name in np.unique(names):
+            mine = np.flatnonzero(names == name)
+            first = mine[np.argmin(runs["time_s"][mine])]
+            times, count = np.unique(runs["time_s"][mine], return_counts=True)
+            if (count > 1).any():
+                raise BadData(
+                    f"{runs.source}, time_s: run {name or '(no run_id)'} has {count.max()} samples at "
+                    f"{number(times[count.argmax()])} s; give each run its own run_id"
+                )
+            for k in moving:
+                size = np.max(np.nan_to_num(np.abs(measured[mine, k])))
+                limit = max(RESTING * size, RESTING_SD * noise.sd[first, k])
+                if runs["time_s"][first] < EARLY and abs(measured[first, k]) > limit:
+                    column, unit = runs.channels[k].column, runs.channels[k].unit
+                    raise BadData(
+                        f"{runs.source} row {first + 1}, time_s: run {name or '(no run_id)'} is moving at "
+                        f"{number(runs['time_s'][first])} s ({number(runs[column][first])} {unit}); a history "
+                        "begins at rest at its first row. If it began earlier, add a row at that time without "
+                        'readings; if it began in motion, state start = "measured" or "free" in the robot\'s file; '
+                        "settled travel is one row a run, without time_s"
+                    )
+        said: list[Note | str] = []
+        step = runs["time_s"].max() / STEPS
+        if robot.rig.imposed != "motor_speed":
+            step = max(step, *(h.max(initial=0.0) for h in _longest(runs, robot)))
+        if step > FAST * LONGEST:
+            said.append(CoarseSteps(float(runs["time_s"].max()), float(step)))
+        return said
+
+    @classmethod
+    def check_settled(cls, runs: Runs) -> None:
+        raise BadData(
+            f"{runs.source}: column time_s: time histories are for calibrate, compare and loop; expected a row a run"
+        )
+
+    @classmethod
+    def settled(cls, runs: Runs, steady: bool = False) -> tuple[Runs, np.ndarray, np.ndarray]:
+        """The medians of the later half of each run, which have settled where the run is long enough; of one whose
+        conditions change, of the longest stretch in which it is driven forwards, where that lasts at all."""
+        time, measured = runs["time_s"], runs.measured()
+        each = [
+            max((s for s in run if s.driven or s.whole), key=lambda s: s.lasts, default=run[0])
+            for run in stretches(runs)
+        ]
+        each = [s for s in each if s.driven and (s.whole or s.lasts >= LASTING)]
+        if steady:
+            speeds = measured[:, [c.zero_at_rest and c.directed for c in runs.channels]]
+            each = [s for s in each if not _changes_still(speeds, s.after(time, 0.5), s.after(time, 0.75))]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
+            shown = [np.nanmedian(measured[s.after(time, 0.5)], 0) for s in each]
+        first = np.array([s.rows[0] for s in each], int)
+        return runs.where(first), np.reshape(shown, (-1, measured.shape[1])), np.array([s.lasts for s in each])
+
+    @classmethod
+    def identity(cls, runs: Runs) -> tuple[str, ...]:
+        """Of histories the run too: repeats begin alike, at rest."""
+        return tuple(runs.columns)
+
+    @classmethod
+    def shows(cls, effect: type[Effect]) -> bool:
+        return not effect.needs_battery
+
+    @classmethod
+    def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        return ("motor.inductance", "motor.inertia", DELAY), ("inertia", *settled_ends.SLIDING)
+
+    def defective(
+        self, robot: Robot, probes: tuple[Effect, ...]
+    ) -> Float[Array, "probes runs knots samples channels"]:
+        """Change of the readings by a defect of each probe's balance [its unit] that is 1 at a knot of a run and
+        falls linearly to 0 at the next ones; an effect `probe` is its amplitude in its balance."""
+        return self.changes(robot, probes, ())[0]
+
+    def changes(
+        self, robot: Robot, probes: tuple[Effect, ...], effects: tuple[ScoredEffect, ...]
+    ) -> tuple[Float[Array, "probes runs knots samples channels"], Float[Array, "runs samples channels instances"]]:
+        """The same, and the change of the readings by each effect at every point of its shape's grid.
+
+        An effect enters one balance with one amplitude. So it changes a run as a defect of that balance does that has
+        the values of its term. What an effect remembers follows from the run too. Between two instants its change of
+        a reading is on a straight line.
+        """
+        others = dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor")
+        entered = tuple(probe(b) for b in others if b not in {p.balance for p in probes})
+        every, size = (*probes, *entered), len(probes)
+        effects = tuple(shaped_as_in(robot, e) for e in effects)
+        counts, places = np.array([len(e.at) for e in effects], int), [p.balance for p in every]
+        entering = np.array([places.index(b) if (b := e.effect.balance) in places else 0 for e in effects], int)
+        entering = np.repeat(entering, counts)
+        enters = np.repeat([1.0 * (e.effect.balance in places) for e in effects], counts)
+        shown = channels.names(robot.channels)
+        at_sensor = np.array([[e.effect.channel == c for e in effects] for c in shown], float)
+        at_sensor = np.repeat(at_sensor, counts, 1) if effects else np.zeros((len(shown), 0))
+        clock = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.knots]]
+
+        def probed(amplitude: Array) -> Robot:
+            put = tuple(eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(every, amplitude, strict=True))
+            return dataclasses.replace(robot, effects=(*robot.effects, *put))
+
+        none = jnp.zeros(len(every))
+
+        def one(
+            conditions: Conditions, clock: Array, instants: Array, along: Followed, times: Array, time: Array
+        ) -> tuple[Array, Array]:
+            # A run that ended early repeats its last knot; only the first of them is one.
+            real = jnp.concatenate([jnp.ones(1), (jnp.diff(clock) > 0).astype(clock.dtype)])
+            before = jnp.concatenate([clock[:1], clock[:-1]])
+            after = jnp.concatenate([clock[1:], clock[-1:] + 1.0])
+            remembered = _remembered(robot, conditions, along, effects)
+
+            def hat(t: Array) -> Array:
+                rising = ((t - before) / jnp.maximum(clock - before, 1e-12)).at[0].set(1.0)
+                falling = jnp.where(after > clock, (after - t) / jnp.where(after > clock, after - clock, 1.0), 1.0)
+                return real * jnp.clip(jnp.minimum(rising, falling), 0.0, 1.0)
+
+            def terms(t: Array, y: Array, held: Conditions, way: Array | None = None) -> Array:
+                signals = moving(robot, held, state_of(robot, y), way)
+                return terms_of(robot, signals, effects, remembered(t))
+
+            def both(by_probes: Array, t: Array, term: Array) -> Array:
+                """Changes by defects of all knots and by every instance, by the change by each probe."""
+                knots = (by_probes[:, :size, None] * hat(t)).reshape(len(by_probes), -1)
+                return jnp.concatenate([knots, by_probes[:, entering] * (enters * term)], 1)
+
+            def source(t: Array, y: Array, held: Conditions, way: Array) -> Array:
+                by_probes = jax.jacfwd(lambda a: rates(probed(a), held, y, way))(none)
+                return both(by_probes, t, terms(t, y, held, way))
+
+            def seen(t: Array, y: Array, dy: Array, held: Conditions) -> Array:
+                """By the state, and at once: the current follows from torque where the speed is imposed."""
+
+                def reading(y: Array, amplitude: Array) -> Array:
+                    return _reading(robot, moving(probed(amplitude), held, state_of(robot, y)))
+
+                by_state, at_once = jax.jacfwd(reading, (0, 1))(y, none)
+                term = terms(t, y, held)
+                shows = jnp.concatenate([jnp.zeros((len(by_state), size * len(clock))), at_sensor * term], 1)
+                return by_state @ dy + both(at_once, t, term) + shows
+
+            first, begins = at_first(robot, conditions)
+            by_probes = jax.jacfwd(lambda a: at_first(probed(a), conditions)[1])(none)
+            begun = by_probes[:, entering] * (enters * terms(clock[0], begins, first))
+            unmoved = jnp.concatenate([jnp.zeros((len(begins), size * len(clock))), begun], 1)
+            changed = respond(conditions, along, source, seen, unmoved)
+            whole = jnp.concatenate([seen(clock[0], begins, unmoved, first)[None], changed])
+            knots = whole[instants, :, : size * len(clock)].reshape(len(instants), -1, size, len(clock))
+            mine = whole[:, :, size * len(clock) :]
+            if self.delayed:
+                step, share = robot.rig.before(times, time)
+                by_effects = mine[step] + share[:, None, None] * (mine[step + 1] - mine[step])
+            else:
+                by_effects = mine[instants]
+            return knots.transpose(2, 3, 0, 1), by_effects
+
+        rows = jnp.where(self.rows_of < 0, 0, self.rows_of)
+        known = self.following(robot).known
+        assert known is not None
+        # One run after another: each is wide by its knots, and large.
+        given = self.conditions, clock, self.instant[rows], known, self.times, self.time[rows]
+        knots, by_effects = jax.lax.map(lambda of_run: one(*of_run), given)
+        return jnp.moveaxis(knots, 0, 1), by_effects
+
+    def following(self, robot: Robot) -> Histories:
+        """The same for a robot whose runs are then known."""
+        if self.known is not None:
+            return self
+        known = jax.vmap(lambda c, t: followed(robot, c, t))(self.conditions, self.times)
+        return dataclasses.replace(self, known=known)
+
+    def whole(self, robot: Robot) -> Signals:
+        """Every signal of every run at every instant, shape (runs, instants)."""
+        found = jax.vmap(lambda c, t, k: histories(robot, c, t, k))(self.conditions, self.times, self.known)
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, self.times.shape), found)
+
+    def at_rows(self, whole: Signals) -> Signals:
+        """Every signal at every row."""
+        return jax.tree.map(lambda x: x[self.run, self.instant], whole)
+
+    @property
+    def time(self) -> Float[Array, " rows"]:
+        """Time of every row since the start of its run [s]."""
+        return self.times[self.run, self.instant]
+
+    def angle(self, whole: Signals) -> Float[Array, " rows"]:
+        """Angle of the driving shaft at every row, since the start of its run [rad]."""
+        speed = jnp.asarray(whole.speed_wheel)
+        turned = 0.5 * (speed[:, 1:] + speed[:, :-1]) * jnp.diff(self.times)
+        angle = jnp.concatenate([jnp.zeros((len(turned), 1)), jnp.cumsum(turned, 1)], 1)
+        return angle[self.run, self.instant]
+
+    @property
+    def of_rows(self) -> Any:
+        """The conditions of every row, with fields of NumPy, shape (rows,)."""
+        run, instant = np.asarray(self.run), np.asarray(self.instant)
+        held = jax.tree.map(np.asarray, self.conditions)
+        return jax.tree.map(lambda x: x[run] if x.ndim == 1 else x[run, instant], held)
+
+    @property
+    def varying(self) -> bool:
+        """Whether some conditions change within a run."""
+        return any(x.ndim > 1 for x in jax.tree.leaves(self.conditions))
+
+    def stretches(self) -> list[list[Stretch]]:
+        """Of each run, the stretches of unchanged conditions."""
+        rows_of, time, of_rows = np.asarray(self.rows_of), np.asarray(self.time), self.of_rows
+        volts = np.where(of_rows.open > 0.5, 0.0, of_rows.voltage * of_rows.duty)
+        volts = volts if of_rows.motor_current is None else of_rows.motor_current
+        values = [x for name in CHANGING if (x := getattr(of_rows, name)) is not None]
+        return [divided(rows[rows >= 0], time, values, volts) for rows in rows_of]
+
+    @property
+    def driven(self) -> Conditions:
+        """As the protocol says. A robot that is driven backward up a slope is one that is driven forward up it; where
+        conditions change, levels that lie close together are one."""
+        if not self.varying:
+            return self.conditions
+        rows = self.of_rows
+        braked = np.zeros(len(rows.voltage)) if rows.load_torque is None else _few(rows.load_torque)
+        if rows.voltage_follows:
+            own = "motor_current" if rows.motor_speed is None else "motor_speed"
+            levels = _few(getattr(rows, own))
+            which = np.stack([rows.configuration, levels, rows.slope_deg, rows.payload, braked], 1)
+            cases = np.unique(which[levels != 0], axis=0, return_index=True)[1]
+            cases = np.flatnonzero(levels != 0)[cases] if len(cases) else np.arange(1)
+            held = {} if rows.motor_speed is None else {"motor_acceleration": np.zeros_like(levels)}
+            held |= {} if rows.load_torque is None else {"load_torque": braked}
+            steady = dataclasses.replace(rows, **{own: levels}, **held)
+            return _some(steady, cases)
+        applied = np.where(rows.open > 0.5, 0.0, rows.voltage * rows.duty)
+        some = np.flatnonzero(applied != 0) if (applied != 0).any() else np.arange(1)
+        way = np.where(applied < 0, -1.0, 1.0)
+        braked = way * braked
+        turned = dataclasses.replace(
+            rows,
+            voltage=_few(np.abs(applied)),
+            slope_deg=_few(way * rows.slope_deg),
+            payload=_few(rows.payload),
+            load_torque=None if rows.load_torque is None else braked,
+            duty=np.ones_like(rows.duty),
+            open=np.zeros_like(rows.open),
+        )
+        which = np.stack([turned.configuration, turned.voltage, turned.slope_deg, turned.payload, braked], 1)[some]
+        cases = some[np.unique(which, axis=0, return_index=True)[1]]
+        return _some(turned, cases)
+
+    def late(self, every: tuple[Array, ...], rig: Rig) -> Float[Array, "rows ..."]:
+        """Of every row, what is there within a step, less the rig's delay.
+
+        Args:
+            every: what `Within.read` takes of every step, shape (runs, steps, ...) each.
+        """
+
+        def of_run(times: Array, every: tuple[Array, ...], time: Array) -> Array:
+            step, share = rig.before(times, time)
+            return Within.read(tuple(x[step] for x in every), share)
+
+        of_runs = jax.vmap(of_run)(self.times, every, self.time[self.rows_of])
+        return _by_row(of_runs, self.rows_of, len(self.run))
+
+    def __call__(self, robot: Robot) -> Observation:
+        def of_run(
+            conditions: Conditions, times: Array, known: Followed | None, instants: Array, time: Array
+        ) -> Array:
+            """Readings of a run's rows."""
+
+            if not self.delayed:
+                return _readings(robot, histories(robot, conditions, times, known, instants))
+            step, share = robot.rig.before(times, time)
+            return Within.read(_of_steps(robot, within(robot, conditions, times, known, step)), share)
+
+        places = self.instant[self.rows_of], self.time[self.rows_of]
+        of_runs = jax.vmap(of_run)(self.conditions, self.times, self.known, *places)
+        reading = _by_row(of_runs, self.rows_of, len(self.run))
+        followed = jnp.all(jnp.isfinite(reading), 1)
+        status = jnp.where(followed, CONVERGED, FAILED)
+        return Observation(reading, jnp.zeros(self.run.shape), status, jnp.zeros_like(status))
+
+    @property
+    def long(self) -> bool:
+        return True
+
+    @property
+    def eased(self) -> bool:
+        return False
+
+    def unreachable(self, status: np.ndarray) -> np.ndarray:
+        return status == FAILED
+
+    def runs_counting(self, included: np.ndarray) -> int:
+        return self.rows_of.shape[0]
+
+    def noise_misfit(self, off: Callable[[], np.ndarray], counts: np.ndarray) -> float:
+        """As the protocol says, and more where the differences between neighbouring samples, in which what a model
+        lacks nearly cancels, show that the noise is larger than its sds (von Neumann, Ann. Math. Stat. 12 (1941))."""
+        residual, rows, total = off(), np.asarray(self.rows_of), 0.0
+        first, second = rows[:, :-1].ravel(), rows[:, 1:].ravel()
+        within = (first >= 0) & (second >= 0)
+        for k in range(residual.shape[1]):
+            both = within & counts[first, k] & counts[second, k]
+            apart = np.abs(residual[second[both], k] - residual[first[both], k])
+            usual = apart[apart <= JUMP * np.median(apart)] if len(apart) else np.zeros(1)
+            total += counts[:, k].sum() * max(1.0, float(np.mean(usual**2)) / 2)
+        return float(total)
+
+    def linearise(
+        self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]
+    ) -> HistoriesLinearization:
+        """As the protocol says; residuals and Jacobian by the program of the searches, and what defects and effects
+        change (`changes`) along the run that it has followed."""
+        problem = dataclasses.replace(problem, data=data)
+        which = getattr(problem.coordinates, "active", None)
+        twice = lambda x: jnp.stack([jnp.asarray(x)] * TOGETHER)  # noqa: E731
+        members = twice(z), twice(data.weight), None if which is None else twice(which)
+        r, jacobian, _, known = jax.tree.map(lambda x: x[0], _evaluate(problem, *members))
+        residual, jacobian = counted(r, jacobian, penalties(data))
+        robot, observe = problem.robot(jnp.asarray(z)), dataclasses.replace(self, known=known)
+        signatures, defects, signals, angle = _responses(observe, robot, effects, data.weight / data.sd)
+        return HistoriesLinearization(
+            residual,
+            jacobian,
+            signatures,
+            defects,
+            data.weight / data.sd,
+            signals,
+            self.rows_of,
+            self.knots,
+            self.time,
+            angle,
+            channels=channels.names(problem.channels),
+            magnitudes=robot.rig.magnitudes,
+        )
+
+    def at_fit(self, problem: Problem, z: Numbers) -> Histories:
+        """The same with its runs known as they are at coordinates z, by the program of the searches."""
+        which = getattr(problem.coordinates, "active", None)
+        twice = lambda x: np.stack([np.asarray(x)] * TOGETHER)  # noqa: E731
+        members = twice(z), twice(problem.data.weight), None if which is None else twice(which)
+        known = _evaluate(problem, *members)[3]
+        return dataclasses.replace(self, known=jax.tree.map(lambda x: x[0], known))
+
+    def replicate(
+        self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Array
+    ) -> Linearization:
+        jacobian = linear.jacobian
+        counts = jnp.concatenate([data.weight.ravel(), jnp.zeros(linear.rows), jnp.ones(jacobian.shape[1])])
+        noise = counts * jax.random.normal(jax.random.wrap_key_data(drawn), counts.shape)
+        return linear.with_residual(noise - jacobian @ solved(jacobian.T @ jacobian, jacobian.T @ noise))
+
+    def starts(self, problem: Problem, random: np.random.Generator, count: int) -> Float[np.ndarray, "starts z"]:
+        """As the protocol says: where the log's equations in weak form lead (`weak_form`) and the prior mean; where a
+        ground may be slid on, as of `settled_ends`."""
+
+        def search(blunt: Problem, starts: np.ndarray, steps: int) -> Optimum:
+            weights = np.repeat(np.asarray(blunt.data.weight)[None], len(starts), 0)
+            evaluate = _evaluator(blunt, weights, None)
+            return searches_long(evaluate, starts, blunt.data, weights, steps, self.policy.batch)[0]
+
+        if not problem.base.has_ground or problem.base.rig.imposed != "voltage":  # no grip that makes for valleys
+            shown = weak_form(problem)
+            if shown is not None:
+                return scans.placed(problem, np.stack([shown.z, np.zeros(len(problem.coordinates))])[:count])
+            return scans.placed(problem, super().starts(problem, random, count))
+        draws = random.standard_normal((settled_ends.DRAWS, len(problem.coordinates)))
+        return scans.placed(problem, settled_ends.starts(problem, draws, search)[:count])
+
+    def scanned(self, problem: Problem) -> tuple[int, ...]:
+        return scans.beyond_a_basin(problem)
+
+    def scan_points(self, problem: Problem, k: int) -> int:
+        """Of a delay so many that none is further from the next than half of the rise of a current L/R or an eighth
+        of a sample, as far as `DELAYS` go."""
+        if problem.coordinates.names[k] != DELAY:
+            return SCANNED
+        motor, time = problem.base.motor, np.unique(np.round(np.asarray(self.time), 9))
+        rise = float(motor.inductance) / float(motor.resistance)
+        fine = min(0.125 * float(np.median(np.diff(time))), max(0.5 * rise, 1e-6)) if len(time) > 1 else 1.0
+        wanted = 2 * scans.RANGE * float(problem.coordinates.spread[k]) / fine
+        return int(2 ** np.clip(np.ceil(np.log2(wanted)), *np.log2(DELAYS)))
+
+    def scan(self, problem: Problem, z: Array, data: Data, k: int, values: Array) -> tuple[Array, Array]:
+        """As the protocol says. A delay shifts what a run shows and does not change it: one run and its derivatives
+        serve for all."""
+        if problem.coordinates.names[k] == DELAY:
+            return _over_delays(problem, z, data, jnp.arange(len(z)) == k, values)
+        found = [
+            _moved(*linearised(problem, z.at[k].set(v), data)[:2], z.at[k].set(v), jnp.arange(len(z)) == k)
+            for v in values
+        ]
+        return jnp.stack([cost for cost, _ in found]), jnp.stack([at for _, at in found])
+
+    def search(
+        self,
+        problem: Problem,
+        starts: Numbers,
+        weights: Numbers,
+        active: Numbers | None = None,
+        *,
+        rivals: bool = False,
+        most: int | None = None,
+    ) -> tuple[Optimum, Observation]:
+        """As the protocol says; the runs are compiled once for all steps."""
+        data, steps = problem.data, self.policy.steps if most is None else most
+
+        def searched(starts: Numbers) -> tuple[Optimum, Observation]:
+            evaluate = _evaluator(problem, weights, active)
+            return searches_long(evaluate, starts, data, weights, steps, self.policy.batch, rivals=rivals)
+
+        found = searched(starts)
+        if not rivals or not scans.scanned(problem):
+            return found
+        k = int(np.nanargmin(found[0].cost))
+        one = lambda x: jax.tree.map(lambda leaf: leaf[k], x)  # noqa: E731
+        data = dataclasses.replace(problem.data, weight=weights[k])
+        best = scans.searched_on(
+            problem,
+            one(found),
+            data,
+            lambda z: one(searched(np.tile(z, (len(starts), 1)))),
+            lambda _: None,
+        )
+        return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), found, best)
+
+    def observed(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
+        return self.at(problem, z, active)[2]
+
+    def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
+        """As the protocol says, by the program of the searches."""
+        which = None if active is None else np.asarray(active)[None]
+        evaluate = _evaluator(problem, np.asarray(problem.data.weight)[None], which)
+        r, jacobian, seen = jax.tree.map(lambda x: x[0], evaluate(np.asarray(z)[None], np.zeros(1, int)))
+        return *counted(jnp.asarray(r), jnp.asarray(jacobian), penalties(problem.data)), seen
+
+    def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
+        """Curves and windows as of settled runs, over time too, and waves in the angle of a shaft. Over the voltage
+        are those over the motors' voltage where that is not the supply's."""
+        rows = self.of_rows
+        angle, electromotive, ways = jax.tree.map(lambda x: np.nan_to_num(np.asarray(x)), _turning(self, robot))
+        if (rows.duty != 1).any():
+            at_motors = np.where(rows.open > 0.5, electromotive, rows.voltage * rows.duty)
+            columns = {**columns, "supply_voltage_V": at_motors}
+        which = self.conditions.configuration
+        on_tracks = np.broadcast_to(jax.vmap(robot.chassis)(which).on_tracks > 0.5, np.shape(which))
+        waves = bases_room.waves(on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots), robot)
+        weight = included.astype(float)
+        told = columns, weight, robot, None, ways
+        return (*bases_room.families(*told), *bases_room.windows(*told), *waves)
+
+    def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> TimeStatistics:
+        names = bases_room.names(bases)
+        orders = [w for w in bases_room.ORDERS if any(n[1] == w for n in names)]
+
+        def strongest(diagnosis: Diagnosis, variable: str) -> Strongest:
+            mine = [k for k, n in enumerate(names) if n[1] == variable]
+            k = max(mine, key=lambda j: np.asarray(diagnosis.scores.curve)[j])
+            return Strongest(names[k][0], float(diagnosis.scores.curve[k]), float(diagnosis.scores.explained[k]))
+
+        def side(diagnosis: Diagnosis) -> TimeSide:
+            lags = min(LAGS, self.rows_of.shape[1] // 4)
+            test = diagnosis.test
+            memory = Memory(
+                float(test.found.white),
+                test.threshold("white"),
+                test.p("white"),
+                lags,
+                _autocorrelation(diagnosis.linear, lags),
+            )
+            waves = {(w, bases_room.ORDERS[w][0]): strongest(diagnosis, w) for w in orders}
+            return TimeSide(memory, waves, strongest(diagnosis, "time"))
+
+        samples = int((np.asarray(self.rows_of) >= 0).sum())
+        unresolved = tuple(w for w in bases_room.ORDERS if w not in orders)
+        return TimeStatistics(self.rows_of.shape[0], samples, unresolved, side(before), side(after))
+
+
+def _autocorrelation(linear: Linearization, lags: int) -> dict[str, list[float]]:
+    """Of each channel's residual over all runs, at lags 1 to `lags` samples."""
+    x = np.asarray(linear.series())
+    power = np.maximum(np.sum(x**2, (0, 1)), 1e-12)
+    by_lag = [np.sum(x[:, k:] * x[:, :-k], (0, 1)) / power for k in range(1, lags + 1)]
+    return {name: [float(lag[k]) for lag in by_lag] for k, name in enumerate(linear.channels)}
+
+
+def _changes(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Instants at which what drives the motors of each run changes at once [s], and by what share of its largest
+    value."""
+    driven, time = applied(runs), runs["time_s"]
+    # An imposed speed takes the current with it; what is on lines does not jump; what is not known is refused later.
+    known = rig.imposed != "motor_speed" and rig.between_rows == "held" and np.isfinite(driven).all() and driven.any()
+    coasts = runs["mode"] == "coast" if runs.has("mode") else np.zeros(len(runs), bool)
+    driven, found = driven if known else np.zeros(len(runs)), []
+    for rows in each:
+        sizes = np.maximum(_jumps(driven[rows]), coasts[rows][1:] != coasts[rows][:-1])
+        found.append((time[rows[1:]][sizes > 0], sizes[sizes > 0]))
+    return found
+
+
+def _in_time(
+    of_rows: Conditions,
+    each: list[np.ndarray],
+    time: np.ndarray,
+    times: np.ndarray,
+    on_lines: tuple[str, ...] = (),
+) -> Conditions:
+    """Conditions of runs, from those of rows: of shape (runs,), those that change within one (runs, instants).
+
+    Args:
+        of_rows: shape (rows,); each: rows of each run in the order of time.
+        time: of rows; times: instants of each run [s].
+        on_lines: fields that go on straight lines from row to row: their mean over the step from each instant on.
+    """
+    middle = np.concatenate([0.5 * (times[:, 1:] + times[:, :-1]), times[:, -1:]], 1)
+    at = np.stack(
+        [
+            rows[np.maximum(np.searchsorted(time[rows], t, side="right") - 1, 0)]
+            for rows, t in zip(each, times, strict=True)
+        ]
+    )
+    conditions = _some(of_rows, np.array([rows[0] for rows in each]))
+    for name in CHANGING:
+        x = None if getattr(of_rows, name) is None else np.asarray(getattr(of_rows, name))
+        if x is not None and any(np.ptp(x[rows]) > 0 for rows in each):
+            values = x[at] if name not in on_lines else _on_lines(x, each, time, middle)
+            conditions = eqx.tree_at(operator.attrgetter(name), conditions, jnp.asarray(values))
+    if of_rows.motor_speed is None:
+        return conditions
+    speed = _on_lines(np.asarray(of_rows.motor_speed), each, time, times)
+    step = np.diff(times, axis=1)
+    slope = np.where(step > 0, np.diff(speed, axis=1) / np.where(step > 0, step, 1.0), 0.0)
+    # An instant accelerates as the step that it begins; the last one begins none, and has that of the step before it.
+    last = np.maximum.accumulate(np.where(step > 0, np.arange(step.shape[1]), 0), 1)
+    slope = np.take_along_axis(slope, np.concatenate([last, last[:, -1:]], 1), 1)
+    # Not by `dataclasses.replace`: its constructor broadcasts, and what does not change has no instants.
+    return eqx.tree_at(
+        lambda c: (c.motor_speed, c.motor_acceleration),
+        conditions,
+        (jnp.asarray(speed), jnp.asarray(slope)),
+        is_leaf=lambda x: x is None,
+    )
+
+
+def _some(conditions: Conditions, rows: np.ndarray) -> Conditions:
+    """Those of some rows; NumPy takes them, for which nothing is compiled."""
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), conditions)
+
+
+def _on_lines(x: np.ndarray, each: list[np.ndarray], time: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Values of rows at instants of each run, on straight lines between the rows; shape (runs, instants)."""
+    return np.stack([np.interp(t, time[rows], x[rows]) for rows, t in zip(each, at, strict=True)])
+
+
+def begin_name(run: str) -> str:
+    """What the beginning of a run is called among the parameters of a rig."""
+    return f"begin_{re.sub(r'[^A-Za-z0-9_-]', '_', run)}"
+
+
+#: Samples at the beginning of a run from which its beginning is measured, at most.
+FIRST_SAMPLES = 5
+
+
+def with_begins(robot: Robot, runs: Runs, noise: Noise) -> Robot:
+    """`robot` with the beginnings of a table's runs, where its rig says that they do not begin at rest: speed and
+    angle of the first samples, extrapolated to the first; free ones have the error of that as their prior."""
+    if robot.rig.start == "rest" or not runs.sampled:
+        return robot
+    measured = runs.measured()
+    found, known = dict[str, Begin](), []
+    rows = runs.configurations(robot)
+    for name in np.unique(runs.run_names):
+        mine = runs.in_order(name)
+        key = begin_name(str(name))
+        at: dict[str, tuple[float, float]] = {}
+        for k, channel in enumerate(runs.channels):
+            field = "motor_speed" if channel.settled else "angle"
+            finite = mine[np.isfinite(measured[mine, k])][:FIRST_SAMPLES]
+            if channel.zero_at_rest and field not in at and len(finite):
+                factor = 1 / _shown_of_unit(robot, int(rows[mine[0]]), channel)
+                value, sd = _extrapolated(runs["time_s"][finite] - runs["time_s"][mine[0]], measured[finite, k])
+                least = float(np.median(noise.sd[finite, k]))
+                at[field] = factor * value, abs(factor) * max(sd, least)
+        found[key] = Begin(**{field: value for field, (value, _) in at.items()})
+        known += [(f"rig.{key}.{field}", value, sd) for field, (value, sd) in at.items()]
+    priors = (*robot.rig.priors, *known) if robot.rig.start == "free" else robot.rig.priors
+    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, begins=Begins(found), priors=priors))
+
+
+def _shown_of_unit(robot: Robot, configuration: int, channel: Channel) -> float:
+    """What a channel shows while the motor shafts turn by 1 rad/s, the load rolls with them and the output's angle is
+    1 rad [SI]."""
+    radius = float(robot.configurations.members[configuration].radius)
+    none, one = jnp.zeros(()), jnp.ones(())
+    rolling = State(none, one, radius / robot.gearbox.ratio, none, distance=radius)
+    return float(channel.read(robot, balances.begin(robot, Conditions(configuration), rolling)))
+
+
+def _extrapolated(time: np.ndarray, shown: np.ndarray) -> tuple[float, float]:
+    """Value at time 0 of a line through samples, and its error; of fewer than three their mean."""
+    if len(time) < 3:
+        return float(np.mean(shown)), 0.0
+    matrix = np.stack([np.ones_like(time), time], 1)
+    line, *_ = np.linalg.lstsq(matrix, shown, rcond=None)
+    scatter = float(np.sum((shown - matrix @ line) ** 2) / (len(time) - 2))
+    return float(line[0]), float(np.sqrt(scatter * np.linalg.inv(matrix.T @ matrix)[0, 0]))
+
+
+def _few(x: np.ndarray) -> np.ndarray:
+    """Numbers, each moved to the nearest of at most `LEVELS` where there are more."""
+    if len(np.unique(x)) <= LEVELS:
+        return x
+    levels = np.linspace(x.min(), x.max(), LEVELS)
+    return levels[np.argmin(np.abs(x[:, None] - levels), 1)]
+
+
+def _check_signs(runs: Runs) -> None:
+    """Refuse speeds and currents without a sign of runs that are driven backward: a rig's inertia may carry it on
+    for as long as a stretch lasts, but not in all of a table."""
+    volts, measured = applied(runs), runs.measured()
+    time, size = runs["time_s"], np.nanmax(np.abs(measured), 0, initial=0.0)
+    unsigned = np.nanmin(measured, 0, initial=0.0) >= -RESTING * size
+    unsigned &= [runs.turns_round(c) for c in runs.channels]
+    unit = runs.layout.imposed_column.rpartition("_")[2]
+    for run in stretches(runs):
+        for s in (s for s in run if volts[s.rows[0]] < 0 and s.lasts >= LASTING):
+            rows = s.after(time, 0.5)
+            for k in np.flatnonzero(unsigned):
+                channel, shown = runs.channels[k], measured[rows, k][np.isfinite(measured[rows, k])]
+                if shown.size and np.median(shown) > RESTING * size[k]:
+                    raise BadData(
+                        f"{runs.source} row {rows[0] + 1}, {channel.column}: got "
+                        f"{number(runs[channel.column][rows[0]])} {channel.unit} at {number(volts[rows[0]])} {unit}; "
+                        "expected readings with a sign, negative backward; or state [instruments."
+                        f"{channel.name}] signed = false in the robot's file, if it shows magnitude alone"
+                    )
+
+
+def _stops(runs: Runs) -> list[Note | str]:
+    """What a run is followed by where its motors are not driven on a slope."""
+    still = (applied(runs) == 0) & (runs["slope_deg"] != 0)
+    if not still.any():
+        return []
+    return [StopsOnSlope(tuple(dict.fromkeys(str(n) or "(no run_id)" for n in runs.run_names[still])))]
+
+
+def _knots(rows: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of a run's rows, evenly chosen, its first and last among them; the last again for the rest."""
+    chosen = rows[np.unique(np.round(np.linspace(0, len(rows) - 1, most)).astype(int))]
+    return np.concatenate([chosen, np.repeat(chosen[-1], most - len(chosen))])
+
+
+def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) -> bool:
+    """Whether a speed still changes by more than `STILL` in the later half of a stretch.
+
+    Args:
+        speeds: shape (rows, channels); half, quarter: rows of the later half and of the last quarter.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
+        before, after = np.nanmedian(speeds[np.setdiff1d(half, quarter)], 0), np.nanmedian(speeds[quarter], 0)
+    return bool(np.any(np.abs(after - before) > STILL * np.abs(before + after) / 2))
+
+
+def _changed(runs: Runs, rows: np.ndarray, share: float = 0.0) -> np.ndarray:
+    """Whether what drives a run changes at each of its rows, what motors are given by more than a share of its
+    largest."""
+    supplied = (runs.layout.imposed_column, SUPPLY, "duty")
+    found = differs(rows, (runs[column] for column in changing(runs) if column not in supplied))
+    found[1:] |= _jumps(applied(runs)[rows]) > share
+    return found
+
+
+def _jumps(driven: np.ndarray) -> np.ndarray:
+    """By what share of its largest value what drives a run changes from row to row."""
+    return np.abs(np.diff(driven)) / max(float(np.abs(driven).max(initial=0.0)), 1e-300)
+
+
+def _usual(apart: np.ndarray) -> float:
+    """The usual one of the times between a run's rows, infinite where there is one row."""
+    return float(np.median(apart)) if len(apart) else np.inf
+
+
+def _longest(runs: Runs, robot: Robot) -> list[np.ndarray]:
+    """Longest step after each row of its log but the last, of each run in the order of their names [s].
+
+    Where the speed is imposed only what effects remember is followed. Where what drives a run changes its sign and
+    shafts and load do not move as one, friction jumps within a step as a speed passes through zero, so it has to be
+    short beside the time from reading to reading: where the table's speeds, or the rates of its angles and positions,
+    are low or change their sign, and as much earlier as the rig's delay may be. Where it shows neither, all along.
+    """
+    whole, rig, exact = runs.whole, robot.rig, robot.rig.imposed == "motor_speed"
+    moved = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and (c.directed or not c.settled)]
+    measured, rates = whole.measured()[:, moved], [k for k, at in enumerate(moved) if not runs.channels[at].settled]
+    driven = None if exact else applied(whole)
+    early, found = DELAYED * np.max(np.asarray(rig.delay)) + EARLIER.get(rig.imposed, 0.0), []
+    for name in np.unique(runs.run_names):
+        rows = whole.in_order(name)
+        time = whole["time_s"][rows]
+        apart, wait = np.diff(time), _usual(np.diff(runs["time_s"][runs.in_order(name)]))
+        both_ways = driven is not None and driven[rows].min() < 0 < driven[rows].max()
+        longest = np.full(len(apart), (FAST if both_ways else 1) * LONGEST)
+        if driven is None:
+            longest[:] = min(SLOWLY * LONGEST, wait / COARSELY)
+        elif runs.log is not None:
+            begins = np.where(_changed(whole, rows, SMALL), np.arange(len(rows)), 0)
+            since = time - time[np.maximum.accumulate(begins)]
+            longest = np.maximum(longest, np.minimum(LATER * since[:-1], wait / BETWEEN))
+        if both_ways and not robot.moves_as_one:
+            speeds = measured[rows]
+            speeds[:, rates] = np.gradient(speeds[:, rates], time, axis=0)
+            slow = _slow(speeds, SLOW[rig.imposed])
+            before = int(np.ceil(early / _usual(apart)))
+            slow = np.convolve(slow, np.ones(before + 1))[before:] > 0
+            longest[slow] = min(LONGEST, wait / FINE)
+        found.append(longest)
+    return found
+
+
+def _slow(speeds: np.ndarray, share: float) -> np.ndarray:
+    """Whether a run may pass through rest between each of its rows and the next; all along where nothing is shown.
+
+    Args:
+        speeds: readings that are 0 at rest or their rates, shape (rows, channels); share: of their largest, below
+            which it may.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
+        far = np.abs(speeds) > share * np.nanmax(np.abs(speeds), 0, initial=0.0)
+    ways = np.where(far, np.sign(speeds), 0.0)
+    return ~np.any((ways[1:] == ways[:-1]) & (ways[1:] != 0), 1)
+
+
+def _common(instants: int) -> int:
+    """The next of the lengths that grids have, an eighth of a power of two apart: logs of about one length share what
+    is compiled, for steps of no length, at most an eighth more."""
+    part = max(2 ** (instants.bit_length() - 1) // 8, 1)
+    return -(-instants // part) * part
+
+
+def _reading(robot: Robot, signals: Signals) -> Float[Array, " channels"]:
+    shown = balances.sensor(robot, signals)
+    return jnp.stack([shown[name] for name in channels.names(robot.channels)], -1)
+
+
+def _readings(robot: Robot, signals: Signals) -> Float[Array, "instants channels"]:
+    return jax.vmap(lambda s: _reading(robot, s))(signals)
+
+
+def _of_steps(robot: Robot, steps: Within) -> tuple[Array, ...]:
+    """What `Within.read` takes of readings."""
+    return *(_readings(robot, s) for s in (steps.first, steps.begin, steps.end)), steps.decays
+
+
+@functools.partial(compiled, options=OVER_TIME)
+def _turning(observe: Histories, robot: Robot) -> tuple[Array, Array, dict[str, Array]]:
+    """Angle of the driving shaft, back-EMF and ways of travel at every row."""
+    whole = observe.whole(robot)
+    rows = observe.at_rows(whole)
+    ways = {name: jnp.broadcast_to(getattr(rows, name), jnp.shape(rows.speed_motor)) for name in WAYS}
+    return observe.angle(whole), jnp.asarray(rows.voltage_back), ways
+
+
+@functools.partial(compiled, options=OVER_TIME)
+def _over_delays(problem: Problem, z: Array, data: Data, scanned: Array, values: Array) -> tuple[Array, Array]:
+    observe: Histories = problem.observe  # type: ignore[assignment]
+
+    def shown(z: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        robot = problem.robot(z)
+        of_run = lambda c, t, k: _of_steps(robot, within(robot, c, t, k))  # noqa: E731
+        *every, decays = jax.vmap(of_run)(observe.conditions, observe.times, observe.known)
+        return tuple(every), (*every, decays)
+
+    slopes, (*every, decays) = jax.jacfwd(shown, has_aux=True)(z)
+    both = [jnp.concatenate([x[..., None], slope], -1) for x, slope in zip(every, slopes, strict=True)]
+
+    def one(value: Array) -> tuple[Array, Array]:
+        at = jnp.where(scanned, value, z)
+        late = observe.late((*both, decays), problem.robot(at).rig)
+        error = data.weight * (late[..., 0] - data.measured) / data.sd
+        finite = jnp.all(jnp.isfinite(late), -1)
+        error = jnp.where(finite, error, MISSING * data.weight)
+        jacobian = jnp.where(finite[..., None], (data.weight / data.sd)[..., None] * late[..., 1:], 0.0)
+        residual = jnp.concatenate([error.ravel(), at - data.centre])
+        whole = jnp.concatenate([jacobian.reshape(-1, z.size), jnp.eye(z.size)])
+        return _moved(residual, whole, at, scanned)
+
+    return jax.lax.map(one, values, batch_size=16)
+
+
+@compiled
+def _moved(residual: Array, jacobian: Array, z: Array, held: Array) -> tuple[Array, Array]:
+    """Objective at the minimum of a linearisation in which one coordinate is held, and the coordinates there."""
+    free = jnp.where(held, 0.0, jacobian)
+    step = -solved(free.T @ free + jnp.diag(held.astype(float)), free.T @ residual)
+    return 0.5 * jnp.sum((residual + free @ step) ** 2), z + step
+
+
+def _evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Evaluate:
+    """Evaluates members of a search, `TOGETHER` in one call of one program, calls side by side on the cores.
+
+    Args:
+        weights, active: of every member, see `Histories.search`.
+    """
+
+    weights, made = np.asarray(weights), threading.Event()
+
+    def some(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
+        filled = np.resize(np.arange(len(members)), TOGETHER)
+        own = None if active is None else np.asarray(active)[members[filled]]
+        return jax.device_get(_evaluate(problem, z[filled], weights[members[filled]], own)[:3])
+
+    def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
+        parts = [(z[k : k + TOGETHER], members[k : k + TOGETHER]) for k in range(0, len(members), TOGETHER)]
+        with Threads(CORES if made.is_set() else 1) as cores:
+            found = list(cores.map(lambda part: some(*part), parts))
+        made.set()  # by its first call the program is compiled
+        return jax.tree.map(lambda *x: np.concatenate(x)[: len(members)], *found)
+
+    return evaluate
+
+
+@functools.partial(compiled, options=OVER_TIME)
+def _evaluate(
+    problem: Problem, z: Numbers, weights: Numbers, active: Numbers | None
+) -> tuple[Array, Array, Observation, Followed]:
+    """Of members of a search what `linearised_signed` returns, and their runs."""
+
+    def one(z: Array, weight: Array, which: Array | None) -> tuple[Array, Array, Observation, Followed]:
+        here = problem
+        if which is not None:
+            here = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(which))
+        observe: Histories = problem.observe.following(here.robot(z))  # type: ignore[attr-defined]
+        here = dataclasses.replace(here, observe=observe)
+        assert observe.known is not None
+        return *linearised_signed(here, z, dataclasses.replace(problem.data, weight=weight)), observe.known
+
+    return jax.vmap(one)(z, weights, active)
+
+
+@functools.partial(compiled, options=SELDOM)
+def _responses(
+    observe: Histories, robot: Robot, effects: tuple[ScoredEffect, ...], scale: Array
+) -> tuple[Array, Array, Signals, Array]:
+    """Signatures and defects as of `HistoriesLinearization`, signals of every row, and the angle there.
+
+    Args:
+        observe: whose runs are known; scale: of readings [1/SI], shape (rows, channels).
+    """
+    defects, by_effects = observe.changes(robot, tuple(probe(b) for b in PROBED), effects)
+    rows_of, rows = observe.rows_of, len(scale)
+    defects = jnp.where(rows_of[:, None, :, None] < 0, 0.0, defects * scale[rows_of][:, None])
+    signatures = _by_row(by_effects, rows_of, rows) * scale[..., None]
+    runs = observe.whole(robot)
+    by_reading = signatures.reshape(scale.size, -1)
+    return finite(by_reading), finite(defects), observe.at_rows(runs), observe.angle(runs)
+
+
+def _remembered(
+    robot: Robot, conditions: Conditions, along: Followed, effects: tuple[ScoredEffect, ...]
+) -> Callable[[Array], list[Array]]:
+    """What effects remember along a run that is known, each at every point of its grid, as a function of time.
+
+    By the stages of the run (`histories.followed`); a rate is linear in what it is a rate of, or nearly so.
+    """
+    mine = [e for e in effects if e.effect.memory_size is not None]
+    counts = np.cumsum([len(e.at) for e in mine])
+    nothing = [jnp.zeros(len(e.at)) for e in effects]
+    if not mine:
+        return lambda t: nothing
+
+    def split(memory: Array) -> list[Array]:
+        return jnp.split(memory, counts[:-1])
+
+    def speeds(y: Array, held: Conditions, way: Array, memory: Array) -> Array:
+        signals = moving(robot, held, state_of(robot, y), way)
+
+        def rate(effect: Effect, remembered: Array) -> Array:
+            known = dataclasses.replace(signals, memory={**signals.memory, effect.name: remembered})
+            return jnp.asarray(effect.rate(robot, known), float)
+
+        return jnp.concatenate([each_shape(e, rate, m) for e, m in zip(mine, split(memory), strict=True)])
+
+    times = jnp.append(along.clock[:, 0], along.clock[-1, 2])
+    steps, constant = steps_of(conditions, times)
+
+    def after(memory: Array, step: tuple[Followed, Step]) -> tuple[Array, Array]:
+        here, taken = step
+        held, spans, passes = taken.held(constant), jnp.diff(here.clock), here.sides[0] != here.sides[1]
+
+        def stage(memory: Array, span: Array, y: Array, way: Array) -> Array:
+            law = lambda m: speeds(y, held, way, m)  # noqa: E731
+            speed, slope = jax.jvp(law, (memory,), (jnp.ones_like(memory),))
+            return memory + span * speed / (1 - span * slope)
+
+        first = stage(memory, spans[0], here.places[0], here.sides[0])
+        ahead = jnp.where(passes, 1.0, spans[1] / jnp.where(spans[0] > 0, spans[0], 1.0))
+        span = jnp.where(passes, spans[1], spans[0])
+        last = stage(memory + ahead * (first - memory), span, here.places[1], here.sides[1])
+        return last, jnp.stack([first, last])
+
+    begin = at_first(robot, conditions)[1]
+    angle = state_of(robot, begin).distance / robot.chassis(conditions.configuration).radius
+    begun = jnp.concatenate(
+        [
+            each_shape(e, lambda effect, _: jnp.asarray(effect.initial(robot, angle), float), jnp.zeros(len(e.at)))
+            for e in mine
+        ]
+    )
+    stages = jax.lax.scan(after, begun, (along, steps))[1]
+    nodes = jnp.concatenate([begun[None], stages.reshape(-1, len(begun))])
+    clock = jnp.append(along.clock[0, 0], along.clock[:, 1:].ravel())
+
+    def at_time(t: Array) -> list[Array]:
+        k = jnp.clip(jnp.searchsorted(clock, t, side="right") - 1, 0, len(clock) - 2)
+        length = clock[k + 1] - clock[k]
+        share = jnp.clip(jnp.where(length > 0, (t - clock[k]) / jnp.where(length > 0, length, 1.0), 0.0), 0.0, 1.0)
+        found = iter(split(nodes[k] + share * (nodes[k + 1] - nodes[k])))
+        return [
+            zero if e.effect.memory_size is None else next(found) for e, zero in zip(effects, nothing, strict=True)
+        ]
+
+    return at_time

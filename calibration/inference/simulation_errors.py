@@ -1,0 +1,107 @@
+"""How far a simulation is from measurements: equation (35), its summary per channel, and R² of (A1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mmrjax.model.channels import Channel
+
+
+def relative_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """δCV = (CV - EV) / CV · 100 [%], eq. (35), with CV simulated and EV measured; any shape."""
+    return 100.0 * (simulated - measured) / simulated
+
+
+#: What errors in percent of fits are of. A simulated size would make a model that overshoots look better.
+OF_SIZE = "channel's measured root mean square"
+
+
+def sized_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """(CV - EV) / rms(EV) · 100 [%], with the rms over the rows that have both.
+
+    Args:
+        simulated, measured: shape (rows, ...).
+    """
+    both = np.isfinite(simulated) & np.isfinite(measured)
+    with np.errstate(divide="ignore", invalid="ignore"):  # nothing of a channel without readings
+        size = np.sqrt(np.sum(np.square(measured), 0, where=both) / both.sum(0))
+        return np.asarray(100.0 * (simulated - measured) / size)
+
+
+def percent_error(simulated: np.ndarray, measured: np.ndarray, *, crosses_zero: bool) -> np.ndarray:
+    """Errors of a comparison [%]: of the channel's size where readings may cross zero, else (35)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (sized_error if crosses_zero else relative_error)(simulated, measured)
+
+
+def share_of_measured(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """rms of simulated less measured over the rms of what is measured [-], by channel over the rows that have both;
+    NaN without such a row; shape (channels,).
+
+    Args:
+        simulated, measured: shape (rows, channels).
+    """
+    both = np.isfinite(simulated) & np.isfinite(measured)
+    off, size = (np.sqrt(np.sum(np.square(x), 0, where=both)) for x in (simulated - measured, measured))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(off / size)
+
+
+def root_mean_square(errors: np.ndarray) -> float:
+    """Of those that there are; NaN where there is none."""
+    finite = errors[np.isfinite(errors)]
+    return float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")
+
+
+def summary(errors: np.ndarray) -> dict[str, float | int]:
+    """Root mean square and worst of the errors (35) [%] over the rows that have one, and their count."""
+    finite = errors[np.isfinite(errors)]
+    if finite.size == 0:
+        return {"rows": 0, "rms_percent": float("nan"), "max_percent": float("nan")}
+    return {
+        "rows": int(finite.size),
+        "rms_percent": root_mean_square(finite),
+        "max_percent": float(np.abs(finite).max()),
+    }
+
+
+def certainty(measured: np.ndarray, approximated: np.ndarray) -> float:
+    """R² of eq. (A1) [-]: 1 - Σ(y - Y)² / (ΣY² - (ΣY)²/n), Y measured, y the approximation.
+
+    NaN where the measured values do not vary, or fewer than two rows have both.
+    """
+    both = np.isfinite(measured) & np.isfinite(approximated)
+    y, approximation = measured[both], approximated[both]
+    if y.size < 2:
+        return float("nan")
+    spread = float(np.sum(y**2) - np.sum(y) ** 2 / y.size)
+    return float(1 - np.sum((approximation - y) ** 2) / spread) if spread > 0 else float("nan")
+
+
+def channel_errors(
+    shown: Sequence[Channel],
+    simulated: np.ndarray,
+    measured: np.ndarray,
+    sd: np.ndarray,
+    percent: np.ndarray | None = None,
+) -> dict[str, dict[str, float | int]]:
+    """Errors of every channel over the rows that have a simulated and a measured value: in percent, in sigmas and, as
+    `rms`, in the channel's unit.
+
+    Args:
+        shown: the channels.
+        simulated, measured, sd: [SI], NaN where there is none, shape (rows, channels).
+        percent: errors of the same shape; None takes `sized_error`.
+    """
+    percent = sized_error(simulated, measured) if percent is None else percent
+    off = simulated - measured
+    answer = {}
+    for k, channel in enumerate(shown):
+        answer[channel.name] = {
+            **summary(percent[:, k]),
+            "rms_sigma": root_mean_square(off[:, k] / sd[:, k]),
+            "rms": root_mean_square(off[:, k]) / channel.factor,
+        }
+    return answer

@@ -1,0 +1,196 @@
+"""The uncertain inputs of a study: which, how they are distributed, and what values their scores stand for."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.special import ndtri
+
+from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.posterior_file import Posterior
+from calibration.inference import priors
+from calibration.inference.fit_posterior import of_coordinates
+from mmrjax import fidelities
+from mmrjax.errors import UsageError
+from mmrjax.fidelities.variation import CONDITIONS, Axis, Variation
+from mmrjax.model.robot import Robot
+
+#: Nearest to an end of the unit interval that a normal score is taken of: 6 sds.
+EDGE = 1e-9
+
+#: The distribution of no parameter.
+NOTHING = Posterior(
+    coordinates=(), units=(), mean=np.zeros(0), covariance=np.zeros((0, 0)), location=np.zeros(0), spread=np.zeros(0),
+    low=np.zeros(0), high=np.zeros(0), softness=np.zeros(0), kinds=(),
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Inputs:
+    """Parameters, normal in their coordinates, and conditions, uniform in their ranges.
+
+    Attributes:
+        parameters: distribution of the parameters; independent but for a posterior.
+        low, high: ranges of the conditions, in their units; conditions: their names.
+        axes: what is known of each input, by name.
+        is_posterior: whether the parameters are those of a fit, and correlated.
+    """
+
+    parameters: Posterior
+    conditions: tuple[str, ...]
+    low: np.ndarray
+    high: np.ndarray
+    axes: dict[str, Axis]
+    is_posterior: bool = False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the inputs: parameters, then conditions."""
+        return (*self.parameters.coordinates, *self.conditions)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """What the values of a point set: inputs, and parameters tied to one."""
+        return (*self.parameters.names, *self.conditions)
+
+    @cached_property
+    def _root(self) -> np.ndarray:
+        return self.parameters.root
+
+    def values(self, scores: Any) -> Any:
+        """Values of `columns` at independent scores: standard normal for parameters, in 0..1 for conditions; in NumPy
+        of an array of NumPy, which compiles nothing, else traceable.
+
+        Args:
+            scores: shape (..., inputs).
+
+        Returns:
+            Shape (..., columns).
+        """
+        p = len(self.parameters)
+        theta = self.parameters.at(self.parameters.mean + scores[..., :p] @ self._root.T)
+        stated = self.low + (self.high - self.low) * scores[..., p:]
+        return (np if isinstance(scores, np.ndarray) else jnp).concatenate([theta, stated], -1)
+
+    def jacobian(self, scores: Float[np.ndarray, "rows inputs"]) -> Float[np.ndarray, "rows columns inputs"]:
+        """d values / d scores of each row."""
+        return np.asarray(jax.jit(jax.vmap(jax.jacfwd(self.values)))(scores))
+
+    @cached_property
+    def slope(self) -> Float[np.ndarray, "columns inputs"]:
+        """The same in the middle."""
+        return self.jacobian(self.centre[None])[0]
+
+    def scores(self, unit: Float[np.ndarray, "... inputs"]) -> Float[np.ndarray, "... inputs"]:
+        """Scores of points of the unit cube."""
+        p = len(self.parameters)
+        return np.concatenate([ndtri(np.clip(unit[..., :p], EDGE, 1 - EDGE)), unit[..., p:]], -1)
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Scores in the middle: medians."""
+        return np.concatenate([np.zeros(len(self.parameters)), np.full(len(self.conditions), 0.5)])
+
+    @property
+    def places(self) -> np.ndarray:
+        """Which of `columns` each input is."""
+        p, tied = len(self.parameters), len(self.parameters.tied)
+        return np.concatenate([np.arange(p), np.arange(p + tied, p + tied + len(self.conditions))])
+
+    def acting(self, configuration: str, others: Sequence[str]) -> np.ndarray:
+        """Indices of the inputs that are not of another configuration."""
+        foreign = tuple(f"{name}." for name in others if name != configuration)
+        return np.array([k for k, name in enumerate(self.names) if not name.startswith(foreign)], int)
+
+
+#: Parameters that a rig has where its file states a prior of them, else they are another robot's.
+_OTHERS = ("driver.", "rig.", "motor.resistance_thermal_", "motor.time_constant_", "motor.temperature_ambient")
+
+
+def default_names(
+    robot: Robot, configurations: Sequence[str], battery: bool, model: str = "steady", turns: bool = False
+) -> tuple[str, ...]:
+    """The robot's parameters that have a prior of some width, of these configurations and what all share.
+
+    Left out: the battery's where it does not feed the motors, what guides carry where there are none, and what the
+    fidelity does not read, in straight travel or in turns.
+    """
+    absent = [name for name in robot.configurations if name not in configurations]
+    wheels = [name for name in configurations if float(robot.configurations[name].on_tracks) < 0.5]
+    out = tuple(f"{name}." for name in absent) + (() if battery else ("battery.",))
+    guides = {f"{name}.{g}" for name in wheels for g in (priors.GUIDE_SHARE, priors.GUIDE_FRICTION)}
+    known = priors.known(robot)
+    left_out = {*guides, *fidelities.unread(model, known, turns), *robot.rig.exact}
+    if not robot.rig.inherits:  # what another robot has is none of its own
+        stated = {name for name, _, _ in robot.rig.priors}
+        left_out |= {name for name in known if name.startswith(_OTHERS) and name not in stated} | {*robot.rig.unknown}
+    return tuple(
+        name
+        for name, p in known.items()
+        if not name.startswith(out) and name not in left_out and p.spec.prior_sd(float(p.value)) > 0
+    )
+
+
+def of_priors(robot: Robot, words: Sequence[str], ranges: Mapping[str, tuple[float, float]]) -> Inputs:
+    """Inputs from the priors of the parameters' fields, around the robot's values, and from stated ranges.
+
+    Args:
+        words: parameters, `motor.*` a group; ranges: of conditions.
+
+    Raises:
+        BadConfiguration: an unknown name, one without a prior of some width, a range that is none; said with choices.
+    """
+    everything = list(priors.known(robot))
+    names = list(dict.fromkeys(name for word in words for name in priors.expand(word, everything, "--parameters")))
+    known = priors.known(robot)
+    for name in names:
+        if not known[name].spec.prior_sd(float(known[name].value)) > 0:
+            raise BadConfiguration(
+                f"--parameters {name}: its prior has no width (nominal value 0 with a relative sd), so nothing "
+                "depends on it; give it a value with --set, or leave it out"
+            )
+    try:
+        coordinates = priors.coordinates(robot, names) if names else None
+    except BadConfiguration as error:
+        raise BadConfiguration(str(error).replace("--prior", "--parameters")) from None
+    size = len(names)
+    parameters = of_coordinates(coordinates, np.zeros(size), np.eye(size)) if coordinates else NOTHING
+    return _inputs(robot, parameters, ranges, posterior=False)
+
+
+def of_posterior(robot: Robot, posterior: Posterior, ranges: Mapping[str, tuple[float, float]]) -> Inputs:
+    """Inputs from the posterior of a calibrated robot, and from stated ranges of conditions."""
+    return _inputs(robot, posterior, ranges, posterior=True)
+
+
+def _inputs(
+    robot: Robot, parameters: Posterior, ranges: Mapping[str, tuple[float, float]], *, posterior: bool
+) -> Inputs:
+    for name in ranges:
+        if name not in CONDITIONS or name == "configuration":
+            allowed = [n for n in CONDITIONS if n != "configuration"]
+            raise BadConfiguration(f"--vary {name}: no such condition; {choices(name, allowed)}")
+    try:
+        axes = Variation(robot, (*parameters.names, *ranges)).axes
+    except UsageError as error:
+        raise BadConfiguration(str(error)) from None
+    for name, (low, high) in ranges.items():
+        least, most = axes[name].bounds
+        if not (math.isfinite(low) and math.isfinite(high) and least <= low < high <= most):
+            raise BadConfiguration(
+                f"--vary {name}: got {low:g} to {high:g}; expected a range within {least:g} to {most:g} "
+                f"{axes[name].unit}, the smaller end first"
+            )
+    ends = np.array(list(ranges.values()), float).reshape(-1, 2)
+    return Inputs(parameters, tuple(ranges), ends[:, 0], ends[:, 1], axes, posterior)

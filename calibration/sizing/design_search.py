@@ -1,0 +1,535 @@
+"""The search for a size: parts enumerated, the rest by gradients from many starts in one batch."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+
+from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.parts import CellSheet
+from calibration.data.requirements_file import Requirements
+from calibration.sizing import sheet
+from calibration.sizing.design import CONTINUOUS, OBJECTIVES, Design, Task, build, evaluate, task
+from calibration.sizing.part_options import Drive, Options, options
+from mmrjax.compile.compiling import compiled
+from mmrjax.model.robot import Robot
+
+#: Cells in series that are tried, cells in parallel, and the radius as a multiple of the robot's (on tracks 1.3 is as
+#: much as the height of 100 mm of Section 2.2 allows).
+CELLS, PARALLEL, RADIUS = (3, 14), (1.0, 12.0), (0.6, 1.3)
+#: Random designs of each enumerated choice, among which the starts are; starts of each motor at least; of one choice
+#: at most.
+TRIES, OF_MOTOR, OF_CHOICE = 6, 6, 3
+#: Rows of one call of `_measured`.
+ROWS = 8192
+#: Steps of each start; after how many the multipliers follow; first and last length in the logarithms.
+STEPS, EVERY, RATE = 120, 12, (0.06, 0.003)
+#: Weight of a violated margin: at first, factor each time, at most.
+WEIGHT, GROWTH, HEAVIEST = 5.0, 1.7, 500.0
+#: Designs that are then refined, points along each of their axes, rounds, and how the box shrinks.
+REFINED, ALONG, ROUNDS, SHRINK = 24, 7, 7, 0.45
+#: Choices of which every ratio of the sheets is tried with whole cells, the most in parallel, and how many are kept.
+WHOLE, MOST_WHOLE, KEPT_WHOLE = 600, 8, 192
+#: Margin of a limit that binds.
+BINDS = 0.01
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """One design.
+
+    Attributes:
+        drive, cell: sheets; ratio, radius: total ratio and rolling radius [m]; in_series, parallel: cells.
+        objectives: by name of `OBJECTIVES`; margins: by label, shares of what is required or permitted.
+        bounds: of the search that it is at; robot: that it makes.
+    """
+
+    drive: Drive
+    cell: CellSheet
+    ratio: float
+    radius: float
+    in_series: int
+    parallel: float
+    objectives: dict[str, float]
+    margins: dict[str, float]
+    bounds: tuple[str, ...]
+    robot: Robot
+
+    @property
+    def feasible(self) -> bool:
+        """Whether every margin holds."""
+        return all(m >= 0 for m in self.margins.values())
+
+    @property
+    def binds(self) -> list[str]:
+        """The limits that it is at, or violates, the nearest first; then the bounds of the search."""
+        order = sorted(self.margins.items(), key=lambda item: item[1])
+        return [*(label for label, m in order if m < BINDS), *self.bounds]
+
+    def to_json(self) -> dict[str, Any]:
+        """As in `result.json`."""
+        return {
+            "motor": self.drive.motor.name, "gearbox": f"{self.drive.family}, stages {self.drive.stages}",
+            "ratio": self.ratio, "radius_m": self.radius, "cell": self.cell.name, "cells": self.in_series,
+            "parallel": self.parallel, "objectives": self.objectives, "feasible": self.feasible, "binds": self.binds,
+            "margins": self.margins,
+        }  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Sizing:
+    """What a search found.
+
+    Attributes:
+        task, options: of the search; objective: that was made small, of a Pareto front the first.
+        unmeetable: labels that no design of the choice meets, which were left out.
+        ideal: the best with any ratio and part of a cell; None where there is none.
+        best: the best with a ratio of the sheets and whole cells; alternatives: the next best, of other motors or
+            cells.
+        motors: by motor, its best design, feasible or the nearest to it.
+        front: designs of which none is better in both objectives; empty unless asked for.
+        starts, evaluated: how many searches, and designs in all.
+    """
+
+    task: Task
+    options: Options
+    objective: str
+    unmeetable: tuple[str, ...]
+    ideal: Found | None
+    best: Found | None
+    alternatives: tuple[Found, ...]
+    motors: dict[str, Found]
+    front: tuple[Found, ...]
+    starts: int
+    evaluated: int
+
+
+@compiled
+def _measured(problem: Task, designs: Design) -> tuple[Array, Array]:
+    """Objectives and margins of designs, shapes (designs, objectives), (designs, margins)."""
+    return jax.vmap(lambda d: evaluate(problem, d))(designs)
+
+
+@compiled
+def _descended(
+    problem: Task,
+    designs: Design,
+    low: Float[Array, "designs 3"],
+    high: Float[Array, "designs 3"],
+    weights: Float[Array, "designs objectives"],
+    kept: Float[Array, " margins"],
+) -> Float[Array, "designs 3"]:
+    """Where searches end that start at designs: the best they passed that meets every margin, or their last.
+
+    An augmented Lagrangian, f + Σ (max(0, λ - w g)² - λ²) / 2w over the logarithms of the continuous numbers, its
+    steps by Adam and held within bounds.
+
+    Args:
+        weights: of the logarithms of the objectives in f; kept: 1 for margins that count, 0 for those left out.
+    """
+    rate = optax.cosine_decay_schedule(RATE[0], STEPS, RATE[1] / RATE[0])
+    adam = optax.adam(rate, b1=0.8, b2=0.95)
+
+    def value(x: Array, d: Design, w: Array, multipliers: Array, weight: Array) -> tuple[Array, tuple[Array, Array]]:
+        objectives, margins = evaluate(problem, dataclasses.replace(d, continuous=x))
+        f = jnp.sum(jnp.where(w > 0, w * jnp.log(jnp.where(w > 0, objectives, 1.0)), 0.0))
+        g = jnp.where(kept > 0, jnp.clip(margins, -5.0, 5.0), 1.0)
+        short = jnp.maximum(multipliers - weight * (g - 1e-3), 0.0)
+        return f + jnp.sum(short**2 - multipliers**2) / (2 * weight), (f, g)
+
+    def one(d: Design, low: Array, high: Array, w: Array) -> Array:
+        def step(carry: tuple, k: Array) -> tuple[tuple, None]:
+            x, state, multipliers, weight, best, at_best = carry
+            slope, (f, g) = jax.grad(value, has_aux=True)(x, d, w, multipliers, weight)
+            better = jnp.all(g >= 0) & (f < best)
+            best, at_best = jnp.where(better, f, best), jnp.where(better, x, at_best)
+            slope = jnp.nan_to_num(slope, nan=0.0, posinf=0.0, neginf=0.0)
+            change, state = adam.update(slope, state)
+            follows = (k + 1) % EVERY == 0
+            multipliers = jnp.where(follows, jnp.clip(multipliers - weight * (g - 1e-3), 0.0, 1e3), multipliers)
+            weight = jnp.where(follows, jnp.minimum(weight * GROWTH, HEAVIEST), weight)
+            return (jnp.clip(x + change, low, high), state, multipliers, weight, best, at_best), None
+
+        x = d.continuous
+        begin = (x, adam.init(x), jnp.zeros_like(kept), jnp.asarray(WEIGHT), jnp.asarray(jnp.inf), x)
+        (x, _, _, _, best, at_best), _ = jax.lax.scan(step, begin, jnp.arange(STEPS))
+        return jnp.where(jnp.isfinite(best), at_best, x)
+
+    return jax.vmap(one)(designs, low, high, weights)
+
+
+@dataclasses.dataclass(frozen=True)
+class Space:
+    """Every enumerated choice, a row each, with the bounds of the continuous numbers.
+
+    Attributes:
+        drive, cell, in_series: of each choice; low, high: logarithms, shape (choices, 3).
+    """
+
+    options: Options
+    drive: np.ndarray
+    cell: np.ndarray
+    in_series: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    def designs(self, rows: np.ndarray, x: np.ndarray) -> Design:
+        """Designs of choices `rows` with continuous numbers `x` (logarithms)."""
+        o = self.options
+        return Design(
+            jnp.asarray(x),
+            {k: jnp.asarray(v[self.drive[rows]]) for k, v in o.drive.items()},
+            {k: jnp.asarray(v[self.cell[rows]]) for k, v in o.cell.items()},
+            jnp.asarray(self.in_series[rows], float),
+        )
+
+
+def space(robot: Robot, problem: Task, options: Options) -> Space:
+    """The choices for a robot."""
+    n_drives, n_cells = len(options.drives), len(options.cells)
+    every = list(itertools.product(range(n_drives), range(n_cells), range(CELLS[0], CELLS[1] + 1)))
+    drive, cell, series = (np.array(x) for x in zip(*every, strict=True))
+    radius = float(robot.configurations[problem.configuration].radius)
+
+    def bounds(k: int, ratio: str) -> np.ndarray:
+        return np.log(
+            np.stack(
+                [
+                    options.drive[ratio][drive],
+                    np.full(len(drive), RADIUS[k] * radius),
+                    np.full(len(drive), PARALLEL[k]),
+                ],
+                axis=1,
+            )
+        )
+
+    return Space(options, drive, cell, series, bounds(0, "ratio_least"), bounds(1, "ratio_most"))
+
+
+def measured(problem: Task, choice: Space, rows: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Objectives and margins of many designs, in calls of one size."""
+    parts = []
+    for first in range(0, len(rows), ROWS):
+        some = np.minimum(np.arange(first, first + ROWS), len(rows) - 1)
+        f, g = jax.device_get(_measured(problem, choice.designs(rows[some], x[some])))
+        parts.append((f[: len(rows) - first], g[: len(rows) - first]))
+    f, g = (np.concatenate(p) for p in zip(*parts, strict=True))
+    f = np.where(f > 0, f, np.inf)  # not moving, or no price: worse than any
+    return f, np.where(np.isfinite(g), g, -5.0)
+
+
+def size(
+    robot: Robot,
+    asked: Requirements,
+    objectives: tuple[str, ...] = ("mass",),
+    *,
+    starts: int = 256,
+    motors: tuple[str, ...] = (),
+    seed: int = 0,
+) -> Sizing:
+    """Search ratio, radius, cells and motor of a robot so that it meets requirements.
+
+    Args:
+        objectives: of `OBJECTIVES`, one to make small, or two for a Pareto front.
+        starts: searches in the batch; motors: names of those to choose from, empty: all; seed: of the starts.
+
+    Raises:
+        BadConfiguration: what `sheet.refuse` raises; an unknown objective or motor.
+    """
+    for name in objectives:
+        if name not in OBJECTIVES:
+            raise BadConfiguration(f"objective: got {name}; {choices(name, OBJECTIVES)}")
+    sheet.refuse(robot, asked)
+    chosen = options(robot, motors)
+    problem = task(robot, asked, chosen)
+    choice = space(robot, problem, chosen)
+    columns = [list(OBJECTIVES).index(name) for name in objectives]
+    drawn = _drawn(problem, choice, "cost" in objectives, np.random.default_rng(seed))
+    kept = drawn.g.max(axis=0) >= 0
+    unmeetable = tuple(label for label, k in zip(problem.labels, kept, strict=True) if not k)
+    search = _Search(problem, choice, kept, columns)
+    weights = search.weights(starts)
+    free = search.descended(drawn, weights)
+    real = search.real(drawn, free, weights)
+    # The best of these with any ratio and parts of a cell: no search may have begun from their choice of parts.
+    top = np.argsort(search.cost(real))[:REFINED]
+    free = free + search.refined(real.rows[top], real.x[top], search.first(len(top)), np.ones(3))
+    evaluated = len(drawn.rows) + starts * STEPS + search.evaluated
+
+    def found(designs: _Designs, k: int) -> Found:
+        margins = np.where(kept, designs.g[k], np.nan)
+        return _found(robot, problem, choice, designs.rows[k], designs.x[k], designs.f[k], margins)
+
+    everything, by_motor = free + real, dict[str, Found]()
+    for k in np.argsort(search.cost(everything)):
+        name = chosen.drives[choice.drive[everything.rows[k]]].motor.name
+        if name not in by_motor:  # a design is a robot to build, and these are a thousand
+            by_motor[name] = found(everything, int(k))
+    good = [k for k in range(len(real.rows)) if np.all(real.g[k][kept] >= 0)]
+    different: dict[tuple[int, int], int] = {}
+    for k in (int(k) for k in np.argsort(search.cost(real)) if k in set(good)):
+        different.setdefault((int(choice.drive[real.rows[k]]), int(choice.cell[real.rows[k]])), k)
+    best = [found(real, k) for k in list(different.values())[:8]]
+    ideal = int(np.argmin(search.cost(free)))
+    front = [found(real, k) for k in _undominated(real.f[:, columns], good)] if len(columns) == 2 else []
+    return Sizing(
+        problem, chosen, objectives[0], unmeetable,
+        found(free, ideal) if np.all(free.g[ideal][kept] >= 0) else None,
+        best[0] if best else None, tuple(best[1:]), by_motor, tuple(front), starts, evaluated,
+    )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class _Designs:
+    """Designs: rows of the choice of parts, shape (designs,); logarithms of ratio, radius and cells in parallel,
+    shape (designs, 3); objectives and margins, shapes (designs, objectives) and (designs, limits)."""
+
+    rows: np.ndarray
+    x: np.ndarray
+    f: np.ndarray
+    g: np.ndarray
+
+    def __add__(self, other: _Designs) -> _Designs:
+        return _Designs(*(np.concatenate([mine, theirs]) for mine, theirs in zip(self, other, strict=True)))
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        return iter((self.rows, self.x, self.f, self.g))
+
+
+def _drawn(problem: Task, choice: Space, costed: bool, rng: np.random.Generator) -> _Designs:
+    """Random designs of every choice of parts: what can be met at all, and where to start.
+
+    Args:
+        costed: whether only drives count whose price is known.
+    """
+    rows = np.repeat(np.arange(len(choice.drive)), TRIES)
+    if costed:
+        rows = rows[np.isfinite(choice.options.drive["cost"][choice.drive[rows]])]
+    low, high = choice.low[rows], choice.high[rows]
+    x = low + (high - low) * rng.random((len(rows), 3)) ** np.array([1.0, 1.0, 2.0])
+    return _Designs(rows, x, *measured(problem, choice, rows, x))
+
+
+@dataclasses.dataclass
+class _Search:
+    """The steps of a search.
+
+    Attributes:
+        kept: which limits some design meets; columns: of the objectives; evaluated: designs so far.
+    """
+
+    problem: Task
+    choice: Space
+    kept: np.ndarray
+    columns: list[int]
+    evaluated: int = 0
+
+    def designs(self, rows: np.ndarray, x: np.ndarray) -> _Designs:
+        """Designs with their objectives and margins."""
+        return _Designs(rows, x, *measured(self.problem, self.choice, rows, x))
+
+    def first(self, count: int) -> np.ndarray:
+        """Weights of the first objective alone, shape (count, objectives)."""
+        return np.tile(np.eye(len(OBJECTIVES))[self.columns[0]], (count, 1))
+
+    def weights(self, starts: int) -> np.ndarray:
+        """Weights of the objectives in each start, shape (starts, objectives): along a Pareto front for two."""
+        weights = np.zeros((starts, len(OBJECTIVES)))
+        share = np.ones(starts) if len(self.columns) == 1 else np.linspace(0.98, 0.02, starts)
+        weights[:, self.columns[0]] += share
+        if len(self.columns) == 2:
+            weights[:, self.columns[1]] += 1 - share
+        return weights
+
+    def cost(self, designs: _Designs) -> np.ndarray:
+        """What is to be small by the first objective, shape (designs,)."""
+        return _cost(designs.f, designs.g, self.kept, self.first(len(designs.rows)))
+
+    def misses(self, drawn: _Designs) -> np.ndarray:
+        """How far designs are from the limits that can be met, shape (designs,)."""
+        return 5 * np.sum(np.maximum(-drawn.g[:, self.kept], 0.0), axis=1)
+
+    def refined(self, rows: np.ndarray, x: np.ndarray, weights: np.ndarray, free: np.ndarray) -> _Designs:
+        """Designs after a search on shrinking boxes around them, see `_refine`."""
+        x, count = _refine(self.problem, self.choice, rows, x, self.kept, weights, free)
+        self.evaluated += count
+        return self.designs(rows, x)
+
+    def descended(self, drawn: _Designs, weights: np.ndarray) -> _Designs:
+        """Designs with any ratio and parts of a cell, by gradients from the best of those drawn."""
+        choice, misses = self.choice, self.misses(drawn)
+        shares = [len(s) for s in np.array_split(np.arange(len(weights)), len(self.columns))]
+        picked = [
+            _starts(choice, drawn.rows, np.log(drawn.f[:, c]) + misses, n)
+            for c, n in zip(self.columns, shares, strict=True)
+        ]
+        rows, x = drawn.rows[np.concatenate(picked)], drawn.x[np.concatenate(picked)]
+        x = np.array(_descended(
+            self.problem, choice.designs(rows, x), jnp.asarray(choice.low[rows]), jnp.asarray(choice.high[rows]),
+            jnp.asarray(weights), jnp.asarray(self.kept, float),
+        ))  # fmt: skip
+        found = self.designs(rows, x)
+        best = np.argsort(_cost(found.f, found.g, self.kept, weights))[: REFINED * len(self.columns)]
+        x[best] = self.refined(rows[best], x[best], weights[best], np.ones(3)).x
+        return self.designs(rows, x)
+
+    def real(self, drawn: _Designs, free: _Designs, weights: np.ndarray) -> _Designs:
+        """Designs with ratios of the sheets and whole cells: those near `free`, and the best of every choice."""
+        rows, x, w = _real(self.choice, free.rows, free.x, weights, np.argsort(self.cost(free)))
+        misses = self.misses(drawn)
+        for c in self.columns:
+            merit = np.where(np.isfinite(drawn.f[:, c]), np.log(drawn.f[:, c]) + misses, np.inf)
+            ranked = np.array(list(dict.fromkeys(drawn.rows[np.argsort(merit)]))[:WHOLE])
+            own = np.eye(len(OBJECTIVES))[c]
+            more_rows, more_x, count = _enumerated(self.problem, self.choice, ranked, self.kept, own)
+            self.evaluated += count
+            rows, x = np.concatenate([rows, more_rows]), np.concatenate([x, more_x])
+            w = np.concatenate([w, np.tile(own, (len(more_rows), 1))])
+        return self.refined(rows, x, w, np.array([0.0, 1.0, 0.0]))
+
+
+def _starts(choice: Space, rows: np.ndarray, merit: np.ndarray, count: int) -> np.ndarray:
+    """The best designs to start from: some of each motor, then the best of all, few of one choice."""
+    order = np.argsort(np.where(np.isfinite(merit), merit, 1e9))
+    motor = [choice.options.drives[d].motor.name for d in choice.drive]
+    taken: list[int] = []
+    of_motor: dict[str, int] = {}
+    of_choice: dict[int, int] = {}
+    for least in (True, False):
+        for k in order:
+            c = int(rows[k])
+            name = motor[c]
+            if len(taken) == count or (least and of_motor.get(name, 0) >= OF_MOTOR):
+                continue
+            if of_choice.get(c, 0) >= OF_CHOICE or k in taken[: len(taken) if not least else 0]:
+                continue
+            taken.append(int(k))
+            of_motor[name], of_choice[c] = of_motor.get(name, 0) + 1, of_choice.get(c, 0) + 1
+    return np.resize(np.array(taken), count)
+
+
+def _cost(f: np.ndarray, g: np.ndarray, kept: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """What is to be small: logarithm of the objective, above any feasible one where a margin is violated."""
+    value = np.sum(np.where(weights > 0, weights * np.log(np.where(weights > 0, f, 1.0)), 0.0), axis=1)
+    short = np.sum(np.maximum(-g[:, kept], 0.0), axis=1)
+    return np.where(np.isfinite(value), value + np.where(short > 0, 100 + short, 0.0), 1e6)
+
+
+def _refine(
+    problem: Task,
+    choice: Space,
+    rows: np.ndarray,
+    x: np.ndarray,
+    kept: np.ndarray,
+    weights: np.ndarray,
+    free: np.ndarray,
+) -> tuple[np.ndarray, int]:
+    """Designs after a search on shrinking boxes around them, and how many were evaluated.
+
+    Args:
+        free: 1 for continuous numbers that may move.
+    """
+    axes = [np.linspace(-1, 1, ALONG) if moves else np.zeros(1) for moves in free]
+    box = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    x, width, count = x.copy(), 0.25 if free.sum() == 1 else 0.05, 0
+    for _ in range(ROUNDS):
+        tried = np.clip(x[:, None] + width * box, choice.low[rows][:, None], choice.high[rows][:, None])
+        n = tried.shape[1]
+        f, g = measured(problem, choice, np.repeat(rows, n), tried.reshape(-1, 3))
+        cost = _cost(f, g, kept, np.repeat(weights, n, axis=0)).reshape(-1, n)
+        x = tried[np.arange(len(rows)), np.argmin(cost, axis=1)]
+        width, count = width * SHRINK, count + len(f)
+    return x, count
+
+
+def _real(
+    choice: Space, rows: np.ndarray, x: np.ndarray, weights: np.ndarray, order: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Designs near those found with ratios of the sheets and whole cells: the two nearest of each."""
+    made: dict[tuple, tuple] = {}
+    for k in order:
+        drive = choice.options.drives[choice.drive[rows[k]]]
+        ratios = sorted(drive.ratios, key=lambda r: abs(math.log(r) - x[k, 0]))[:2]
+        parallel = math.exp(x[k, 2])
+        for ratio, p in itertools.product(
+            ratios, {max(1, math.floor(parallel + 1e-6)), max(1, math.ceil(parallel - 1e-6))}
+        ):
+            key = (int(rows[k]), ratio, p)
+            made.setdefault(key, (rows[k], [math.log(ratio), x[k, 1], math.log(p)], weights[k]))
+    chosen, points, w = zip(*made.values(), strict=True)
+    return np.array(chosen), np.array(points), np.array(w)
+
+
+def _enumerated(
+    problem: Task, choice: Space, rows: np.ndarray, kept: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """The best designs of choices with every ratio of their sheets, few whole cells in parallel and three radii, and
+    how many were evaluated."""
+    of_row, points = [], []
+    for row in rows:
+        low, high = choice.low[row, 1], choice.high[row, 1]
+        ratios = choice.options.drives[choice.drive[row]].ratios
+        for ratio, p, share in itertools.product(ratios, range(1, MOST_WHOLE + 1), (0.4, 0.7, 1.0)):
+            of_row.append(row)
+            points.append([math.log(ratio), low + share * (high - low), math.log(p)])
+    every, x = np.array(of_row), np.array(points)
+    f, g = measured(problem, choice, every, x)
+    best = np.argsort(_cost(f, g, kept, np.tile(weights, (len(every), 1))))[:KEPT_WHOLE]
+    return every[best], x[best], len(every)
+
+
+def _undominated(f: np.ndarray, among: list[int]) -> list[int]:
+    """Those of which none other is at least as good in both and better in one, by the first objective."""
+    order = sorted(among, key=lambda k: (f[k, 0], f[k, 1]))
+    front: list[int] = []
+    for k in order:
+        if not front or f[k, 1] < f[front[-1], 1] * (1 - 1e-9):
+            front.append(k)
+    return front
+
+
+def _found(
+    robot: Robot, problem: Task, choice: Space, row: int, x: np.ndarray, f: np.ndarray, g: np.ndarray
+) -> Found:
+    drive, cell = choice.options.drives[choice.drive[row]], choice.options.cells[choice.cell[row]]
+    series = int(choice.in_series[row])
+    ratio, radius, parallel = (float(v) for v in np.exp(x))
+    design = jax.tree.map(lambda v: v[0], choice.designs(np.array([row]), x[None]))
+    made, _ = build(problem.robot, problem.base_mass, problem.configuration, design)
+    made = jax.tree.map(lambda v: np.asarray(v) if eqx.is_array(v) else v, made)
+
+    def rated(key: str) -> float:
+        return float(choice.options.drive[key][choice.drive[row]])
+
+    made = dataclasses.replace(
+        made,
+        battery=dataclasses.replace(
+            made.battery, cells=series, voltage_cutoff=float(choice.options.cell["cutoff"][choice.cell[row]]),
+            current_limit=parallel * cell.current_max if math.isfinite(cell.current_max) else None,
+        ),
+        motor=dataclasses.replace(
+            made.motor, speed_limit=rated("speed_motor"), temperature_limit=rated("temperature")
+        ),
+        gearbox=dataclasses.replace(
+            made.gearbox, speed_limit=rated("speed_gearbox"), torque_limit=rated("torque")
+        ),
+    )  # fmt: skip
+    margins = {label: float(v) for label, v in zip(problem.labels, g, strict=True) if np.isfinite(v)}
+    at_bound = tuple(
+        f"{word} {name}"
+        for word, bound in (("least", choice.low[row]), ("largest", choice.high[row]))
+        for name, v, b in zip(CONTINUOUS, x, bound, strict=True)
+        if abs(v - b) < 1e-6 and (word, name) != ("least", "parallel")
+    )
+    values = {name: float(v) for name, v in zip(OBJECTIVES, f, strict=True) if np.isfinite(v)}
+    return Found(drive, cell, ratio, radius, series, parallel, values, margins, at_bound, made)

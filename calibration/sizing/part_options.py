@@ -1,0 +1,145 @@
+"""What a search may choose from: drives (motor and gearbox) and cells, from the packaged sheets, as arrays.
+
+Where a sheet is silent about what the model needs, the paper's robot stands in, in proportion (docs/requirements.md):
+friction of a motor by its no-load torque, efficiency of a gearbox by the sheet's largest, resistance and mass of a
+cell by its capacity, and its own ratings of winding and speeds.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from calibration.data.parts import CellSheet, GearboxSheet, MotorSheet, cells, gearboxes, motors
+from mmrjax.model.robot import Robot
+
+#: The paper's parts among the sheets.
+MOTOR, GEARBOX, CELL = "RE 30 24 V", "GP 32 C 23:1", "XP2200SL"
+#: Ratio of the belt stage between gearbox and driving wheel, which is kept (docs/paper-notes.md).
+BELT_STAGE = 25 / 12
+#: A current that limits nothing [A].
+FREE = 1e9
+
+
+class Drive(NamedTuple):
+    """A motor with one size of gearbox (a family with so many stages), of which the ratio can be chosen.
+
+    Attributes:
+        motor: its sheet; family, stages: of the gearbox; ratios: total ones, ascending; gearbox: any of its sheets.
+    """
+
+    motor: MotorSheet
+    family: str
+    stages: int
+    ratios: tuple[float, ...]
+    gearbox: GearboxSheet
+
+    @property
+    def name(self) -> str:
+        """As people read it."""
+        return f"{self.motor.name}, {self.family}, {self.stages} stage{'s' if self.stages > 1 else ''}"
+
+
+def drives(names: tuple[str, ...] = ()) -> tuple[Drive, ...]:
+    """Every motor of the sheets (or those named) with every size of gearbox that its source combines it with."""
+    found = []
+    for motor in motors():
+        if names and motor.name not in names:
+            continue
+        for family in motor.gearboxes:
+            for stages in sorted({g.stages for g in gearboxes() if g.family == family}):
+                ranked = sorted(
+                    (g for g in gearboxes() if (g.family, g.stages) == (family, stages)), key=lambda g: g.ratio
+                )
+                ratios = tuple(BELT_STAGE * g.ratio for g in ranked)
+                found.append(Drive(motor, family, int(stages), ratios, ranked[0]))
+    return tuple(found)
+
+
+def packable() -> tuple[CellSheet, ...]:
+    """The cells that a pack can be computed of: capacity, full voltage and cut-off are stated, or are the paper's."""
+    return tuple(c for c in cells() if c.cells == 1 and (c.name == CELL or not math.isnan(c.voltage_cut_off)))
+
+
+def mass_per_charge() -> float:
+    """Mass of lithium-polymer cells [kg/C], of the one pack whose label states it."""
+    return next(c.mass / (c.cells * c.capacity) for c in cells() if not math.isnan(c.mass) and c.chemistry == _LIPO)
+
+
+_LIPO = "lithium-polymer"
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Numbers of drives and cells, one row each, by name.
+
+    Attributes:
+        drives, cells: the sheets; drive, cell: columns, shapes (drives,) and (cells,); base_mass: of the paper's two
+            motors, two gearboxes and cells, which a robot's mass holds [kg].
+    """
+
+    drives: tuple[Drive, ...]
+    cells: tuple[CellSheet, ...]
+    drive: dict[str, np.ndarray]
+    cell: dict[str, np.ndarray]
+    base_mass: float
+
+
+def _stated(value: float, otherwise: float) -> float:
+    return otherwise if math.isnan(value) else value
+
+
+def options(robot: Robot, names: tuple[str, ...] = ()) -> Options:
+    """What can be chosen for a robot.
+
+    Args:
+        robot: whose friction, efficiencies and cells stand in where sheets are silent; names: of motors, empty: all.
+    """
+    chosen, packs = drives(names), packable()
+    paper_motor = next(m for m in motors() if m.name == MOTOR)
+    paper_gear = next(g for g in gearboxes() if g.name == GEARBOX)
+    paper_cell = next(c for c in cells() if c.name == CELL)
+    sides, battery = float(robot.sides), robot.battery
+    idle = paper_motor.torque_constant * paper_motor.current_no_load
+    rows = []
+    for d in chosen:
+        m, g = d.motor, d.gearbox
+        share = m.torque_constant * m.current_no_load / idle
+        rows.append(
+            {
+                "resistance": m.resistance, "torque_constant": m.torque_constant,
+                "friction_coulomb": float(robot.motor.friction_coulomb) * share,
+                "friction_viscous": float(robot.motor.friction_viscous) * share,
+                "inertia": m.inertia, "inductance": m.inductance,
+                "resistance_thermal_winding": m.resistance_thermal_winding,
+                "resistance_thermal_housing": m.resistance_thermal_housing,
+                "efficiency": float(robot.gearbox.efficiency_load) * g.efficiency / paper_gear.efficiency,
+                "mass": sides * (m.mass + g.mass), "cost": sides * (m.price + g.price),
+                "temperature": _stated(m.temperature_winding_max, robot.motor.temperature_limit),
+                "speed_motor": _stated(m.speed_max, robot.motor.speed_limit),
+                "speed_gearbox": _stated(g.speed_input_max, robot.gearbox.speed_limit),
+                "torque": g.torque_max * BELT_STAGE,
+                "ratio_least": d.ratios[0], "ratio_most": d.ratios[-1],
+            }
+        )  # fmt: skip
+    per_charge = mass_per_charge()
+    resistance = float(battery.resistance) * paper_cell.capacity
+    columns = [
+        {
+            "capacity": c.capacity, "voltage_full": c.voltage_full,
+            "cutoff": _stated(c.voltage_cut_off, battery.voltage_cutoff),
+            "resistance": _stated(c.resistance, resistance / c.capacity),
+            "mass": _stated(c.mass, per_charge * c.capacity),
+            "current": _stated(c.current_max, FREE),
+        }
+        for c in packs
+    ]  # fmt: skip
+    base = sides * (paper_motor.mass + paper_gear.mass) + battery.cells * per_charge * float(battery.capacity)
+    return Options(chosen, packs, _columns(rows), _columns(columns), base)
+
+
+def _columns(rows: list[dict[str, float]]) -> dict[str, np.ndarray]:
+    return {key: np.array([row[key] for row in rows]) for key in rows[0]}

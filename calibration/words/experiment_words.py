@@ -1,0 +1,301 @@
+"""What to do next, for an engineer: calibration acts and runs of the menu, what to read and to watch, more runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from calibration.discovery import menu, setups
+from calibration.discovery.loop_notes import (
+    CarryOut,
+    Instruction,
+    MoreRuns,
+    NoMenu,
+    NothingPossible,
+    NothingTells,
+    Overspeed,
+    Overvoltage,
+    TooWeak,
+    Watch,
+)
+from calibration.inference import bases
+from mmrjax.model import channels
+from mmrjax.model.quantities import RPM
+
+# --- amounts --------------------------------------------------------------------------------------------
+
+
+def both(words: Sequence[str]) -> str:
+    """«a, b and c»."""
+    *others, last = words
+    return f"{', '.join(others)} and {last}" if others else last
+
+
+def amounts(values: Sequence[float], unit: str) -> str:
+    """«15 and 33 V», each once, in order."""
+    return f"{both([f'{v:g}' for v in sorted(set(values), key=abs)])} {unit}"
+
+
+#: Torque below which it is in mN·m [N·m].
+SMALL = 0.1
+
+
+def torques(values: Sequence[float]) -> str:
+    """«0, 0.2 and 0.4 N·m»; in mN·m where all are below `SMALL`."""
+    size, unit = (1e3, "mN·m") if max(map(abs, values)) < SMALL else (1.0, "N·m")
+    return amounts([menu.round_significant(size * v, 3) for v in values], unit)
+
+
+def slopes(angles: Sequence[float]) -> str:
+    """«on the level and up 10 and 20 deg»."""
+    words = ["on the level"] if any(s == 0 for s in angles) else []
+    for word, sign in (("up", 1), ("down", -1)):
+        some = [abs(s) for s in angles if s * sign > 0]
+        words += [f"{word} {amounts(some, 'deg')}"] if some else []
+    return both(words)
+
+
+# --- the menu -------------------------------------------------------------------------------------------
+
+#: How each calibration act is done, by its name; what is set fills the gap.
+ACTS = {
+    "zero current": "Switch the motors off; read the ammeter",
+    "zero reading": "Switch the motors off, at rest and with no load; read the {}",
+    "shunt": "Put a precision shunt and a load in the place of the robot, set {} by the shunt; read the ammeter",
+    "strobe": "Set the motor to {} by a stroboscope; read the tachometer",
+    "timing": "Time the robot by light gates over a distance measured with a tape, at {}; read the speed that the "
+    "bench shows",
+}
+#: Units of what they set.
+UNITS = {"shunt": "A", "strobe": "rad/s", "timing": "m/s", "zero current": ""}
+#: What is done in each kind of runs.
+DOING = {
+    "travel": "travel",
+    "run": "run",
+    "backwards": "travel backwards",
+    "other way": "run the other way round",
+    "about": "turn the slope about by the same inclinometer and travel forwards",
+    "laden": "travel with {payload:g} kg",
+    "lifted": "put it on stands, the movers in the air, and run",
+    "one lifted": "put it on stands, {others}, and run",
+    "alone": "Uncouple the {gears} and run the motors alone",
+    "braked": "Uncouple the {gears} and put a brake of {brake:g} mN·m on each motor shaft, and run",
+    "held": "Hold {shafts} in a vice and switch on for a moment,",
+    "one held": "Hold one motor's shaft in a vice, {others}, and switch on for a moment,",
+}
+
+
+def experiment(e: menu.Experiment) -> str:
+    """What to do, what to read, and what to watch."""
+    return _act(e) if isinstance(e, menu.Act) else _run(e)
+
+
+def _act(act: menu.Act) -> str:
+    if act.name == "weigh":
+        return _weigh(act)
+    (kind,) = act.kinds
+    if act.channel:
+        return ACTS[kind].format(channels.find(act.channel).label)
+    return ACTS[kind].format(amounts([v for (v,) in act.at], UNITS[kind]))
+
+
+def _weigh(act: menu.Act) -> str:
+    configurations, payload = {k for k, _ in act.at}, max(m for _, m in act.at)
+    each = {1: "", 2: "in both configurations, "}.get(len(configurations), "in each configuration, ")
+    laden = f"unladen and with the payload of {payload:g} kg, " if payload > 0 else "unladen, "
+    return (
+        f"Weigh the robot {each}{laden}on scales that are good to 20 g; read the total mass, and take the stated one "
+        "from it"
+    )
+
+
+def _run(run: menu.Run) -> str:
+    level = (run.imposed != "voltage" or bool(run.torque)) and not any(run.slope)
+    where = "" if run.setup in setups.WEIGHTLESS or level else f" {slopes(run.slope)}"
+    read = both([channels.find(c).label for c in run.channels])
+    turning = [menu.round_significant(v / RPM) for v in run.voltage]
+    unit = {"voltage": "V", "motor_current": "A of each motor"}.get(run.imposed)
+    at = amounts(turning, "rpm of the motor") if unit is None else amounts(run.voltage, unit)
+    against = f" against a brake of {torques(run.torque)}" if any(run.torque) else ""
+    text = f"{_doing(run)}{where} at {at}{against}; read {read}"
+    return f"{text}. Watch {'; '.join(map(watch, run.watch))}" if run.watch else text
+
+
+def _doing(run: menu.Run) -> str:
+    doing = DOING[run.doing].format(
+        payload=run.payload[0],
+        brake=1e3 * run.brake,
+        others="the other motor disconnected" if run.motors == 2 else "all motors but one disconnected",
+        gears="gearbox" if run.motors == 1 else "gearboxes",
+        shafts={1: "the motor's shaft", 2: "both motor shafts"}.get(run.motors, f"all {run.motors} motor shafts"),
+    )
+    return f"{run.where}: {doing}" if run.where else doing
+
+
+def watch(about: Watch) -> str:
+    """What can be damaged, and what shows that it will be."""
+    if isinstance(about, Overspeed):
+        return (
+            f"the motor speed: about {about.speed / RPM:.0f} rpm without load at {about.voltage:g} V, and no more "
+            f"than {about.limit / RPM:.0f} rpm; raise the voltage slowly"
+        )
+    if isinstance(about, Overvoltage):
+        return f"the supply: {about.voltage:g} V is more than the table's {about.used:g} V"
+    settles = math.isfinite(about.temperature)
+    would = f"would reach {about.temperature:.0f} °C" if settles else "would burn: no temperature settles"
+    allowed = "" if about.allowed is None else _allowed(about.allowed)
+    heats = f"a winding left on {would}{allowed}"
+    return {
+        "held": f"current × time: {about.current:.2g} A in a motor that does not turn, and so is not cooled; {heats}"
+        ", so switch off within seconds and let it cool between readings",
+        "braked": f"the brake and the winding's temperature: {heats}; seconds are enough for a reading",
+        "run": f"the winding's temperature: {heats}; keep the runs short",
+    }[about.how]
+
+
+def _allowed(temperature: float) -> str:
+    """What a winding may reach, where somebody has stated it."""
+    return f" ({temperature:.0f} °C is allowed)" if temperature < menu.UNLIMITED else ""
+
+
+# --- what is proposed -----------------------------------------------------------------------------------
+
+
+def instruction(what: Instruction) -> str:
+    """What to do and what to read."""
+    if isinstance(what, NothingPossible):
+        return "Every experiment of the menu is forbidden or beyond reach"
+    if isinstance(what, NoMenu):
+        return f"The menu of experiments is of straight travel and has no {what.word}"
+    if isinstance(what, NothingTells):
+        return f"No experiment of the menu tells {' and '.join(what.names)} apart by {what.sigma:g} sigma"
+    if isinstance(what, CarryOut):
+        return ". And: ".join(map(experiment, what.experiments))
+    if isinstance(what, TooWeak):
+        return f"A series in {what.variable} would show what is missing by {what.sigma:.1f} sigma"
+    return f"{more_runs(what)}; read every channel. What the {bases.in_words(what.place)} lacks then shows its shape"
+
+
+def more_runs(what: MoreRuns) -> str:
+    """More runs along the variable of a discrepancy."""
+    if what.variable in bases.ORDERS:
+        return _steady_speeds(what)
+    happens = bases.window(what.variable)
+    if happens is not None:
+        return _again(happens)
+    if what.within.imposed != "voltage":
+        by_kind = _of_level(what)
+    else:
+        by_kind = {} if what.within.has_ground else _of_shaft(what)
+    last = f"Repeat with {what.variable.replace('_', ' ')} in even small steps from its least to its largest"
+    return (_usual(what) | by_kind).get(what.variable, last)
+
+
+def _steady_speeds(what: MoreRuns) -> str:
+    """How a wave is followed from speed to speed."""
+    three = [f"{menu.round_significant(v):g}" for v in (what.low, 0.5 * (what.low + what.high), what.high)]
+    return (
+        f"Mark the driving shaft, start every run from the mark, and record steady travel at {', '.join(three[:2])} "
+        f"and {three[2]} V with at least 20 samples a wave: what keeps its {what.variable} at every speed turns with "
+        "that part"
+    )
+
+
+def _again(happens: bases.Window) -> str:
+    """The same runs, where something happens for a while or at one level."""
+    if happens.axis == "order":
+        return (
+            f"Make runs {happens.low:.0f} to {happens.high:.0f} again, and as many before and after them, in another "
+            "order: what comes back with them hangs on their conditions, what does not happened then"
+        )
+    if happens.axis != "time":
+        return f"Make the runs at {happens.words} again, on another day, and as many a little below and above that"
+    return (
+        f"Make two of the runs again, sampled as finely as the instruments allow from {happens.low:.3g} to "
+        f"{happens.high:.3g} s, one of them with all that is switched in that time left as it is"
+    )
+
+
+def _steps(what: MoreRuns, first: str = "") -> str:
+    """`the supply voltage in 15 even steps up to 8 V`: what drives the motors, as the table varied it."""
+    top = menu.round_significant(what.top)
+    if what.by_duty:
+        return f"the duty{_up_to(max(what.within.duties), what.runs, first=first)} at {top:g} V"
+    return f"the supply voltage{_up_to(what.top, what.runs, 'V', first)}"
+
+
+def _up_to(most: float, runs: int, unit: str = "", first: str = "") -> str:
+    """` from crawl to 12 V in steps of 1 V`: levels that a person can set."""
+    step = menu.step_of_settings(most, runs)
+    last, by = (f"{x:g} {unit}".rstrip() for x in (menu.last_setting(most, step), step))
+    return f" from {first} to {last} in steps of {by}" if first else f" up to {last} in steps of {by}"
+
+
+def _usual(what: MoreRuns) -> dict[str, str]:
+    """By variable, of a vehicle whose voltage is imposed."""
+    low, high, within = what.low, what.high, what.within
+    load = [f"a payload up to {what.payload:g} kg"] * bool(what.payload > 0)
+    load += [f"a slope up to {what.slope:g} deg"] * bool(what.slope > 0)
+    loaded = " and ".join(load) or "a brake or a drawbar pull"
+    volts, angle, mass = what.steps
+    by_duty = what.by_duty
+    driven = f"the supply voltage from {low:g} to {high:g} V in steps of {volts:g} V"
+    crawl = (
+        _steps(what, "crawl") if by_duty else f"the supply voltage in steps of {volts:g} V from crawl to {high:g} V"
+    )
+    return {
+        "voltage": f"Repeat at one slope and payload with {_steps(what) if by_duty else driven}",
+        "current": f"Repeat at {high:g} V with {loaded}, raised in small steps, so that the current rises evenly "
+        f"from no load to its largest, some {within.current * within.motors:.2g} A",
+        "speed_motor": f"Repeat on the level, unladen, with {crawl}",
+        "slope": f"Repeat at one voltage and payload with the slope from 0 to {what.slope:g} deg in steps of "
+        f"{angle:g} deg, and downhill",
+        "payload": f"Repeat at one voltage and slope with the payload from 0 to {what.payload:g} kg in steps of "
+        f"{mass:g} kg",
+        "speed": "Repeat on the level, unladen, with the travelling speed in even steps from crawl to its largest, "
+        f"some {within.speed:.2g} m/s at {high:g} V",
+        "time": f"Record one condition from a cold start for ten minutes, at {low:g} V rather than more, and again "
+        f"at once while everything is warm; watch the winding's temperature{_allowed(within.hot)}",
+        "order": "Repeat the table in another order, rows that were first last, and one condition again after every "
+        "fifth run",
+    }
+
+
+def _of_level(what: MoreRuns) -> dict[str, str]:
+    """By variable, where the motors' speed or current is imposed."""
+    within = what.within
+    level = "Repeat on the level, unladen," if within.has_ground else "Repeat"
+    of_speed = within.imposed == "motor_speed"
+    most = max(within.levels, default=within.motor_speed if of_speed else within.current)
+    one, levels = ("motor speed", (most / RPM, "rpm")) if of_speed else ("motor current", (most, "A"))
+    turning = f"with the {one}{_up_to(levels[0], what.runs, levels[1])}"
+    words = {
+        "speed_motor": f"{level} {turning}",
+        "speed": f"{level} {turning}, and so the travelling speed",
+        "slope": f"Repeat at one {one} and payload with the slope from 0 to {what.slope:g} deg, and downhill",
+        "payload": f"Repeat at one {one} and slope with the payload from 0 to {what.payload:g} kg",
+        "time": f"Record one {one} from a cold start for ten minutes, and again at once while all is warm",
+    }
+    if not within.has_ground:
+        words["current"] = (
+            f"{level} at one {one} with {_brake(what)}" if any(within.torques) else words["speed_motor"]
+        )
+    return words
+
+
+def _brake(what: MoreRuns) -> str:
+    """`the brake's torque up to 0.8 N·m in steps of 0.05 N·m`, as the table varied it."""
+    most = max(what.within.torques)
+    size, unit = (1e3, "mN·m") if most < SMALL else (1.0, "N·m")
+    return f"the brake's torque{_up_to(size * most, what.runs, unit)}"
+
+
+def _of_shaft(what: MoreRuns) -> dict[str, str]:
+    """By variable, where the load is a shaft."""
+    crawl, top = f"Repeat with {_steps(what, 'crawl')}", menu.round_significant(what.top)
+    return {
+        "voltage": f"Repeat with {_steps(what)}",
+        "speed_motor": crawl,
+        "speed": crawl,
+        "current": f"Repeat at {top:g} V with {_brake(what)}" if any(what.within.torques) else crawl,
+    }

@@ -1,0 +1,807 @@
+"""What is said of the loop: its verdict, whether names stand, what is ruled out, hidden or worse, its remarks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calibration.data.input_errors import rounded
+from calibration.discovery import loop_notes
+from calibration.discovery.clusters import Cluster
+from calibration.discovery.location import DiscrepancyLocation
+from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME
+from calibration.inference import bases
+from calibration.inference import blocks as blocks_room
+from calibration.inference.series_noise import SeriesNoise
+from calibration.words import fit_words
+from mmrjax import effects
+from mmrjax.errors import counted
+from mmrjax.model import channels
+
+if TYPE_CHECKING:
+    from calibration.discovery.discover import LoopStages
+    from calibration.discovery.result import (
+        DiscoveryResult,
+        Errors,
+        Estimate,
+        FoundEffect,
+        Ranking,
+        Resolved,
+        Sensitivity,
+        StatedValue,
+        UnnamedDiscrepancy,
+        Worse,
+    )
+
+#: χ² from which on its digits are not printed [σ²].
+LARGE = 1e5
+
+
+def misfit(chi2: float) -> str:
+    """A χ² or a difference of two: `8088`, and `1e+08` where digits would say nothing."""
+    return f"{chi2:.0f}" if abs(chi2) < LARGE else f"{chi2:.0e}"
+
+
+# --- the verdict ----------------------------------------------------------------------------------------
+
+
+def statement(said: loop_notes.Summary) -> str:
+    """A verdict in a sentence or a few."""
+    text = _verdict(said)
+    if said.aside:
+        share = 100 * said.aside / said.of
+        text = f"{said.aside} of {said.of} rows ({share:.0f} %) lie off alone and are set aside. {text}"
+    if said.noise:
+        text = f"{text} But {'; '.join(map(fit_words.noise_off, said.noise))}"
+    if said.cluster is not None:
+        text = f"{text} {cluster(said.cluster).capitalize()}: that is a finding, and none is set aside."
+    return text
+
+
+def _verdict(said: loop_notes.Summary) -> str:
+    where, p = said.where, said.p
+    if said.verdict == "undescribed":
+        return _undescribed(said)
+    if said.verdict == "none":
+        return f"Nothing is missing: what the fitted model leaves is what noise leaves (family-wise p = {p:.2g})."
+    if said.verdict in WITHOUT_NAME and where is not None:
+        found = said.mechanism
+        if said.verdict == "mechanism" and found is not None:
+            within = _within(where) if where.family in found.families else ""
+            text = f"Missing: {_mechanism(found, within)} (family-wise p {p_value(p)}). "
+            text += "No law of the library is established."
+        else:
+            text = _without_name(where, p, "is established" if said.missing else "explains it")
+            text += f" No mechanism is established: {no_mechanism(found)}." if found is not None else ""
+        if said.missing:
+            text += _tentative(said.missing, said.support)
+        elif said.nearest:
+            one = len(said.nearest) == 1
+            text += f" Nearest {'comes' if one else 'come'} {' and '.join(said.nearest)}, which "
+            text += f"{'does' if one else 'do'} not stand."
+        return text
+    names = [_named(one) for one in said.missing if one.established]
+    in_model = _tentative([one for one in said.missing if not one.established], said.support)
+    left = "" if where is None else f" Something remains in the {bases.in_words(where.place)}."
+    return f"Missing: {'; '.join(names)} (family-wise p {p_value(p)}).{in_model}{left}"
+
+
+def headline(found: loop_notes.Headline) -> str:
+    """What holds at every noise that was tried, in a sentence."""
+    *first, last = [f"{f:g}" for f in found.factors]
+    at = f"At {', '.join(first)} and {last} times the noise" if first else "At the stated noise"
+    claims = " and ".join(
+        _claim(c[: n or len(c)], c[n:] if n else ()) for c, n in zip(found.claims, found.shared, strict=False)
+    )
+    laws = " and ".join(" or ".join(c) for c in found.claims)
+    held = {
+        "none": "nothing is missing",
+        "undescribed": "this model does not describe these runs",
+        "open": "the answer differs: whether anything is missing depends on the noise",
+        "named": f"{laws} is established as a law",
+        "class": f"one of {laws} is established",
+        "mechanism": f"{claims} is established as a mechanism",
+        "place": f"{claims or 'something'} is missing, and no more is established",
+    }
+    return f"{at} {held[found.level]}"
+
+
+def _claim(sure: Sequence[str], others: Sequence[str]) -> str:
+    """Members of a claim, and what some noises do not tell from them."""
+    apart = f" (not told at each noise from a {' or a '.join(others)})" if others else ""
+    return f"a {' or a '.join(sure)}{apart}"
+
+
+def _undescribed(said: loop_notes.Summary) -> str:
+    """That a model does not describe the runs, by how much, and what to check."""
+    each = [
+        f"{channels.find(m.channel).label} by {100 * m.error:.0f} % of its measured rms"
+        + (f" (its noise is estimated as {100 * m.noise:.0f} %)" if m.noise > m.error else "")
+        for m in said.missed
+    ]
+    check = [f"columns that vary and are not used ({', '.join(said.unused)})"] * bool(said.unused)
+    check += [f"parameters far from their priors ({', '.join(said.far)})"] * bool(said.far)
+    check += ["units, signs and sides of the columns"]
+    return (
+        f"This model does not describe these runs: refitted, it misses {', '.join(each)}. No effect is named. "
+        f"Check first: {'; '.join(check)}."
+    )
+
+
+def _mechanism(found: loop_notes.Mechanism, within: str) -> str:
+    """A mechanism with its evidence."""
+    return f"a {' or a '.join(found.families)}{within}, established as a mechanism: it {evidence(found)}"
+
+
+def evidence(found: loop_notes.Mechanism) -> str:
+    """How large a mechanism is, what it predicts, and whether it is found again."""
+    errors = f", {found.gain / found.se:.1f} standard errors" if 0 < found.se < math.inf else ""
+    return (
+        f"explains {100 * found.share:.0f} % of the excess misfit, gains {found.gain:.2g} nat a reading that it "
+        f"changes on runs that the fit has not seen{errors}, and is found again in {100 * found.again:.0f} % of the "
+        "data with a block left out"
+    )
+
+
+#: What speaks against a mechanism.
+NO_MECHANISM = {
+    "share": "it explains only {share:.0f} % of the excess misfit",
+    "gain": "on runs that its fit has not seen it gains {0.gain:.2g} ± {0.se:.2g} nat a reading",
+    "again": "it is found again in only {again:.0f} % of the data with a block left out",
+    "many": "{many} variables may drive it",
+}
+
+
+def no_mechanism(found: loop_notes.Mechanism) -> str:
+    """What speaks against the mechanism that explains most."""
+    numbers = {"share": 100 * found.share, "again": 100 * found.again, "many": len(found.drivers)}
+    why = [NO_MECHANISM[name].format(found, **numbers) for name in found.fails]
+    return f"the best one is a {found.families[0]}, but {' and '.join(why)}"
+
+
+def course(d: UnnamedDiscrepancy) -> str:
+    """Course of a smooth curve in words, with its values at both ends; empty for one that is over no variable."""
+    if d.window is not None or d.variable not in bases.VARIABLES or len(d.at) < 2:
+        return ""
+    ends = [f"{d.value[k]:.2g} {d.unit} at {_level(d.variable, d.at[k])}" for k in (0, -1)]
+    k = int(np.argmax(np.abs(d.value - np.interp(d.at, d.at[[0, -1]], d.value[[0, -1]]))))
+    between = f", by way of {d.value[k]:.2g} {d.unit} at {_level(d.variable, d.at[k])}"
+    bent = not min(d.value[0], d.value[-1]) <= d.value[k] <= max(d.value[0], d.value[-1])
+    verb = "rises" if d.value[-1] > d.value[0] else "falls"
+    return f"{verb} from {ends[0]} to {ends[1]}{between * bent}"
+
+
+def proposed_formula(d: UnnamedDiscrepancy) -> str:
+    """The formula of a curve, or its course where no single term explains it."""
+    if d.proposal.expression:
+        return f"{d.proposal.formula} ({d.proposal.mark})"
+    what = course(d)
+    return f"The curve {what}; {NO_FORMULA}" if what else NO_FORMULA
+
+
+#: Units in which people set the variables of a curve, and their SI values.
+_SET_IN = {"speed_motor": ("rpm", math.pi / 30), "slope": ("°", math.pi / 180), "speed": ("mm/s", 1e-3)}
+
+
+def _level(variable: str, x: float) -> str:
+    units = {"voltage": "V", "current": "A", "payload": "kg", "time": "s"}
+    unit, factor = _SET_IN.get(variable, (units.get(variable, ""), 1.0))
+    return f"{float(f'{x / factor:.3g}'):g} {unit}".rstrip()
+
+
+def brief(said: loop_notes.Summary) -> str:
+    """A verdict, and the effects in the model by their leaders."""
+    found = []
+    if said.verdict == "mechanism" and said.mechanism is not None:
+        found.append(" or ".join(said.mechanism.families))
+    for word, established in (("established", True), ("tentative", False)):
+        names = [one.names[0] for one in said.missing if one.established == established]
+        found += [f"{', '.join(names)} {word}"] * bool(names)
+    return ": ".join([said.verdict, *[", ".join(found)] * bool(found)])
+
+
+def at_other_noise(found: Sequence[Sensitivity]) -> str:
+    """The verdicts with other noise, in a sentence; empty for none."""
+    same: dict[str, list[str]] = {}
+    for one in found:
+        same.setdefault(brief(one.summary), []).append(f"{one.factor:g}")
+    each = [
+        f"with {' and with '.join(factors)} times that noise the verdict is {words}"
+        for words, factors in same.items()
+    ]
+    near = " (by fits a few steps from those with the stated noise)" if any(one.near for one in found) else ""
+    return "; ".join(each) + near
+
+
+def _named(one: loop_notes.Missing) -> str:
+    """An effect, with what it cannot be told from."""
+    if len(one.names) + len(one.values) == 1:
+        return one.names[0]
+    family = f"{one.families[0]}, " if len(one.families) == 1 else ""
+    listed = ", ".join(one.names) if len(one.names) == 1 else f"one of {', '.join(one.names)}"
+    values = [freed_value(v) for v in one.values]
+    return f"{family}{', or '.join([listed, *values])} (these data cannot tell which)"
+
+
+def _tentative(those: Sequence[loop_notes.Missing], support: loop_notes.NameSupport | None) -> str:
+    """Effects that are in the model without a name of their own, each with what speaks against it."""
+    if not those:
+        return ""
+    each = [
+        f"{_named(one)}, which {doubts(one.test)}" if doubts(one.test) else f"{_named(one)} ({reason(support)})"
+        for one in those
+    ]
+    return f" Tentative, in the model since it predicts better: {'; '.join(each)}."
+
+
+def verdict(stages: LoopStages) -> str:
+    """The verdict as soon as it is known: `verdict: class, series_resistance or supply_sag`."""
+    sure = [" or ".join(members) for members in stages.members] or [f"a {family}" for family in stages.families]
+    return f"verdict: {', '.join((stages.verdict, *sure))}"
+
+
+def ranking(found: Ranking, most: int = 5) -> list[str]:
+    """What regression says of the library, a line each: whether anything is missing, and the strongest effects."""
+    by = f"by regression on {found.windows} windows of the log" if found.windows else "by regression"
+    if not found.missing:
+        return [f"{by}: nothing is missing (family-wise p = {found.p_value:.2g})"]
+    first = f"{by}, not yet confirmed: something is missing (family-wise p {p_value(found.p_value)})"
+    beyond = [e for e in found.effects if e.score > found.chance and not e.supplies][:most]
+    if not beyond:
+        return [f"{first}; no effect explains more than chance"]
+    lines = [
+        f"  {k}. {e.name}, a {e.family}: lowers the misfit by {rounded(e.score)} σ², "
+        f"amplitude {e.amplitude:.3g} ± {e.sd:.2g} {e.unit}".rstrip(" -")
+        for k, e in enumerate(beyond, 1)
+    ]
+    return [f"{first}; effects by what each alone would explain:", *lines]
+
+
+def so_far(effects: Sequence[str], families: Sequence[str]) -> str:
+    """What a search has found whose verdict is not known yet."""
+    return (
+        f"so far, confirmed by simulation: {' and '.join(f'a {f}' for f in dict.fromkeys(families))} "
+        f"({' and '.join(effects)}); which claim stands is not tested yet"
+    )
+
+
+def _without_name(where: DiscrepancyLocation, p: float, no_effect: str) -> str:
+    others = [bases.in_words(p).removesuffix(" balance") for p in where.alike if p != where.place]
+    also = f" (or {', '.join(others)}, which act alike in these data)" if others else ""
+    what = f": {where.family}" if where.variable in bases.VARIABLES else ""
+    return (
+        f"Something is missing in the {bases.in_words(where.place)}{also}, {_shown(where)}{what}; no effect of the "
+        f"library {no_effect} (family-wise p {p_value(p)})."
+    )
+
+
+def _shown(where: DiscrepancyLocation) -> str:
+    """Where a discrepancy shows, and where it is as improbable."""
+    well = [shown_over(v, where.by_duty).removeprefix("best shown ") for v in where.variables_alike]
+    return shown_over(where.variable, where.by_duty) + (f" (as well {', '.join(well)})" if well else "")
+
+
+def _within(where: DiscrepancyLocation) -> str:
+    """The window of what happens for a while, after a comma; empty for other discrepancies."""
+    return "" if bases.window(where.variable) is None else f", {_shown(where)}"
+
+
+def shown_over(variable: str, by_duty: bool = False) -> str:
+    """Where a discrepancy shows; `by_duty`: the motors' voltage varied with the duty alone."""
+    variable = "duty" if by_duty and variable == "voltage" else variable
+    happens = bases.window(variable)
+    if variable == "side":
+        return "unlike on the two sides"
+    if happens is None:
+        return f"best shown over {variable.replace('_', ' ')}" if variable != "order" else "drifting from run to run"
+    if happens.axis == "time":
+        return f"from {happens.low:.3g} to {happens.high:.3g} s after the start of the runs"
+    if happens.axis == "order":
+        return f"in runs {happens.low:.0f} to {happens.high:.0f}"
+    return f"in the runs at {happens.words}"
+
+
+def freed_value(v: loop_notes.FreedValue) -> str:
+    """`motor.resistance is 1.94 ohm`."""
+    return f"{v.name} is {v.value:.3g} {v.unit}".strip()
+
+
+def p_value(p: float) -> str:
+    """A p-value; a small one, of which the bootstrap knows little, as a bound rounded up."""
+    if p > 0.01:
+        return f"= {p:.2g}"
+    step = 10.0 ** math.floor(math.log10(p))
+    return f"≤ {math.ceil(p / step - 1e-9) * step:.1g}"
+
+
+def cluster(c: Cluster) -> str:
+    """What rows that lie off have in common."""
+    where = f"at {c.axis} {c.level}" if c.level else f"at {c.axis} {c.low:.3g} to {c.high:.3g}"
+    return f"{c.inside} of {c.of} rows that lie off stand together {where} (p = {c.p:.1g})"
+
+
+# --- the first screen -----------------------------------------------------------------------------------
+
+
+def answer(found: DiscoveryResult) -> str:
+    """Whether the model is complete, in a sentence."""
+    if found.verdict == "none":
+        return "Yes, as far as these runs can show: what the fitted model leaves is noise."
+    if found.verdict == "undescribed":
+        return "No verdict: this model does not describe these runs."
+    sure, weak = ([e for e in found.effects if is_established(found, e) == want] for want in (True, False))
+    lacks, stated = found.unnamed, found.summary.mechanism
+    if found.verdict == "mechanism" and stated is not None:
+        over = ""
+        if lacks is not None:
+            over = f", which {course(lacks)}" if course(lacks) else _within(lacks)
+        return f"No: missing is a {' or a '.join(stated.families)}{over}. Its exact law is not established."
+    if lacks is not None and not weak:
+        place = bases.in_words(lacks.channel or lacks.balance)
+        return f"No. Something is missing in the {place}, and nothing in the library explains it."
+    kinds = list(dict.fromkeys(map(_kind_of, sure)))
+    perhaps = [k for k in dict.fromkeys(map(_kind_of, weak)) if k not in kinds]
+    parts = [f"missing is {' and '.join(kinds)}"] * bool(kinds)
+    parts += [f"{'perhaps also' if kinds else 'perhaps'} {' and '.join(perhaps)}"] * bool(perhaps)
+    return f"No: {'; '.join(parts)}."
+
+
+def _kind_of(effect: FoundEffect) -> str:
+    """`a voltage drop that changes with current`."""
+    return f"a {' or '.join(effect.families)}"
+
+
+def is_established(found: DiscoveryResult, effect: FoundEffect) -> bool:
+    """Whether the name of an effect stands by itself."""
+    return found.support is None or found.support.established(effect.name)
+
+
+def how_sure(found: DiscoveryResult, effect: FoundEffect) -> str:
+    """How sure an effect is, in a few words."""
+    test = None if found.support is None else found.support.test_of(effect.name)
+    if is_established(found, effect):
+        known = "" if test is None else f": {test.root:.1f} σ, where chance reaches {test.needed:.1f}"
+        if test is not None and test.shows_form:
+            over = test.over.replace("_", " ")
+            known += f"; accuracy of its form ±{100 * test.spread:.0f} % over {over}"
+        return f"established{known}"
+    return f"tentative: it predicts, but {doubts(test)}" if doubts(test) else "tentative"
+
+
+def use_it(found: DiscoveryResult) -> list[str]:
+    """How well the robot that is written predicts runs that its fit has not seen, by kind of block."""
+    when = 1 if found.written else 0
+    lines = (
+        [f"Like these runs: errors up to {_worst(found.errors[when], len(found.runs))}."]
+        if found.errors[when]
+        else []
+    )
+    for kind, both in found.errors_held_out.items():
+        lines.append(f"Another {blocks_room.in_words(kind)}: {_worst(both[when], len(found.runs))}.")
+    return lines
+
+
+def _worst(errors: Errors, total: int) -> str:
+    """The largest rms error of any channel, and of how many rows where not all are reached: `16.7 % (14/20)`."""
+    rows = max(int(e["rows"]) for e in errors.values())
+    worst = max((float(e["rms_percent"]) for e in errors.values() if e["rows"]), default=math.nan)
+    few = f" ({rows}/{total} reached)" if rows < total else ""
+    return f"{worst:.1f} %{few}" if rows else "not reached"
+
+
+def largest_share(found: DiscoveryResult) -> str:
+    """The reading that weighs most in what is left; empty where none stands out."""
+    seen, runs = found.readings_of_rows, found.runs
+    after = seen.after if found.written else seen.before
+    squares = np.where(found.included[:, None], ((after - seen.measured) / seen.sd) ** 2, np.nan)
+    total = float(np.nansum(squares))
+    if not total > 0 or (share := 100 * float(np.nanmax(squares)) / total) < SHARE:
+        return ""
+    row, k = np.unravel_index(int(np.nanargmax(squares)), squares.shape)
+    columns = {c: runs[c][row] for c in ("configuration", *runs.axes) if runs.has(c)}
+    at, label = _conditions(columns), found.channels[k].label
+    return f"Row {found.numbers[row]} ({at}): its {label} makes {share:.0f} % of the misfit that is left"
+
+
+def _conditions(columns: Mapping[str, str | float]) -> str:
+    """Conditions of a run by column: `6T2A, 33 V, 20 deg`."""
+    return ", ".join(str(x) if isinstance(x, str) else f"{x:g} {c.rpartition('_')[2]}" for c, x in columns.items())
+
+
+#: Share of what is left from which one reading is worth a look [%].
+SHARE = 10.0
+
+
+def header(found: DiscoveryResult, robot_name: str) -> str:
+    """What heads the proposed robot's file."""
+    start = f" from {robot_name}" if robot_name else ""
+    return f"found by the loop{start} with {found.runs.source}: {found.statement}"
+
+
+def refit_header(found: DiscoveryResult, robot_name: str) -> str:
+    """What heads the file of the robot with nothing added."""
+    start = f" from {robot_name}" if robot_name else ""
+    return f"fitted by the loop{start} to {found.runs.source}, with nothing added"
+
+
+#: In the place of a formula.
+NO_FORMULA = "no single term explains 90 % of it"
+
+# --- whether names stand --------------------------------------------------------------------------------
+
+#: Why names do not stand, or beside what they do.
+REASONS = {
+    "": "",
+    "implausible": "no effect of the library that explains it is of a plausible size",
+    "larger": "{effects} would explain more, but not at a plausible size",
+    "better curve": "one {curves} is the better explanation than {effects}",
+    "curve alone": "one {curves} leaves nothing",
+    "none by itself": "{lost}",
+    "beside": "each by itself, at the fit of the others, explains more than chance would: {strengths}",
+}
+
+
+def reason(support: loop_notes.NameSupport | None) -> str:
+    """Why names do not stand, or beside what they do; empty where there is nothing to say."""
+    if support is None:
+        return ""
+    return REASONS[support.why].format(
+        effects=" and ".join(support.effects),
+        curves=" and ".join(map(_curve, support.curves)),
+        strengths=", ".join(map(_strength, support.tests)),
+        lost="; ".join(f"{t.effect} {doubts(t)}" for t in support.tests if t.fails),
+    )
+
+
+def why(found: DiscoveryResult) -> str:
+    """Why names do not stand, or beside what they do: a curve that leaves nothing comes first."""
+    said, lacks = reason(found.support), found.unnamed
+    if lacks is None or not found.after.adequate or (found.support is not None and found.support.curves):
+        return said
+    over = loop_notes.CurveOver(lacks.place, (lacks.variable,))
+    return "; ".join([REASONS["curve alone"].format(curves=_curve(over)), *[said] * bool(said)])
+
+
+def _strength(test: loop_notes.NameTest) -> str:
+    """How much an effect explains by itself, and what chance and the loss of a row leave of that."""
+    less = "" if test.row is None else f", without {test.what} {test.row} {test.root_without:.1f}"
+    return f"{test.effect} {test.root:.1f} σ (chance {test.needed:.1f}{less})"
+
+
+#: What speaks against an effect by itself: short, and in words.
+DOUBTS = {
+    "chance": ("chance", "explains {0.root:.1f} σ{beside}, and chance reaches {0.needed:.1f}"),
+    "curve": ("a curve", "is a worse explanation than a smooth curve in its place"),
+    "row": ("{0.what} {0.rests_on}", "rests on {0.what} {0.rests_on}"),
+    "blocks": ("blocks", "is chosen again in {again:.0f} % of the data with a block left out"),
+    "larger": ("size", "has a rival of an implausible size ({larger})"),
+    "remains": ("equation", "leaves something in its own equation"),
+    "form": ("its form", "changes{spread} over {over_variable} ({0.varies:.1f} σ)"),
+}
+
+
+def doubts(test: loop_notes.NameTest | None) -> str:
+    """What speaks against an effect by itself; empty for nothing."""
+    if test is None or not test.fails:
+        return ""
+    over = ", ".join(_over(c.place, *c.variables) for c in test.curves)
+    said = {"beside": over and f" beside smooth curves ({over})", "larger": " and ".join(test.larger)}
+    said |= {"over_variable": test.over.replace("_", " ")}
+    said["spread"] = f" by ±{100 * test.spread:.0f} %" if math.isfinite(test.spread) else ""
+    *first, last = [DOUBTS[d][1].format(test, **said, again=100 * test.again) for d in test.fails]
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def _curve(c: loop_notes.CurveOver) -> str:
+    if bases.window(c.variables[0]) is not None:
+        return f"constant in the {bases.in_words(c.place)} {shown_over(c.variables[0])}"
+    return f"smooth {'curve' if len(c.variables) == 1 else 'surface'} in the {_over(c.place, *c.variables)}"
+
+
+def _over(place: str, *variables: str) -> str:
+    """`slip balance over speed motor and slope`."""
+    return f"{bases.in_words(place)} over {' and '.join(v.replace('_', ' ') for v in variables)}"
+
+
+def standing(found: DiscoveryResult) -> str:
+    """Why names do not stand, or beside what they do, in a sentence; empty where there is nothing to say."""
+    if not found.standing:
+        return ""
+    if found.verdict in WITHOUT_NAME:
+        return f"Why no name: {found.standing}."
+    return f"{found.standing[0].upper()}{found.standing[1:]}."
+
+
+def called(found: DiscoveryResult, effect: FoundEffect) -> str:
+    """The name of an effect, and where it is tentative what speaks against it."""
+    said = tentative(found, effect)
+    return f"{effect.name}\n({said})" if said else effect.name
+
+
+def tentative(found: DiscoveryResult, effect: FoundEffect) -> str:
+    """In a few words, what speaks against the name of an effect; empty where it is established."""
+    if found.support is None or is_established(found, effect):
+        return ""
+    test = found.support.test_of(effect.name)
+    return ": ".join(["tentative", *([", ".join(DOUBTS[d][0].format(test) for d in test.fails)] if test else [])])
+
+
+#: Why an effect is not plausible.
+RULED_OUT = {
+    "power": "{0.name} would make its balance supply power",
+    "size": "{0.name} at {0.size:.2g} times its largest plausible size; check {check}",
+    "edge": "{0.name} is within an sd of the largest plausible size",
+}
+
+
+def why_ruled_out(reasons: Sequence[loop_notes.RuledOut]) -> str:
+    """Why effects are not plausible, each."""
+    return "; ".join(RULED_OUT[r.why].format(r, check=" and ".join(r.check)) for r in reasons)
+
+
+def ruled_out(found: DiscoveryResult) -> str:
+    """What would explain the data better than what is proposed, or as well, but for its size; empty for nothing."""
+    candidates, same = found.implausible, found.settings.same
+    if found.verdict not in WITHOUT_NAME:
+        better = tuple(a for a in candidates if a.rise_chi2 < -same)
+        candidates = better or tuple(a for a in candidates if a.rise_chi2 <= same)
+    if not candidates or found.verdict in ("none", "undescribed"):
+        return ""
+    first = min(candidates, key=lambda a: (len(a.effects), a.rise_chi2))
+    what = "the curve" if found.verdict in WITHOUT_NAME else "what is proposed"
+    more = first.rise_chi2 < -found.settings.same
+    gain = f"{misfit(-first.rise_chi2)} σ² more than {what}" if more else f"as much as {what}"
+    are = "are" if len(first.effects) > 1 else "is"
+    return (
+        f"{' and '.join(first.effects)} would explain {gain}, but {are} ruled out by size or sign alone: {first.why}."
+    )
+
+
+# --- beside names ---------------------------------------------------------------------------------------
+
+
+def hidden(found: DiscoveryResult) -> str:
+    """Which effects what was found could hide, and what would show them, in a sentence; empty for none."""
+    if not found.hidden:
+        return ""
+    each = [
+        f"{h.name} up to {h.amplitude:.2g} {h.unit}".strip()
+        + (f" ({h.experiment} would show it)" if h.experiment else "")
+        for h in found.hidden
+    ]
+    return f"Could be hidden behind what was found: {', '.join(each)}."
+
+
+def stated_value(name: str, s: StatedValue) -> str:
+    """`motor.resistance is 1.94 ohm (stated 0.611, +9.6 sds)`."""
+    return (
+        f"{freed_value(loop_notes.FreedValue(name, s.value, s.unit))} (stated {s.stated:.3g}, {s.prior_sds:+.1f} sds)"
+    )
+
+
+def size(e: FoundEffect) -> str:
+    """Amplitude of an effect: `-0.0154 ± 0.00014`, with its unit where it has one."""
+    return _estimate(e.parameters["amplitude"])
+
+
+def _estimate(found: Estimate) -> str:
+    return f"{found.value:.3g} ± {found.sd:.2g} {found.unit}".rstrip(" -")
+
+
+def alike(found: DiscoveryResult, e: FoundEffect) -> str:
+    """What these data cannot tell from an effect: others, of settled runs also what settles to one of them, and
+    stated values that may be wrong instead."""
+    settled = [x.name for x in effects.ALL if x.settles_to in e.members and not found.runs.sampled]
+    others = ", ".join(
+        [
+            name + (f" (at {m.size:.2g} times its largest plausible size)" if m.size >= 1 else "")
+            for name, m in list(e.members.items())[1:]
+        ]
+        + [f"{name} (time histories alone tell that)" for name in settled if name not in e.members]
+    )
+    values = " or ".join(stated_value(name, s) for name, s in e.stated.items())
+    return ", or ".join(words for words in (others, values) if words)
+
+
+def worse(found: Sequence[Worse], predicted: Mapping[str, tuple[int, int]]) -> str:
+    """Which errors rise, and where fewer rows are predicted, in a sentence; empty where none does.
+
+    Args:
+        predicted: kind of block → rows that are predicted before and after.
+    """
+    parts = []
+    for kind, (before, after) in predicted.items():
+        mine = [w for w in found if w.kind == kind]
+        changes = [f"{channels.find(w.channel).label} {_change(w.before, w.after)} %" for w in mine]
+        if any(w.rows < max(before, after) for w in mine):
+            changes[-1] += f" (of the {min(w.rows for w in mine)} rows that both predict)"
+        if before > after:
+            changes.append(f"{counted(before - after, 'row')} fewer predicted")
+        if changes:
+            parts.append(f"by {blocks_room.in_words(kind)} {', '.join(changes)}")
+    return f"Held out, what was found predicts worse: {'; '.join(parts)}." if parts else ""
+
+
+def _change(before: float, after: float) -> str:
+    """Two numbers with as many digits as tell them apart."""
+    texts = [(f"{before:.{k}f}", f"{after:.{k}f}") for k in range(1, 6)]
+    return " → ".join(next((pair for pair in texts if pair[0] != pair[1]), texts[-1]))
+
+
+# --- the track model ------------------------------------------------------------------------------------
+
+
+def asked(about: loop_notes.Asked) -> str:
+    """What the track model was asked about."""
+    return {
+        "missing": f"what is missing in the {about.balance} balance over {about.variable.replace('_', ' ')}",
+        "found": f"{', '.join(about.effects)}, found by the lumped model",
+        "near": f"{', '.join(about.effects)}, which explains the readings nearly as well",
+    }[about.why]
+
+
+def resolved(found: Resolved) -> str:
+    """What the track model says, in a sentence or two."""
+    before, after = found.slip_rms
+    gear = ", ".join(
+        f"{name.removeprefix('running_gear.')} {_estimate(e)}"
+        for name, e in found.constants.items() if name.startswith("running_gear.")
+    )  # fmt: skip
+    on = "" if found.settled else "; the search had not settled, go on with --members and more --generations"
+    slip = f"slip of the {found.rows} rows on tracks {before:.2g} → {after:.2g} points rms"
+    if not found.explains:
+        why = f"; {', '.join(found.outside)} outside" if found.outside else ""
+        return (
+            f"The track model was asked about {asked(found.asked)}: no running gear within its priors was found to "
+            f"leave it ({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}{why}){on}"
+        )
+    held = len(found.constants) - len(found.known_from_rows)
+    known = f"not determined by these rows: {held} of {len(found.constants)} constants"
+    return (
+        f"The track model was asked about {asked(found.asked)}: a running gear within its priors leaves it ({slip}, "
+        f"χ² falls by {found.fall:.0f}, p = {found.p:.2g}): {gear}; {known}{on}"
+    )
+
+
+# --- remarks --------------------------------------------------------------------------------------------
+
+
+def in_parts(noise: SeriesNoise) -> str:
+    """An estimated sd: `0.055 A and 1.3 % of the reading`."""
+    parts = [
+        f"{noise.floor / noise.channel.factor:.2g} {noise.channel.unit}" if noise.floor or not noise.share else "",
+        f"{100 * noise.share:.2g} % of the reading" if noise.share else "",
+    ]
+    step = math.sqrt(12) * noise.least / noise.channel.factor
+    shown = f" (its display steps by {step:.2g} {noise.channel.unit})" if noise.least > noise.floor else ""
+    return " and ".join(filter(None, parts)) + shown
+
+
+def noise_from_series(note: loop_notes.NoiseFromSeries) -> str:
+    """Channels whose sds are estimated along series."""
+    shown = [f"{s.channel.label} {in_parts(s)}" for s in note.noise]
+    along = dict.fromkeys(f"{s.count} series of {s.axis}" for s in note.noise)
+    freedom = min(s.freedom for s in note.noise)
+    return (
+        f"no sd is stated for {', '.join(s.channel.name for s in note.noise)}: {', '.join(shown)} are estimated "
+        f"from how readings scatter along {' and '.join(along)} ({freedom:.1f} degrees of freedom); state yours with "
+        "--noise"
+    )
+
+
+def copies(note: loop_notes.Copies) -> str:
+    """Rows that copy earlier ones."""
+    rows = ", ".join(map(str, note.rows))
+    if len(note.rows) == 1:
+        return f"row {rows} is an exact copy of an earlier one and counts once"
+    return f"rows {rows} are exact copies of earlier ones and count once"
+
+
+def kept_out(note: loop_notes.KeptOut) -> str:
+    """Rows that do not count."""
+    why = {
+        "unusable": "are not used: the fitted model slides or fails there",
+        "outliers": "stand alone: outliers, which no effect explains; they are kept out",
+    }
+    return f"rows {', '.join(map(str, note.rows))} {why[note.why]}"
+
+
+def still_lacks(note: loop_notes.StillLacks) -> str:
+    """What the effects found leave."""
+    place, over = bases.in_words(note.place), note.variable.replace("_", " ")
+    return f"what was found does not explain everything: the {place} still lacks something over {over}"
+
+
+def late(note: loop_notes.Late) -> str:
+    """How late what is imposed acts, and what to state."""
+    when = "later" if note.delay > 0 else "earlier"
+    return (
+        f"what is imposed acts {1e3 * abs(note.delay):.3g} ± {1e3 * note.sd:.2g} ms {when} than its column says, and "
+        f'the rig\'s file states no delay: with [rig] delay = "{note.delay:.3g} ± {note.sd:.2g}" it begins there'
+    )
+
+
+def led(note: loop_notes.Led) -> str:
+    """By what the leader of a class was chosen, and whether the other way would have chosen another."""
+    names, leader = note.names, note.leader
+    by = {
+        HELD_OUT: "errors held out",
+        FIT: "the fit to all rows",
+        loop_notes.DRAW: f"the fit to all rows, as errors held out are within {note.told:.0%}",
+    }
+    each = ", ".join(f"{n} {x:.2f} σ" for n, x in zip(names, note.rms_sigma, strict=True))
+    said = f"{names[leader]} comes first in its class by {by[note.by]}; errors held out: {each}"
+    if note.prefer == HELD_OUT and leader != note.closest:
+        said += f"; by the fit to all rows {names[note.closest]} would, by Δχ² {note.rise_chi2:.1f}"
+    if leader != note.best:
+        asked = note.prefer == HELD_OUT
+        why = "is not as adequate" if asked else f"would come first by --prefer {HELD_OUT}, where adequate"
+        said += f"; {names[note.best]} {why}"
+    return said
+
+
+def rests_on(note: loop_notes.RestsOn) -> str:
+    """An effect that stands by one run alone."""
+    test = note.test
+    at = _conditions(note.conditions)
+    run = f"{test.what} {test.rests_on}{f' ({at})' * bool(at)}"
+    beside = " and ".join(f"{x:g}" for x in note.beside)
+    others = f"run it at {note.axis} {beside} too" if beside else "runs at conditions on either side of it"
+    return (
+        f"{test.effect} rests on {test.what} {test.rests_on} ({test.root:.1f} σ with it, {test.root_without:.1f} σ "
+        f"without): repeat {run}, and {others}"
+    )
+
+
+def unwritten(note: loop_notes.Unwritten) -> str:
+    """Why what was found is not in the robot that is written."""
+    what = "the curve" if note.curve else "what was found"
+    how = "no better than" if note.curve and note.gain > 0 else "worse than"
+    return (
+        f"{what} predicts runs that it has not seen {how} the refit ({note.gain:+.2f} ± {note.se:.2f} nat a "
+        "reading): robot.toml is the refit"
+    )
+
+
+def outstanding(note: loop_notes.Outstanding) -> str:
+    """Verdicts that are not there yet."""
+    at = " and ".join(f"{f:g}" for f in note.factors)
+    return (
+        f"out of time: whether the verdict stands with {at} times the {note.word} noise is not known; run the same "
+        "command without --within"
+    )
+
+
+#: Kind of note → a sentence with its fields, or a function that makes one.
+SAID: dict[type, str | Callable[[Any], str]] = {
+    loop_notes.AssumedNoise: "no sd is stated for {channels}: {usual} is assumed; state yours with --noise",
+    loop_notes.NoiseFromSeries: noise_from_series,
+    loop_notes.RefitWorse: lambda note: (
+        f"{note.channel}: the refit misses it by {note.refit:.0%} of its measured rms and the robot as stated by "
+        f"{note.stated:.0%}, so the {note.word} noise gives some of its readings too large a weight; state the "
+        "instrument's with --noise"
+    ),
+    loop_notes.Copies: copies,
+    loop_notes.KeptOut: kept_out,
+    loop_notes.PhasesDiffer: "the wave stands at another angle in each run (it explains {free:.0f} σ² free in each, "
+    "{held:.0f} with one phase): robot.toml holds the mean; start runs from a mark",
+    loop_notes.StillLacks: still_lacks,
+    loop_notes.Late: late,
+    loop_notes.Led: led,
+    loop_notes.NotPredictable: lambda note: (
+        f"not predictable from the others, so neither scored nor tested: blocks by "
+        f"{' and by '.join(blocks_room.in_words(kind) for kind in note.kinds)} that hold all runs of a configuration "
+        "with parameters of its own"
+    ),
+    loop_notes.LostReplicates: "only {settled} of {asked} bootstrap tables could be fitted again; the thresholds are "
+    "theirs",
+    loop_notes.Outstanding: outstanding,
+    loop_notes.TooFewReplicates: "{settled} bootstrap tables are too few for every kind of evidence "
+    "to count; use 500 or "
+    "more",
+    loop_notes.RestsOn: rests_on,
+    loop_notes.Unwritten: unwritten,
+}

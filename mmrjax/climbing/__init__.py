@@ -1,0 +1,1 @@
+"""Levers, posture, terrain and static limits, and a robot that climbs."""

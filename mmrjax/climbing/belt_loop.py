@@ -1,0 +1,191 @@
+"""A belt round two pulleys of unlike radius: where its points are, how its grousers stand, what it does to corners.
+
+The frame has its origin on the first pulley's axle and its first axis towards the second pulley. The belt runs
+clockwise: along the lower run to the first pulley, up, along the upper run to the second, down. A point of it is
+told by how far it is along the path from the middle of the lower run.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mmrjax.model.params import Scalar
+
+
+class Loop(eqx.Module):
+    """A closed belt with grousers.
+
+    Attributes:
+        first, second: pitch radii of the pulleys [m], the first not the smaller; distance: of their axles [m].
+        grouser_height, grouser_length: over the pitch line, and along it [m].
+        grousers: their number.
+    """
+
+    first: Scalar
+    second: Scalar
+    distance: Scalar
+    grouser_height: Scalar
+    grouser_length: Scalar
+    grousers: int = eqx.field(static=True)
+
+    @property
+    def taper(self) -> Scalar:
+        """Angle between a run and the line of the axles [rad]."""
+        return jnp.arcsin((self.first - self.second) / self.distance)
+
+    @property
+    def run(self) -> Scalar:
+        """Length of a straight run [m]."""
+        return self.distance * jnp.cos(self.taper)
+
+    @property
+    def marks(self) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+        """Where the first arc begins and ends, and the second [m along the path]."""
+        begin = self.run / 2
+        end = begin + self.first * (jnp.pi + 2 * self.taper)
+        return begin, end, end + self.run, end + self.run + self.second * (jnp.pi - 2 * self.taper)
+
+    @property
+    def length(self) -> Scalar:
+        """Length of the belt [m]."""
+        return self.marks[3] + self.run / 2
+
+    @property
+    def pitch(self) -> Scalar:
+        """Pitch of the grousers [m]."""
+        return self.length / self.grousers
+
+    def normal(self, turned: Array) -> Float[Array, "n 2"]:
+        """Outward normal of a belt that has `turned` by so much since its lower run [rad]."""
+        return jnp.stack([-jnp.sin(turned - self.taper), -jnp.cos(turned - self.taper)], axis=-1)
+
+    def turned(self, place: Array) -> Array:
+        """Angle by which the belt has turned since its lower run [rad], at `place` [m], also beyond an end."""
+        a, b, c, d = self.marks
+        return jnp.clip(place - a, 0.0, b - a) / self.first + jnp.clip(place - c, 0.0, d - c) / self.second
+
+    def tilt(self, place: Array) -> tuple[Array, Array]:
+        """Angle [rad] of a grouser on its rigid base, the mean of the path's under it, and how it rises [rad/m]."""
+        half = self.grouser_length / 2
+
+        def integral(s: Array) -> Array:
+            total = jnp.zeros_like(s)
+            for begin, end, radius in zip(self.marks[::2], self.marks[1::2], (self.first, self.second), strict=True):
+                within = jnp.clip(s - begin, 0.0, end - begin)
+                total = total + (within**2 / 2 + (end - begin) * jnp.maximum(s - end, 0.0)) / radius
+            return total
+
+        mean = (integral(place + half) - integral(place - half)) / self.grouser_length
+        return mean, (self.turned(place + half) - self.turned(place - half)) / self.grouser_length
+
+    def point(self, place: Array) -> Float[Array, "n 2"]:
+        """Points of the pitch line [m] at `place` from 0 to the belt's length."""
+        a, b, c, d = self.marks
+        normal = self.normal(self.turned(place))
+        first = place < (b + c) / 2
+        first = first & (place > -self.run)
+        along = jnp.where(
+            first,
+            jnp.minimum(place - a, 0.0) + jnp.maximum(place - b, 0.0),
+            jnp.minimum(place - c, 0.0) + jnp.maximum(place - d, 0.0),
+        )
+        radius = jnp.where(first, self.first, self.second)
+        centre = jnp.stack([jnp.where(first, 0.0, self.distance), jnp.zeros_like(place)], axis=-1)
+        return centre + radius[..., None] * normal + along[..., None] * tangent(normal)
+
+    def places(self, drawn: Scalar) -> Float[Array, " grousers"]:
+        """Where the grousers are once the belt has run on by `drawn` [m]."""
+        return jnp.mod(jnp.arange(self.grousers) * self.pitch + drawn, self.length)
+
+    def project(self, at: Float[Array, "n 2"]) -> tuple[Array, Array]:
+        """Height of points over the pitch line [m], negative within the belt, and the place under them [m]."""
+        a, b, c, _ = self.marks
+        sin, cos = jnp.sin(self.taper), jnp.cos(self.taper)
+        upper = at[..., 1] > 0
+        beside = jnp.abs(at[..., 1])
+        along = at[..., 0] * cos - beside * sin
+        from_second = at - jnp.stack([self.distance, jnp.zeros_like(self.distance)])
+        on_first, on_second = along < 0, along > self.run
+        height = jnp.where(
+            on_first,
+            _size(at) - self.first,
+            jnp.where(on_second, _size(from_second) - self.second, at[..., 0] * sin + beside * cos - self.first),
+        )
+        straight = jnp.where(upper, b + along, jnp.mod(a - along, self.length))
+        place = jnp.where(
+            on_first,
+            a + self.first * self._angle(at),
+            jnp.where(on_second, c + self.second * (self._angle(from_second) - jnp.pi - 2 * self.taper), straight),
+        )
+        return height, place
+
+    def _angle(self, arm: Array) -> Array:
+        """By how much a belt with its normal along `arm` has turned since its lower run [rad]."""
+        return jnp.mod(jnp.arctan2(-arm[..., 0], -arm[..., 1]) + self.taper, 2 * jnp.pi)
+
+
+class Tips(NamedTuple):
+    """Tips of grousers [m], and their displacement per displacement of the belt [-], each (n, 2)."""
+
+    at: Array
+    rate: Array
+
+
+def tips(loop: Loop, place: Float[Array, " n"]) -> Tips:
+    """Tips of the grousers at `place` [m along the path]; see `belt.tips` on their rigid bases."""
+    tilt, rise = loop.tilt(place)
+    normal = loop.normal(tilt)
+    height = loop.grouser_height
+    run = tangent(loop.normal(loop.turned(place)))
+    return Tips(loop.point(place) + height * normal, run + height * rise[:, None] * tangent(normal))
+
+
+class Corners(NamedTuple):
+    """How near a belt is to points beside it.
+
+    Attributes:
+        gap: between them [m]; normal: out of the belt, (n, 2); rate: displacement of the belt's material there per
+            displacement of the belt, (n, 2); place: on the path [m].
+    """
+
+    gap: Array
+    normal: Array
+    rate: Array
+    place: Array
+
+
+def surface(loop: Loop, at: Float[Array, "n 2"]) -> Corners:
+    """The belt between its grousers beside points."""
+    height, place = loop.project(at)
+    normal = loop.normal(loop.turned(place))
+    return Corners(height, normal, tangent(normal), place)
+
+
+def teeth(loop: Loop, drawn: Scalar, at: Float[Array, "n 2"]) -> Corners:
+    """The grouser nearest to each of some points, a rigid tooth with flanks across its base."""
+    under = loop.project(at)[1]
+    ahead = jnp.mod(under - drawn + loop.pitch / 2, loop.pitch) - loop.pitch / 2
+    place = jnp.mod(under - ahead, loop.length)
+    tilt, rise = loop.tilt(place)
+    normal = loop.normal(tilt)
+    along = tangent(normal)
+    arm = at - loop.point(place)
+    u, w = jnp.sum(arm * along, axis=-1), jnp.sum(arm * normal, axis=-1)
+    flank, top = jnp.abs(u) - loop.grouser_length / 2, w - loop.grouser_height
+    outward = jnp.where((flank > top)[:, None], jnp.sign(u)[:, None] * along, normal)
+    run = tangent(loop.normal(loop.turned(place)))
+    rate = run + rise[:, None] * (w[:, None] * along - u[:, None] * normal)
+    return Corners(jnp.maximum(flank, top), outward, rate, place)
+
+
+def tangent(normal: Array) -> Array:
+    """Direction of running where the belt's outward normal is `normal`."""
+    return jnp.stack([normal[..., 1], -normal[..., 0]], axis=-1)
+
+
+def _size(vector: Array) -> Array:
+    return jnp.sqrt(jnp.sum(vector**2, axis=-1) + 1e-300)

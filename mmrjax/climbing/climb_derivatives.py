@@ -1,0 +1,214 @@
+"""Margins of one climb, that of its success among them, and their derivatives forward through its simulation.
+
+Derivatives are those of the computed run, with contacts that open and close at their instants. They do not know that
+with another robot another grouser meets the edge: slopes over a stretch of each value, of runs side by side, do.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mmrjax.climbing import climb_simulation as climb
+from mmrjax.climbing.climb_simulation import OVER, RISES, SETTLES, TURNED_OVER, UNFINISHED, Climb, Passed, Sequence
+from mmrjax.climbing.footing import PITCH
+from mmrjax.climbing.terrain import Terrain
+from mmrjax.compile.compiling import SELDOM, compiled
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+
+#: Margins within so much of the least one count beside it, and so do instants [-].
+SMOOTH = 0.05
+#: Runs of which a slope is made.
+BESIDE = 8
+#: What a climb comes to: unit and words. Of a robot that gets over all are taken up to the crest, where its centre of
+#: mass is past the obstacle: how it falls on its nose then is another matter. Margins are shares.
+OUTPUTS: dict[str, tuple[str, str]] = {
+    "margin_success": ("-", "smoothed least of the four margins: above 0 where it gets over, else below"),
+    "margin_reach": ("-", "how far its centre of mass ends beyond the obstacle, of half the wheelbase; 1 if over"),
+    "margin_upright": ("-", "what was left to the pitch at which it tips, of that pitch"),
+    "margin_grip": ("-", "what the friction of the ground had left, of all that it could hold"),
+    "margin_torque": ("-", "what the traction motors had left, of their torque at stall"),
+    "crest_time_s": ("s", "time to the crest, or to the verdict"),
+    "crest_energy_J": ("J", "energy of all motors until then"),
+    "crest_current_rms_A": ("A", "root mean square of the current of each traction motor until then"),
+    "crest_current_most_A": ("A", "largest current of each traction motor until then"),
+    "crest_front_current_most_A": ("A", "the same of the front levers' motor"),
+    "crest_rear_current_most_A": ("A", "the same of the rear levers' motor"),
+}
+
+
+class Given(NamedTuple):
+    """One run, fields without a leading axis."""
+
+    robot: Robot
+    conditions: Conditions
+    terrain: Terrain
+    sequence: Sequence
+
+
+def least(values: Float[Array, " n"]) -> Scalar:
+    """Smoothed least of values, -τ log mean exp(-x / τ) with τ = `SMOOTH`: between the least and the mean."""
+    lowest = jax.lax.stop_gradient(jnp.min(values))
+    return lowest - SMOOTH * jnp.log(jnp.mean(jnp.exp(-(values - lowest) / SMOOTH)))
+
+
+def crest(terrain: Terrain, record: Passed, over: bool) -> int | None:
+    """The first sample at which the centre of mass of a robot that gets over is past the obstacle; else None."""
+    return int(jnp.argmax(record.centre > terrain.finish)) if over else None
+
+
+def outputs(robot: Robot, terrain: Terrain, record: Passed, crest: int | None) -> dict[str, Scalar]:
+    """`OUTPUTS` of a run until its verdict, from its record of shape (samples,)."""
+    reach = jnp.asarray((record.centre - terrain.finish) / (robot.running_gear.wheelbase / 2))
+    # the crest is between two samples
+    share = jnp.ones(()) if crest is None else -reach[crest - 1] / (reach[crest] - reach[crest - 1])
+    until: Passed = jax.tree.map(lambda x: x[: None if crest is None else crest + 1], record)
+
+    def end(x: Scalar) -> Scalar:
+        x = jnp.asarray(x)
+        return x[-2] + share * (x[-1] - x[-2])
+
+    driven = until.time >= SETTLES + RISES
+    stall = jnp.where(driven, until.voltage, 1.0) / robot.motor.resistance
+    margins = {
+        "margin_reach": reach[-1] if crest is None else jnp.ones(()),
+        "margin_upright": least(1 - jnp.abs(until.motion.q[:, PITCH]) / TURNED_OVER),
+        "margin_grip": least(jnp.asarray(1 - until.grip)),
+        "margin_torque": least(1 - jnp.where(driven, until.current, 0.0) / stall),
+    }
+    levers = jnp.max(jnp.abs(until.lever_current), axis=0)
+    return {
+        "margin_success": least(jnp.stack(list(margins.values()))),
+        **margins,
+        "crest_time_s": end(until.time),
+        "crest_energy_J": end(until.energy["supply"] + until.energy["levers"]),
+        "crest_current_rms_A": jnp.sqrt(jnp.mean(until.current**2)),
+        "crest_current_most_A": jnp.max(jnp.abs(until.current)),
+        "crest_front_current_most_A": levers[0],
+        "crest_rear_current_most_A": levers[1],
+    }
+
+
+class Derivatives(NamedTuple):
+    """What a climb comes to, by the names of `OUTPUTS`, and its derivatives by values.
+
+    Attributes:
+        climb: the run; found: its outputs; by: their derivatives, of shape (values,).
+        slope, slope_sd: of straight lines through `BESIDE` runs along each value, and how well these determine it.
+    """
+
+    climb: Climb
+    found: dict[str, float]
+    by: dict[str, Float[np.ndarray, " values"]]
+    slope: dict[str, Float[np.ndarray, " values"]]
+    slope_sd: dict[str, Float[np.ndarray, " values"]]
+
+
+def climb_derivatives(
+    given: Callable[[Float[Array, " values"]], Given],
+    values: Float[Array, " values"],
+    widths: Float[Array, " values"],
+    *,
+    duration: float = climb.DURATION,
+    step: float = climb.STEP,
+    sample: float = climb.SAMPLE,
+    part: float = 1.0,
+    progress: Callable[[float], None] | None = None,
+) -> Derivatives:
+    """One climb and the derivatives of `OUTPUTS` by the `values` of which its robot, conditions, terrain and sequence
+    are made, with slopes over `widths` to both sides. The other arguments are those of `climb_batch`."""
+    directions = jnp.eye(len(values))
+    parts, samples, steps = climb.divided(duration, step, sample, part)
+    interval, each = jnp.asarray(step, float), jnp.asarray(steps)
+    run, turned = _along(given, values, directions)
+    state, moved = _along(functools.partial(_initial, step=interval), run, turned)
+    records: list[Any] = []
+    for k in range(parts):
+        first = jnp.asarray(k * samples * steps * step)
+        (state, record), (moved, changed) = _part((run, state), (turned, moved), first, interval, each, samples)
+        records.append(jax.device_get((record, changed)))
+        if progress is not None:
+            progress((k + 1) / parts / 2)
+        if state[2].verdict >= 0:
+            break
+    record = jax.tree.map(lambda *x: jnp.concatenate(x), *[r for r, _ in records])
+    changed = jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *[c for _, c in records])
+    verdict, ended = int(state[2].verdict), state[2].ended
+    last = UNFINISHED if verdict < 0 else verdict, ended, state[2].furthest
+    whole = Climb(*jax.tree.map(lambda x: np.asarray(x)[None], (*last, record)))
+    ran = jax.tree.map(jnp.asarray, whole.run(0))
+    count = len(ran.time)
+    top = crest(run.terrain, ran, verdict == OVER)
+    found, by = _along(
+        lambda run_of: outputs(run_of[0].robot, run_of[0].terrain, run_of[1], top),
+        (run, ran),
+        (turned, jax.tree.map(lambda x: x[:, :count], changed)),
+    )
+    offsets = np.linspace(-1, 1, BESIDE)
+    beside = jnp.concatenate([values + np.outer(offsets, unit * widths) for unit in directions])
+    more = jax.vmap(given)(beside)
+    batch = climb.climb_batch(
+        *more, duration=duration, step=step, sample=sample, part=part,
+        progress=None if progress is None else lambda share: progress((1 + share) / 2),
+    )  # fmt: skip
+    single = (jax.tree.map(lambda x, k=k: x[k], (more.robot, more.terrain)) for k in range(len(beside)))
+    others = [outputs_of_run(robot, terrain, batch, k) for k, (robot, terrain) in enumerate(single)]
+    slope, sd = {}, {}
+    for name in found:
+        y = np.array([float(other[name]) for other in others]).reshape(-1, BESIDE)
+        square, off = np.sum(offsets**2), y - y.mean(axis=1, keepdims=True)
+        rise = off @ offsets / square
+        left = off - np.outer(rise, offsets)
+        slope[name] = rise / np.asarray(widths)
+        sd[name] = np.sqrt(np.sum(left**2, axis=1) / (BESIDE - 2) / square) / np.asarray(widths)
+    return Derivatives(
+        whole, {n: float(x) for n, x in found.items()}, {n: np.asarray(x) for n, x in by.items()}, slope, sd
+    )
+
+
+def outputs_of_run(robot: Robot, terrain: Terrain, ended: Climb, k: int) -> dict[str, Scalar]:
+    """`OUTPUTS` of run `k` of a batch."""
+    record = jax.tree.map(jnp.asarray, ended.run(k))
+    return outputs(robot, terrain, record, crest(terrain, record, bool(ended.verdict[k] == OVER)))
+
+
+def _along(function: Callable[[Any], Any], at: Any, directions: Any) -> tuple[Any, Any]:
+    """A function and how its numbers change along `directions`, leaves with a leading axis (None: not at all)."""
+    numbers, rest = eqx.partition(at, eqx.is_inexact_array)
+    further: list[Any] = []
+
+    def one(moved: Any) -> tuple[Any, Any, Any]:
+        def of_numbers(numbers: Any) -> tuple[Any, Any]:
+            found, others = eqx.partition(function(eqx.combine(numbers, rest)), eqx.is_inexact_array)
+            arrays, words = eqx.partition(others, eqx.is_array)
+            further.append(words)
+            return found, arrays
+
+        return jax.jvp(of_numbers, (numbers,), (moved,), has_aux=True)
+
+    found, changed, arrays = jax.vmap(one, out_axes=(None, 0, None))(directions)
+    return eqx.combine(found, arrays, further[-1]), changed
+
+
+def _initial(run: Given, step: Scalar) -> Any:
+    return climb.begin(climb.system(*run, step))
+
+
+def _sampled(at: tuple[Given, Any], first: Scalar, step: Scalar, steps: Scalar, samples: int) -> Any:
+    run, state = at
+    return climb.sampled(climb.system(*run, step), state, first, steps, samples)
+
+
+@functools.partial(compiled, options=SELDOM)
+def _part(at: Any, directions: Any, first: Scalar, step: Scalar, steps: Scalar, samples: int) -> Any:
+    along = functools.partial(_sampled, first=first, step=step, steps=steps, samples=samples)
+    return _along(along, at, directions)

@@ -1,0 +1,685 @@
+"""Half a robot with levers over a terrain in its plane of travel: its state, one step, and how a run ends.
+
+The bodies are the chassis with payload, two pulleys and two levers; the belts run rigidly with the pulleys. The
+levers' drives follow a sequence of angles at most at the levers' rate, or have its voltages. Contacts are of
+`footing`, the drive of the tracks of `balances`, those of the levers of `lever_drives`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mmrjax.climbing import footing
+from mmrjax.climbing.footing import COORDINATES, FRONT, PITCH, REAR, SHAFT, Footing, Shape
+from mmrjax.climbing.lever_drives import LeverDrive, Swing, lever_drive, swing
+from mmrjax.climbing.terrain import Terrain
+from mmrjax.compile.compiling import SMALL, compiled
+from mmrjax.model import balances, contact
+from mmrjax.model.chassis import Chassis
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.masses import Masses, without_levers
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import GRAVITY, Signals, State
+from mmrjax.model.track_friction import Track
+from mmrjax.numerics.linear_equations import factorise, solution
+from mmrjax.undercarriage.half_robot import contacts_resist, current_after
+from mmrjax.undercarriage.running_gear import RunningGear
+
+#: How a climb ends; the last two: its time was over while it still went on, numbers that mean nothing.
+VERDICTS = OVER, TIPS, STALLS, SLIDES, HANGS, UNFINISHED, FAILED = range(7)
+NAMES = ("over", "tips", "stalls", "slides", "hangs", "unfinished", "failed")
+_RUNNING = -1
+
+STEP, SAMPLE, DURATION = 1e-4, 2e-2, 20.0  # [s]
+SETTLES, RISES = 0.3, 0.1  # before the motors are switched on, and until they have their voltage [s]
+#: Pitch beyond which a robot has turned over [rad].
+TURNED_OVER = np.radians(100.0)
+#: A robot that gains less than this way [m] in this time [s] is stuck.
+GAIN, PATIENCE = 5e-3, 2.0
+#: How far a lever may begin below the ground [m], which is on it then.
+ON_GROUND = 4e-4
+#: A belt slower than this [m/s] stands; a body that bears more than this share of the weight hangs.
+STANDS, BEARS = 5e-3, 0.1
+#: Contacts that bear less than this share of the weight do not carry the robot: it falls or bounces.
+CARRIED = 0.5
+#: Time in which levers come to their rate and near their angle [s], and rate below which they are let stand [rad/s].
+_SWINGS, _STILL = 0.03, 5e-3
+LED = np.array([FRONT, REAR])
+#: What the pulleys of both levers' tracks turn by on their levers, per velocity of `COORDINATES`.
+_ON_BELTS = np.eye(COORDINATES)[LED] + np.eye(COORDINATES)[SHAFT]
+
+
+class Sequence(eqx.Module):
+    """Angles of the levers, or voltages of their motors, over distance or time, straight between knots and constant
+    beyond them.
+
+    Attributes:
+        at: knots, of the middle of the wheelbase from where the obstacle begins [m], or times [s].
+        front, rear: angles at them, 0 along the wheelbase outward, positive up [rad]; or voltages, positive up [V].
+        begins: angles of front and rear at which levers that have voltages begin [rad]; None: angles are asked for.
+        over_time: whether knots are times.
+        supply: highest voltage of the levers' motors [V]; None: that of the supply.
+    """
+
+    at: Float[Array, " knots"]
+    front: Float[Array, " knots"]
+    rear: Float[Array, " knots"]
+    begins: Float[Array, " 2"] | None = None
+    over_time: bool = eqx.field(default=False, static=True)
+    supply: Scalar | None = None
+
+    @property
+    def first(self) -> Float[Array, " 2"]:
+        """ψ of both levers in the beginning [rad]."""
+        return _turned(*(self.asked(-jnp.inf, 0.0) if self.begins is None else self.begins))
+
+    def asked(self, place: Scalar, time: Scalar) -> tuple[Array, Array]:
+        """Angles of front and rear that are asked for [rad], or voltages of their motors, positive up [V]."""
+        at = time if self.over_time else place
+        return jnp.interp(at, self.at, self.front), jnp.interp(at, self.at, self.rear)
+
+
+def _turned(front: Array, rear: Array) -> Float[Array, " 2"]:
+    """ψ of both levers at their angles, or their angles at ψ, see `footing` [rad]."""
+    return jnp.stack([front, jnp.pi - rear])
+
+
+def still(front: Scalar, rear: Scalar) -> Sequence:
+    """Levers that stay at their angles [rad]."""
+    one = jnp.zeros(1)
+    return Sequence(one, one + front, one + rear)
+
+
+class Motion(eqx.Module):
+    """State of half a robot: coordinates and velocities (see `footing`), current of one motor [A], charge taken from
+    the battery [C], current that the levers' motors take from the supply [A]."""
+
+    q: Float[Array, " 6"]
+    v: Float[Array, " 6"]
+    current: Scalar
+    discharge: Scalar
+    drawn: Scalar
+
+
+#: Where energy goes: what the motors of tracks and of levers take, then what is lost.
+SOURCES = ("supply", "levers")
+LOSSES = ("winding", "motor", "gearbox", "track", "sliding", "contact", "rolling", "lever_winding", "lever_gears")
+
+
+Energy = dict[str, Any]
+
+
+class Passed(eqx.Module):
+    """What an instant or a sample has: means over it, and energy since the start of the run.
+
+    Attributes:
+        current: of one motor [A]; total_current: of all motors, from the supply, I_s of (10) [A].
+        torque: of each drive on its pair of levers [N·m], lever_current [A] and lever_voltage [V] of its motor, up.
+        holds: 1 where a pair stands by its worm alone, without current [-].
+        energy: in and lost, by the names of `SOURCES` and `LOSSES`, of the whole robot [J].
+        stored: in motion, height, contacts and windings, of the whole robot [J].
+        body: share of all normal force that the body bears [-].
+        grip: share of what its friction could hold that the ground gives to all that rolls [-].
+        carried: share of the weight that all contacts bear [-].
+        centre: x of the centre of mass [m]; base: how far the outermost contacts are behind and ahead of it [m], of
+            a sample the furthest, as contacts that leave the ground for some steps bear nevertheless.
+    """
+
+    time: Scalar
+    motion: Motion
+    current: Scalar
+    total_current: Scalar
+    voltage: Scalar
+    torque: Float[Array, " 2"]
+    lever_current: Float[Array, " 2"]
+    lever_voltage: Float[Array, " 2"]
+    holds: Float[Array, " 2"]
+    energy: Energy
+    stored: Scalar
+    normal: Scalar
+    body: Scalar
+    grip: Scalar
+    carried: Scalar
+    centre: Scalar
+    base: Float[Array, " 2"]
+
+    @property
+    def margin(self) -> Scalar:
+        """Distance from gravity's line through the centre of mass to the nearer of the outermost contacts [m].
+
+        Negative where the line is beyond them, NaN of a robot that falls or bounces.
+        """
+        least = jnp.min(self.base, axis=-1)
+        return jnp.where(jnp.isfinite(least) & (self.carried >= CARRIED), least, jnp.nan)
+
+
+class System(eqx.Module):
+    """One run's constants; robot and chassis have the main tracks' losses alone, the levers' tracks their own."""
+
+    robot: Robot
+    conditions: Conditions
+    terrain: Terrain
+    sequence: Sequence
+    shape: Shape
+    half: Masses
+    lever: Float[Array, " 3"]
+    chassis: Chassis
+    lever_track: Track
+    drive: LeverDrive
+    step: Scalar
+
+
+def system(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, step: Scalar = STEP) -> System:
+    """Constants of one run (scalar conditions); the robot may hold tracers."""
+    zero = jnp.zeros_like(conditions.voltage)
+    mass = balances.begin(robot, conditions, State(zero, zero, zero, zero)).mass
+    robot, gear = robot.within(conditions.configuration), robot.running_gear
+    chassis = robot.chassis(conditions.configuration)
+    half, shape = without_levers(robot, conditions, mass), footing.shape_of(chassis, gear, robot.radius_pulley)
+    none = jnp.zeros_like(chassis.on_tracks)
+    lever = jnp.stack([gear.lever_mass, gear.lever_centre, gear.lever_inertia]) * jnp.stack(
+        [chassis.on_tracks, jnp.ones(()), chassis.on_tracks]
+    )
+    main, own = (
+        jax.tree.map(lambda part, whole: jnp.where(chassis.on_tracks > 0.5, part, whole), track, without)
+        for track, without in zip(
+            gear.levers.tracks(chassis.track),
+            (chassis.track, dataclasses.replace(chassis.track, loss_coulomb=none, loss_viscous=none)),
+            strict=True,
+        )
+    )
+    chassis = dataclasses.replace(chassis, track=main)
+    robot = eqx.tree_at(lambda r: r.configurations.chosen, robot, chassis)
+    drive = lever_drive(robot)
+    return System(
+        robot, conditions, terrain, sequence, shape, half, lever, chassis, own, drive, jnp.asarray(step, float)
+    )
+
+
+def inertia(run: System, q: Array, v: Array) -> tuple[Float[Array, "6 6"], Float[Array, " 6"], Scalar]:
+    """Mass matrix M without rotors, bias c (centrifugal forces and gravity) and potential energy, per side.
+
+    M v' + c = Q. Each body's centre of mass moves by its arm about the middle of the wheelbase and, of a lever, about
+    its axle; gravity is tilted by the slope of the conditions.
+    """
+    half, shape = run.half, run.shape
+    body, *levers = footing.frames(shape, q)
+    down = GRAVITY * jnp.stack([jnp.sin(run.conditions.slope), jnp.cos(run.conditions.slope)])
+    zero, one = jnp.zeros(()), jnp.ones(())
+
+    def across(arm: Array) -> Array:
+        """Velocity of a point at `arm` that turns nose down, per angular speed."""
+        return jnp.stack([arm[1], -arm[0]])
+
+    matrix, bias, height = jnp.zeros((COORDINATES, COORDINATES)), jnp.zeros(COORDINATES), zero
+    mass_lever, centre_lever = run.lever[0], run.lever[1]
+    masses: list[tuple[Scalar, Array, Array | None, int | None]] = []
+    arm = body.along(jnp.stack([half.forward, half.up]))
+    masses.append((half.chassis, arm, None, None))
+    for lever in levers:
+        axle = lever.origin - body.origin
+        masses.append((half.pulley, axle, None, None))
+        reach = lever.along(jnp.stack([centre_lever, zero]))
+        masses.append((mass_lever, axle + reach, reach, lever.turns))
+    for mass, at, out, turns in masses:
+        columns = [jnp.stack([one, zero]), jnp.stack([zero, one]), across(at), *[jnp.zeros(2)] * 3]
+        centrifugal = -at * v[PITCH] ** 2
+        if out is not None and turns is not None:
+            columns[turns] = -across(out)
+            centrifugal = -(at - out) * v[PITCH] ** 2 - out * (v[PITCH] - v[turns]) ** 2
+        moves = jnp.stack(columns, axis=1)
+        matrix = matrix + mass * moves.T @ moves
+        bias = bias + mass * moves.T @ (centrifugal + down)
+        height = height + mass * down @ (body.origin + at)
+    turning = [(half.inertia, {PITCH: 1.0}), (2 * half.inertia_pulley, {PITCH: 1.0, SHAFT: 1.0})]
+    turning += [(run.lever[2], {PITCH: 1.0, k: -1.0}) for k in (FRONT, REAR)]
+    for about, by in turning:
+        row = jnp.zeros(COORDINATES).at[np.array(list(by))].set(jnp.array(list(by.values())))
+        matrix = matrix + about * jnp.outer(row, row)
+    return matrix, bias, height
+
+
+class _Pull(eqx.Module):
+    """What the contacts do, as `balances.resolved` asks for it."""
+
+    traction: Scalar
+    guide: Scalar
+    load: Scalar
+    force: Float[Array, " pairs"]
+
+
+class _Mover(eqx.Module):
+    at: Footing
+    v: Array
+    radius: Scalar
+    levers: Scalar  # what the levers' tracks lose, on the shaft [N·m]
+
+    @property
+    def normal(self) -> Scalar:
+        """Normal load of one side, of all that rolls [N]."""
+        return jnp.sum(self.at.force * self.at.rolls)
+
+    def pull(self, chassis: Chassis, signals: Signals) -> _Pull:
+        """Friction of the contacts (25) by Fig. 7, and of the guide (26)."""
+        at = self.at
+        force = jnp.asarray(chassis.ground.traction(_sliding(at, self.v, signals), at.force, signals.adhesion))
+        guide = jnp.sum(chassis.track.guide_friction * at.guided * at.force * signals.direction)
+        load = guide * self.radius + self.levers - jnp.sum(force * at.along[:, SHAFT] + at.force * at.off[:, SHAFT])
+        return _Pull(jnp.sum(force), guide, load, force)
+
+
+def _sliding(at: Footing, v: Array, signals: Signals) -> Array:
+    return -(at.along @ v) - signals.speed_slip_terms
+
+
+def carried(at: Footing, v: Array) -> tuple[Array, Scalar]:
+    """Share of the load of each contact that rolls, and the robot's speed along the ground, their mean by load."""
+    bears = at.force * at.rolls
+    share = bears / jnp.maximum(jnp.sum(bears), 1e-9)
+    return share, share @ (at.carried @ v)
+
+
+def instant(run: System, motion: Motion, on: Scalar) -> tuple[Signals, Footing, _Pull, Array]:
+    """All signals, contacts, forces and the shares of the load of an instant; `on`: share of their
+    voltage that the motors have."""
+    at = footing.footing(run.shape, run.terrain, motion.q, motion.v)
+    share, speed = carried(at, motion.v)
+    conditions = _driven(run, on)
+
+    ratio = run.robot.gearbox.ratio
+    state = State(motion.current, ratio * motion.v[SHAFT], speed, motion.discharge)
+    mover = _Mover(at, motion.v, run.shape.main.first, jnp.sum(_lever_loss(run, motion.v[SHAFT] + motion.v[LED])))
+    signals, pulled = balances.resolved(run.robot, conditions, state, mover, 2 * run.half.inertia_pulley)
+    return signals, at, pulled, share
+
+
+def _driven(run: System, on: Scalar) -> Conditions:
+    return dataclasses.replace(run.conditions, duty=run.conditions.duty * on)
+
+
+def _lever_loss(run: System, speed: Array) -> Array:
+    """Loss torques of the levers' tracks (24) [N·m] at the speeds of their pulleys on their levers [rad/s]."""
+    rolls = contact.direction(run.shape.main.first * speed, run.chassis.speed_still)
+    return jnp.asarray(run.lever_track.torque_loss(speed, rolls))
+
+
+def _loaded(run: System, motion: Motion) -> System:
+    """The run with what the levers' motors take from the battery beside the others, I_s of eq. (10)."""
+    battery = run.robot.battery
+    battery = dataclasses.replace(battery, current_other=battery.current_other + motion.drawn)
+    return dataclasses.replace(run, robot=dataclasses.replace(run.robot, battery=battery))
+
+
+def asked(run: System, motion: Motion, time: Scalar) -> Float[Array, " 2"]:
+    """Angular speeds of the levers after a step that are asked for [rad/s]: towards the sequence's angles, at most at
+    their rate; levers that have come there stand."""
+    rate = run.robot.running_gear.levers.rate
+    toward = (_turned(*run.sequence.asked(motion.q[0], time)) - motion.q[LED]) / (4 * _SWINGS)
+    speed = motion.v[LED] + run.step / _SWINGS * (jnp.clip(toward, -rate, rate) - motion.v[LED])
+    return jnp.where((jnp.abs(toward) < _STILL) & (jnp.abs(motion.v[LED]) < _STILL), 0.0, speed)
+
+
+def _swung(run: System, motion: Motion, time: Scalar, source: Scalar, free: Array, yields: Array) -> Swing:
+    """What the drives do to the levers in a step, which without them are at the rates `free` after it [rad/s]."""
+    levers, sequence = run.robot.running_gear.levers, run.sequence
+    most = jnp.abs(source) if sequence.supply is None else sequence.supply
+    high = jnp.stack([most, most])
+    low = -high
+    aims = asked(run, motion, time)
+    if sequence.begins is not None:
+        aims = jnp.zeros_like(aims)
+        front, rear = sequence.asked(motion.q[0], time)
+        low = high = jnp.clip(jnp.stack([front, -rear]), low, high)
+    # beyond its range nothing drives a lever on
+    angles = _turned(*motion.q[LED])
+    above, below = angles > levers.angle_most + 1e-3, angles < levers.angle_least - 1e-3
+    up, down = jnp.stack([above[0], below[1]]), jnp.stack([below[0], above[1]])
+    low, high = (jnp.where(up, jnp.minimum(x, 0.0), jnp.where(down, jnp.maximum(x, 0.0), x)) for x in (low, high))
+    return swing(run.drive, run.step, motion.v[LED], free, yields, aims, low, high)
+
+
+def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[Motion, Energy, Passed]:
+    """One step, linearly implicit in what contacts and drive resist by as `half_robot.advance` is.
+
+    (M + Δt K) Δv = Δt (Q - c), with the drives' torques on the levers as those and the levers' rates answer each
+    other within the step. Energy is that of the step's impulses at the mean of its velocities, and of a current of
+    the tracks' motors that changes evenly.
+
+    Returns:
+        Motion and energy after it, and what was before it.
+    """
+    run, on = _loaded(run, motion), jnp.clip((time - SETTLES) / RISES, 0.0, 1.0)
+    signals, at, pulled, share = instant(run, motion, on)
+    robot, step, radius = run.robot, run.step, run.shape.main.first
+    matrix, bias, height = inertia(run, motion.q, motion.v)
+    ratio, rotor = robot.gearbox.ratio, robot.motor.inertia
+    armature = rotor * ratio**2 * signals.efficiency_load + signals.inertia_added
+    resisted = signals.resistance * (share @ at.carried)
+    force = pulled.force @ at.along + at.force @ at.off - resisted
+    force = force.at[SHAFT].set(signals.torque_net - resisted[SHAFT])
+    belts = motion.v[SHAFT] + motion.v[LED]
+    lost, stiffens = jax.jvp(lambda speed: _lever_loss(run, speed), (belts,), (jnp.ones_like(belts),))
+    stiffens = jnp.maximum(stiffens, 0.0)
+    force = force.at[LED].add(-lost)
+
+    rises = jnp.maximum(
+        run.chassis.ground.traction_rise(_sliding(at, motion.v, signals), at.force, signals.adhesion), 0
+    )
+    shaft = _shaft_loss(run, motion, signals, at)
+    damping = contacts_resist(at.along, at.off, pulled.force, at.force, rises, at.damped)
+    damping = damping.at[SHAFT, SHAFT].add(shaft) + (_ON_BELTS.T * stiffens) @ _ON_BELTS
+    whole = matrix.at[SHAFT, SHAFT].add(armature) + step * damping
+    # of wheels, whose levers weigh nothing
+    whole = whole.at[LED, LED].add(1 - run.chassis.on_tracks)
+    pushed = step * (force - bias)
+    factors = factorise(whole[:4, :4])
+    moved, *coupled = (solution(factors, x) for x in (pushed[:4], whole[:4, 4], whole[:4, 5]))
+    coupling = jnp.stack(coupled, axis=1)
+    left = whole[4:, 4:] - whole[4:, :4] @ coupling
+    inverse = jnp.array([[left[1, 1], -left[0, 1]], [-left[1, 0], left[0, 0]]]) / (
+        left[0, 0] * left[1, 1] - left[0, 1] * left[1, 0]
+    )
+    alone = motion.v[LED] + inverse @ (pushed[4:] - whole[4:, :4] @ moved)
+    swung = _swung(run, motion, time, signals.voltage_source, alone, step * inverse / robot.sides)
+    led = swung.rate - motion.v[LED]
+    gained = jnp.concatenate([moved - coupling @ led, led])
+    v = motion.v + gained
+    middle = motion.v + gained / 2
+
+    charge = balances.charge_drawn(robot, run.conditions, signals.total_current)
+    current = current_after(robot, _driven(run, on), step, signals)
+    drawn = swung.voltage @ swung.current / jnp.maximum(jnp.abs(signals.voltage_source), 1e-9)
+    after = Motion(motion.q + step * v, v, current, motion.discharge + step * charge, drawn)
+
+    pair = run.drive
+    # (1 / step) is what a compiler makes of a division by a constant: a step that is an argument gives the same bits
+    geared = (pair.constant * swung.current - pair.inertia * led * (1 / step) - swung.torque) @ middle[LED]
+    off, along = at.off @ gained, at.along @ gained
+    normal = at.force - at.damped * off
+    friction = pulled.force - rises * along - pulled.force / jnp.maximum(at.force, 1e-9) * at.damped * off
+    motor = ratio * middle[SHAFT]
+    drive = signals.torque_motor - signals.torque_idle
+    mesh = drive - rotor * ratio * gained[SHAFT] * (1 / step)
+    own = signals.torque_load - signals.torque_track_loss - (pulled.load - pulled.guide * radius)
+    rise = current - signals.current
+    mean, resistance = signals.current + rise / 2, robot.motor.resistance
+    added = run.step * robot.sides * jnp.stack([
+        signals.voltage * mean,
+        swung.voltage @ swung.current / robot.sides,
+        (signals.voltage_drop + resistance * rise / 2) * mean + resistance * rise**2 / 12,
+        signals.torque_motor_loss * motor,
+        (signals.torque_idle + (1 - signals.efficiency_load) * mesh) * motor + own * middle[SHAFT],
+        (signals.torque_track_loss + shaft * gained[SHAFT]) * middle[SHAFT]
+        + (lost + stiffens * (_ON_BELTS @ gained)) @ (_ON_BELTS @ middle),
+        -friction @ (at.along @ middle),
+        -(normal - at.elastic) @ (at.off @ middle),
+        resisted @ middle,
+        pair.resistance * swung.current @ swung.current / robot.sides,
+        geared / robot.sides,
+    ])  # fmt: skip
+    spent = {name: energy[name] + added[k] for k, name in enumerate((*SOURCES, *LOSSES))}
+    kinetic = motion.v @ matrix @ motion.v + (signals.inertia_added + rotor * ratio**2) * motion.v[SHAFT] ** 2
+    stored = kinetic / 2 + signals.inductance * motion.current**2 / 2 + height + jnp.sum(at.energy)
+    up = jnp.array([1.0, -1.0])  # of a rear lever that is where ψ falls
+    total = jnp.sum(at.force)
+    held = run.chassis.ground.force_adhesion(jnp.sum(at.force * at.rolls), signals.adhesion)
+    centre = motion.q[0] - matrix[1, PITCH] / matrix[0, 0]
+    passed = Passed(
+        time=time,
+        motion=motion,
+        current=signals.current,
+        total_current=signals.total_current + drawn,
+        voltage=signals.voltage,
+        torque=up * swung.torque,
+        lever_current=up * swung.current,
+        lever_voltage=up * swung.voltage,
+        holds=1.0 * swung.holds,
+        energy=energy,
+        stored=robot.sides * stored + pair.inertia * motion.v[LED] @ motion.v[LED] / 2,
+        normal=total,
+        body=jnp.sum(at.force * (1 - at.rolls)) / jnp.maximum(total, 1e-9),
+        grip=jnp.sum(jnp.abs(pulled.force) * at.rolls) / jnp.maximum(held, 1e-9),
+        carried=total / (GRAVITY * matrix[0, 0]),
+        centre=centre,
+        base=_base(centre, at),
+    )
+    return after, spent, passed
+
+
+def _base(centre: Scalar, at: Footing) -> Float[Array, " 2"]:
+    """How far the outermost contacts are behind and ahead of the centre of mass [m], level ground assumed below."""
+    bears, ahead = at.force > 0, at.place - centre
+    return jnp.stack([jnp.max(jnp.where(bears, way, -jnp.inf)) for way in (-ahead, ahead)])
+
+
+def _shaft_loss(run: System, motion: Motion, signals: Signals, at: Footing) -> Scalar:
+    """How the drive's losses rise with the speed of the shaft [N·m·s], as they do steeply from rest; contacts and
+    winding apart, which are resolved. Where they fall: nothing."""
+    one = jnp.ones_like(motion.v[SHAFT])
+    force = jnp.sum(run.chassis.track.guide_friction * at.guided * at.force) * run.shape.main.first
+
+    def loss(speed: Scalar) -> Scalar:
+        direction = contact.direction(run.chassis.radius * speed, run.chassis.speed_still)
+        motor = speed * run.robot.gearbox.ratio
+        own = run.robot.motor.torque_loss(motor, direction) + run.robot.gearbox.torque_idle(motor, direction)
+        track = run.chassis.track.torque_loss(speed, direction)
+        return track + force * direction + own * run.robot.gearbox.ratio * signals.efficiency_load
+
+    return jnp.maximum(jax.jvp(loss, (motion.v[SHAFT],), (one,))[1], 0.0)
+
+
+class Progress(eqx.Module):
+    """Where a run stands: its verdict or that it goes on, when that was given, the furthest it came and when, angle
+    of its shafts since."""
+
+    verdict: Array
+    ended: Scalar
+    furthest: Scalar
+    since: Scalar
+    belt: Scalar
+
+
+def stand(run: System, clear: float = 0.1) -> Motion:
+    """At rest on the ground before the obstacle, its foremost point `clear` [m] from it."""
+    shape = run.shape
+    angles = run.sequence.first
+    outer = shape.main.first + shape.gear.grouser_height
+    axle = jnp.where(shape.on_tracks > 0.5, outer, shape.wheel)
+    tip = shape.gear.lever_length * jnp.cos(angles[0]) + shape.gear.levers.roller
+    reach = shape.half + jnp.maximum(axle, jnp.where(shape.on_tracks > 0.5, tip, 0.0))
+    x = -(reach + clear)
+    below = jnp.stack([x, jnp.zeros_like(x)])
+    gap, normal = (a[0] for a in run.terrain.distance(below[None]))
+    place = below + (axle - gap - 2e-5) * normal
+    zero = jnp.zeros_like(x)
+    q = jnp.stack([place[0], place[1], jnp.arctan2(normal[0], normal[1]), zero, angles[0], angles[1]])
+    return Motion(q, jnp.zeros(COORDINATES), zero, run.conditions.discharge + zero, zero)
+
+
+def _judged(
+    run: System, before: Motion, passed: Passed, motion: Motion, progress: Progress
+) -> tuple[Motion, Progress]:
+    """Whether a run has ended by now, after a sample; one that has stays as it is."""
+    q, v = motion.q, motion.v
+    outer = run.shape.main.first + run.shape.gear.grouser_height
+    finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v)) & jnp.isfinite(motion.current)
+    finite = finite & (jnp.max(jnp.abs(v)) < 1e4)
+    rear = q[0] - run.shape.half * jnp.cos(q[PITCH])
+    gained = q[0] > progress.furthest + GAIN
+    swings = jnp.max(jnp.abs(v[LED])) > 0.05
+    moved = gained | swings | (passed.time < SETTLES)
+    progress = Progress(
+        progress.verdict,
+        jnp.where(progress.verdict == _RUNNING, passed.time, progress.ended),
+        jnp.where(gained, q[0], progress.furthest),
+        jnp.where(moved, passed.time, progress.since),
+        jnp.where(moved, q[SHAFT], progress.belt),
+    )
+    waits = passed.time - progress.since
+    stuck = waits > PATIENCE
+    stands = jnp.abs(q[SHAFT] - progress.belt) * run.shape.main.first < STANDS * PATIENCE
+    fallen = q[1] < jnp.minimum(run.terrain.points[0, 1], run.terrain.points[-1, 1])
+    why = jnp.where(stands, STALLS, jnp.where((passed.body > BEARS) | fallen, HANGS, SLIDES))
+    verdict = jnp.where(stuck, why, _RUNNING)
+    verdict = jnp.where(rear > run.terrain.finish + outer, OVER, verdict)
+    verdict = jnp.where(jnp.abs(q[PITCH]) > TURNED_OVER, TIPS, verdict)
+    verdict = jnp.where(finite, verdict, FAILED)
+    ended = progress.verdict != _RUNNING
+    verdict = jnp.where(ended, progress.verdict, verdict)
+    motion = jax.tree.map(lambda new, old: jnp.where(finite & ~ended, new, old), motion, before)
+    return motion, dataclasses.replace(progress, verdict=verdict)
+
+
+def begin(run: System, motion: Motion | None = None) -> tuple[Motion, Energy, Progress]:
+    """What a run begins with: motion (None: at rest before the obstacle), no energy yet, and that it goes on, or that
+    it failed, as its levers would begin below the ground."""
+    angles, gear = _turned(*run.sequence.first), run.shape.gear
+    under = clearance(run.shape.main.first + gear.grouser_height, gear, angles) < -ON_GROUND
+    buried = jnp.any(under & (run.shape.on_tracks > 0.5)) & (motion is None)
+    motion = stand(run) if motion is None else motion
+    zero = jnp.zeros_like(motion.q[0])
+    energy = dict.fromkeys((*SOURCES, *LOSSES), zero)
+    return motion, energy, Progress(jnp.where(buried, FAILED, _RUNNING), zero, motion.q[0], zero, zero)
+
+
+def clearance(axle: Scalar, gear: RunningGear, angles: Float[Array, " levers"]) -> Float[Array, " levers"]:
+    """How far the rollers of levers at `angles` [rad] are above level ground [m], the axles `axle` above it [m]."""
+    return axle + gear.lever_length * jnp.sin(angles) - gear.levers.roller
+
+
+def sampled(run: System, state: Any, first: Scalar, steps: Scalar, samples: int) -> tuple[Any, Passed]:
+    """A part of a run of so many `samples` of so many `steps`, from time `first` [s]: its end and its record."""
+
+    def sample(state: Any, k: Array) -> tuple[Any, Passed]:
+        motion, energy, progress = state
+
+        def small(j: Array, carry: Any) -> Any:
+            *after, passed = advance(run, carry[0], first + (k * steps + j) * run.step, carry[1])
+            base = jnp.maximum(passed.base, carry[2].base)
+            return (*after, dataclasses.replace(passed, base=base))
+
+        nothing = jax.eval_shape(lambda: advance(run, motion, first, energy)[2])
+        nothing = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf, x.dtype), nothing)
+        after, spent, passed = jax.lax.fori_loop(0, steps, small, (motion, energy, nothing))
+        ended = progress.verdict != _RUNNING
+        after, progress = _judged(run, motion, passed, after, progress)
+        kept = jax.tree.map(lambda new, old: jnp.where(ended, old, new), spent, energy)
+        return (after, kept, progress), passed
+
+    return jax.lax.scan(sample, state, jnp.arange(samples))
+
+
+def divided(duration: float, step: float, sample: float, part: float) -> tuple[int, int, int]:
+    """How a run of a `duration` is divided: into parts no longer than `part`, samples of a part, steps of a sample.
+
+    A sample is of whole steps and all parts are alike, so the run may be longer by some samples.
+    """
+    steps, parts = max(round(sample / step), 1), math.ceil(duration / part - 1e-9)
+    return parts, math.ceil(duration / (parts * steps * step) - 1e-9), steps
+
+
+class Climb(eqx.Module):
+    """Runs: verdicts as indices into `NAMES`, when they were given [s], and records of shape (runs, samples)."""
+
+    verdict: np.ndarray
+    ended: np.ndarray
+    furthest: np.ndarray
+    record: Passed
+
+    @property
+    def names(self) -> list[str]:
+        """The verdicts in words."""
+        return [NAMES[k] for k in self.verdict]
+
+    @property
+    def during(self) -> np.ndarray:
+        """Which samples are before a run's verdict, after which it stays as it ended; shape (runs, samples)."""
+        return np.asarray(self.record.time) <= np.asarray(self.ended)[:, None] + 1e-9
+
+    def run(self, k: int) -> Passed:
+        """The record of run `k` until its verdict, shape (samples,)."""
+        count = int(np.sum(self.during[k]))
+        return jax.tree.map(lambda x: x[k, :count], self.record)
+
+
+def _alike(robot: Robot) -> int | None:
+    """Axis of the runs in a robot's parameters; None where one robot runs them all."""
+    return 0 if jnp.ndim(robot.sides) else None
+
+
+@compiled
+def _begin(
+    robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, step: Scalar, motion: Motion | None
+) -> Any:
+    def one(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, motion: Motion | None) -> Any:
+        return begin(system(robot, conditions, terrain, sequence, step), motion)
+
+    return jax.vmap(one, in_axes=(_alike(robot), 0, 0, 0, 0))(robot, conditions, terrain, sequence, motion)
+
+
+def _part(
+    robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any, first: Scalar,
+    step: Scalar, steps: Scalar, samples: int,
+) -> tuple[Any, Passed]:  # fmt: skip
+    def one(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any) -> Any:
+        return sampled(system(robot, conditions, terrain, sequence, step), state, first, steps, samples)
+
+    each = (_alike(robot), 0, 0, 0, 0)
+    found: tuple[Any, Passed] = jax.vmap(one, in_axes=each)(robot, conditions, terrain, sequence, state)
+    return found
+
+
+_compiled = compiled(_part, options=SMALL)
+
+
+def climb_batch(
+    robot: Robot,
+    conditions: Conditions,
+    terrain: Terrain,
+    sequence: Sequence,
+    *,
+    duration: float = DURATION,
+    step: float = STEP,
+    sample: float = SAMPLE,
+    part: float = 1.0,
+    record: bool = True,
+    start: Motion | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Climb:
+    """Climb over a batch of conditions, terrains and sequences (leading axis of every field), until all have ended.
+
+    Args:
+        robot: of all runs, or every parameter of it with a leading axis too.
+        duration: of the longest run [s]; step, sample: intervals of integration and of the record [s].
+        part: length of run between two looks at whether all have ended [s].
+        record: whether samples are kept; else the record is the last sample.
+        start: motions with which the runs begin; None: at rest before the obstacle.
+        progress: told the share of the time that is done.
+    """
+    parts, samples, steps = divided(duration, step, sample, part)
+    interval, each = jnp.asarray(step, float), jnp.asarray(steps)  # arrays: one program for all lengths of a step
+    state = _begin(robot, conditions, terrain, sequence, interval, start)
+    kept: list[Passed] = []
+    for k in range(parts):
+        first = jnp.asarray(k * samples * steps * step)
+        state, passed = _compiled(robot, conditions, terrain, sequence, state, first, interval, each, samples)
+        verdict = np.asarray(state[2].verdict)
+        last = passed if record else jax.tree.map(lambda x: x[:, -1:], passed)
+        kept = [*(kept if record else []), jax.device_get(last)]
+        if progress is not None:
+            progress((k + 1) / parts)
+        if np.all(verdict != _RUNNING):
+            break
+    verdict = np.where(verdict == _RUNNING, UNFINISHED, verdict)
+    joined = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *kept)
+    return Climb(verdict, np.asarray(state[2].ended), np.asarray(state[2].furthest), joined)

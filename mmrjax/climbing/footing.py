@@ -1,0 +1,266 @@
+"""Contacts of half a robot with a terrain, both ways: its grousers and wheels on the ground, corners on its belts.
+
+Coordinates q of half a robot with levers: x, z [m] of the middle of the wheelbase, pitch θ [rad] nose down, angle φ
+[rad] of the pulleys relative to the chassis (the belts are rigid here: all turn alike), angles ψ_1, ψ_2 [rad] of
+front and rear lever from the chassis' forward axis, positive upward. Velocities v alike. A lever's belt runs on its
+lever at r (φ̇ + ψ̇).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mmrjax.climbing import belt_loop as loop
+from mmrjax.climbing.belt_loop import Loop
+from mmrjax.climbing.terrain import Terrain
+from mmrjax.model import contact
+from mmrjax.model.chassis import Chassis
+from mmrjax.model.contact import damping_contact, force_contact
+from mmrjax.model.paper_tables import GROUSERS_LEVER
+from mmrjax.model.params import Scalar
+from mmrjax.undercarriage.running_gear import GROUSERS, RunningGear
+
+COORDINATES = 6
+PITCH, SHAFT, FRONT, REAR = 2, 3, 4, 5
+
+
+class Shape(eqx.Module):
+    """What of half a robot meets the ground.
+
+    Attributes:
+        main, lever: the belts of one side, those of both levers alike.
+        gear: the running gear.
+        on_tracks: 1 where levers bear, 0 where wheels do [-]; wheel: their radius [m].
+        belly: height of the body's underside over the axles [m].
+    """
+
+    main: Loop
+    lever: Loop
+    gear: RunningGear
+    on_tracks: Scalar
+    wheel: Scalar
+    belly: Scalar
+
+    @property
+    def half(self) -> Scalar:
+        """Half the wheelbase [m]."""
+        return self.gear.wheelbase / 2
+
+
+class Frame(NamedTuple):
+    """Where a part is: its origin in the world [m], the angle of its first axis [rad], which coordinate turns it."""
+
+    origin: Array
+    angle: Scalar
+    turns: int | None = None
+
+    def world(self, at: Array) -> Array:
+        """Points of the part in the world."""
+        return self.origin + self.along(at)
+
+    def along(self, vector: Array) -> Array:
+        """Directions of the part in the world."""
+        cos, sin = jnp.cos(self.angle), jnp.sin(self.angle)
+        a, b = vector[..., 0], vector[..., 1]
+        return jnp.stack([a * cos - b * sin, a * sin + b * cos], axis=-1)
+
+    def within(self, at: Array) -> Array:
+        """Points of the world in the part."""
+        return self._replace(origin=jnp.zeros(2), angle=-self.angle).along(at - self.origin)
+
+
+class Footing(eqx.Module):
+    """All pairs that may touch, and what they bear at an instant.
+
+    Attributes:
+        gap: distance [m]; gap_rate [m/s]; normal: of the robot's contact, out of the ground.
+        off, along: change of the contact's speed off the ground and along it (forward where the ground is level) per
+            velocity of `COORDINATES`; carried: along it where the belts stand.
+        force: normal force [N]; damped: how fast it falls with the gap's rate [N·s/m]; elastic: what of it is stored
+            again [N]; energy: stored in it [J].
+        guided: share that passes to the lower guide [-]; rolls: 1 but for the body [-].
+        place: x of the contact [m].
+    """
+
+    gap: Float[Array, " pairs"]
+    gap_rate: Float[Array, " pairs"]
+    normal: Float[Array, "pairs 2"]
+    off: Float[Array, "pairs 6"]
+    along: Float[Array, "pairs 6"]
+    carried: Float[Array, "pairs 6"]
+    force: Float[Array, " pairs"]
+    damped: Float[Array, " pairs"]
+    elastic: Float[Array, " pairs"]
+    energy: Float[Array, " pairs"]
+    guided: Float[Array, " pairs"]
+    rolls: Float[Array, " pairs"]
+    place: Float[Array, " pairs"]
+
+
+class _Group(NamedTuple):
+    """Pairs of one part: contact points in the world, gaps, normals, displacement of the belt per angle of the
+    pulleys (0 on the body), shares on the guide, whether they bear."""
+
+    at: Array
+    gap: Array
+    normal: Array
+    rate: Array
+    turns: int | None
+    guided: Array
+    bears: Array
+    rolls: float = 1.0
+
+
+def frames(shape: Shape, q: Sequence[Scalar] | Array) -> tuple[Frame, Frame, Frame]:
+    """Chassis, front and rear lever."""
+    body = Frame(jnp.stack([q[0], q[1]]), -q[PITCH])
+    levers = [
+        Frame(body.world(jnp.stack([end * shape.half, jnp.zeros_like(shape.half)])), q[k] - q[PITCH], k)
+        for end, k in ((1.0, FRONT), (-1.0, REAR))
+    ]
+    return body, levers[0], levers[1]
+
+
+def _guided(shape: Shape, place: Array) -> Array:
+    """Share of a load on the main belt at `place` that passes to the lower guide [-], as in `belt.tips`."""
+    run, length = shape.main.run, shape.main.length
+    off = jnp.minimum(place, length - place)  # from the middle of the lower run
+    return jnp.asarray(contact.step(run / 2 - off, 0.0, 0.0, shape.gear.guide_gap, 1.0))
+
+
+def _belt(shape: Shape, terrain: Terrain, belt: Loop, frame: Frame, drawn: Scalar, bears: Scalar) -> list[_Group]:
+    """Grousers on the ground, and corners on the belt between grousers and on their flanks."""
+    radius, main = shape.main.first, frame.turns is None
+    place = belt.places(drawn)
+    tips = loop.tips(belt, place)
+    at = frame.world(tips.at)
+    gap, normal = terrain.distance(at)
+
+    def group(at: Array, gap: Array, normal: Array, rate: Array, place: Array) -> _Group:
+        guided = _guided(shape, place) if main else jnp.zeros_like(gap)
+        return _Group(at, gap, normal, radius * rate, frame.turns, guided, bears * jnp.ones_like(gap))
+
+    groups = [group(at, gap, normal, frame.along(tips.rate), place)]
+    corners = terrain.corners
+    local = frame.within(corners)
+    for near in (loop.surface(belt, local), loop.teeth(belt, drawn, local)):
+        normal = -frame.along(near.normal)
+        at = corners + terrain.nose * -normal
+        groups.append(group(at, near.gap - terrain.nose, normal, frame.along(near.rate), near.place))
+    return groups
+
+
+def _wheels(shape: Shape, terrain: Terrain, body: Frame) -> list[_Group]:
+    """Wheels on edges of the ground and on its corners."""
+    a, b = terrain.points[:-1], terrain.points[1:]
+    along = b - a
+    length = jnp.sqrt(jnp.maximum(jnp.sum(along**2, axis=1), 1e-30))
+    normals = jnp.stack([-along[:, 1], along[:, 0]], axis=1) / length[:, None]
+    corners = terrain.corners
+    groups = []
+    for end in (1.0, -1.0):
+        centre = body.world(jnp.stack([end * shape.half, jnp.zeros_like(shape.half)]))
+        share = jnp.sum((centre - a) * along, axis=1) / length**2
+        to_edge = jnp.sum((centre - a) * normals, axis=1)
+        beside = (share >= 0) & (share <= 1) & (length > 1e-9) & (to_edge > 0)
+        arm = centre - corners
+        to_corner = jnp.sqrt(jnp.sum(arm**2, axis=1))
+        gap = jnp.concatenate([jnp.where(beside, to_edge, FAR_OFF), to_corner]) - shape.wheel - terrain.nose
+        normal = jnp.concatenate([normals, arm / to_corner[:, None]])
+        at = centre - (shape.wheel + jnp.minimum(gap, 0.0))[:, None] * normal
+        none = jnp.zeros_like(gap)
+        rate = shape.wheel * loop.tangent(-normal)
+        groups.append(_Group(at, gap, normal, rate, None, none, none + 1 - shape.on_tracks))
+    return groups
+
+
+#: Distance of what can't touch [m].
+FAR_OFF = 1e3
+
+
+def _body(shape: Shape, terrain: Terrain, body: Frame) -> _Group:
+    """Corners under the body."""
+    local = body.within(terrain.corners)
+    over = jnp.abs(local[:, 0]) < shape.half
+    gap = jnp.where(over & (local[:, 1] < 0), shape.belly - local[:, 1], FAR_OFF) - terrain.nose
+    up = body.along(jnp.broadcast_to(jnp.array([0.0, 1.0]), local.shape))
+    none = jnp.zeros_like(gap)
+    return _Group(terrain.corners + terrain.nose * up, gap, up, 0 * up, None, none, none + 1, 0.0)
+
+
+def footing(shape: Shape, terrain: Terrain, q: Array, v: Array) -> Footing:
+    """Pairs that may touch and their normal forces (27) at coordinates `q`, velocities `v`."""
+    body, front, rear = frames(shape, q)
+    radius = shape.main.first
+    rear_axle = body._replace(origin=rear.origin)  # from which the main belt's loop is told
+    groups = _belt(shape, terrain, shape.main, rear_axle, radius * q[SHAFT], jnp.ones(()))
+    for lever in (front, rear):
+        assert lever.turns is not None
+        drawn = radius * (q[SHAFT] + q[lever.turns])
+        groups += _belt(shape, terrain, shape.lever, lever, drawn, shape.on_tracks)
+    groups += _wheels(shape, terrain, body)
+    groups.append(_body(shape, terrain, body))
+
+    at, normal, rate = (jnp.concatenate([getattr(g, name) for g in groups]) for name in ("at", "normal", "rate"))
+    gap, guided, bears = (jnp.concatenate([getattr(g, name) for g in groups]) for name in ("gap", "guided", "bears"))
+    rolls = np.concatenate([np.full(len(g.gap), g.rolls) for g in groups])
+    along = loop.tangent(normal)
+    carried, own = [], []
+    for direction in (normal, along):
+        columns = [direction[:, 0], direction[:, 1], _turned(direction, at - body.origin)]
+        belt = jnp.sum(direction * rate, axis=1)
+        levers, with_belt = [], []
+        for lever in (front, rear):
+            on = np.concatenate([np.full(len(g.gap), g.turns == lever.turns) for g in groups])
+            turned = jnp.where(on, -_turned(direction, at - lever.origin), 0.0)
+            levers.append(turned)
+            with_belt.append(turned + jnp.where(on, belt, 0.0))
+        carried.append(jnp.stack([*columns, 0 * belt, *levers], axis=1))
+        own.append(jnp.stack([*columns, belt, *with_belt], axis=1))
+    off, gear = own[0], shape.gear
+    gap_rate = off @ v
+    stiffness, exponent = gear.contact_stiffness, gear.contact_exponent
+    force = force_contact(gap, gap_rate, 0.0, stiffness, exponent, gear.contact_damping, gear.contact_depth) * bears
+    depth = jnp.where((gap < 0) & (bears > 0), -gap, 0.0)
+    elastic = stiffness * depth**exponent
+    return Footing(
+        gap=gap,
+        gap_rate=gap_rate,
+        normal=normal,
+        off=off,
+        along=own[1],
+        carried=carried[1],
+        force=force,
+        damped=jnp.asarray(damping_contact(force, gap, 0.0, gear.contact_damping, gear.contact_depth)),
+        elastic=elastic,
+        energy=elastic * depth / (exponent + 1),
+        guided=guided,
+        rolls=jnp.asarray(rolls),
+        place=at[:, 0],
+    )
+
+
+def _turned(direction: Array, arm: Array) -> Array:
+    """Speed along directions of points at `arm` that turn about an axle nose down, per angular speed [m]."""
+    return direction[:, 0] * arm[:, 1] - direction[:, 1] * arm[:, 0]
+
+
+def shape_of(chassis: Chassis, gear: RunningGear, radius: Scalar) -> Shape:
+    """Shapes of one side of a robot, from its parameters."""
+    main = Loop(radius, radius, gear.wheelbase, gear.grouser_height, gear.grouser_length, GROUSERS)
+    lever = Loop(
+        radius,
+        gear.levers.roller - gear.grouser_height,
+        gear.lever_length,
+        gear.grouser_height,
+        gear.grouser_length,
+        GROUSERS_LEVER,
+    )
+    belly = gear.clearance - (radius + gear.grouser_height)
+    return Shape(main, lever, gear, chassis.on_tracks, chassis.radius, belly)

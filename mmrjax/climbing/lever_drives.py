@@ -1,0 +1,168 @@
+"""Drives of the levers, Fig. 5b: what a pair of levers and its motor do to each other in one step.
+
+Each pair has a motor, a planetary gear and a worm. All is referred to the levers' shaft: torques are multiplied by
+the ratio i = i_p i_w of both gears, speeds are divided by it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from mmrjax.model.gearbox import Gearbox
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+
+#: Pieces of a drive's law: the voltage is at its least (-1) or most (1), or such that the rate is what is asked (0);
+#: the way in which the levers move, 0 where they stand; the sign of T where they move.
+_PIECES = np.array([
+    (0, 0, 0),
+    *((end, way, sign) for end in (-1, 1) for way, sign in ((0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))),
+])  # fmt: skip
+#: Current below which a motor counts as without [A].
+_NONE = 1e-9
+
+
+class LeverDrive(eqx.Module):
+    """The drive of a pair of levers, at their shaft.
+
+    With the motor's torque e = i C_m I, its rotor's i² J_d and friction i M_df (14), and T on the levers,
+
+        e - i² J_d ω' - i M_df = c T,
+
+    c = 1 / (η_p η_w) where T acts with the motion, c = (2 - 1/η_w) (2 - 1/η_p) where it acts against it (the loss in
+    a mesh is in proportion to its force, whichever way power flows: `Gearbox.efficiency_backward`). A worm of η_w up
+    to 1/2 is not turned by its load; below that the motor has to help to lower it, and its planetary gear is driven:
+    c = (2 - 1/η_w) / η_p. At rest e may be anything between the two.
+
+    Attributes:
+        constant: i C_m [N·m/A, V·s/rad]; resistance: of the winding [ohm]; inertia: i² J_d [kg·m²].
+        dry, viscous: i M_df0 [N·m], i² K_fd [N·m·s].
+        ahead, back: c where T acts with the motion and against it [-].
+        current_limit: of the motor [A].
+    """
+
+    constant: Scalar
+    resistance: Scalar
+    inertia: Scalar
+    dry: Scalar
+    viscous: Scalar
+    ahead: Scalar
+    back: Scalar
+    current_limit: Scalar
+
+    def against(self, torque: Scalar, direction: float) -> Scalar:
+        """c T [N·m] of a torque on levers that move up (`direction` 1) or down (-1)."""
+        return jnp.where(torque * direction > 0, self.ahead, self.back) * torque
+
+
+def lever_drive(robot: Robot) -> LeverDrive:
+    """The drive of a pair of levers of a robot: its motor behind both gears."""
+    levers, motor = robot.running_gear.levers, robot.motor
+    ratio = levers.worm_ratio * levers.planetary_ratio
+    planetary = Gearbox(efficiency_load=levers.planetary_efficiency, mesh_theory=True).efficiency_backward
+    worm = 2 - 1 / levers.worm_efficiency
+    return LeverDrive(
+        constant=ratio * motor.torque_constant,
+        resistance=motor.resistance,
+        inertia=ratio**2 * motor.inertia,
+        dry=ratio * motor.friction_coulomb,
+        viscous=ratio**2 * motor.friction_viscous,
+        ahead=1 / (levers.worm_efficiency * levers.planetary_efficiency),
+        back=worm * jnp.where(worm > 0, planetary, 1 / levers.planetary_efficiency),
+        current_limit=levers.current_limit,
+    )
+
+
+class Swing(NamedTuple):
+    """What both pairs do in a step, each (2,).
+
+    Attributes:
+        torque: on the levers [N·m]; rate: after the step [rad/s]; voltage [V] and current [A] of their motors.
+        holds: whether a pair stands by its worm alone, without current.
+    """
+
+    torque: Array
+    rate: Array
+    voltage: Array
+    current: Array
+    holds: Bool[Array, " 2"]
+
+
+def swing(
+    drive: LeverDrive,
+    step: Scalar,
+    rate: Float[Array, " 2"],
+    free: Float[Array, " 2"],
+    yields: Float[Array, "2 2"],
+    asked: Float[Array, " 2"],
+    least: Float[Array, " 2"],
+    most: Float[Array, " 2"],
+) -> Swing:
+    """One step of both pairs: the rates that are asked for where the voltages allow them, else what these bring.
+
+    What carries the levers gives ω = free + yields T after the step. Between the voltages `least` and `most` the
+    one is taken at which ω is what is asked; of a lever that is to stand, the least that holds it. Each drive's law
+    is of straight pieces (`_PIECES`); of all pairs of them the one is taken whose solution is on both, or least off.
+
+    Args:
+        step: [s]; rate: before it [rad/s]; free: after it, of levers without torque [rad/s]; yields: [rad/(N·m·s)].
+        asked: rates after it [rad/s]; least, most: voltages of the motors [V].
+    """
+    limits = drive.constant * rate + drive.resistance * drive.current_limit * jnp.array([[-1.0], [1.0]])
+    least, most = jnp.maximum(least, limits[0]), jnp.minimum(most, limits[1])
+    kept = drive.inertia * (1 / step)
+    stiff = kept + drive.constant**2 / drive.resistance + drive.viscous
+
+    end, way, sign = _PIECES.T
+    moves, follows = way != 0, end == 0
+    pushed = drive.constant / drive.resistance * jnp.where(end > 0, most[:, None], least[:, None])
+    # α T + β ω = γ on a piece, (pairs, pieces)
+    alpha = jnp.where(moves, jnp.where(sign * way > 0, drive.ahead, drive.back), 0.0) + 0 * pushed
+    beta = jnp.where(moves, stiff, 1.0) + 0 * pushed
+    gamma = jnp.where(moves, pushed + kept * rate[:, None] - way * drive.dry, follows * asked[:, None])
+
+    (a, b), (c, d) = beta[:, None] * yields[:, :, None]
+    a, d = (a + alpha[0])[:, None], (d + alpha[1])[None]
+    b, c = b[:, None], c[None]
+    r, s = ((gamma - beta * free[:, None])[k] for k in range(2))
+    r, s = r[:, None], s[None]
+    size = a * d - b * c
+    torque = jnp.stack([(d * r - b * s) / size, (a * s - c * r) / size])
+    turned = free[:, None, None] + jnp.einsum("ij,jkl->ikl", yields, torque)
+
+    def motor(k: int, ways: tuple[slice | None, ...]) -> tuple[Array, Array, Array, Array]:
+        """How far the solutions are off the pieces of a pair [N·m], and least and greatest i C_m I of its motor."""
+        force, speed = torque[k], turned[k]
+        turning = kept * (speed - rate[k]) + drive.viscous * speed
+        up, down = drive.against(force, 1.0) + drive.dry + turning, drive.against(force, -1.0) - drive.dry + turning
+        low, high = jnp.where(asked[k] > 0, up, down), jnp.where(asked[k] < 0, down, up)
+        weak, strong = (drive.constant / drive.resistance * (x[k] - drive.constant * speed) for x in (least, most))
+        on = pushed[k][ways]
+        beyond = end[ways] * (speed - asked[k]) * stiff
+        stays = jnp.maximum(on - up, down - on)
+        goes = jnp.maximum(-way[ways] * speed * stiff, -sign[ways] * force)
+        off = jnp.where(
+            follows[ways],
+            jnp.maximum(low - strong, weak - high),
+            jnp.maximum(jnp.where(moves[ways], goes, stays), beyond),
+        )
+        return jnp.maximum(off, 0.0), jnp.clip(jnp.clip(0.0, low, high), weak, strong), force, speed
+
+    both = motor(0, (slice(None), None)), motor(1, (None, slice(None)))
+    off = jnp.nan_to_num(jnp.maximum(both[0][0], both[1][0]), nan=jnp.inf, posinf=jnp.inf)
+    best = jnp.unravel_index(jnp.argmin(off), off.shape)
+    chosen, taken = jnp.stack(best), jnp.stack([pair[1][best] for pair in both])
+    torque, after = torque[:, *best], turned[:, *best]
+    fixed = jnp.where(jnp.asarray(end)[chosen] > 0, most, least)
+    stands = jnp.where(jnp.asarray(follows)[chosen], asked == 0, ~jnp.asarray(moves)[chosen])
+    after = jnp.where(stands, 0.0, after)
+    voltage = jnp.where(
+        jnp.asarray(follows)[chosen], drive.resistance / drive.constant * taken + drive.constant * after, fixed
+    )
+    current = (voltage - drive.constant * after) / drive.resistance
+    return Swing(torque, after, voltage, current, stands & (jnp.abs(current) < _NONE))

@@ -1,0 +1,121 @@
+"""Levers: what they have beyond their masses and length, their tracks' losses, the gears of their drives, Fig. 5b."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import equinox as eqx
+
+from mmrjax.model.params import Scalar, parameter
+from mmrjax.model.track_friction import Track
+
+_UNSTATED = "the paper prints none"
+
+
+class Levers(eqx.Module):
+    """Roller at the tip of a lever, and drive of a pair: motor, planetary gear, worm (Fig. A1: 11-14).
+
+    Length, mass, centre and inertia of a lever, and the angles at which it stands where a run states none, are the
+    running gear's. Angles here: 0 along the wheelbase outward, positive up, π folded.
+    """
+
+    roller: Scalar = parameter(
+        13.5e-3,
+        unit="m",
+        meaning="radius of the roller at a lever's tip over the grousers of its track",
+        bounds=(1e-3, 0.5),
+        relative_sd=0.05,
+        source="Table 6, d/2; with the pitch radius of 8 mm that it leaves, the track of 112 teeth closes to 0.4 mm",
+    )
+    worm_ratio: Scalar = parameter(
+        30.0,
+        unit="-",
+        meaning="ratio of the worm gear of a pair of levers",
+        bounds=(1.0, 1e3),
+        relative_sd=0.01,
+        source="Fig. 5b",
+    )
+    worm_efficiency: Scalar = parameter(
+        0.5,
+        unit="-",
+        meaning="efficiency of the worm gear, driven by its worm; up to 0.5 it holds by itself",
+        bounds=(0.05, 0.99),
+        sd=0.15,
+        source="Fig. 5b, which no table resolves; a worm of one start: 0.4-0.6",
+    )
+    planetary_ratio: Scalar = parameter(
+        23.04,
+        unit="-",
+        meaning="ratio of the planetary gear between motor and worm",
+        bounds=(1.0, 1e4),
+        relative_sd=0.8,
+        source=f"that of the traction drive, Fig. A1: 12 beside 2; {_UNSTATED}",
+    )
+    planetary_efficiency: Scalar = parameter(
+        0.75,
+        unit="-",
+        meaning="efficiency of the planetary gear between motor and worm",
+        bounds=(0.1, 1.0),
+        sd=0.1,
+        source=f"catalogue of the traction drive's gear; {_UNSTATED}",
+    )
+    rate: Scalar = parameter(
+        1.0,
+        unit="rad/s",
+        meaning="rate at which a pair of levers swings where its angle is imposed",
+        bounds=(1e-3, 100.0),
+        relative_sd=0.5,
+        source=f"8810 rpm over the two gears' ratios: 1.3 rad/s without load; {_UNSTATED}",
+    )
+    angle_least: Scalar = parameter(
+        -math.pi,
+        unit="rad",
+        meaning="least angle of a lever, straight back under the belt",
+        bounds=(-2 * math.pi, 0.0),
+        sd=0.5,
+        source=f"nothing in Fig. A2 stops a lever; {_UNSTATED}",
+    )
+    angle_most: Scalar = parameter(
+        math.pi,
+        unit="rad",
+        meaning="greatest angle of a lever, folded along the body",
+        bounds=(0.0, 2 * math.pi),
+        sd=0.5,
+        source=f"transport posture, Table 6; {_UNSTATED}",
+    )
+    current_limit: Scalar = parameter(
+        1000.0,
+        unit="A",
+        meaning="largest current of a motor of the levers that its driver lets flow",
+        bounds=(0.01, 1e4),
+        relative_sd=0.1,
+        source="none on the bench: above any current",
+    )
+    share_coulomb: Scalar = parameter(
+        0.4,
+        unit="-",
+        meaning="share of a side's static loss torque of the tracks that each of its two levers' tracks has",
+        bounds=(0.0, 0.5),
+        sd=0.05,
+        source="Table 3: (350 - 70) / 2 of 350 mN·m",
+    )
+    share_viscous: Scalar = parameter(
+        13 / 32,
+        unit="-",
+        meaning="share of a side's pseudo-viscous loss of the tracks that each of its two levers' tracks has",
+        bounds=(0.0, 0.5),
+        sd=0.05,
+        source="Table 3: (16 - 3) / 2 of 16 mN·m·s",
+    )
+
+    def tracks(self, side: Track) -> tuple[Track, Track]:
+        """Of the tracks of a side, the main one and that of one lever."""
+
+        def share(coulomb: Scalar, viscous: Scalar) -> Track:
+            return dataclasses.replace(
+                side, loss_coulomb=coulomb * side.loss_coulomb, loss_viscous=viscous * side.loss_viscous
+            )
+
+        own = share(self.share_coulomb, self.share_viscous)
+        return share(1 - 2 * self.share_coulomb, 1 - 2 * self.share_viscous), own

@@ -1,0 +1,213 @@
+"""Posture: how a robot rests on its one-sided supports, main belts and the rollers of its levers, on a plane.
+
+Frame of the robot, its origin the middle of the wheelbase: forward along it, up across it. Seen from the side a robot
+is two axles and two rollers, circles over the grousers, with a belt around each pair: the main one around the axles,
+a lever's between its axle and its roller. On a plane it rests on the lower hull of the circles, on an edge between
+two of them, and that gives height, pitch and loads in closed form. All are smooth in angles, lengths and masses
+as long as the same two circles carry; where another takes over, pitch and height go on, but their derivatives and the
+contact jump.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mmrjax.model import masses
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+
+#: Circles of an outline, from tail to nose.
+CIRCLES = REAR_ROLLER, REAR_AXLE, FRONT_AXLE, FRONT_ROLLER = range(4)
+#: Pairs of circles around which a belt runs.
+BELTS = ((REAR_ROLLER, REAR_AXLE), (REAR_AXLE, FRONT_AXLE), (FRONT_AXLE, FRONT_ROLLER))
+#: What may carry: tail and nose of an edge of the hull.
+EDGES = np.array(list(itertools.permutations(CIRCLES, 2)))
+#: How far a belt may hang over the ground and still bear [m]: grousers and ground yield by about as much.
+TOUCH = 5e-4
+#: Pitch beyond which a robot has tipped over, whatever it comes to lie on [rad].
+UPRIGHT = np.pi / 3
+#: Rounding of heights [m].
+_ROUNDING = 1e-9
+
+
+class Outline(eqx.Module):
+    """A robot seen from the side, in its own frame.
+
+    Attributes:
+        forward, up: centres of the circles, in the order of `CIRCLES` [m].
+        radius: of the circles, what rolls on the ground: wheels or belts over the grousers [m].
+        belt: radius of the main belt over its grousers [m].
+        tracked: 1 on tracks; on wheels there are no levers: their rollers lie on the axles, without radius [-].
+        centre_forward, centre_up: centre of mass of all [m].
+    """
+
+    forward: Float[Array, "... 4"]
+    up: Float[Array, "... 4"]
+    radius: Float[Array, "... 4"]
+    belt: Scalar
+    tracked: Scalar
+    centre_forward: Scalar
+    centre_up: Scalar
+
+    def pitched(self, pitch: Scalar) -> Outline:
+        """The same with its nose raised by `pitch` [rad], about the middle of the wheelbase."""
+        forward, up = turned(self.forward, self.up, jnp.asarray(pitch)[..., None])
+        at, high = turned(self.centre_forward, self.centre_up, pitch)
+        return dataclasses.replace(self, forward=forward, up=up, centre_forward=at, centre_up=high)
+
+    @property
+    def length(self) -> Scalar:
+        """Overall length, over the grousers [m]."""
+        return jnp.max(self.forward + self.radius, -1) - jnp.min(self.forward - self.radius, -1)
+
+    @property
+    def height(self) -> Scalar:
+        """Overall height, over the grousers [m]."""
+        return jnp.max(self.up + self.radius, -1) - jnp.min(self.up - self.radius, -1)
+
+
+def turned(forward: Scalar, up: Scalar, pitch: Scalar) -> tuple[Array, Array]:
+    """A point of the frame of the robot along the ground and above it, about the middle of the wheelbase [m]."""
+    sine, cosine = jnp.sin(pitch), jnp.cos(pitch)
+    return jnp.asarray(forward * cosine - up * sine), jnp.asarray(forward * sine + up * cosine)
+
+
+def parts(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> masses.Masses:
+    """Masses of half a robot of this mass with its payload [kg], None: as stated; its levers as the conditions state
+    them."""
+    if mass is None:
+        stated = robot.chassis(conditions.configuration).mass + conditions.payload
+        mass = stated if conditions.total_mass is None else conditions.total_mass
+    return masses.masses(robot, conditions, mass)
+
+
+def outline(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> Outline:
+    """A robot of this mass with its payload [kg] from the side, its levers as the conditions state them.
+
+    Args:
+        mass: None: as stated.
+    """
+    chassis, gear = robot.chassis(conditions.configuration), robot.running_gear
+    tracked = jnp.asarray(chassis.on_tracks)
+    ahead, high = parts(robot, conditions, mass).centre
+    front, rear = masses.lever_angles(gear, conditions)
+    half, reach = gear.wheelbase / 2, gear.lever_length * tracked
+    axle, roller = chassis.radius + tracked * gear.grouser_height, gear.levers.roller * tracked
+    none = jnp.zeros_like(half)
+    at = [-half - reach * jnp.cos(rear), -half, half, half + reach * jnp.cos(front)]
+    lie = [reach * jnp.sin(rear), none, none, reach * jnp.sin(front)]
+    forward, up, radius = (
+        jnp.stack(jnp.broadcast_arrays(*(jnp.asarray(x) for x in row)), -1)
+        for row in (at, lie, [roller, axle, axle, roller])
+    )
+    return Outline(forward, up, radius, robot.radius_pulley + gear.grouser_height, tracked, ahead, high)
+
+
+class Posture(eqx.Module):
+    """How a robot rests on a plane.
+
+    Attributes:
+        pitch: nose up [rad]; height: of the middle of the wheelbase above the plane [m].
+        rear, front: where it is carried, ahead of the middle of the wheelbase along the plane [m].
+        line: 1 where a belt bears all along between them, 0 where they bear alone [-].
+        centre_ahead: centre of mass ahead of the middle of the wheelbase, along the plane [m]; centre_height: above
+            the plane [m].
+        load_front: share of the load normal to the plane at its front, were it carried at both ends alone; beyond
+            0..1 the robot tips [-].
+        margin: distance along the plane from where gravity's line through the centre of mass meets it to the nearer
+            end of the contact; negative where the robot tips [m].
+        tips_back, tips_forward: slopes on which it would, uphill and downhill [rad].
+        inertia: in pitch about the centre of mass [kg·m²].
+    """
+
+    pitch: Scalar
+    height: Scalar
+    rear: Scalar
+    front: Scalar
+    line: Scalar
+    centre_ahead: Scalar
+    centre_height: Scalar
+    load_front: Scalar
+    margin: Scalar
+    tips_back: Scalar
+    tips_forward: Scalar
+    inertia: Scalar
+
+    @property
+    def length(self) -> Scalar:
+        """Distance of the ends of the contact [m]."""
+        return self.front - self.rear
+
+
+def posture(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> Posture:
+    """The posture in which a robot rests on a slope, for one run; of several that hold, the one with least pitch.
+
+    Two circles i (tail) and j (nose), d apart in the direction β of the frame, touch a plane at the pitch
+
+        θ = asin((r_j - r_i) / d) - β,
+
+    and carry the robot if no other circle is below and gravity's line through the centre of mass passes between them.
+    The slope is that of the conditions, uphill ahead. Where no edge holds, the one that lacks least is returned, with
+    a negative `margin`; a pitch beyond `UPRIGHT` is none.
+
+    Args:
+        mass: with payload [kg]; None: as stated.
+    """
+    inertia = robot.sides * parts(robot, conditions, mass).inertia_pitch(robot.running_gear.wheelbase)
+    return rest(outline(robot, conditions, mass), conditions.slope, inertia)
+
+
+def level(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> Posture:
+    """The same on level ground."""
+    return posture(robot, dataclasses.replace(conditions, slope_deg=jnp.zeros_like(conditions.slope_deg)), mass)
+
+
+def rest(side: Outline, slope: Scalar, inertia: Scalar) -> Posture:
+    """The posture of an outline on a slope [rad]; see `posture`."""
+    tail, nose = EDGES.T
+    ahead, rise = side.forward[nose] - side.forward[tail], side.up[nose] - side.up[tail]
+    apart = jnp.sqrt(jnp.maximum(ahead**2 + rise**2, 1e-12))
+    ratio = (side.radius[nose] - side.radius[tail]) / apart
+    tangent = jnp.abs(ratio) < 1
+    pitch = jnp.arcsin(jnp.where(tangent, ratio, 0.0)) - jnp.arctan2(rise, jnp.where(apart > 1e-6, ahead, 1.0))
+    pitch = jnp.arctan2(jnp.sin(pitch), jnp.cos(pitch))
+    at = side.pitched(pitch)
+    low = at.up - at.radius  # (edges, circles)
+    every = np.arange(len(EDGES))
+    gaps = low - low[every, tail][:, None]
+    rear, front = at.forward[every, tail], at.forward[every, nose]
+    high = jnp.asarray(at.centre_up) - low[every, tail]
+    centre = jnp.asarray(at.centre_forward)
+    foot = centre - high * jnp.tan(slope)
+    margin = jnp.minimum(foot - rear, front - foot)
+
+    upright = jnp.abs(pitch) < UPRIGHT
+    lowest = upright & tangent & (apart > 1e-6) & (jnp.min(gaps, -1) > -_ROUNDING)
+    # Circles on one line make several edges of one pitch: the longest is the contact.
+    rank = jnp.where(margin >= 0, jnp.abs(pitch) - 1e-3 * (front - rear), 10 - margin)
+    best = jnp.argmin(jnp.where(lowest, rank, jnp.inf))
+
+    touching = gaps[best] < TOUCH
+    between = (np.arange(4) >= np.minimum(tail, nose)[:, None]) & (np.arange(4) <= np.maximum(tail, nose)[:, None])
+    line = jnp.all(touching | ~jnp.asarray(between)[best]) * side.tracked
+    return Posture(
+        pitch=pitch[best],
+        height=-low[best, jnp.asarray(tail)[best]],
+        rear=rear[best],
+        front=front[best],
+        line=line,
+        centre_ahead=centre[best],
+        centre_height=high[best],
+        load_front=((foot - rear) / (front - rear))[best],
+        margin=margin[best],
+        tips_back=jnp.arctan2(centre - rear, high)[best],
+        tips_forward=jnp.arctan2(front - centre, high)[best],
+        inertia=inertia,
+    )

@@ -1,0 +1,266 @@
+"""Static limits: how high a step, how wide a gap a robot stands on in given postures of its levers; geometry alone.
+
+Friction and torque that bring it there are not asked about, which makes a static limit an upper bound for a robot
+that climbs slowly with its levers held.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mmrjax.climbing import resting_posture as posture
+from mmrjax.climbing.resting_posture import BELTS, FRONT_ROLLER, REAR_ROLLER, Outline, Posture
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+
+#: Pitches that are looked at at once, then in the best one's neighbourhood, and how often; of a posture, of any.
+_PITCHES, _POSTURES = (181, 33, 4), (13, 9, 1)
+#: How far beside the highest step its two sides are looked at [rad].
+_BESIDE = 1e-5
+
+
+class Step(eqx.Module):
+    """The highest step on which a robot stands with its centre of mass over the edge.
+
+    Attributes:
+        height: of the step [m]; pitch: nose up [rad].
+        side: the robot there, in a frame along the ground, its middle of the wheelbase the origin; base: height of
+            that above the lower ground [m].
+    """
+
+    height: Scalar
+    pitch: Scalar
+    side: Outline
+    base: Scalar
+
+
+class Limits(eqx.Module):
+    """Static limits of a robot with its levers as they stand.
+
+    Attributes:
+        step: the highest, driven onto nose first [m].
+        gap: the widest, that its contact bridges on both sides of its centre of mass [m]; 0 where no belt bears.
+        contact: length of the contact on level ground [m].
+        tip_front, tip_rear: tops of the levers' rollers above level ground [m]; on wheels those of the wheels.
+        tips_back, tips_forward, tips_aside: slopes on which it tips over: uphill, downhill, across [rad].
+        length, height: overall, on level ground [m].
+    """
+
+    step: Scalar
+    gap: Scalar
+    contact: Scalar
+    tip_front: Scalar
+    tip_rear: Scalar
+    tips_back: Scalar
+    tips_forward: Scalar
+    tips_aside: Scalar
+    length: Scalar
+    height: Scalar
+
+
+def lowest(side: Outline) -> tuple[Scalar, Scalar]:
+    """Lowest points of a pitched outline behind the line through its centre of mass and ahead of it [m]."""
+    line = side.centre_forward
+    # circles: the bottom where it lies on that side, else where the line cuts the arc
+    apart, radius = side.forward - line, side.radius
+    cut = jnp.where(jnp.abs(apart) < radius, jnp.sqrt(jnp.maximum(radius**2 - apart**2, 1e-18)), -jnp.inf)
+    ahead = side.up - jnp.where(apart >= 0, radius, cut)
+    behind = side.up - jnp.where(apart <= 0, radius, cut)
+
+    # belts: where the line cuts a straight run, both of each, as either may be the lower one
+    one, other = np.array([*BELTS, *(pair[::-1] for pair in BELTS)]).T
+    around = jnp.where(np.array([True, False, False, True]), radius, side.belt)
+    along, rise = side.forward[other] - side.forward[one], side.up[other] - side.up[one]
+    apart = jnp.sqrt(jnp.maximum(along**2 + rise**2, 1e-12))
+    ratio = (around[other] - around[one]) / apart
+    runs = (jnp.abs(ratio) < 1) & (apart > 1e-6)
+    direction = jnp.arctan2(rise, jnp.where(runs, along, 1.0)) - jnp.arcsin(jnp.where(runs, ratio, 0.0))
+    sine, cosine = jnp.sin(direction), jnp.cos(direction)
+    (x0, x1) = (side.forward[k] + around[k] * sine for k in (one, other))
+    (z0, z1) = (side.up[k] - around[k] * cosine for k in (one, other))
+    crosses = runs & ((x0 - line) * (x1 - line) <= 0) & (jnp.abs(x1 - x0) > 1e-9)
+    share = (line - x0) / jnp.where(crosses, x1 - x0, 1.0)
+    belt = jnp.min(jnp.where(crosses, z0 + share * (z1 - z0), jnp.inf))
+    return jnp.minimum(jnp.min(behind), belt), jnp.minimum(jnp.min(ahead), belt)
+
+
+def step_at(side: Outline, pitch: Scalar) -> Scalar:
+    """The step [m] on which an outline stands at a pitch [rad] with its centre of mass over the edge.
+
+    What is lowest behind the centre of mass stands on the lower ground, what is lowest ahead of it on the step:
+    H = min over x ≥ x_c of z less min over x ≤ x_c of z. Where belt and pulley alone do, with the tail turning on
+    a circle of radius R, the centre of mass ℓ ahead of that and h above the axles,
+
+        H = R (1 - cos θ) + (ℓ - (h + R) tan θ) sin θ.
+    """
+    behind, ahead = lowest(side.pitched(pitch))
+    return ahead - behind
+
+
+def _highest(height: Callable[[Scalar], Scalar], count: int, near: int, rounds: int) -> tuple[Scalar, Scalar]:
+    """The pitch of the highest step among `count`, then among `near` ever closer ones, and their distance [rad]."""
+    apart = jnp.pi / 2 / (count - 1)
+    grid = jnp.linspace(0.0, jnp.pi / 2, count)
+    best = grid[jnp.argmax(jax.vmap(height)(grid))]
+    for _ in range(rounds):
+        grid = jnp.clip(best + apart * jnp.linspace(-1.0, 1.0, near), 0.0, jnp.pi / 2)
+        best, apart = grid[jnp.argmax(jax.vmap(height)(grid))], apart * 2 / (near - 1)
+    return best, apart
+
+
+def step(side: Outline, pitch: Scalar | None = None) -> Step:
+    """The highest of `step_at`, nose up, for one outline.
+
+    Where two parts of the outline meet at the highest step, its derivatives are those of both, weighted by their
+    rises s with pitch on the other side: dH = (s_1 dH_2 - s_2 dH_1) / (s_1 - s_2).
+
+    Args:
+        pitch: of the highest step [rad]; None: it is looked for.
+    """
+    still = jax.lax.stop_gradient(side)
+    best = _highest(lambda pitch: step_at(still, pitch), *_PITCHES)[0] if pitch is None else pitch
+    beside = best + jnp.array([-_BESIDE, _BESIDE])
+    rises = jax.vmap(lambda pitch: jax.jvp(lambda x: step_at(still, x), (pitch,), (jnp.ones_like(pitch),))[1])(beside)
+    share = jnp.clip(-rises[1] / jnp.maximum(rises[0] - rises[1], 1e-12), 0.0, 1.0)
+    moved = jnp.asarray(jax.vmap(lambda pitch: step_at(side, pitch) - step_at(still, pitch))(beside))
+    pitched = side.pitched(best)
+    height = step_at(still, best) + share * moved[0] + (1 - share) * moved[1]
+    return Step(height, best, pitched, -lowest(pitched)[0])
+
+
+def with_levers(conditions: Conditions, front: Scalar, rear: Scalar) -> Conditions:
+    """Conditions with levers at these angles [rad]."""
+    front, rear = (jnp.broadcast_to(jnp.degrees(x), conditions.shape) for x in (front, rear))
+    return dataclasses.replace(conditions, levers_front_deg=front, levers_rear_deg=rear)
+
+
+def flush(robot: Robot) -> Scalar:
+    """Angle at which a lever's lower run is in line with the main belt [rad], downward."""
+    gear = robot.running_gear
+    return -jnp.arcsin((robot.radius_pulley + gear.grouser_height - gear.levers.roller) / gear.lever_length)
+
+
+def best_levers(robot: Robot, conditions: Conditions, pitch: Scalar) -> tuple[Scalar, Scalar]:
+    """The angles of front and rear levers [rad] in which one run's robot stands on its highest step at a pitch θ.
+
+    The belt is over the edge, and the tail stands on the rollers of the rear levers. Front levers reach out level,
+    which brings their mass furthest over the step: φ_1 = -θ. Rear levers of length L stand
+
+        θ - φ_2 = π/2 + atan2(μ c sin θ, L cos θ),
+
+    upright but for what their mass, a share μ of all, c from their axle, is worth further ahead; both within the
+    levers' range.
+    """
+    gear, half = robot.running_gear, posture.parts(robot, conditions)
+    moved = gear.lever_mass * gear.lever_centre / (half.chassis + 2 * half.pulley)
+    rear = pitch - jnp.pi / 2 - jnp.arctan2(moved * jnp.sin(pitch), gear.lever_length * jnp.cos(pitch))
+    least, most = gear.levers.angle_least, gear.levers.angle_most
+    return jnp.clip(-pitch, least, most), jnp.clip(rear, least, most)
+
+
+def best_step(robot: Robot, conditions: Conditions) -> tuple[Step, Scalar, Scalar]:
+    """The highest step of one run in any posture within the levers' range, and the angles of front and rear levers
+    [rad]; its derivatives are those at these angles.
+
+    What a robot that climbs slowly can get over in whatever sequence of postures, where the wall of the step carries
+    nothing: as its tail leaves the lower ground, the centre of mass has to be over the step, and what is under it is
+    no higher than in the best posture. The pitch alone is searched for, the levers' angles follow (`best_levers`).
+    """
+    still, run = jax.lax.stop_gradient((robot, conditions))
+
+    def height(pitch: Scalar) -> Scalar:
+        return step_at(posture.outline(still, with_levers(run, *best_levers(still, run, pitch))), pitch)
+
+    best, apart = _highest(height, *_POSTURES)
+    for _ in range(2):  # smooth there: the tops of parabolas
+        low, middle, high = jnp.asarray(jax.vmap(height)(best + apart * jnp.array([-1.0, 0.0, 1.0])))
+        bend = 2 * middle - low - high
+        best = (
+            best
+            + jnp.where(bend > 0, jnp.clip((high - low) / (2 * jnp.where(bend > 0, bend, 1.0)), -1, 1), 0.0) * apart
+        )
+        apart = apart / 16
+    front, rear = best_levers(still, run, best)
+    return step(posture.outline(robot, with_levers(conditions, front, rear)), best), front, rear
+
+
+def stairs_rise(robot: Robot, conditions: Conditions, tread: Scalar, friction: Scalar) -> Scalar:
+    """The highest rise of stairs of this tread [m] on which one run's robot stands without rocking or sliding, its
+    levers flush with the belt.
+
+    A belt of friction μ that holds by that alone slides where tan α = μ, with tan α = rise / tread. On noses
+    t / cos α apart it always has one behind gravity's line through its centre of mass and one ahead of it if it
+    reaches that far both ways: ℓ - h tan α ≥ t / cos α at the tail, of the centre of mass ℓ ahead of the tail and h
+    above the belt; 0 where not even noses without rise are. Grousers that catch a nose hold more, and a robot that
+    rocks may get on.
+    """
+    angle = flush(robot)
+    rests = posture.level(robot, with_levers(conditions, angle, angle))
+    tail, nose = rests.centre_ahead - rests.rear, rests.front - rests.centre_ahead
+    # ℓ cos α - h sin α = t
+    reach = jnp.sqrt(tail**2 + rests.centre_height**2)
+    rocks = jnp.arccos(jnp.clip(tread / reach, 0.0, 1.0 - 1e-12)) - jnp.arctan2(rests.centre_height, tail)
+    bridged = jnp.minimum(tail, nose) >= tread
+    steepest = jnp.minimum(jnp.arctan(friction), jnp.maximum(rocks, 0.0))
+    return jnp.where(bridged, tread * jnp.tan(steepest), 0.0) * rests.line
+
+
+def limits(robot: Robot, conditions: Conditions) -> Limits:
+    """The static limits of a robot, for one run; slopes are level but those on which it tips."""
+    side, rests = posture.outline(robot, conditions), posture.level(robot, conditions)
+    highest, lies = step(side), side.pitched(rests.pitch)
+    tops, tracked = lies.up + lies.radius + rests.height, jnp.asarray(side.tracked) > 0.5
+    bridged: Scalar = jnp.minimum(rests.front - rests.centre_ahead, rests.centre_ahead - rests.rear)
+    width = robot.chassis(conditions.configuration).turning.width
+    return Limits(
+        step=highest.height,
+        gap=jnp.maximum(bridged, 0.0) * rests.line,
+        contact=rests.length,
+        tip_front=jnp.where(tracked, tops[FRONT_ROLLER], jnp.max(tops)),
+        tip_rear=jnp.where(tracked, tops[REAR_ROLLER], jnp.max(tops)),
+        tips_back=rests.tips_back,
+        tips_forward=rests.tips_forward,
+        tips_aside=jnp.arctan2(width / 2, rests.centre_height),
+        length=lies.length,
+        height=lies.height,
+    )
+
+
+@jax.jit
+def _over_levers(robot: Robot, conditions: Conditions, angles: Float[Array, "n 2"]) -> tuple[Step, Array]:
+    def at(pair: Array) -> tuple[Step, Array]:
+        here = dataclasses.replace(conditions, levers_front_deg=pair[0], levers_rear_deg=pair[1])
+        side = posture.outline(robot, here)
+        return step(side), jnp.asarray(posture.rest(side, here.slope, 0.0).margin)
+
+    return jax.lax.map(at, angles, batch_size=256)
+
+
+def over_levers(
+    robot: Robot, conditions: Conditions, front_deg: Float[np.ndarray, " n"], rear_deg: Float[np.ndarray, " m"]
+) -> tuple[Step, Float[Array, "n m"]]:
+    """The highest step with the levers at each pair of angles [deg], for one run, and the margin of tipping at rest
+    on its slope [m] (see `Posture`); leaves of shape (n, m, ...)."""
+    pairs = np.stack(np.meshgrid(front_deg, rear_deg, indexing="ij"), -1)
+    found = _over_levers(robot, conditions, jnp.asarray(pairs.reshape(-1, 2), float))
+    return jax.tree.map(lambda x: x.reshape(*pairs.shape[:2], *x.shape[1:]), found)
+
+
+@jax.jit
+def standing(robot: Robot, conditions: Conditions) -> tuple[Posture, Limits, Outline, Step]:
+    """How a robot stands in each run of a batch, its limits there, and its outline at rest and on its highest step;
+    leaves of shape (runs, ...)."""
+
+    def of_one(one: Conditions) -> tuple[Posture, Limits, Outline, Step]:
+        side, rests = posture.outline(robot, one), posture.posture(robot, one)
+        return rests, limits(robot, one), side.pitched(rests.pitch), step(side)
+
+    return jax.vmap(of_one)(conditions)

@@ -1,0 +1,152 @@
+"""Terrain in the plane of travel: a polyline with its signed distance, its normal and its convex corners.
+
+All terrains are polylines that go forward (x never falls), of points [m] with the ground on their right, so flat
+ground has its free side up. The obstacle begins at x = 0. Rounded noses are the level line of the distance to a
+polyline that lies their radius deeper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from mmrjax.model.params import Scalar
+
+#: How far the ground goes on before and after an obstacle [m].
+FAR = 100.0
+#: Depth of a gap [m]: nothing of a robot reaches its floor.
+DEEP = 5.0
+#: Where corners are that a polyline has not [m].
+_NOWHERE = (0.0, -1e3)
+
+
+class Terrain(eqx.Module):
+    """A polyline of ground.
+
+    Attributes:
+        points: its vertices [m]; equal ones are one.
+        nose: radius of its convex corners [m].
+        finish: where the obstacle ends [m].
+    """
+
+    points: Float[Array, "points 2"]
+    nose: Scalar
+    finish: Scalar
+
+    @property
+    def corners(self) -> Float[Array, "corners 2"]:
+        """Convex corners, centres of the noses [m]; concave ones are out of reach."""
+        before, at, after = self.points[:-2], self.points[1:-1], self.points[2:]
+        turn = _cross(at - before, after - at)
+        # A vertex that stands twice turns by nothing: its next one that differs is what counts.
+        return jnp.where((turn < -1e-15)[:, None], at, jnp.asarray(_NOWHERE))
+
+    def inside(self, at: Float[Array, "n 2"]) -> Bool[Array, " n"]:
+        """Whether points lie below the polyline."""
+        a, b = self.points[:-1], self.points[1:]
+        under = (at[:, None, 0] >= a[:, 0]) & (at[:, None, 0] < b[:, 0])
+        return jnp.any(under & (_cross(b - a, at[:, None] - a) < 0), axis=1)
+
+    def distance(self, at: Float[Array, "n 2"]) -> tuple[Float[Array, " n"], Float[Array, "n 2"]]:
+        """Distance of points from the ground [m], negative within it, and the ground's normal there.
+
+        The normal is the gradient of the distance: that of the nearest edge, or away from the nearest corner.
+        """
+        a, along = self.points[:-1], self.points[1:] - self.points[:-1]
+        square = jnp.maximum(jnp.sum(along**2, axis=1), 1e-30)  # of no edge where a vertex stands twice
+        from_a = at[:, None] - a
+        share = jnp.clip(jnp.sum(from_a * along, axis=-1) / square, 0.0, 1.0)
+        off = from_a - share[..., None] * along
+        squared = jnp.sum(off**2, axis=-1)
+        nearest = jnp.argmin(squared, axis=1)[:, None]
+        off, share, least = _at(off, nearest), _at(share, nearest), _at(squared, nearest)
+        length = jnp.sqrt(jnp.maximum(least, 1e-300))
+        sign = jnp.where(self.inside(at), -1.0, 1.0)
+        edge = along / jnp.sqrt(square)[:, None]
+        edge = jnp.stack([-edge[:, 1], edge[:, 0]], axis=1)[nearest[:, 0]]
+        within = (share > 0) & (share < 1) | (least < 1e-24)
+        normal = jnp.where(within[:, None], edge, (sign / length)[:, None] * off)
+        return jnp.where(within, jnp.sum(edge * off, axis=1), sign * length) - self.nose, normal
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def _at(values: Array, which: Array) -> Array:
+    index = which[..., None] if values.ndim == 3 else which
+    return jnp.take_along_axis(values, index, axis=1)[:, 0]
+
+
+def _terrain(points: Sequence[tuple[Scalar, Scalar]], finish: Scalar, nose: Scalar = 0.0, size: int = 0) -> Terrain:
+    """Of points [m] between the ground before and the ground after; padded to `size` of them."""
+    zero = jnp.zeros(())
+    rows = jnp.stack([jnp.stack([x + zero, z + zero]) for x, z in points])
+    # Noses: the polyline stands their radius deeper; risers face backward.
+    rows = rows + jnp.asarray([1.0, -1.0]) * nose
+    rows = jnp.concatenate([rows, jnp.broadcast_to(rows[-1], (max(size - len(points), 0), 2))])
+    return Terrain(rows, nose + zero, finish + zero)
+
+
+def flat(size: int = 0) -> Terrain:
+    """Level ground."""
+    return _terrain([(-FAR, 0.0), (FAR, 0.0)], 0.0, size=size)
+
+
+def slope(angle: Scalar, size: int = 0) -> Terrain:
+    """Ground that rises at a constant `angle` [rad], through the origin."""
+    x, z = FAR * jnp.cos(angle), FAR * jnp.sin(angle)
+    return _terrain([(-x, -z), (x, z)], 0.0, size=size)
+
+
+def step(height: Scalar, nose: Scalar = 0.0, size: int = 0) -> Terrain:
+    """A step up (or down) by `height` [m], its corner rounded by `nose` [m]."""
+    return _terrain([(-FAR, 0.0), (0.0, 0.0), (0.0, height), (FAR, height)], 0.0, nose, size)
+
+
+def stairs(rise: Scalar, tread: Scalar, count: int, nose: Scalar = 0.0, size: int = 0) -> Terrain:
+    """`count` steps of `rise` and `tread` [m], noses rounded by `nose` [m]."""
+    points: list[tuple[Scalar, Scalar]] = [(-FAR, 0.0)]
+    for k in range(count):
+        points += [(k * tread, k * rise), (k * tread, (k + 1) * rise)]
+    last = (count - 1) * tread
+    return _terrain([*points, (last + FAR, count * rise)], last, nose, size)
+
+
+def gap(width: Scalar, size: int = 0) -> Terrain:
+    """A trench of `width` [m] without a floor in reach."""
+    points = [(-FAR, 0.0), (0.0, 0.0), (0.0, -DEEP), (width, -DEEP), (width, 0.0), (width + FAR, 0.0)]
+    return _terrain(points, width, size=size)
+
+
+def polyline(x: Sequence[float] | np.ndarray, z: Sequence[float] | np.ndarray, size: int = 0) -> Terrain:
+    """Level ground up to the first point (x, z) [m], the polyline, level ground from its last point on.
+
+    Raises:
+        ValueError: fewer than two points, no number, x falls, or a wall goes back on itself.
+    """
+    x, z = np.asarray(x, float), np.asarray(z, float)
+    if x.ndim != 1 or x.shape != z.shape or len(x) < 2:
+        raise ValueError(f"terrain: got x of shape {x.shape} and z of {z.shape}; expected two points or more")
+    if not (np.isfinite(x).all() and np.isfinite(z).all()):
+        raise ValueError("terrain: got a point that is no number; expected x and z in metres")
+    if (back := np.flatnonzero(np.diff(x) < 0)).size:
+        k = int(back[0])
+        raise ValueError(
+            f"terrain: x falls from {x[k]:g} to {x[k + 1]:g} m at point {k + 2}; expected ground that goes forward, "
+            "x equal or larger from point to point (no overhangs)"
+        )
+    keep = np.concatenate([[True], (np.diff(x) != 0) | (np.diff(z) != 0)])
+    x, z = x[keep], z[keep]
+    up = np.where(np.diff(x) == 0, np.diff(z), 0.0)
+    if (back := np.flatnonzero(up[1:] * up[:-1] < 0)).size:
+        k = int(back[0]) + 1
+        raise ValueError(
+            f"terrain: z goes from {z[k]:g} back to {z[k + 1]:g} m at x = {x[k]:g} m; expected a wall up or down"
+        )
+    points = [(x[0] - FAR, z[0]), *zip(x, z, strict=True), (x[-1] + FAR, z[-1])]
+    return _terrain(points, float(x[-1]), size=size)

@@ -1,0 +1,1 @@
+"""Compiled functions, and programs that are kept on disk."""

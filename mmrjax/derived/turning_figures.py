@@ -1,0 +1,99 @@
+"""What follows from how a robot turns: radius, instantaneous centre, effective width, what each side takes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from mmrjax.compile.compiling import compiled
+from mmrjax.fidelities.steady import steady, steady_batch
+from mmrjax.model import channels
+from mmrjax.model.conditions import OF_SIDES, Conditions
+from mmrjax.model.quantities import MM
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Result
+
+#: Yaw rate below which a robot travels straight [rad/s]; its turn would take two centuries.
+NONE = 1e-9
+#: Channels of a motion in the plane.
+PLANE = ("speed", "lateral_speed", "yaw_rate")
+#: Columns, with what they are.
+COLUMNS: dict[str, str] = {
+    "turning_radius_mm": "radius of the circle of the centre of mass, positive to the left; inf: straight",
+    "centre_x_mm": "instantaneous centre of rotation ahead of the centre of mass",
+    "centre_y_mm": "instantaneous centre of rotation to the left of the centre of mass",
+    "effective_width_mm": "effective track width (V_teor,right - V_teor,left) / yaw rate",
+    "power_left_W": "electrical power of the left motor", "power_right_W": "electrical power of the right motor",
+    "winding_left_C": "winding of the left motor after long running",
+    "winding_right_C": "winding of the right motor after long running",
+}  # fmt: skip
+
+
+def turning_radius(ahead: Any, aside: Any, rate: Any) -> Array:
+    """Of the circle of the centre of mass, positive to the left, inf where it travels straight [m].
+
+    Args:
+        ahead, aside: speeds of the centre of mass [m/s]; rate: yaw rate [rad/s]; arrays of one shape.
+    """
+    turns = jnp.abs(rate) > NONE
+    along = jnp.sqrt(jnp.maximum(jnp.square(ahead) + jnp.square(aside), 1e-24))  # a root of nothing has no derivative
+    left = jnp.where(jnp.asarray(ahead) * rate < 0, -1.0, 1.0)
+    return jnp.where(turns, left * along / jnp.where(turns, jnp.abs(rate), 1.0), jnp.inf)
+
+
+@compiled
+def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
+    """The radius of a settled turn of one run.
+
+    Returns:
+        `turning_radius` [m], NaN where nothing settles; `status` of the turn. Derivatives are implicit.
+    """
+    point = steady(robot, conditions)
+    found = turning_radius(*(point.reading[name] for name in PLANE))
+    return {"turning_radius": jnp.where(jnp.isnan(point.speed), jnp.nan, found), "status": point.status}
+
+
+def by_itself(robot: Robot, imposed: float) -> Result:
+    """How a robot whose sides differ turns on level ground where both are driven alike, a settled turn of each of its
+    configurations in order.
+
+    Args:
+        imposed: voltage [V], or motor speed [rad/s] where that is what its rig imposes.
+    """
+    both = OF_SIDES[-2:] if robot.rig.imposed == "motor_speed" else OF_SIDES[:2]
+    alike = dict.fromkeys(both, imposed if robot.rig.imposed == "motor_speed" else 1.0)
+    asked = Conditions([*robot.configurations], voltage=abs(imposed), **alike).resolved(robot)
+    return jax.device_get(steady_batch(robot, asked))
+
+
+def columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray) -> dict[str, np.ndarray]:
+    """The columns of settled turns, of what their channels read [SI]; arrays of one shape.
+
+    Args:
+        radius: of the driving wheels [m].
+    """
+    turn = np.asarray(reading["yaw_rate"])
+    # What is left of zero by rounding is no radius.
+    rate = np.where(np.abs(turn) > NONE, turn, np.nan)
+    shafts = {side: np.asarray(reading[f"motor_speed_{side}"]) for side in channels.SIDES}
+    rolled = {side: radius * n / float(robot.gearbox.ratio) for side, n in shafts.items()}
+    units = float(robot.sides) / 2
+    ahead, left = (-np.asarray(reading["lateral_speed"]) / rate, np.asarray(reading["speed"]) / rate)
+    found = {
+        "turning_radius_mm": np.asarray(turning_radius(*(np.asarray(reading[name]) for name in PLANE))) / MM,
+        "centre_x_mm": ahead / MM,
+        "centre_y_mm": left / MM,
+        "effective_width_mm": (rolled["right"] - rolled["left"]) / rate / MM,
+    }
+    for side in channels.SIDES:
+        current = np.asarray(reading[f"motor_current_{side}"])
+        found[f"power_{side}_W"] = units * np.asarray(reading[f"motor_voltage_{side}"]) * current
+    for side in channels.SIDES:
+        current = np.asarray(reading[f"motor_current_{side}"])
+        found[f"winding_{side}_C"] = np.asarray(robot.motor.temperature_settled(jnp.asarray(current)))
+    return {name: np.where(np.isnan(turn), np.nan, x) for name, x in found.items()}

@@ -1,0 +1,185 @@
+"""Effects on the armature circuit [V]: further drops in eq. (15)."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from mmrjax.effects.base import Effect, amplitude
+from mmrjax.model.params import Scalar, parameter
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals
+
+
+class ElectricalEffect(Effect):
+    """Voltage drop of one motor's circuit [V]."""
+
+    balance = "electrical"
+
+
+class SeriesResistance(ElectricalEffect):
+    """ΔU = a I_d: Ohm's law for everything in series with one motor that its data sheet leaves out.
+
+    Leads, ammeter and brush contacts in series with each motor.
+
+    Source: Fig. 20 of the paper (leads and ammeter of the bench); Ohm (1827).
+    """
+
+    driver = "current"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="ohm",
+        meaning="resistance in series with each motor",
+        bounds=(-0.5, 5.0),
+        sd=0.5,
+        source="bench leads and meters: tenths of an ohm",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * signals.current
+
+
+class BrushDrop(ElectricalEffect):
+    """ΔU = a I / √(I² + I_b²): a constant drop against the current, smooth through zero.
+
+    Contact voltage of the brushes, nearly the same at every current.
+
+    Source: IEEE Std 113-1985 takes a constant 2 V for carbon and graphite brushes of large machines; small
+    graphite brushes on copper drop tenths of a volt. The smoothing current I_b is that below which the
+    contact is ohmic.
+    """
+
+    driver = "current"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="V",
+        meaning="voltage drop of a pair of brushes",
+        bounds=(-0.5, 3.0),
+        sd=0.5,
+        source="0.2 V (copper-graphite) to 1 V (graphite) a pair",
+    )
+    current_ohmic: Scalar = parameter(
+        0.1,
+        unit="A",
+        meaning="current I_b below which the contact is ohmic",
+        bounds=(5e-3, 1.0),
+        relative_sd=0.5,
+        source="below the no-load current of 165 mA",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * signals.current / jnp.sqrt(signals.current**2 + self.current_ohmic**2)
+
+
+class WindingHeating(ElectricalEffect):
+    """ΔU = a α R I · R_th R I²: copper's resistance at a share `a` of the settled temperature rise.
+
+    The winding's resistance rises as the current heats it.
+
+    Source: IEC 60028 for α; the maker's sheet for R_th = 7.7 K/W. A run shorter than the thermal time
+    constants (16 s winding, 593 s housing) reaches only a share of the settled rise: 1 is settled, 0 cold.
+    The rise is taken at the cold resistance (first order in α) and held at the winding's limit of 125 °C, so
+    that the inrush of a start, which lasts milliseconds, is not taken for a settled current of 50 A. Where the
+    winding's temperature is followed (missions), its resistance follows that, and the effect adds nothing.
+    """
+
+    driver = "current"
+    rests_on = ("motor.resistance_thermal_housing", "motor.resistance_thermal_winding")
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="share of the settled temperature rise that the run reaches",
+        bounds=(-0.5, 3.0),
+        sd=1.0,
+        source="0 cold, 1 settled; above 1 for a closed housing",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        motor = robot.motor
+        if signals.temperature is not None:
+            return jnp.zeros_like(signals.current)
+        rise = jnp.minimum(motor.temperature_cold(signals.current), motor.temperature_limit)
+        rise = rise - motor.temperature_ambient
+        return self.amplitude * motor.temperature_coefficient * rise * motor.voltage_winding(signals.current)
+
+
+class ThermalDrift(ElectricalEffect):
+    """ΔU = a α R I T, with the rise T of the winding over its housing: τ T' = R_wh R I² - T, T(0) = 0.
+
+    The winding warms up while the run lasts.
+
+    Source: IEC 60028 for α; the maker's sheet of RE30 310007 for τ and R_wh. The housing, with 593 s, stays
+    where it was during a run: its share is `winding_heating`, which settled travel cannot tell from this.
+    The memory is T [K]; where none is kept it is settled. Where the winding's temperature is followed (missions), its
+    resistance follows that, and the effect adds nothing.
+    """
+
+    driver = "current"
+    dissipative = True
+    settles_to = "winding_heating"
+    memory_size = 10.0
+    memory_unit = "K"
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="share of the sheet's temperature rise",
+        bounds=(-1.0, 10.0),
+        sd=1.0,
+        source="1 by the sheet; more in still air between printed walls",
+    )
+    time_constant: Scalar = parameter(
+        16.3,
+        unit="s",
+        meaning="thermal time constant of the winding τ",
+        bounds=(1.0, 600.0),
+        relative_sd=0.3,
+        source="maker's sheet of RE30 310007",
+    )
+    resistance_thermal: Scalar = parameter(
+        1.7,
+        unit="K/W",
+        meaning="thermal resistance winding to housing R_wh",
+        bounds=(0.1, 20.0),
+        relative_sd=0.2,
+        source="maker's sheet of RE30 310007",
+    )
+
+    def settled(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.resistance_thermal * robot.motor.voltage_winding(signals.current) * signals.current
+
+    def rate(self, robot: Robot, signals: Signals) -> Scalar:
+        return (self.settled(robot, signals) - signals.memory[self.name]) / self.time_constant
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        if signals.temperature is not None:
+            return jnp.zeros_like(signals.current)
+        drop = robot.motor.voltage_winding(signals.current)
+        return self.amplitude * robot.motor.temperature_coefficient * self.recall(robot, signals) * drop
+
+
+class CoastDecay(ElectricalEffect):
+    """ΔU = -a (1 - |D|) E: between the pulses of a duty D the motors are left to coast, for a share a of the pauses.
+
+    A driver in fast decay, whose current ends within each period: the mean torque is in proportion to the duty, and
+    the speed without load does not depend on it.
+
+    Source: Mohan, Undeland and Robbins, Power Electronics (2003), chapter 7: discontinuous conduction, with pulses
+    and pauses long against L/R (see `driver.Driver`, whose `decay = "fast"` is a = 1, and where the supply's current
+    and the heat of the pulses follow too). At full duty it is absent, as where the motors are open or shorted.
+    """
+
+    driver = "duty"
+    needs_duty = True
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="share of the pauses between pulses in which the motors coast",
+        bounds=(-0.5, 1.5),
+        sd=0.5,
+        source="0 slow decay, 1 fast decay with the current ending at once",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return -self.amplitude * signals.pause * robot.motor.voltage_back(signals.speed_motor)

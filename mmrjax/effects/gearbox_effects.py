@@ -1,0 +1,192 @@
+"""Effects on the gearbox [N·m] at its output shaft, eqs. (19)-(23)."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from mmrjax.effects.base import Effect, amplitude
+from mmrjax.effects.bristle import Bristle, breakaway_parameter
+from mmrjax.model.params import Scalar, parameter
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals
+from mmrjax.numerics.one_sided import at_least, magnitude
+
+
+class GearboxEffect(Effect):
+    """Torque lost in the gearbox, at its output shaft [N·m]."""
+
+    balance = "gearbox"
+
+
+def torque_output(robot: Robot, signals: Signals) -> Scalar:
+    """Torque of traction and track losses at the output shaft [N·m]."""
+    return signals.torque_track_loss + robot.chassis(signals.configuration).radius * signals.traction
+
+
+class GearLoadLoss(GearboxEffect):
+    """ΔM_r = a |M_load|: a share of the torque at the output shaft.
+
+    Teeth lose more, or less, of the load than the catalogue says.
+
+    Source: Niemann and Winter, Maschinenelemente II (2003): load-dependent mesh loss P_Z = P μ_z H_v. It is
+    eq. (19)'s η_rm in another form: look-alike of a change of η_rm by -a η_rm.
+    """
+
+    driver = "load"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="share of the output torque lost beyond eq. (19)",
+        bounds=(-0.2, 0.5),
+        sd=0.05,
+        source="η_rm of two or three planet stages: 0.70 to 0.80",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        load = torque_output(robot, signals)
+        return self.amplitude * magnitude(load, signals.direction) * signals.direction
+
+
+class GearQuadraticLoss(GearboxEffect):
+    """ΔM_r = a M_load²: the square of the torque at the output shaft.
+
+    Gear loss that grows faster than the load.
+
+    Source: second-order term of the load-dependent mesh loss, whose friction grows with tooth load
+    (Ohlendorf, Verlustleistung und Erwärmung von Stirnrädern, 1958: μ as the power 0.2 of the load) and
+    whose planets tilt.
+    """
+
+    driver = "load"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="1/N/m",
+        meaning="loss torque over squared output torque",
+        bounds=(-0.05, 0.3),
+        sd=0.03,
+        source="at 2 N·m 6 % of the load",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        load = torque_output(robot, signals)
+        return self.amplitude * load**2 * signals.direction
+
+
+class StribeckGear(GearboxEffect):
+    """ΔM_r = a exp(-|ω_m| / ω_s) sign ω_m at the output shaft.
+
+    Gear friction that falls as the input gains speed.
+
+    Source: Tustin (1947), the exponential law; mixed lubrication of grease-packed planets (Niemann and
+    Winter, 2003). With the same ω_s it is `stribeck_motor` times i η_rm.
+    """
+
+    driver = "speed"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="friction torque at rest, at the output",
+        bounds=(-0.1, 1.0),
+        sd=0.05,
+        source="some 1.5 mN·m at the input, times 48 and η_rm",
+    )
+    speed_fade: Scalar = parameter(
+        300.0,
+        unit="rad/s",
+        meaning="input speed ω_s over which the excess fades",
+        bounds=(20.0, 3000.0),
+        relative_sd=0.5,
+        source="grease leaves mixed lubrication at 1000 to 5000 rpm of the input",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * jnp.exp(-jnp.abs(signals.speed_motor) / self.speed_fade) * signals.direction
+
+
+class BackdrivingLoss(GearboxEffect):
+    """ΔM_r = a |M_load| where the load drives the motor, 0 where the motor drives the load.
+
+    Teeth lose more of the load, or less, while power flows back through them, as down a slope.
+
+    Source: Duclusaud, Passault, Padois and Ly, Extended friction models for the physics simulation of servo
+    actuators (2024, arXiv:2410.08650), whose directional models give motor and load a share of friction each;
+    Niemann and Winter, Maschinenelemente II (2003): the efficiency backward 2 - 1/η is below η. Of the load's
+    torque a share 1 - a gets to the gear, and of that eq. (19)'s η_b to the motor; at a = 1 the gear locks itself.
+    The load that it goes by is without the rotor's inertia; it fades at rest with the shaft's smooth sign.
+    """
+
+    driver = "load"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="share of the load's torque lost beyond eq. (19) while the load drives",
+        bounds=(-0.2, 1.0),
+        sd=0.1,
+        source="η - (2 - 1/η) = 0.09 for η_rm of Table 2",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        driving = at_least(0.0, -torque_output(robot, signals) * signals.direction)
+        return self.amplitude * driving * signals.direction
+
+
+class BristleLoadLoss(Bristle, GearboxEffect):
+    """ΔM_r = a |M_load| z, θ_s z' = ω_k - |ω_k| z, z(0) = 0: a share of the load lost through a bristle.
+
+    Teeth that carry a load yield over a small turn before they slide, so that their loss builds up after a reversal.
+
+    Source: Duclusaud, Passault, Padois and Ly, Extended friction models for the physics simulation of servo actuators
+    (2024, arXiv:2410.08650): friction in proportion to the load, here through Dahl's bristle (1968). Settled
+    z = sign ω_k: it is then `gear_load_loss`, and reversals tell the two apart. With `bristle_backdriving_loss` of
+    amplitude b it is μ_avg |M_load| z + μ_dif M_load z² with μ_avg = a + b/2 and μ_dif = -b/2. Bent teeth give
+    energy back, so it is not a pure loss.
+    """
+
+    driver = "load"
+    settles_to = "gear_load_loss"
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="share of the output torque lost through the bristle",
+        bounds=(-0.2, 0.5),
+        sd=0.05,
+        source="as of `gear_load_loss`",
+    )
+    angle_breakaway: Scalar = breakaway_parameter()
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        load = magnitude(torque_output(robot, signals), signals.direction)
+        return self.amplitude * load * self.recall(robot, signals)
+
+
+class BristleBackdrivingLoss(Bristle, GearboxEffect):
+    """ΔM_r = a (|M_load| z - M_load z²) / 2, θ_s z' = ω_k - |ω_k| z, z(0) = 0.
+
+    Teeth that lose more of the load, or less, while it drives the motor, through the bristle of `bristle_load_loss`.
+
+    Source: Duclusaud, Passault, Padois and Ly (2024, arXiv:2410.08650), whose directional models give motor and load
+    a share of friction each; Dahl (1968). Settled z = sign ω_k: it is then `backdriving_loss`, 0 where the motor
+    drives the load and a |M_load| where the load drives the motor. Reversals under a load tell the two apart. See
+    `bristle_load_loss` for the sum of both.
+    """
+
+    driver = "load"
+    settles_to = "backdriving_loss"
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="share of the load's torque lost through the bristle while the load drives",
+        bounds=(-0.2, 1.0),
+        sd=0.1,
+        source="as of `backdriving_loss`",
+    )
+    angle_breakaway: Scalar = breakaway_parameter()
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        load, bend = torque_output(robot, signals), self.recall(robot, signals)
+        driving = magnitude(load, signals.direction) * bend - load * bend**2
+        return 0.5 * self.amplitude * driving

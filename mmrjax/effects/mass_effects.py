@@ -1,0 +1,62 @@
+"""Effects on the mass [kg]: what robot and load weigh beyond what is stated."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from mmrjax.effects.base import Effect, amplitude
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals
+
+
+class MassEffect(Effect):
+    """Mass beyond the stated one [kg]."""
+
+    balance = "mass"
+
+
+class MassError(MassEffect):
+    """ΔM = a M: the stated mass, payload included, times 1 + a.
+
+    The robot and its load weigh more than stated, by a share.
+
+    Source: calibration error of the scales (OIML R 76 class IIII: a few tenths of a percent; a spring
+    balance: percents). Weight, adhesion, guide load and inertia all follow from the mass, so it enters there
+    and nowhere else.
+    """
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="relative error of the stated mass",
+        bounds=(-0.3, 0.3),
+        sd=0.03,
+        source="spring balance, cables and mud: a few percent",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * signals.mass
+
+
+class MassOffset(MassEffect):
+    """M = stated mass + a in the wheeled configuration; in the tracked one M is as stated.
+
+    Kilograms that one configuration carries beyond what is stated; `configurations` may name others.
+
+    Source: Table A2 prints 13.1 kg for the wheeled robot, Table 7 states 11.5 kg. Weight, adhesion,
+    guide load and inertia all follow from the mass, so it enters there and nowhere else.
+    """
+
+    driver = "configuration"
+    movers = "wheels"
+
+    amplitude: Scalar = amplitude(
+        unit="kg",
+        meaning="mass of the wheeled robot beyond the stated mass",
+        bounds=(-5.0, 5.0),
+        sd=1.0,
+        source="flippers weigh 4 x (470 + 25) g, wheels 4 x 86 g (Table 7)",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * jnp.ones_like(signals.payload)

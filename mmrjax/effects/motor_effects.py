@@ -1,0 +1,189 @@
+"""Effects on the motor's torque [N·m] at its shaft, eqs. (14), (17), (18)."""
+
+from __future__ import annotations
+
+import math
+
+import jax.numpy as jnp
+
+from mmrjax.effects.base import Effect, amplitude
+from mmrjax.effects.periodic import Periodic, phase_parameter
+from mmrjax.model import contact
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Index, Scalar, parameter
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals
+
+
+class MotorEffect(Effect):
+    """Torque lost at the motor's shaft [N·m]."""
+
+    balance = "motor"
+
+
+class Windage(MotorEffect):
+    """ΔM_df = a ω_m |ω_m|: turbulent drag, torque as the square of speed.
+
+    Air drag of the rotor.
+
+    Source: Vrancik, Prediction of windage power loss in alternators, NASA TN D-4849 (1968): power as the
+    cube of speed at a constant skin friction coefficient.
+    """
+
+    driver = "speed"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m·s^2",
+        meaning="torque over squared motor speed",
+        bounds=(-1e-9, 1e-8),
+        sd=5e-10,
+        source="at 1200 rad/s 0.7 mN·m, a fifth of eq. (14)",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        # ω² with the shaft's smooth sign: |ω| alone has no derivative at rest.
+        return self.amplitude * signals.speed_motor**2 * signals.direction
+
+
+class StribeckMotor(MotorEffect):
+    """ΔM_df = a exp(-|ω_m| / ω_s) sign ω_m.
+
+    Friction of brushes and bearings that falls as the shaft gains speed.
+
+    Source: Tustin, The effects of backlash and of speed-dependent friction on the stability of closed-cycle
+    control systems, J. IEE 94 (1947), the exponential law; Armstrong-Hélouvry, Dupont and Canudas de Wit
+    (1994), with exponent 1.
+    """
+
+    driver = "speed"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="friction torque at rest beyond the dry friction",
+        bounds=(-3e-3, 2e-2),
+        sd=1.5e-3,
+        source="half of the dry friction of Table 2",
+    )
+    speed_fade: Scalar = parameter(
+        300.0,
+        unit="rad/s",
+        meaning="motor speed ω_s over which the excess fades",
+        bounds=(20.0, 3000.0),
+        relative_sd=0.5,
+        source="sleeve bearings leave mixed lubrication at 1000 to 5000 rpm",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * jnp.exp(-jnp.abs(signals.speed_motor) / self.speed_fade) * signals.direction
+
+
+class IronLoss(MotorEffect):
+    """ΔM_df = a 2x / (1 + x²), x = ω_m / ω_c: the drag of an eddy-current brake.
+
+    Eddy currents in the motor's solid parts, weakened by their own field at high speed.
+
+    Source: Wouterse, Critical torque and speed of eddy current brake with widely separated soft iron poles,
+    IEE Proc. B 138 (1991). Below ω_c the drag grows as the speed and is eq. (14)'s viscous term; hysteresis
+    is its dry one: what can be told from them is the bend towards ω_c.
+    """
+
+    driver = "speed"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="largest drag torque, reached at ω_c",
+        bounds=(-2e-3, 1e-2),
+        sd=1e-3,
+        source="a quarter of the no-load torque of 4.3 mN·m",
+    )
+    speed_critical: Scalar = parameter(
+        800.0,
+        unit="rad/s",
+        meaning="motor speed ω_c of the largest drag",
+        bounds=(50.0, 2e4),
+        relative_sd=0.5,
+        source="millimetres of solid steel: 10^2 to 10^4 rad/s",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        share = signals.speed_motor / self.speed_critical
+        return self.amplitude * 2 * share / (1 + share**2)
+
+
+class TorqueConstantSaturation(MotorEffect):
+    """ΔM_d = a C_m I³: C_m(I) = C_m (1 - a I²) in the torque of eq. (17).
+
+    Armature reaction weakens the torque constant at high current.
+
+    Source: demagnetising part of the armature reaction, even in the current (Fitzgerald, Kingsley and Umans,
+    Electric Machinery, 2003, ch. 7). It weakens torque and back-EMF alike; it stands in the motor balance
+    alone, where its share is the larger: with I R a tenth of U, the back-EMF's part is a second-order one.
+    So it is not a loss of power by itself.
+    """
+
+    driver = "load"
+
+    amplitude: Scalar = amplitude(
+        unit="1/A^2",
+        meaning="relative loss of torque constant over squared current",
+        bounds=(-0.01, 0.05),
+        sd=3e-3,
+        source="3 % at 3 A; an ironless rotor saturates little",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * robot.motor.torque_electromagnetic(signals.current) * signals.current**2
+
+
+class Cogging(Periodic, MotorEffect):
+    """ΔM = a sin(n θ_m + φ) fade(n ω_m), with n ripples a turn; fade falls from 1 at ω_f to 0 at 2 ω_f.
+
+    The motor's torque ripples as its commutator turns.
+
+    Source: Kenjo and Nagamori, Permanent-Magnet and Brushless DC Motors (1985): ripple at twice the number
+    of segments. The RE30 has an ironless rotor, hence no reluctance torque, and 13 segments. Above ω_f the
+    rotor's inertia leaves no more than a / (J_d ω_f) of speed, 0.03 rad/s at the prior's size, so the ripple
+    is faded out instead of being integrated at 5 kHz: it acts at a crawl and at the start.
+    """
+
+    driver = "angle"
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="amplitude of the torque ripple",
+        bounds=(-5e-3, 5e-3),
+        sd=5e-4,
+        source="a tenth of the no-load torque of 4.3 mN·m",
+    )
+    phase: Scalar = phase_parameter()
+    ripples: Scalar = parameter(
+        26.0,
+        unit="-",
+        meaning="ripples a turn n",
+        bounds=(1.0, 100.0),
+        relative_sd=0.01,
+        source="twice the 13 segments of the commutator",
+    )
+    rate_fade: Scalar = parameter(
+        1000.0,
+        unit="rad/s",
+        meaning="ripple rate ω_f from which it is faded out",
+        bounds=(10.0, 1e5),
+        relative_sd=0.1,
+        source="a choice of the model, see above",
+    )
+
+    def order(self, robot: Robot, configuration: Index) -> Scalar:
+        return self.ripples
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        share = self.ripples * signals.speed_motor / self.rate_fade
+        fade = contact.step(share**2, 1.0, 1.0, 4.0, 0.0)
+        return self.amplitude * self.wave(signals) * fade
+
+    def step_longest(self, robot: Robot, conditions: Conditions) -> float:
+        """No limit: where the ripple acts, the start's own steps are shorter than its period."""
+        return math.inf

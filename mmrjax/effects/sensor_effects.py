@@ -1,0 +1,157 @@
+"""Effects on what the instruments show, each in its channel's unit."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Iterator
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+
+from mmrjax.effects.base import Effect, amplitude, made
+from mmrjax.model import channels
+from mmrjax.model.channels import Channel
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals
+
+
+class SensorEffect(Effect):
+    """An error of the instrument of one channel, added to what it shows: of its scale, a x, or of its zero, a."""
+
+    balance = "sensor"
+
+    @property
+    @abc.abstractmethod
+    def of_zero(self) -> bool:
+        """Whether it is the same whatever is shown."""
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        shown = robot.rig.instrument(self.channel).shows(channels.find(self.channel).read(robot, signals))
+        # Times one of the signals' shape, so that a batch stays a batch.
+        return self.amplitude * (jnp.ones_like(shown) if self.of_zero else shown)
+
+
+class AmmeterGain(SensorEffect):
+    """ΔI_Σ = a I_Σ in the reading.
+
+    The ammeter's scale is off.
+
+    Source: limits of error of meters by IEC 60051-2 (class 0.5 to 2.5) and tolerance of a shunt.
+    """
+
+    channel = "total_current"
+    of_zero = False
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="relative error of the current reading",
+        bounds=(-0.2, 0.2),
+        sd=0.02,
+        source="class 2.5 meter, shunt of 1 %",
+    )
+
+
+class AmmeterOffset(SensorEffect):
+    """ΔI_Σ = a in the reading, in either direction of travel.
+
+    The ammeter does not show zero at zero.
+
+    Source: zero error of meters, IEC 60051-2; consumers beside the motors on the same line, eq. (10).
+    """
+
+    channel = "total_current"
+    of_zero = True
+
+    amplitude: Scalar = amplitude(
+        unit="A",
+        meaning="current shown with the motors off",
+        bounds=(-1.0, 2.0),
+        sd=0.1,
+        source="control electronics on the line: 0.05 to 0.2 A",
+    )
+
+
+class EncoderScale(SensorEffect):
+    """Δω_m = a ω_m in the reading.
+
+    Counts of the motor's encoder are divided by a wrong number.
+
+    Source: time base and pulses per turn of the counter; a tachometer's class by IEC 60051.
+    """
+
+    channel = "motor_speed"
+    of_zero = False
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="relative error of the motor speed reading",
+        bounds=(-0.1, 0.1),
+        sd=0.01,
+        source="optical tachometer 0.1 %, analogue one 1 to 2 %",
+    )
+
+
+class SpeedGain(SensorEffect):
+    """ΔV = a V in the reading.
+
+    The distance over which the robot is timed is not what is stated.
+
+    Source: speed as distance over time (Section 4 of the paper): both errors are relative ones.
+    """
+
+    channel = "speed"
+    of_zero = False
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="relative error of the speed reading",
+        bounds=(-0.1, 0.1),
+        sd=0.02,
+        source="1 to 2 cm in 1 m, a tenth of a second by hand",
+    )
+
+
+def _error(read: Channel, of_zero: bool) -> type[Effect]:
+    """The error of the scale of a channel's instrument, or of its zero."""
+    largest, unit = (10 * read.zero_error, read.unit_si or read.unit) if of_zero else (0.2, "-")
+    source = "limits of error of instruments, IEC 60051-2", "class of the instrument: 0.5 to 2.5 %"
+    if read.unit_shown == "°C":
+        source = "tolerances of thermocouples, IEC 60584-1", "class of the instrument: 1 to 3 K"
+    odd, zero = of_zero and read.directed, of_zero
+
+    class Error(SensorEffect):
+        name = f"{read.name}_{'offset' if zero else 'gain'}"
+        channel = read.name
+        of_zero = zero
+        odd_in_travel = odd
+
+        amplitude: Scalar = amplitude(
+            unit=unit,
+            meaning=f"error of the {read.label} reading" if zero else f"relative error of the {read.label} reading",
+            bounds=(-largest, largest),
+            sd=read.zero_error if zero else 0.02,
+            source=source[1],
+        )
+
+    Error.__doc__ = f"""Δx = a{"" if zero else " x"} in the reading x of {read.label}.
+
+    The {"zero" if zero else "scale"} of the instrument is off.
+
+    Source: {source[0]}.
+    """
+    return made(Error, "".join(word.capitalize() for word in Error.name.split("_")))
+
+
+def _errors() -> Iterator[type[Effect]]:
+    """Of every channel that the classes above are not about: of its scale, but of a temperature, whose zero is a
+    convention; then of its zero. Random numbers go by position: new ones stand at the end."""
+    own = [c for c in channels.EVERY if c not in channels.usual()]
+    yield from (_error(c, of_zero=c.unit_shown == "°C") for c in own)
+    yield from (_error(c, of_zero=True) for c in own if c.misses_zero)
+
+
+#: A rig has those of its channels.
+OF_CHANNELS: dict[str, type[Effect]] = {effect.name: effect for effect in _errors()}
+#: The same by the names of their classes, see `made`.
+Made = SimpleNamespace(**{effect.__name__: effect for effect in OF_CHANNELS.values()})

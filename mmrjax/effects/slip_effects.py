@@ -1,0 +1,212 @@
+"""Effects on the slip [m/s]: speed that is lost without sliding, eqs. (32), (33)."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from mmrjax.effects.base import Effect, amplitude
+from mmrjax.effects.periodic import Periodic, phase_parameter
+from mmrjax.model.params import Index, Scalar, parameter
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals
+
+#: Share of V_1 and distance of the demand from its limit within which shaking contacts are rounded off [-].
+SLOWEST, ROUNDED = 1e-3, 0.05
+
+
+class SlipEffect(Effect):
+    """Speed lost between belt or tyre and the ground [m/s]."""
+
+    balance = "slip"
+
+
+class RollingRadius(SlipEffect):
+    """ΔV = -a r_k ω_k: the robot travels (1 + a) r_k per radian, at the same lever arm of the traction.
+
+    The distance rolled per turn differs from the nominal radius.
+
+    Source: kinematic rolling radius against loaded radius (Wong, Theory of Ground Vehicles, 2008, ch. 1).
+    The difference is kinematic, so it is not dissipative by itself: a > 0 lessens the loss in slip.
+    """
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="relative error of the rolling radius",
+        bounds=(-0.2, 0.2),
+        sd=0.03,
+        source="belt and tyre thickness against radius: a few percent",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return -self.amplitude * signals.speed_theoretical
+
+
+class BeltCreep(SlipEffect):
+    """ΔV = a P V_teor: elastic creep, a share of the speed in proportion to the traction.
+
+    The belt stretches under traction and creeps on its pulley.
+
+    Source: Firbank, Mechanics of the belt drive, Int. J. Mech. Sci. 12 (1970) 1053: creep = change of
+    tension over the belt's stiffness E A; so a = 1/(E A). The demand stands for the traction, equal to it in
+    steady travel.
+    """
+
+    driver = "demand"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="1/N",
+        meaning="creep over traction of a side, 1/(E A)",
+        bounds=(-1e-3, 1e-2),
+        sd=5e-4,
+        source="E A of 1 to 20 kN for narrow rubber with cord; at 22 N 1 %",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * signals.demand * signals.speed_theoretical * signals.direction
+
+
+class NonlinearSlip(SlipEffect):
+    """ΔV = a V_teor u³, u = demand over the adhesion limit of eq. (6).
+
+    Slip that grows steeply as the adhesion is used up.
+
+    Source: Janosi and Hanamoto (1961): traction saturates over slip; the cube is the steep part of its
+    inverse. u is held within 2, beyond which the robot slides anyway.
+    """
+
+    driver = "demand"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="slip at the adhesion limit",
+        bounds=(-0.05, 0.5),
+        sd=0.05,
+        source="slip of tracks at full adhesion: 5 to 20 %",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        used = jnp.clip(signals.demand / signals.adhesion_limit, -2.0, 2.0)
+        return self.amplitude * used**3 * signals.speed_theoretical * signals.direction
+
+
+class SpeedSlip(SlipEffect):
+    """ΔV = a V_teor |V_teor|: a share of the speed in proportion to the speed.
+
+    Slip that grows with speed.
+
+    Source: first term of an expansion of the slip in speed; treads that lift off between impacts. The loss
+    is kinematic: on a descent it does not take power out.
+    """
+
+    driver = "speed"
+
+    amplitude: Scalar = amplitude(
+        unit="s/m",
+        meaning="slip over speed",
+        bounds=(-0.1, 0.2),
+        sd=0.02,
+        source="2 % at 1 m/s",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * signals.speed_theoretical**2 * signals.direction
+
+
+class LoadSlip(SlipEffect):
+    """ΔV = a V_teor N: radius r_k (1 - a N).
+
+    Belt and tyre that yield under load roll off less.
+
+    Source: effective rolling radius of a loaded tyre (Wong 2008, ch. 1; Pacejka, Tire and Vehicle Dynamics,
+    2012, ch. 1). Kinematic, so not dissipative by itself.
+    """
+
+    driver = "load"
+
+    amplitude: Scalar = amplitude(
+        unit="1/N",
+        meaning="relative loss of rolling radius over load of a side",
+        bounds=(-1e-3, 2e-3),
+        sd=1e-4,
+        source="at 100 N 1 %: tread 5 mm thick yields 0.5 mm",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * signals.normal * signals.speed_theoretical
+
+
+class PulleyEccentricity(Periodic, SlipEffect):
+    """ΔV = -a r_k ω_k sin(θ_k + φ): the radius that rolls off is r_k (1 + a sin) with a = e / r_k.
+
+    The driving pulley or wheel runs out of true.
+
+    Source: order 1 of the driving wheel's angle; total run-out by ISO 1101. The lever arm of the traction
+    changes alike, which is left out: an effect enters one balance.
+    """
+
+    driver = "angle"
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="eccentricity over rolling radius e / r_k",
+        bounds=(-0.1, 0.1),
+        sd=0.01,
+        source="0.2 to 0.5 mm of run-out on a printed or pressed pulley of 38 mm",
+    )
+    phase: Scalar = phase_parameter()
+
+    def order(self, robot: Robot, configuration: Index) -> Scalar:
+        return 1.0 / robot.gearbox.ratio
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return -self.amplitude * signals.speed_theoretical * self.wave(signals)
+
+
+class VibrationSlip(SlipEffect):
+    """ΔV = a √((V_teor / V_1)² + 0.001²)^p u / √((1 - |u|)² + 0.05²), u = demand over the adhesion limit of eq. (6);
+    on tracks alone.
+
+    Contacts that shake slide while they bear little; dry friction turns into an apparent viscous one.
+
+    Source: Section 3.2.4 and its ref. [46]; Blekhman, Vibrational Mechanics (2000). The law of Fig. 7 averaged over
+    contacts that swing by s (`mmrjax.vibration`), where V_s is small beside s: slip in proportion to s and, with the
+    load's lead, to u; s itself grows as 1 / (1 - u), as the track model shows (docs/vibration.md). That is rounded
+    off within 0.05 of the limit, beyond which the robot slides anyway, and the power of the speed at rest. Under a
+    demand that pulls forward the robot runs ahead of its tracks.
+    """
+
+    driver = "demand"
+    dissipative = True
+    movers = "tracks"
+    resolved = True
+
+    amplitude: Scalar = amplitude(
+        unit="m/s",
+        meaning="speed lost at V_1 and half of the adhesion",
+        bounds=(-0.05, 0.5),
+        sd=0.02,
+        source="contacts of the track model swing by 1 to 4 % of the speed: running gears of docs/vibration.md",
+    )
+    exponent: Scalar = parameter(
+        2.0,
+        unit="-",
+        meaning="exponent p of the speed with which the swing grows",
+        bounds=(0.0, 5.0),
+        sd=0.7,
+        source="inertia forces of what shakes grow as the square of its frequency; running gears: 2.1 to 3.4",
+    )
+    speed_reference: Scalar = parameter(
+        1.0,
+        unit="m/s",
+        meaning="speed V_1 that the amplitude is stated at",
+        bounds=(1e-3, 100.0),
+        relative_sd=0.01,
+        source="a choice: the amplitude is what varies",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        used = signals.demand / signals.adhesion_limit
+        faster = jnp.hypot(signals.speed_theoretical / self.speed_reference, SLOWEST) ** self.exponent
+        return self.amplitude * faster * used / jnp.hypot(1 - jnp.abs(used), ROUNDED)

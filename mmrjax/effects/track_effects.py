@@ -1,0 +1,481 @@
+"""Effects on the loss of tracks and bearings [N·m] at the driving pulley, eqs. (24), (26)."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from mmrjax.effects.base import Effect, amplitude
+from mmrjax.effects.bristle import Bristle, breakaway_parameter
+from mmrjax.effects.periodic import Periodic, phase_parameter
+from mmrjax.model.params import Index, Scalar, parameter
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals
+from mmrjax.numerics.one_sided import magnitude
+
+
+class TrackEffect(Effect):
+    """Torque lost between the driving shaft and the ground, of one side [N·m]."""
+
+    balance = "track"
+
+
+class Churning(TrackEffect):
+    """ΔM_t = a ω_k |ω_k| at the pulley, for a side's tracks.
+
+    Track loss that grows with the square of speed.
+
+    Source: the next term after eq. (24); impact of teeth and grousers takes a momentum that grows as the
+    speed, at a rate that grows as the speed (Merritt, The Evolution of a Tank Transmission, 1946).
+    """
+
+    driver = "speed"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m·s^2",
+        meaning="torque over squared pulley speed",
+        bounds=(-1e-3, 1e-2),
+        sd=5e-4,
+        source="at 25 rad/s a tenth to the whole of eq. (24)",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        # ω² with the shaft's smooth sign: |ω| alone has no derivative at rest.
+        return self.amplitude * signals.speed_wheel**2 * signals.direction
+
+
+class StribeckTrack(TrackEffect):
+    """ΔM_t = a exp(-|ω_k| / ω_s) sign ω_k at the pulley, for a side's tracks.
+
+    Belt and pulley-bearing friction that falls as the belt gains speed.
+
+    Source: Tustin (1947), the exponential law; Armstrong-Hélouvry, Dupont and Canudas de Wit (1994).
+    """
+
+    driver = "speed"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="loss torque at rest beyond M_t0",
+        bounds=(-0.1, 1.0),
+        sd=0.1,
+        source="a third of M_t0 of Table 3",
+    )
+    speed_fade: Scalar = parameter(
+        8.0,
+        unit="rad/s",
+        meaning="pulley speed ω_s over which the excess fades",
+        bounds=(0.5, 80.0),
+        relative_sd=0.5,
+        source="belt speeds of 0.1 to 0.5 m/s",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * jnp.exp(-jnp.abs(signals.speed_wheel) / self.speed_fade) * signals.direction
+
+
+class TensionFriction(TrackEffect):
+    """ΔM_t = a r_k |P_t|: tension presses the tight side on pulleys and guides.
+
+    Belt friction that grows with the traction the belt carries.
+
+    Source: Euler (1769) and Eytelwein (1808): normal force of a belt round a pulley in proportion to its
+    tension; Merritt, The Evolution of a Tank Transmission (1946), track efficiency as a share of the
+    tractive effort.
+    """
+
+    driver = "load"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="loss torque over torque of the traction",
+        bounds=(-0.2, 1.0),
+        sd=0.1,
+        source="1 - efficiency of a rubber track's final drive: 5 to 15 %",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        radius = robot.chassis(signals.configuration).radius
+        return self.amplitude * radius * magnitude(signals.traction, signals.direction) * signals.direction
+
+
+class CentrifugalTension(TrackEffect):
+    """ΔM_t = a M_t0 v², v = ω_k r_p the belt's speed: dry loss M_t0 in proportion to the tension T_0 + ρ v².
+
+    The belt's own centrifugal tension adds to its loss.
+
+    Source: centrifugal tension ρ v² of a running belt (Eytelwein 1808; Budynas and Nisbett, Shigley's
+    Mechanical Engineering Design, 2011, ch. 17); so a = ρ / T_0. With the belts of Table 7, ρ = 0.05 kg/m,
+    and T_0 of 1 to 10 N. Unlike `churning` it scales with the configuration's own M_t0. r_p is the radius of
+    the pulley, which drives the belt in both.
+    """
+
+    needs_belt = True
+    driver = "speed"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="s^2/m^2",
+        meaning="mass of the belt per length over its rest tension",
+        bounds=(-0.1, 0.5),
+        sd=0.05,
+        source="0.005 for a taut belt, 0.05 for a slack one",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        loss = robot.chassis(signals.configuration).track.loss_coulomb
+        belt_speed = signals.speed_wheel * robot.radius_pulley
+        return self.amplitude * loss * belt_speed**2 * signals.direction
+
+
+class BendingLoss(TrackEffect):
+    """ΔM_t = a 2x / (1 + x²), x = ω_k / ω_r: loss modulus of a standard linear solid.
+
+    Rubber that is bent round the pulleys (of a load on a shaft: of a belt drive or coupling) relaxes while it passes.
+
+    Source: Ferry, Viscoelastic Properties of Polymers (1980), ch. 3, the loss modulus G'' of a Maxwell
+    element; Gerbert, Traction Belt Mechanics (1999), bending loss of a belt at each run on and off a pulley.
+    Far from ω_r it is like eq. (24)'s terms.
+    """
+
+    driver = "speed"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="largest loss torque, reached at ω_r",
+        bounds=(-0.1, 1.0),
+        sd=0.05,
+        source="a seventh of M_t0 of Table 3",
+    )
+    speed_relaxation: Scalar = parameter(
+        8.0,
+        unit="rad/s",
+        meaning="pulley speed ω_r of the largest loss",
+        bounds=(0.5, 200.0),
+        relative_sd=0.5,
+        source="relaxation over a tenth of a second, about the bend's duration",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        share = signals.speed_wheel / self.speed_relaxation
+        return self.amplitude * 2 * share / (1 + share**2)
+
+
+class StickSlip(TrackEffect):
+    """ΔM_t = a z, θ_s z' = ω_k exp(-(ω_k/ω_s)²) - |ω_k| z, z(0) = 0: bristles bend over θ_s, then let go.
+
+    Break-away: dry contacts of the track hold more before they slip.
+
+    Source: Dahl (1968) with the Stribeck curve of Canudas de Wit, Olsson, Åström and Lischinsky, A new model
+    for control of systems with friction, IEEE Trans. Automatic Control 40 (1995); the curve stands with the
+    drive of z so that its rate stays finite. Settled: z = exp(-(ω_k/ω_s)²) sign ω_k, nothing at travelling
+    speed. Torque that falls with speed is what lets a crawling drive stick and slip. The memory is z [-].
+    Bent bristles give energy back, so it is not a pure loss.
+    """
+
+    driver = "speed"
+    transient = True
+    memory_size = 1.0
+    memory_unit = "-"
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="break-away torque of a side beyond M_t0",
+        bounds=(-0.2, 2.0),
+        sd=0.1,
+        source="a third of M_t0 of Table 3",
+    )
+    angle_breakaway: Scalar = parameter(
+        0.01,
+        unit="rad",
+        meaning="turn of the pulley over which the contacts let go θ_s",
+        bounds=(1e-4, 1.0),
+        relative_sd=0.5,
+        source="0.4 mm of belt: shear of teeth and seals",
+    )
+    speed_fade: Scalar = parameter(
+        3.0,
+        unit="rad/s",
+        meaning="pulley speed ω_s above which the excess is gone",
+        bounds=(0.05, 8.0),
+        relative_sd=0.5,
+        source="belt speed of 0.1 m/s",
+    )
+
+    def _excess(self, signals: Signals) -> Scalar:
+        return jnp.exp(-((signals.speed_wheel / self.speed_fade) ** 2))
+
+    def settled(self, robot: Robot, signals: Signals) -> Scalar:
+        return self._excess(signals) * signals.direction
+
+    def rate(self, robot: Robot, signals: Signals) -> Scalar:
+        speed = signals.speed_wheel
+        turn = speed * self._excess(signals) - speed * signals.direction * signals.memory[self.name]
+        return turn / self.angle_breakaway
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * self.recall(robot, signals)
+
+
+class DirectionalFriction(TrackEffect):
+    """ΔM_t = a (sign ω_k)²: a dry loss of M_t0 + a forward and of M_t0 - a backward.
+
+    Dry friction that is larger one way round than the other.
+
+    Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), who states the Coulomb friction of a drive's
+    joint for each direction by itself; seals with a lip, teeth and belts that bear on another flank. The mean of both
+    directions is eq. (24)'s M_t0, half their difference is a: runs one way alone show their sum, and this is M_t0 by
+    another name. A constant torque (`torque_offset`) is the same wherever the shaft turns. It takes power beside an
+    M_t0 that is larger, and by itself it gives it one way, so it is not dissipative.
+    """
+
+    driver = "direction"
+    odd_in_travel = True
+    needs_reverse = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="loss torque forward beyond the mean of both directions",
+        bounds=(-0.5, 0.5),
+        sd=0.05,
+        source="a seventh of M_t0 of Table 3",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * signals.direction**2
+
+
+class StribeckExponent(TrackEffect):
+    """ΔM_t = a exp(-(|ω_k| / ω_s)^δ) sign ω_k at the driven shaft; δ = 2 unless stated.
+
+    Friction of bearings and seals that leaves mixed lubrication sooner or later than exponentially.
+
+    Source: Armstrong-Hélouvry, Dupont and Canudas de Wit, A survey of models, analysis tools and compensation
+    methods for the control of machines with friction, Automatica 30 (1994) 1083: the exponential of Bo and Pavelescu
+    with δ of 1/2 to 1, of Tustin with 1 (`stribeck_track`), Armstrong's Gaussian with 2. Here |ω_k| / ω_s is
+    rounded off within a thousandth, where the sign fades too: below δ = 1 its power has no derivative at rest.
+    """
+
+    driver = "speed"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="loss torque at rest beyond M_t0",
+        bounds=(-0.1, 1.0),
+        sd=0.1,
+        source="a third of M_t0 of Table 3",
+    )
+    # The first of two shapes is what the loop frees: of a curve with any δ from 1/2 to 2, once dry and viscous
+    # friction are fitted, δ = 1 and δ = 2 with ω_s free leave half of what δ free at one ω_s and δ = 1 do.
+    speed_fade: Scalar = parameter(
+        8.0,
+        unit="rad/s",
+        meaning="shaft speed ω_s over which the excess fades",
+        bounds=(0.05, 80.0),
+        relative_sd=0.5,
+        source="belt speeds of 0.1 to 0.5 m/s",
+    )
+    exponent: Scalar = parameter(
+        2.0,
+        unit="-",
+        meaning="exponent δ of the speed",
+        bounds=(0.5, 4.0),
+        relative_sd=0.5,
+        source="1/2 to 2 in the survey, and much larger for boundary lubricants",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        share = (signals.speed_wheel / self.speed_fade) ** 2 + 1e-3**2
+        return self.amplitude * jnp.exp(-(share ** (0.5 * self.exponent))) * signals.direction
+
+
+class DirectionalViscous(TrackEffect):
+    """ΔM_t = a |ω_k|: a viscous loss of K + a forward and of K - a backward.
+
+    Friction whose growth with speed is larger one way round than the other.
+
+    Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), who fits viscous friction of a joint for
+    each direction by itself; seals with a lip and guides that draw their lubricant in one way. Beside
+    `directional_friction`, which is even in the speed too, it is what grows with it. The mean of both directions is
+    eq. (24)'s viscous loss: runs one way alone show their sum.
+    """
+
+    driver = "direction"
+    odd_in_travel = True
+    needs_reverse = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m·s",
+        meaning="viscous loss forward beyond the mean of both directions",
+        bounds=(-0.05, 0.05),
+        sd=5e-3,
+        source="a third of the viscous loss of Table 3",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        # With the shaft's smooth sign: |ω| alone has no derivative at rest.
+        return self.amplitude * signals.speed_wheel * signals.direction
+
+
+class TorqueOffset(TrackEffect):
+    """ΔM_t = a, whichever way the shaft turns and at rest too; at its radius a force a / r_k.
+
+    Something pulls one way all the time: a cable, a spring, a counterweight, a command or meter of torque with an
+    offset.
+
+    Source: Swevers, Verdonck and De Schutter, Dynamic model identification for industrial robots, IEEE Control
+    Systems 27 (2007) 58: an offset beside dry and viscous friction of each joint. While a shaft turns it is
+    `directional_friction`, which fades at rest: histories through rest alone tell them apart. Of the motor it is
+    a i η_rm at the output. A stated torque of a load on a shaft (`torque_constant`) is the same.
+    """
+
+    needs_reverse = True
+    odd_in_travel = True
+    settles_to = "directional_friction"
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="torque that acts against forward rotation",
+        bounds=(-0.5, 0.5),
+        sd=0.05,
+        source="a seventh of M_t0 of Table 3",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * jnp.ones_like(signals.speed_motor)
+
+
+class Presliding(Bristle, TrackEffect):
+    """ΔM_t = a (z - sign ω_k), θ_s z' = ω_k - |ω_k| z, z(0) = 0: of the dry loss a share a acts through bristles.
+
+    Dry friction builds up over a small turn instead of at once, as contacts yield before they slide.
+
+    Source: Dahl, A solid friction model (1968), with exponent 1; it is the first order of Canudas de Wit, Olsson,
+    Åström and Lischinsky (1995) without their damping of the bristles. Settled z = sign ω_k: travel shows nothing
+    of it, reversals do. The memory is z [-]. At a = M_t0 all of the dry friction is Dahl's. `stick_slip` is what the
+    contacts hold beyond M_t0 before they let go; `bristle_load_loss` grows with the load.
+    """
+
+    driver = "direction"
+    transient = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="dry loss that acts through bristles",
+        bounds=(-0.5, 2.0),
+        sd=0.1,
+        source="a third of M_t0 of Table 3",
+    )
+    angle_breakaway: Scalar = breakaway_parameter()
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * (self.recall(robot, signals) - signals.direction)
+
+
+class AngleFriction(Periodic, TrackEffect):
+    """ΔM_t = a sin(θ_k + φ) sign ω_k: dry friction that changes over a turn of the driven shaft.
+
+    A bent shaft, a bearing or a guide that is tight at one place of each turn.
+
+    Source: Popović and Goldenberg, Modeling of friction using spectral analysis, IEEE Trans. Robotics and Automation
+    14 (1998) 114: friction of a joint by its angle, its first order here. Where a history begins at a measured angle
+    the phase is that of the shaft, else of each run's beginning. It is friction, so that it turns round with the
+    speed; as large as M_t0 it would stop being a loss at some angle.
+    """
+
+    driver = "angle"
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="amplitude of the dry loss over a turn",
+        bounds=(-0.5, 0.5),
+        sd=0.05,
+        source="a seventh of M_t0 of Table 3",
+    )
+    phase: Scalar = phase_parameter()
+
+    def order(self, robot: Robot, configuration: Index) -> Scalar:
+        return 1 / robot.gearbox.ratio
+
+    def initial(self, robot: Robot, angle: Scalar) -> Scalar:
+        return angle
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * self.wave(signals) * signals.direction
+
+
+class PositionFriction(TrackEffect):
+    """ΔM_t = a θ sign ω_k, θ' = ω_k: dry friction that grows along the travel.
+
+    Guides or a screw that run tighter towards one end.
+
+    Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), ch. 4: friction of a joint by its position,
+    to first order. The memory is θ [rad], counted as the channel of the angle or position is, which a rig has to
+    show; without one it is 0 at the start of each run. Its mean over the travel is M_t0.
+    """
+
+    driver = "position"
+    transient = True
+    memory_size = 10.0
+    memory_unit = "rad"
+
+    amplitude: Scalar = amplitude(
+        unit="N·m/rad",
+        meaning="dry loss over the angle of the driven shaft",
+        bounds=(-0.1, 0.1),
+        sd=0.01,
+        source="over ten radians a third of M_t0 of Table 3",
+    )
+
+    def initial(self, robot: Robot, angle: Scalar) -> Scalar:
+        return angle
+
+    def settled(self, robot: Robot, signals: Signals) -> Scalar:
+        return jnp.zeros_like(signals.speed_motor)
+
+    def rate(self, robot: Robot, signals: Signals) -> Scalar:
+        return signals.speed_wheel
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * self.recall(robot, signals) * signals.direction
+
+
+class DirectionalStribeck(TrackEffect):
+    """ΔM_t = a exp(-|ω_k| / ω_s) (sign ω_k)²: an excess at a crawl of E + a forward and of E - a backward.
+
+    Friction that falls with speed, by more one way round than the other.
+
+    Source: Canudas de Wit, Olsson, Åström and Lischinsky, A new model for control of systems with friction, IEEE
+    Trans. Automatic Control 40 (1995): the curve g of the steady friction need not be the same both ways; here the
+    exponential of Tustin (1947). The mean E of both directions is `stribeck_track`: runs one way alone show their
+    sum. Far above ω_s it is absent, far below it is `directional_friction`; what grows with the speed is
+    `directional_viscous`. Runs both ways at a crawl tell the three apart.
+    """
+
+    driver = "direction"
+    odd_in_travel = True
+    needs_reverse = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="excess at a crawl forward beyond the mean of both directions",
+        bounds=(-0.5, 0.5),
+        sd=0.05,
+        source="half of what `stribeck_track` commonly is",
+    )
+    speed_fade: Scalar = parameter(
+        8.0,
+        unit="rad/s",
+        meaning="shaft speed ω_s over which the excess fades",
+        bounds=(0.5, 80.0),
+        relative_sd=0.5,
+        source="belt speeds of 0.1 to 0.5 m/s",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        excess = jnp.exp(-jnp.abs(signals.speed_wheel) / self.speed_fade)
+        return self.amplitude * excess * signals.direction**2

@@ -1,0 +1,321 @@
+"""What `simulate` returns: results with the conditions that they belong to, as a table or as arrays."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from mmrjax.compile.precision import on_host
+from mmrjax.compile.programs import has_tracer
+from mmrjax.errors import UsageError, choices, counted
+from mmrjax.fidelities import outputs
+from mmrjax.fidelities.base import History
+from mmrjax.missions import mission_batch
+from mmrjax.missions.mission import Mission
+from mmrjax.model.channels import Channel, usual
+from mmrjax.model.channels import names as channel_names
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.signals import CODES, STATUSES, Result
+
+if TYPE_CHECKING:
+    from mmrjax.fidelities.simulation import Pending
+
+#: Columns of a printed table beside conditions and channels.
+_SHOWN = ("slip", "adhesion_used", "power_supply_W", "winding_settled_C")
+#: Columns of conditions: heading, unit and digits after the point.
+_CONDITIONS = {
+    "configuration": ("configuration", "", 0),
+    "supply_voltage_V": ("supply", "V", 2),
+    "total_mass_kg": ("total mass", "kg", 2),
+    "payload_kg": ("payload", "kg", 2),
+    "slope_deg": ("slope", "deg", 2),
+    "load_torque_Nm": ("load torque", "N·m", 4),
+}
+STATUS, _ = CODES
+_WORDS = {"status": ("status", "", 0), "flags": ("flags", "", 0)}
+
+
+class StatusCodes(np.ndarray):
+    """Codes of how runs ended that compare with the words of `STATUSES`: `results.status == "converged"`."""
+
+    __hash__ = None  # as of every array
+
+    def __eq__(self, other: Any) -> Any:
+        return np.asarray(self) == _codes(other)
+
+    def __ne__(self, other: Any) -> Any:
+        return np.asarray(self) != _codes(other)
+
+    def __getitem__(self, key: Any) -> Any:
+        return np.asarray(np.asarray(self)[key]).view(StatusCodes)
+
+
+def _codes(words: Any) -> Any:
+    """Codes of some words of `STATUSES`; anything else as it is.
+
+    Raises:
+        UsageError: a word that is none of them.
+    """
+    asked = np.asarray(words)
+    if asked.dtype.kind != "U":
+        return words
+    if unknown := sorted(set(asked.ravel().tolist()) - set(STATUSES)):
+        raise UsageError(f"status: got {unknown[0]}; {choices(unknown[0], STATUSES)}")
+    return np.array([STATUSES.index(word) for word in asked.ravel().tolist()], int).reshape(asked.shape)
+
+
+class _Numbers:
+    """Fields of `Result` and channels that `Results` shows under their own names, for type checkers and `dir`."""
+
+    theoretical_speed: Array
+    slip: Array
+    voltage: Array
+    mass: Array
+    traction: Array
+    adhesion_used: Array
+    power_supply: Array
+    power_motor: Array
+    power_gear: Array
+    power_ground: Array
+    power_lift: Array
+    efficiency_motor: Array
+    efficiency_gear: Array
+    efficiency_chassis: Array
+    winding_settled: Array
+    voltage_cell: Array
+    status: Array
+    flags: Array
+    reading: Mapping[str, Array]
+    # channels
+    total_current: Array
+    motor_speed: Array
+    speed: Array
+    motor_current: Array
+    output_speed: Array
+    output_angle: Array
+    position: Array
+    motor_voltage: Array
+    output_torque: Array
+    winding_temperature: Array
+    motor_current_left: Array
+    motor_current_right: Array
+    motor_speed_left: Array
+    motor_speed_right: Array
+    motor_voltage_left: Array
+    motor_voltage_right: Array
+    yaw_rate: Array
+    lateral_speed: Array
+    yaw: Array
+    place_x: Array
+    place_y: Array
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Results(_Numbers):
+    """Results of one run, or of a batch, of one fidelity; a pytree.
+
+    Of `steady`, numbers are computed when they are first asked for and kept: what the instruments show and how the
+    runs ended by one program, everything else (and the results as a pytree) by another. The two round differently, by
+    some 1e-15 of a number; what has been asked for stays as it is.
+
+    Every field of `Result`, every channel and every column that the fidelity adds is an attribute:
+    `results.slip`, `results.total_current`, `results.guide_share`. All numbers have the shape of the conditions.
+    `results.status == "converged"` compares codes with a word of `STATUSES`, outside a trace.
+
+    Attributes:
+        conditions: with configurations as indices.
+        total_mass: of robot and payload [kg], stated or the robot's own.
+        result: in SI units.
+        further: what this fidelity alone knows, by column, in the column's unit.
+        history: runs over time (`time`, `distance`, `signals`, `reading`), their last axis; None where the fidelity
+            has none or none was asked for.
+        configurations: names of the robot's configurations, in the order of their indices.
+        model: the fidelity.
+        mission: of runs over a profile, totals, segments and course; None without a profile.
+        stated: conditions that the profile states, in place of those of the runs.
+        channels: of the robot, in the order of columns.
+    """
+
+    conditions: Conditions
+    total_mass: Scalar
+    result: Result
+    further: dict[str, Scalar]
+    history: History | None
+    configurations: tuple[str, ...]
+    model: str
+    mission: Mission | None = None
+    stated: tuple[str, ...] = ()
+    channels: tuple[Channel, ...] = dataclasses.field(default_factory=usual)
+
+    def __post_init__(self) -> None:
+        result = self.result
+        if isinstance(result, Result) and (coded := _compared(result.status)) is not result.status:
+            object.__setattr__(self, "result", dataclasses.replace(result, status=coded))
+
+    @staticmethod
+    def pending(batch: Pending, configurations: tuple[str, ...], model: str) -> Results:
+        """Results of which nothing has been computed yet."""
+        results = object.__new__(Results)
+        known = {"conditions": batch.conditions, "further": {}, "history": None, "mission": None, "stated": ()}
+        results.__dict__.update(
+            known, configurations=configurations, model=model, channels=batch.robot.channels, _pending=batch
+        )
+        return results
+
+    def on_host(self) -> Results:
+        """The same with NumPy's arrays; what has not been computed yet is still not."""
+        batch = self.__dict__.get("_pending")
+        if batch is None or "result" in self.__dict__:
+            return jax.tree.map(np.asanyarray, self)
+        return Results.pending(on_host(batch), self.configurations, self.model)
+
+    def _compute(self, name: str) -> None:
+        """Compute what holds a name, where nothing that has been computed does."""
+        own, batch = self.__dict__, self.__dict__.get("_pending")
+        if batch is None or name.startswith("_"):
+            return
+        if name == "total_mass":
+            own[name] = batch.total_mass()
+        elif "result" not in own and name in (*channel_names(batch.robot.channels), "status"):
+            shown = own.get("_shown") or batch.shown()
+            own["_shown"] = {**shown, STATUS: _compared(shown[STATUS])}
+            own.update(own["_shown"])
+        elif "result" not in own:
+            whole = batch.result()
+            shown = own.get("_shown", {})
+            reading = {k: shown.get(k, x) for k, x in whole.reading.items()}
+            status = shown.get(STATUS, _compared(whole.status))
+            own["result"] = dataclasses.replace(whole, reading=reading, status=status)
+
+    if not TYPE_CHECKING:  # which knows the names by `_Numbers`
+
+        def __getattr__(self, name: str) -> Any:
+            self._compute(name)
+            if name in self.__dict__:
+                return self.__dict__[name]
+            result, further = self.__dict__.get("result"), self.__dict__.get("further")
+            if further is not None and name in further:
+                return further[name]
+            if result is not None and not name.startswith("__"):
+                try:
+                    return getattr(result, name)
+                except AttributeError:
+                    pass
+            raise AttributeError(f"{type(self).__name__} has no {name}")
+
+    def __dir__(self) -> list[str]:
+        return sorted({*object.__dir__(self), *_Numbers.__annotations__, *self.further})
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the batch; () for one run."""
+        return self.conditions.shape if "_pending" in self.__dict__ else self.result.status.shape
+
+    @property
+    def configuration(self) -> np.ndarray:
+        """Names of the runs' configurations."""
+        return np.array(self.configurations)[np.asarray(self.conditions.configuration)]
+
+    @property
+    def statuses(self) -> np.ndarray:
+        """How the runs ended, in words of `STATUSES`; `status` holds their codes."""
+        return np.array(STATUSES)[np.asarray(self.status)]
+
+    def rows_table(self) -> dict[str, np.ndarray]:
+        """The same as `to_dict`, under the name that results of fits have too."""
+        return self.to_dict()
+
+    def to_dict(self) -> dict[str, np.ndarray]:
+        """Conditions and outcomes by the columns of `runs.csv`, units in the names; arrays of the batch's shape.
+
+        Over a profile the outcomes are the mission's numbers; conditions that the profile states are NaN.
+        """
+        conditions, nan = self.conditions, np.full(self.shape, np.nan)
+        as_table = {"voltage": "supply_voltage_V", "payload": "payload_kg", "slope_deg": "slope_deg"}
+        columns = {column: np.asarray(getattr(conditions, name)) for name, column in as_table.items()}
+        columns["supply_voltage_V"] = np.where(np.asarray(conditions.battery) > 0.5, np.nan, conditions.voltage)
+        columns |= {as_table[name]: nan for name in self.stated if name in as_table}
+        torque = nan if "load_torque" in self.stated else conditions.load_torque
+        braked = {} if torque is None else {"load_torque_Nm": np.asarray(torque)}
+        found = outputs.columns(self.result, self.channels, self.further)
+        if self.mission is not None:
+            found = {name: found[name] for name in (*mission_batch.names("turned" in self.mission.total.of), *CODES)}
+        return {
+            "configuration": self.configuration,
+            "supply_voltage_V": columns["supply_voltage_V"],
+            "total_mass_kg": nan if "payload" in self.stated else np.asarray(self.total_mass),
+            "payload_kg": columns["payload_kg"],
+            "slope_deg": columns["slope_deg"],
+            **braked,
+            **found,
+        }
+
+    def table(self, columns: Sequence[str] | None = None, rows: int = 40) -> str:
+        """A table for people, a line a run.
+
+        Args:
+            columns: of `to_dict`; None takes the conditions, what the instruments show and a few more.
+            rows: most that are shown.
+        """
+        content = {name: np.ravel(values) for name, values in self.to_dict().items()}
+        rows_of: tuple[outputs.Output | mission_batch.Output, ...] = (
+            *outputs.table(self.channels), *mission_batch.OUTPUTS, *mission_batch.OF_TURNS,
+        )  # fmt: skip
+        about = {**_CONDITIONS, **_WORDS, **{o.column: (o.label, o.unit, o.resolution) for o in rows_of}}
+        if columns is None and self.mission is not None:
+            columns = ["configuration", *mission_batch.USUAL, "status"]
+        elif columns is None:
+            shown = [
+                output.column
+                for output in outputs.table(self.channels)
+                if output.column in _SHOWN or output.name in self.reading
+            ]
+            columns = [
+                "configuration",
+                "supply_voltage_V",
+                "slope_deg",
+                "payload_kg",
+                *(["load_torque_Nm"] if "load_torque_Nm" in content else []),
+                *shown,
+                *self.further,
+                "status",
+            ]
+        cells = []
+        for name in columns:
+            label, unit, digits = about.get(name, (name.replace("_", " "), "", 3))
+            values = content[name][:rows]
+            words = values.dtype.kind == "U"
+            body = [str(v) if words else f"{v:z.{digits}f}" for v in values]
+            column = [label, f"[{unit}]" if unit not in ("", "-") else "", *body]
+            width = max(map(len, column))
+            cells.append([c.ljust(width) if words else c.rjust(width) for c in column])
+        lines = ["  ".join(line).rstrip() for line in zip(*cells, strict=True)]
+        left = len(content["status"]) - rows
+        return "\n".join([*lines, f"... and {left} more"] if left > 0 else lines)
+
+    def __str__(self) -> str:
+        return self.table()
+
+    def __repr__(self) -> str:
+        if has_tracer(self):
+            return f"Results of {self.model}, traced"
+        return f"Results of {self.model}, {counted(max(self.status.size, 1), 'run')}\n{self.table()}"
+
+
+def _compared(status: Any) -> Any:
+    """Codes that compare with words. Tracers, and what is no array, are returned unchanged."""
+    is_array = isinstance(status, np.ndarray | jax.Array) and not isinstance(status, jax.core.Tracer)
+    return np.asarray(status).view(StatusCodes) if is_array else status
+
+
+jax.tree_util.register_dataclass(
+    Results,
+    data_fields=["conditions", "total_mass", "result", "further", "history", "mission"],
+    meta_fields=["configurations", "model", "stated", "channels"],
+)

@@ -1,0 +1,417 @@
+"""The public API's one verb: simulate a robot under conditions, in any fidelity. What is wrong is refused here."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mmrjax import fidelities
+from mmrjax.compile.compiling import compiled
+from mmrjax.compile.precision import ambient, at_once, in_double, in_trace
+from mmrjax.compile.programs import has_tracer
+from mmrjax.errors import UsageError, choices
+from mmrjax.fidelities.base import Fidelity, History, Run
+from mmrjax.fidelities.results import Results
+from mmrjax.missions import mission_batch
+from mmrjax.missions.mission import Start
+from mmrjax.missions.profile import Profile
+from mmrjax.model import channels, params, power
+from mmrjax.model.conditions import OF_TURNS, Conditions, Named, sides_contradict
+from mmrjax.model.params import Scalar
+from mmrjax.model.quantities import CONDITIONS
+from mmrjax.model.robot import NO_BRAKE, Robot, cannot_turn
+from mmrjax.model.signals import CODES, Result
+
+#: Runs of which `simulate` keeps histories at once.
+HISTORIES = 1000
+#: What is said of runs that say nothing of either side, of a robot whose sides differ.
+STRAIGHT = "the robot's sides differ, and runs that say nothing of either side travel straight, as if steered"
+#: What is said of reverse mode through a fidelity that has none.
+FORWARD_ALONE = (
+    "derivatives are forward (jax.jacfwd, jax.jvp); for jax.grad use model steady, or mmrjax.step for runs over time"
+)
+STATUS, _ = CODES
+
+
+@in_double
+def simulate(
+    robot: Robot,
+    conditions: Conditions,
+    model: str | None = None,
+    *,
+    duration: float | None = None,
+    step: float | None = None,
+    history: bool = True,
+    profile: Profile | None = None,
+    start: Start | None = None,
+    **options: float | None,
+) -> Results:
+    """Simulate one run, or a batch.
+
+    Values are checked where they are concrete; tracers pass, so that `jax.grad`, `jax.jacfwd`, `jax.vmap` and
+    `jax.jit` go through (reverse mode through `steady` and `track`, forward mode through all; for reverse mode over
+    time see `step`). Of `steady`, what is
+    asked of the results is computed when it is asked (see `Results`).
+
+    Args:
+        robot: any robot; its parameters may be tracers or, under `jax.vmap`, batches.
+        conditions: fields of one shape, configurations by name or index.
+        model: fidelity, one of `fidelities.NAMES`; `steady` where not stated, `drive` with a profile.
+        duration: of a run [s]; `drive` 30, `track` 1.5 where not stated.
+        step: of integration [s]; `track` 1e-4 where not stated.
+        history: whether to keep runs over time, where the fidelity can; `track` then starts from standstill, else
+            rolling at the steady speed.
+        profile: a mission that every run is to follow (`mmrjax.profile`), by `drive` only; what it does not state
+            the conditions do. Results then have `mission`, and the columns of `missions.mission_batch.OUTPUTS`.
+            Derivatives are forward, by its values and times too; with tracers state `history=False`.
+        start: the state that a mission begins in; None: at rest at ambient temperature.
+        options: of a further fidelity, by name.
+
+    Returns:
+        Numbers of the conditions' shape, each run with its status.
+
+    Raises:
+        UsageError: a value that is not allowed, an unknown name, an option that the fidelity does not have.
+    """
+    if not isinstance(robot, Robot):
+        raise UsageError(f"robot: got {type(robot).__name__}; expected a Robot such as mmrjax.nominal()")
+    if not isinstance(conditions, Conditions):
+        raise UsageError(f"conditions: got {type(conditions).__name__}; expected mmrjax.Conditions(...)")
+    model = model or (fidelities.NAMES[0] if profile is None else mission_batch.MODEL)
+    if model not in fidelities.TABLE:
+        raise UsageError(f"model: got {model}; {choices(str(model), fidelities.TABLE)}")
+    if profile is not None or start is not None:
+        _check_profile(model, profile, {"duration": duration, "step": step, **options})
+    try:
+        stated = fidelities.facts(model).resolved(duration=duration, step=step, **options)
+    except ValueError as error:
+        raise UsageError(f"model {model}, {error}") from error
+    _check_robot(robot)
+    conditions = _resolved(robot, conditions)
+    _check_conditions(conditions)
+    _check_battery(robot, conditions)
+    _check_turning(robot, conditions, profile)
+    _check_brake(robot, conditions, profile)
+    turns = conditions.turns or (profile is not None and profile.turns)
+    if not (turns or has_tracer(robot.effects)) and (unlike := robot.unlike):
+        warnings.warn(f"{', '.join(unlike)}: {STRAIGHT}; {OF_TURNS[0]}=1, {OF_TURNS[1]}=1 let it turn", stacklevel=2)
+    if in_trace(robot, conditions, profile, start):
+        robot = ambient(robot)
+        conditions, profile, start = jax.device_put((conditions, profile, start))
+    if profile is not None:
+        return _forward_alone(_missions(robot, conditions, profile, start, history))
+    robot = robot.showing_turns() if conditions.turns else robot
+    fidelity, traced = fidelities.get(model), has_tracer((robot, conditions))
+    if not traced:
+        try:
+            fidelity.check(robot, _flat(conditions), stated)
+        except ValueError as error:
+            raise UsageError(f"model {model}, {error}") from error
+    names = robot.configurations.names
+    if fidelity.outputs is not None and not traced:
+        return Results.pending(Pending(robot, conditions, fidelity), names, model)
+    run = _run(fidelity, robot, conditions, stated, history and fidelities.facts(model).histories)
+    results = Results(
+        conditions, total_mass(robot, conditions), run.result, run.columns, run.history, names, model,
+        channels=robot.channels,
+    )  # fmt: skip
+    return results if fidelities.facts(model).reverse else _forward_alone(results)
+
+
+def _forward_alone(results: Results) -> Results:
+    """The same results, which refuse reverse mode in a sentence: a loop over steps of adaptive length has none."""
+    if not has_tracer(results):
+        return results
+    kind = results.model if results.mission is None else f"{results.model} over a profile"
+    named: Results = eqxi.nondifferentiable_backward(results, msg=f"{kind}: {FORWARD_ALONE}")
+    return named
+
+
+def _check_battery(robot: Robot, conditions: Conditions) -> None:
+    """Refuse a cut-off at which no cell gives current, and warn of one that hardly acts, where a run is on the
+    battery."""
+    if has_tracer((robot.battery, conditions.battery)) or not (np.asarray(conditions.battery) > 0.5).any():
+        return
+    if any(np.ndim(x) for x in jax.tree.leaves(robot.battery)):  # a batch of robots
+        return
+    if refused := power.cutoff_refused(robot.battery):
+        raise UsageError(f"battery.voltage_cutoff: {refused}")
+    if remark := power.cutoff_remark(robot.battery):
+        warnings.warn(f"battery.voltage_cutoff: {remark}", stacklevel=3)
+
+
+def _check_turning(robot: Robot, conditions: Conditions, profile: Profile | None) -> None:
+    """Refuse to turn a robot that cannot, where its sides are driven apart."""
+    freed = [name for name in OF_TURNS if getattr(conditions, name) is not None]
+    freed += ["profile"] if profile is not None and profile.turns else []
+    if not freed or has_tracer((robot, conditions.configuration)):
+        return
+    if any(np.ndim(x) for x in jax.tree.leaves((robot.sides, robot.configurations))):  # a batch of robots
+        return
+    if why := cannot_turn(robot, [robot.configurations.names[k] for k in np.unique(conditions.configuration)]):
+        raise UsageError(f"{freed[0]}: {why}")
+
+
+def _check_brake(robot: Robot, conditions: Conditions, profile: Profile | None) -> None:
+    """Refuse the torque of a brake on a vehicle."""
+    braked = conditions.load_torque is not None or (profile is not None and profile.load_torque is not None)
+    if braked and robot.has_ground:
+        raise UsageError(f"load_torque: {NO_BRAKE}; state slope_deg or payload")
+
+
+def _check_profile(model: str, profile: Any, options: Mapping[str, float | None]) -> None:
+    if profile is None:
+        raise UsageError("start: got one without a profile; expected profile=mmrjax.profile(...) beside it")
+    if not isinstance(profile, Profile):
+        raise UsageError(f"profile: got {type(profile).__name__}; expected mmrjax.profile(...)")
+    if model != mission_batch.MODEL:
+        raise UsageError(
+            f"model: got {model} beside a profile; expected {mission_batch.MODEL}, which follows profiles"
+        )
+    for name, value in options.items():
+        if value is not None:
+            raise UsageError(f"{name}: got {value!r} beside a profile, whose last row ends the mission; leave it out")
+
+
+def _missions(robot: Robot, conditions: Conditions, profile: Profile, start: Start | None, history: bool) -> Results:
+    """Every run of a batch over the same profile."""
+    flat = _flat(conditions)
+    if not has_tracer((robot, flat, profile, start)):
+        cell = mission_batch.begins_below(robot, flat, profile, start)
+        if np.isfinite(cell).any():
+            k = int(np.argmax(np.isfinite(cell)))
+            at = f"[{k}]" if len(cell) > 1 else ""
+            raise UsageError(
+                f"discharge{at}: got {float(np.asarray(flat.discharge)[k]):g} C; a cell is then at {cell[k]:.4g} V, "
+                f"below its cut-off of {robot.battery.voltage_cutoff:g} V, before the mission begins"
+            )
+    found = mission_batch.batch(robot, flat, profile, start, history=history)
+    further = mission_batch.columns(mission_batch.numbers(robot, flat, found))
+    course = None
+    if found.course is not None:
+        course = History.of(robot, found.course.time, found.course.distance, found.course.signals)
+    found, further, course = _shaped((found, further, course), conditions.shape)
+    names, mass = robot.configurations.names, total_mass(robot, conditions)
+    return Results(
+        conditions,
+        mass,
+        found.result,
+        further,
+        course,
+        names,
+        mission_batch.MODEL,
+        found,
+        profile.stated,
+        robot.channels,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Pending:
+    """A batch that has been checked, and of which nothing has been computed.
+
+    Attributes:
+        robot: concrete; conditions: of any shape, configurations resolved; fidelity: one that has `outputs`.
+    """
+
+    robot: Robot
+    conditions: Conditions
+    fidelity: Fidelity
+
+    @at_once
+    def shown(self) -> dict[str, jax.Array]:
+        """What the robot's instruments show, by channel, and the codes of how the runs ended as `status`."""
+        outputs, names = self.fidelity.outputs, (*channels.names(self.robot.channels), STATUS)
+        assert outputs is not None
+        return _in_chunks(self.fidelity, lambda flat: outputs(self.robot, flat, names), self.conditions)
+
+    @at_once
+    def result(self) -> Result:
+        """Everything."""
+        return _run(self.fidelity, self.robot, self.conditions, {}, history=False).result
+
+    @at_once
+    def total_mass(self) -> jax.Array:
+        """Mass of robot and payload, stated or the robot's own [kg]."""
+        return total_mass(self.robot, self.conditions)
+
+
+def _run(
+    fidelity: Fidelity, robot: Robot, conditions: Conditions, options: Mapping[str, float], history: bool
+) -> Run:
+    """A batch of any shape."""
+    runs = math.prod(conditions.shape)
+    if history and runs > HISTORIES:
+        raise UsageError(f"history: got {runs} runs; at most {HISTORIES} are kept over time; expected history=False")
+    simulate = fidelity.histories if history else fidelity.run
+    assert simulate is not None
+    if has_tracer((robot, conditions)):
+        return _shaped(simulate(robot, _flat(conditions), options), conditions.shape)
+    return _in_chunks(fidelity, lambda flat: simulate(robot, flat, options), conditions)
+
+
+T = TypeVar("T")
+
+
+def _in_chunks(fidelity: Fidelity, function: Callable[[Conditions], T], conditions: Conditions) -> T:
+    """What a function of conditions of shape (runs,) gives, of the shape that the conditions have.
+
+    More runs than a fidelity takes at once go in chunks of one size, which share a compilation; the last one ends
+    with the last run. Few are filled up (`Facts.filled`), by NumPy, for which nothing is compiled; else nothing is
+    dispatched leaf by leaf: at 262 144 runs that took twenty times as long as the equations.
+    """
+    size = fidelity.facts.at_once(jax.default_backend() != "cpu")
+    runs = math.prod(conditions.shape)
+    filled = min(fidelity.facts.filled(runs), size)
+    if 0 < runs < filled:
+        rows = np.minimum(np.arange(filled), runs - 1)  # the last ones stand for the last run again
+        found = function(jax.device_put(jax.tree.map(lambda x: np.ravel(x)[rows], conditions)))
+        return jax.device_put(
+            jax.tree.map(lambda x: np.asarray(x)[:runs].reshape((*conditions.shape, *x.shape[1:])), found)
+        )
+    flat = _flat(conditions)
+    if runs <= size:
+        return _shaped(function(flat), conditions.shape)
+    parts = [function(_rows(flat, np.asarray(first), size)) for first in range(0, runs, size)]
+    return _shaped(_joined(parts, runs), conditions.shape)
+
+
+def _flat(conditions: Conditions) -> Conditions:
+    """Conditions of shape (runs,)."""
+    return conditions if len(conditions.shape) == 1 else _raveled(conditions)
+
+
+@compiled
+def _raveled(conditions: Conditions) -> Conditions:
+    return jax.tree.map(jnp.ravel, conditions)
+
+
+def _shaped(tree: T, shape: tuple[int, ...]) -> T:
+    """A tree whose leaves have a leading axis of runs, with that axis in a batch's own shape."""
+    return tree if len(shape) == 1 else _reshaped(tree, shape)
+
+
+@compiled
+def _reshaped(tree: T, shape: tuple[int, ...]) -> T:
+    return jax.tree.map(lambda x: jnp.reshape(x, shape + x.shape[1:]), tree)
+
+
+@compiled
+def _rows(conditions: Conditions, first: np.ndarray, size: int) -> Conditions:
+    """So many runs from the first on, or the last ones where there are not as many left."""
+    return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, size), conditions)
+
+
+@compiled
+def _joined(parts: list[T], runs: int) -> T:
+    """Chunks of one size one after another, the last one's beginning left out where it repeats the one before."""
+    return jax.tree.map(lambda *x: jnp.concatenate([*x[:-1], x[-1][(len(x) * len(x[-1]) - runs) :]]), *parts)
+
+
+def _check_robot(robot: Robot) -> None:
+    """Refuse parameters out of the bounds that their fields declare."""
+    concrete = [p for p in params.walk(robot) if not isinstance(p.value, jax.core.Tracer)]
+    for parameter, value in zip(concrete, jax.device_get([p.value for p in concrete]), strict=True):
+        spec = parameter.spec
+        wrong = _first_outside(value, *spec.bounds)
+        if wrong is not None:
+            low, high = spec.bounds
+            raise UsageError(
+                f"{parameter.name}{wrong[0]}: got {wrong[1]:.6g}; expected {low:g} to {high:g} {spec.unit} "
+                f"({spec.meaning})"
+            )
+
+
+def _resolved(robot: Robot, conditions: Conditions) -> Conditions:
+    """Conditions with indices for names, every index one that the robot has."""
+    names, which = robot.configurations.names, conditions.configuration
+    if isinstance(which, Named):
+        try:
+            return dataclasses.replace(conditions, configuration=which.among(names))
+        except KeyError as error:
+            raise UsageError(f"configuration: got {error.args[0]}; {choices(error.args[0], names)}") from error
+    if not has_tracer(which) and which.size and not _within(_ends(which), 0, len(names) - 1):
+        wrong = _first_outside(which, 0, len(names) - 1)
+        assert wrong is not None
+        known = ", ".join(f"{k} ({name})" for k, name in enumerate(names))
+        raise UsageError(f"configuration{wrong[0]}: got {wrong[1]:g}; expected one of {known}")
+    return conditions
+
+
+def total_mass(robot: Robot, conditions: Conditions) -> jax.Array:
+    """Mass of robot and payload, stated or the robot's own [kg]."""
+    if conditions.total_mass is not None:
+        return conditions.total_mass
+    own = tuple(chassis.mass for chassis in robot.configurations.members)
+    return _own_mass(own, conditions.configuration, conditions.payload)
+
+
+@compiled
+def _own_mass(own: tuple[Scalar, ...], configuration: jax.Array | np.ndarray, payload: jax.Array) -> jax.Array:
+    return jnp.stack([jnp.asarray(mass) for mass in own])[configuration] + payload
+
+
+def _check_conditions(conditions: Conditions) -> None:
+    stated_names = {f.name for f in dataclasses.fields(conditions) if getattr(conditions, f.name) is not None}
+    # A duty that nobody states is 1, and under a transformation a tracer: that is no statement either.
+    if has_tracer(conditions.duty) or (np.asarray(conditions.duty) == 1).all():
+        stated_names.remove("duty")
+    if why := sides_contradict(stated_names):
+        raise UsageError(why)
+    ends: dict[int, tuple[float, float]] = {}  # by array: several fields may share one
+    for field in dataclasses.fields(conditions):
+        value = getattr(conditions, field.name)
+        if field.name == "configuration" or value is None or has_tracer(value) or not value.size:
+            continue
+        condition = CONDITIONS[field.name]
+        (low, high), unit = condition.range, condition.unit_shown
+        if id(value) not in ends:
+            ends[id(value)] = _ends(value)
+        if not _within(ends[id(value)], low, high):
+            wrong = _first_outside(value, low, high)
+            assert wrong is not None
+            raise UsageError(
+                f"{field.name}{wrong[0]}: got {wrong[1]:.6g}; expected {low:g} to {high:g} {unit}".rstrip()
+            )
+    stated, payload = conditions.total_mass, conditions.payload
+    if stated is None or has_tracer((stated, payload)):
+        return
+    bare = np.asarray(stated) - np.asarray(payload)
+    wrong = _first_outside(bare, np.nextafter(0.0, 1.0), math.inf)
+    if wrong is not None:
+        at = np.unravel_index(int(np.argmax(~(bare > 0))), bare.shape)
+        mass, load = float(np.asarray(stated)[at]), float(np.asarray(payload)[at])
+        raise UsageError(f"total_mass{wrong[0]}: got {mass:g} kg; expected more than the payload, {load:g} kg")
+
+
+def _ends(values: jax.Array | np.ndarray) -> tuple[float, float]:
+    """Least and greatest of some numbers, found where they are; NaN where one of them is."""
+    on_host = not isinstance(values, jax.Array) or all(device.platform == "cpu" for device in values.devices())
+    numbers = np.asarray(values) if on_host else values
+    least, most = jax.device_get((numbers.min(), numbers.max()))
+    return float(least), float(most)
+
+
+def _within(ends: tuple[float, float], low: float, high: float) -> bool:
+    """Whether every number is within the limits, and finite."""
+    return low <= ends[0] and ends[1] <= high and math.isfinite(ends[0]) and math.isfinite(ends[1])
+
+
+def _first_outside(value: Any, low: float, high: float) -> tuple[str, float] | None:
+    """Index in brackets (none for one number) and value of the first number that is not within the limits."""
+    numbers = np.asarray(value)
+    if not numbers.shape and low <= numbers <= high and math.isfinite(numbers):
+        return None
+    bad = ~((numbers >= low) & (numbers <= high) & np.isfinite(numbers))
+    if not bad.any():
+        return None
+    at = np.unravel_index(int(np.argmax(bad)), bad.shape)
+    return ("[" + ", ".join(str(int(k)) for k in at) + "]" if at else ""), float(numbers[at])

@@ -1,0 +1,148 @@
+"""Stages of a start (Figs. 23, 24), starting, acceleration with slipping, uniform travel, and the slip over each."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mmrjax.fidelities.base import History
+from mmrjax.model.paper_tables import PITCH_GROUSER, PITCH_TOOTH
+from mmrjax.model.robot import Robot
+
+#: What the stages are called, in order.
+NAMES = ("starting", "acceleration with slipping", "uniform")
+#: Share of the last speed within which a start is over [-], and the end of a run over which that is averaged [s].
+WITHIN, LAST = 0.01, 0.15
+
+
+@dataclasses.dataclass(frozen=True)
+class Stages:
+    """The stages of one start; times since its first sample.
+
+    Attributes:
+        sense: in which the shafts turn at the end, 1 or -1.
+        starting: end of the first stage [s]: the slide has reached its maximum, the shafts have spun up.
+        slipping: end of the second [s]: the slide is back within V_s for good; `starting` if it never left.
+        settled: t' [s]: the speed within 1 % of its last value, the mean over the last 0.15 s.
+        end: of the run [s].
+        slip: of each stage, and over_settling: from 0 to t', by `mean_slip` [-]; NaN of one that has no length.
+    """
+
+    sense: float
+    starting: float
+    slipping: float
+    settled: float
+    end: float
+    slip: tuple[float, float, float]
+    over_settling: float
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Where the stages begin and end [s]."""
+        return 0.0, self.starting, self.slipping, self.end
+
+    def to_json(self) -> dict[str, Any]:
+        """What `result.json` says of it."""
+
+        def number(x: float) -> float | None:
+            return float(x) if np.isfinite(x) else None
+
+        each = zip(NAMES, self.bounds[:-1], self.bounds[1:], self.slip, strict=True)
+        return {
+            "stages": [{"stage": n, "from_s": a, "until_s": b, "slip": number(s)} for n, a, b, s in each],
+            "acceleration_time_s": self.settled,
+            "slip_over_acceleration": number(self.over_settling),
+        }
+
+
+def _smoothed(time: np.ndarray, values: np.ndarray, period: float) -> np.ndarray:
+    """Means over a `period` about each instant of evenly spaced samples; at the ends of the nearest whole one."""
+    count = min(round(period / (time[-1] / len(time))) | 1, len(values) | 1) if time[-1] > 0 else 1
+    if count < 3 or count > len(values):
+        return values
+    return np.pad(np.convolve(values, np.ones(count) / count, "valid"), count // 2, mode="edge")
+
+
+def mean_slip(
+    time: Float[np.ndarray, " times"],
+    speed: Float[np.ndarray, " times"],
+    theoretical: Float[np.ndarray, " times"],
+    begin: float,
+    end: float,
+) -> float:
+    """Mean of the slip (33) over a time, 1 - ∫V_x dt / ∫V_x_teor dt [-]: the share of the movers' way that is lost.
+
+    That is s weighted by V_x_teor, and finite from standstill on, where s itself is 0/0. NaN without any way.
+    """
+    if not end > begin:
+        return np.nan
+    within = time[(time > begin) & (time < end)]
+    at = np.concatenate([[begin], within, [end]])
+    travelled, rolled = (np.trapezoid(np.interp(at, time, v), at) for v in (speed, theoretical))
+    return float(1 - travelled / rolled) if abs(rolled) > 1e-9 else np.nan
+
+
+def stages(
+    time: Float[np.ndarray, " times"],
+    speed: Float[np.ndarray, " times"],
+    theoretical: Float[np.ndarray, " times"],
+    sliding: Float[np.ndarray, " times"],
+    speed_static: float,
+    way: float = 0.0,
+) -> Stages:
+    """The stages of one start, of samples without gaps.
+
+    Args:
+        time: [s]; speed, theoretical, sliding: V, r_k ω_k and the contact patch's speed over the ground [m/s].
+        speed_static: V_s of the friction law [m/s].
+        way: of the movers between two contacts that make them ripple [m]; slide and speed are judged by their means
+            over that at the last speed. 0: nothing ripples.
+    """
+    sense = -1.0 if theoretical[-1] < -1e-4 else 1.0
+    starting = float(time[int(np.argmax(sense * sliding))])
+    sliding, even = (_smoothed(time, x, way / max(abs(float(theoretical[-1])), 1e-3)) for x in (sliding, speed))
+    beyond = np.flatnonzero((sense * sliding > speed_static) & (time >= starting))
+    slipping = float(time[min(int(beyond[-1]) + 1, len(time) - 1)]) if beyond.size else starting
+    last = speed[ending(time)].mean()
+    late = np.flatnonzero(np.abs(even - last) > WITHIN * abs(last))
+    settled = float(time[min(int(late[-1]) + 1, len(time) - 1)]) if late.size else 0.0
+    bounds = (0.0, starting, max(slipping, starting), float(time[-1]))
+    each = [mean_slip(time, speed, theoretical, a, b) for a, b in itertools.pairwise(bounds)]
+    over = mean_slip(time, speed, theoretical, 0.0, settled)
+    return Stages(sense, bounds[1], bounds[2], settled, bounds[3], (each[0], each[1], each[2]), over)
+
+
+def of_histories(robot: Robot, history: History, which: Sequence[int] | np.ndarray) -> list[Stages | None]:
+    """Of each run of a batch from standstill up to its last number; None of one without numbers.
+
+    Args:
+        which: index of each run's configuration in `robot`, whose loads are vehicles.
+    """
+    found: list[Stages | None] = []
+    for k, index in enumerate(which):
+        signals = history.signals
+        upto = numbers(np.asarray(signals.total_current)[k])
+        of_run = (history.time, signals.speed, signals.speed_theoretical, signals.speed_sliding)
+        time, *motion = (np.asarray(x)[k][:upto] for x in of_run)
+        chassis = robot.configurations.members[int(index)]
+        static, way = float(chassis.ground.friction.speed_static), 0.0
+        if history.reactions is not None:  # contacts are resolved
+            way = PITCH_GROUSER if float(chassis.on_tracks) > 0.5 else PITCH_TOOTH
+        found.append(stages(time, motion[0], motion[1], motion[2], static, way) if upto else None)
+    return found
+
+
+def numbers(values: Float[np.ndarray, " times"]) -> int:
+    """How many samples a run has up to its last that is a number."""
+    finite = np.flatnonzero(np.isfinite(values))
+    return int(finite[-1]) + 1 if finite.size else 0
+
+
+def ending(time: Float[np.ndarray, " times"]) -> np.ndarray:
+    """Which samples are of the last 0.15 s, some pitches of the running gear; of a short run its last tenth."""
+    return np.asarray(time >= time[-1] - min(LAST, 0.1 * float(time[-1])))

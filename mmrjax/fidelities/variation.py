@@ -1,0 +1,204 @@
+"""What varies over many points: parameters of a robot and conditions by name, and the outputs of each point."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mmrjax import fidelities
+from mmrjax.compile.compiling import compiled
+from mmrjax.errors import UsageError, choices
+from mmrjax.fidelities import outputs as table_of_outputs
+from mmrjax.fidelities.base import Run
+from mmrjax.missions.profile import Profile
+from mmrjax.model import params, quantities
+from mmrjax.model.channels import Channel
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import CODES
+
+#: Every condition of a run in words; `configuration` is an index among the robot's.
+CONDITIONS: dict[str, str] = {
+    "configuration": "configuration of the chassis",
+    **{field: condition.label for field, condition in quantities.CONDITIONS.items()},
+}
+#: What every point has beside its outputs: code into `signals.STATUSES`, bit mask over `signals.FLAGS`.
+STATUS, FLAGS = CODES
+
+
+@dataclasses.dataclass(frozen=True)
+class Axis:
+    """What is known of one thing that varies.
+
+    Attributes:
+        name: dotted parameter, or condition.
+        unit: of its values; meaning: in words; bounds: least and greatest value allowed [unit].
+        value: of the robot, or of conditions where none is stated [unit]; None: the robot's own mass and the payload.
+        prior_sd: standard deviation of the parameter's prior around `value` [unit]; None for a condition.
+        spec: of the parameter's field; None for a condition.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    bounds: tuple[float, float]
+    value: float | None
+    prior_sd: float | None = None
+    spec: params.Spec | None = None
+
+
+class Variation(eqx.Module):
+    """A robot of which some parameters, and conditions, take other values at each point.
+
+    Attributes:
+        robot: that every point starts from.
+        names: of what varies: dotted parameters as `params.walk` gives them, or conditions (`CONDITIONS`).
+
+    Raises:
+        UsageError: a name that is neither, or stated twice; the message says which are near.
+    """
+
+    robot: Robot
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(self, robot: Robot, names: tuple[str, ...]) -> None:
+        known = variable_names(robot)
+        for k, name in enumerate(names):
+            if name not in known:
+                raise UsageError(
+                    f"{name}: neither a parameter of the robot nor a condition; {choices(name, known, 3)}"
+                )
+            if name in names[:k]:
+                raise UsageError(f"{name}: stated twice; expected each name once")
+        self.robot, self.names = params.strong(robot), tuple(names)
+
+    @property
+    def axes(self) -> dict[str, Axis]:
+        """What is known of each name, in order."""
+        every = {p.name: p for p in params.walk(self.robot)}
+        return {name: self._axis(name, every.get(name)) for name in self.names}
+
+    def _axis(self, name: str, parameter: params.Parameter | None) -> Axis:
+        if parameter is not None:
+            spec, value = parameter.spec, float(parameter.value)
+            return Axis(name, spec.unit, spec.meaning, spec.bounds, value, spec.prior_sd(value), spec)
+        if name == "configuration":
+            return Axis(name, "", CONDITIONS[name], (0.0, len(self.robot.configurations) - 1.0), 0.0)
+        condition, usual = quantities.CONDITIONS[name], getattr(Conditions(), name)
+        at = None if usual is None else float(usual)
+        return Axis(name, condition.unit_shown, condition.label, condition.range, at)
+
+    @property
+    def varies_robot(self) -> bool:
+        """Whether some name is a parameter of the robot."""
+        return any(name not in CONDITIONS for name in self.names)
+
+    def at(self, values: Float[Array, "... names"], conditions: Conditions) -> tuple[Robot, Conditions]:
+        """The robot and the conditions of a point, or of a batch, whose leaves that vary then have its shape.
+
+        Args:
+            values: in the order of `names`, in the axes' units; `configuration` is an index, rounded.
+            conditions: what does not vary, names of configurations resolved.
+        """
+        given: dict[str, Any] = {name: values[..., k] for k, name in enumerate(self.names)}
+        stated = {name: given.pop(name) for name in self.names if name in CONDITIONS}
+        if "configuration" in stated:
+            stated["configuration"] = jnp.round(stated["configuration"]).astype(int)
+        robot = params.replace(self.robot, given) if given else self.robot
+        return robot, dataclasses.replace(conditions, **stated)
+
+
+def variable_names(robot: Robot) -> tuple[str, ...]:
+    """Every name that may vary: conditions, then the robot's parameters."""
+    return (*CONDITIONS, *(p.name for p in params.walk(robot)))
+
+
+def evaluate(
+    variation: Variation,
+    fidelity: str,
+    values: Float[Array, "points names"],
+    conditions: Conditions,
+    options: Mapping[str, float],
+    outputs: tuple[str, ...],
+    profile: Profile | None = None,
+) -> dict[str, Array]:
+    """Outputs of many points in one call, compiled once for each number of points.
+
+    Traceable; what does not vary is an argument of the compiled program, not a constant in it.
+
+    Args:
+        fidelity: one of `fidelities.NAMES`; options: all that it has, from `Facts.resolved`.
+        values: a row a point, in the order of `variation.names`.
+        conditions: what does not vary, of shape () or (points,), names of configurations resolved.
+        outputs: names of `outputs.table`, or of columns that the fidelity adds; also `flags`. Over a profile
+            columns of `missions.OUTPUTS`.
+        profile: a mission that every point is to follow, by the fidelity `missions.MODEL`; fields of shape (rows,).
+
+    Returns:
+        By name in SI units (a fidelity's own column in its unit), and `status`; arrays of shape (points,).
+
+    Raises:
+        UsageError: an output that the fidelity does not have.
+    """
+    found = _evaluate(variation, fidelity, values, conditions, dict(options), tuple(outputs), profile)
+    return {name: found[name] for name in (*outputs, STATUS)}  # jit sorts the names
+
+
+@compiled
+def _evaluate(
+    variation: Variation,
+    fidelity: str,
+    values: Array,
+    conditions: Conditions,
+    options: dict[str, float],
+    names: tuple[str, ...],
+    profile: Profile | None,
+) -> dict[str, Array]:
+    (points, _) = values.shape
+    conditions = jax.tree.map(lambda x: jnp.broadcast_to(x, (points,)), conditions)
+    shown = variation.robot.channels
+    if profile is None and fidelity == "steady":
+        from mmrjax.fidelities.steady import steady_outputs
+
+        _known(names, table_of_outputs.names(shown))
+        robot, each = variation.at(values, conditions)
+        each = jax.tree.map(lambda x: jnp.broadcast_to(x, (points,)), each)
+        return steady_outputs(robot, each, (*names, STATUS))
+
+    def simulate(robot: Robot, conditions: Conditions) -> Run:
+        if profile is not None:
+            from mmrjax.missions import mission_batch
+
+            return mission_batch.run(robot, conditions, profile)
+        return fidelities.get(fidelity).run(robot, conditions, options)
+
+    if not variation.varies_robot:
+        return pick(simulate(*variation.at(values, conditions)), shown, names)
+
+    def one(values: Array, conditions: Conditions) -> Run:
+        robot, point = variation.at(values, conditions)
+        run = simulate(robot, jax.tree.map(lambda x: x[None], point))
+        return jax.tree.map(lambda x: x[0], run)
+
+    return pick(jax.vmap(one)(values, conditions), shown, names)
+
+
+def pick(run: Run, shown: tuple[Channel, ...], names: tuple[str, ...]) -> dict[str, Array]:
+    """Outputs of a batch by name, as `evaluate` returns them, of a rig that shows these channels."""
+    rows = {row.name: row for row in table_of_outputs.table(shown)}
+    _known(names, (*rows, *run.columns))
+    found = {n: rows[n].get(run.result) if n in rows else run.columns[n] for n in names if n != FLAGS}
+    further = {FLAGS: run.result.flags} if FLAGS in names else {}
+    return {**found, **further, STATUS: run.result.status}
+
+
+def _known(names: tuple[str, ...], known: tuple[str, ...]) -> None:
+    for name in names:
+        if name not in known and name != FLAGS:
+            raise UsageError(f"outputs: got {name}; {choices(name, (*known, FLAGS), 3)}")

@@ -1,0 +1,1 @@
+"""Missions: a profile over time, with heat, events and energy."""

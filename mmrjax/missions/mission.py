@@ -1,0 +1,332 @@
+"""Missions: the ODE of `drive` over a profile, with heat, standing still, and energy integrated as states.
+
+A robot that has come to rest stands: what friction can hold does not move, neither by the smooth friction of the
+shafts nor by the creep of the ground's law, until motors or gravity overcome it. Standing and breaking away are
+events that the steps land on, and derivatives pass through the moments at which they happen.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from mmrjax.fidelities.result import mask, withhold
+from mmrjax.missions import mission_straight, mission_turning
+from mmrjax.missions.mission_steps import EVENTS, FIRST, Asked, Carry, Law, follow
+from mmrjax.missions.profile import BRAKE, COAST, MOTOR_SPEED, SPEED, Profile
+from mmrjax.model import balances, energy
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import (
+    BATTERY_EMPTY,
+    CONVERGED,
+    CUT_OFF,
+    FAILED,
+    ROLLS_BACK,
+    SLIDES,
+    STALLED,
+    TIPS,
+    Result,
+    Signals,
+)
+
+#: Relative tolerance of a step, and in the units of the unknowns.
+TOLERANCE = 2e-5
+#: Most steps of one segment.
+MOST_STEPS = 4096
+#: A demanded speed is missed where at the end of a segment it is off by more than this share of the segment's
+#: largest [-].
+MISSED = 0.02
+
+
+class Totals(eqx.Module):
+    """What a mission or a segment comes to.
+
+    Attributes:
+        time: that it took [s].
+        of: integrals by the names of the law's `TOTALS`; `drawn` and `returned` are the source's, the rest where it
+            went.
+        stored: rise of the energy in motion [J].
+        given: by the source on balance [J]: by a battery as its charge at both ends says, by a supply as integrated.
+    """
+
+    time: Array
+    of: dict[str, Array]
+    stored: Array
+    given: Array
+
+    @property
+    def energy(self) -> Scalar:
+        """Taken from the source on balance [J]."""
+        return self.of["drawn"] - self.of["returned"]
+
+    @property
+    def unaccounted(self) -> Scalar:
+        """Energy in, less where it went, less what is stored [J]: what the integration is off by.
+
+        That a battery gives follows from its charge alone, so that a charge that is off shows too.
+        """
+        return self.given - sum(self.of[name] for name in energy.SINKS) - self.stored
+
+
+class Start(eqx.Module):
+    """The state that a mission begins in; at rest and at ambient temperature where nothing is stated.
+
+    Attributes:
+        speed: of the robot, its movers rolling [m/s]; current: of one motor [A].
+        temperature_winding, temperature_housing: [°C], None: ambient.
+    """
+
+    speed: Scalar = 0.0
+    current: Scalar = 0.0
+    temperature_winding: Scalar | None = None
+    temperature_housing: Scalar | None = None
+
+
+class Course(eqx.Module):
+    """A mission over time: its accepted steps, shape (kept,); those after the last are NaN.
+
+    Attributes:
+        time: since the mission began [s]; segment: index of the segment, -1 after the last.
+        event: index into `MARKS` of what a step has landed on, -1 for none.
+        distance: along the ground, forward less backward [m]; path: either way [m].
+        temperature_winding, temperature_housing: [°C]; of a robot that turns of either side, shape (kept, 2).
+        energy: taken from the source on balance [J].
+        signals: every signal; of a robot that turns of left and right side, shape (kept, 2).
+    """
+
+    time: Float[Array, " kept"]
+    segment: Int[Array, " kept"]
+    event: Int[Array, " kept"]
+    distance: Float[Array, " kept"]
+    path: Float[Array, " kept"]
+    energy: Float[Array, " kept"]
+    temperature_winding: Float[Array, " kept"]
+    temperature_housing: Float[Array, " kept"]
+    signals: Signals
+
+
+class Mission(eqx.Module):
+    """A robot's run over a profile.
+
+    Attributes:
+        total: of the mission; segments: of each segment of each cycle, fields of shape (cycles, segments).
+        peaks: by the names of the law's `PEAKS` (`cell_low` the lowest voltage of a cell); of the segments too.
+        status: of each segment at its end, flags: of each segment; shape (cycles, segments).
+        result: the end of the mission, with its status and the flags of all of it. Status is `converged` where the
+            profile was followed to its end; `battery_empty`; `cut_off` where the cells stayed below their cut-off;
+            `stalled`, `slides`, `rolls_back` or `tips` where some segment that asks for motion ends so, the first
+            one; `failed` the integrator gave up.
+        temperature_winding, temperature_housing: of the hottest at the end [°C]; discharge: [C].
+        steps: that were taken, and how many of them were rejected.
+        course: over time, where it was asked for.
+    """
+
+    total: Totals
+    segments: Totals
+    peaks: dict[str, Array]
+    segment_peaks: dict[str, Array]
+    status: Int[Array, "cycles segments"]
+    flags: Int[Array, "cycles segments"]
+    result: Result
+    temperature_winding: Scalar
+    temperature_housing: Scalar
+    discharge: Scalar
+    steps: Int[Array, ""]
+    rejected: Int[Array, ""]
+    course: Course | None
+
+
+def law_of(conditions: Conditions, profile: Profile) -> Law:
+    """How a robot moves: free to turn where the profile or the conditions drive its sides apart, or head it."""
+    return mission_turning if profile.turns or conditions.turns else mission_straight
+
+
+def initial_unknowns(law: Law, robot: Robot, conditions: Conditions, start: Start) -> Float[Array, " unknowns"]:
+    """The unknowns at the beginning, headed as the conditions say, else uphill; in SI."""
+    ambient, heading = robot.motor.temperature_ambient, conditions.heading_deg
+    winding, housing = (ambient if t is None else t for t in (start.temperature_winding, start.temperature_housing))
+    shafts = start.speed / robot.chassis(conditions.configuration).radius * robot.gearbox.ratio
+    y = jnp.zeros_like(law.units(robot))
+    for at, value in (
+        (law.CURRENT, start.current), (law.MOTOR, shafts), (law.WINDING, winding), (law.HOUSING, housing),
+        (law.GROUND, start.speed), (law.HEADING, 0.0 if heading is None else jnp.radians(heading)),
+        (law.DISCHARGE, conditions.discharge),
+    ):  # fmt: skip
+        y = y.at[at].set(value)
+    return y
+
+
+def _ends(
+    law: Law, robot: Robot, otherwise: Conditions, segment: Profile, found: Any, asked: Asked, stands: Array
+) -> tuple[Array, Array]:
+    """Status of a segment at its end, and whether the robot has missed what was demanded."""
+    mode, signals = segment.mode[0], balances.signals_of(found)
+    driven = jnp.max(jnp.abs(jnp.asarray(signals.duty * signals.voltage_source)))
+    status = jnp.where(stands, STALLED, law.status(robot, asked.conditions, found))
+    slow = [jnp.max(jnp.abs(jnp.asarray(x))) < 1.0 for x in (signals.direction, signals.direction_travel)]
+    rests = stands | (slow[0] & slow[1])
+    wanted = (mode != BRAKE) & (mode != COAST) & (driven > 1e-6)
+    status = jnp.where(~wanted & (status == STALLED), CONVERGED, status)  # it stands, as it should
+    controlled = (mode == MOTOR_SPEED) | (mode == SPEED)
+    per_speed = robot.gearbox.ratio / robot.chassis(otherwise.configuration).radius
+    demanded = law.demanded(robot, otherwise, segment)
+    # A ramp that ends in a stop is measured by where it began.
+    largest = jnp.max(jnp.abs(demanded if segment.linear else demanded[:1])) * jnp.where(
+        mode == SPEED, per_speed, 1.0
+    )
+    off = jnp.max(jnp.abs(jnp.asarray(asked.error)))
+    missed = controlled & (off > MISSED * jnp.maximum(largest, 10.0))
+    status = jnp.where(controlled & (rests | (status == STALLED)) & ~missed, CONVERGED, status)
+    return status, missed
+
+
+def _ending(c: Carry) -> Array:
+    """Status of a mission that has ended before its profile."""
+    return jnp.where(c.failed, FAILED, jnp.where(c.cut_off, CUT_OFF, BATTERY_EMPTY))
+
+
+def mission(
+    robot: Robot,
+    conditions: Conditions,
+    profile: Profile,
+    start: Start | None = None,
+    *,
+    tolerance: Scalar = TOLERANCE,
+    most_steps: int = MOST_STEPS,
+    keep: int = 0,
+) -> Mission:
+    """Run one robot over a profile.
+
+    Args:
+        robot: any robot; its parameters may be tracers.
+        conditions: one run, scalar fields: what the profile does not state.
+        profile: one mission.
+        start: state that it begins in; None: at rest, at ambient temperature.
+        tolerance: relative, and in `UNITS` absolute, error of a step.
+        most_steps: of one segment; a mission that needs more has `failed`.
+        keep: accepted steps of which the mission over time is kept; 0 for none.
+
+    Returns:
+        The mission; derivatives are forward (`jax.jvp`, `jax.jacfwd`), by parameters, conditions and values and times
+        of the profile, through stops and reversals; at a limit that begins to act they are those of one side.
+    """
+    begin, law = Start() if start is None else start, law_of(conditions, profile)
+    names, highest = list(law.TOTALS), len(law.PEAKS)
+    dtype = jnp.result_type(conditions.voltage, profile.time)
+    y0 = initial_unknowns(law, robot, conditions, begin).astype(dtype) / law.units(robot).astype(dtype)
+    q0 = jnp.zeros(len(names), dtype)
+    whole, false = jnp.asarray(0), jnp.asarray(False)
+    buffer = None
+    if keep:
+        blank = jnp.full((keep, 1), jnp.nan, dtype)
+        buffer = (blank * y0, blank * q0, jnp.zeros(keep, bool), jnp.full(keep, -1))
+    carry = Carry(
+        y=y0, q=q0, step=jnp.asarray(FIRST, dtype), stands=jnp.asarray(begin.speed == 0.0), ended=false,
+        below=false, low=jnp.zeros((), dtype), cut_off=false, peaks=jnp.full(highest, -jnp.inf, dtype),
+        flags=whole, events=jnp.full(len(EVENTS), -1.0, dtype), accepted=whole, rejected=whole, failed=false,
+        kept=whole, buffer=buffer, slope=jnp.zeros_like(y0),
+    )  # fmt: skip
+
+    def charge(y: Array) -> Array:
+        return y[law.DISCHARGE] * law.UNITS[law.DISCHARGE]
+
+    def one(carry: Carry, k: Array) -> tuple[Carry, tuple]:
+        segment = profile.row(k)
+        fresh = carry._replace(peaks=jnp.full(highest, -jnp.inf, dtype), flags=whole)
+        beginning = law.instant(robot, conditions, segment, carry.y.at[law.CLOCK].set(0.0), carry.stands)[0]
+        c = follow(law, robot, conditions, segment, fresh, tolerance, most_steps)
+        found, _, _, asked = law.instant(robot, conditions, segment, c.y, c.stands)
+        status, missed = _ends(law, robot, conditions, segment, found, asked, c.stands)
+        status = jnp.where(c.ended, _ending(c), status)
+        slips = law.over(robot, found)["slips"] & ~c.stands
+        flags = c.flags | mask({"demand_missed": missed & ~c.ended, "slips": slips})
+        rise = law.stored(robot, found) - law.stored(robot, beginning)
+        drawn, returned = (c.q[names.index(name)] for name in ("drawn", "returned"))
+        before, after = (robot.battery.energy(charge(x.y)) for x in (carry, c))
+        given = jnp.where(conditions.battery > 0.5, after - before, drawn - returned)
+        ran = ~carry.ended
+        time, rise, given = (jnp.where(ran, x, 0.0) for x in (c.y[law.CLOCK], rise, given))
+        out = (time, jnp.where(ran, c.q, 0.0), rise, given, c.peaks, status, flags, found, c.kept)
+        carry = c._replace(peaks=jnp.maximum(carry.peaks, c.peaks), flags=carry.flags | flags)
+        return carry, out
+
+    order = jnp.tile(jnp.arange(profile.segments), profile.cycles)
+    c, (time, q, rise, given, peaks, status, flags, found, kept) = jax.lax.scan(one, carry, order)
+    shape = (profile.cycles, profile.segments)
+    totals = {n: q[:, i].reshape(shape) for i, n in enumerate(names)}
+    each = Totals(time.reshape(shape), totals, rise.reshape(shape), given.reshape(shape))
+    total = jax.tree.map(jnp.sum, each)
+    bad = (status == STALLED) | (status == SLIDES) | (status == ROLLS_BACK) | (status == TIPS)
+    first = jnp.argmax(bad)
+    outcome = jnp.where(jnp.any(bad), status[first], CONVERGED)
+    outcome = jnp.where(c.ended, _ending(c), outcome)
+    end = jax.tree.map(lambda x: x[-1], found)
+    answer = withhold(law.RESULT(robot, end, outcome), outcome != FAILED, outcome != FAILED)
+    answer = dataclasses.replace(answer, flags=c.flags)
+
+    def named(x: Array) -> dict[str, Array]:
+        signs = {"cell_low": -1.0}
+        return {name: signs.get(name, 1.0) * x[..., i] for i, name in enumerate(law.PEAKS)}
+
+    course = None
+    if buffer is not None:
+        course = _course(law, robot, conditions, profile, c, each, kept)
+    winding, housing = _temperatures(law, c.y)
+    return Mission(
+        total=total, segments=each, peaks=named(c.peaks), segment_peaks=named(peaks.reshape(*shape, -1)),
+        status=status.reshape(shape), flags=flags.reshape(shape), result=answer,
+        temperature_winding=jnp.max(winding), temperature_housing=jnp.max(housing), discharge=charge(c.y),
+        steps=c.accepted + c.rejected, rejected=c.rejected,
+        course=course,
+    )  # fmt: skip
+
+
+def _temperatures(law: Law, y: Array) -> tuple[Array, Array]:
+    """Of windings and housings [°C]."""
+    winding, housing = (np.asarray(law.UNITS)[k] * y[..., k] for k in (law.WINDING, law.HOUSING))
+    return winding, housing
+
+
+def _course(
+    law: Law, robot: Robot, conditions: Conditions, profile: Profile, c: Carry, each: Totals, kept: Array
+) -> Course:
+    assert c.buffer is not None
+    ys, qs, stood, marks = c.buffer
+    at = jnp.arange(len(ys))
+    # Of each kept step its segment: the first whose count reaches beyond it.
+    segment = jnp.minimum(jnp.searchsorted(kept, at, side="right"), len(kept) - 1)
+    within = at < kept[-1]
+    begun = jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.time.ravel())])[segment]
+    so_far = {
+        name: jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.of[name].ravel())])[segment] + qs[:, i]
+        for i, name in enumerate(law.TOTALS)
+    }
+
+    def signals(y: Array, stands: Array, k: Array) -> Signals:
+        return balances.signals_of(law.instant(robot, conditions, profile.row(k % profile.segments), y, stands)[0])
+
+    every = law.at_places(jax.vmap(signals)(ys, stood, segment), so_far)
+    winding, housing = _temperatures(law, ys)
+
+    def shown(x: Array) -> Array:
+        return jnp.where(within.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan)
+
+    return Course(
+        time=shown(begun + ys[:, law.CLOCK]),
+        segment=jnp.where(within, segment, -1),
+        event=jnp.where(within, marks, -1),
+        distance=shown(so_far["distance"]),
+        path=shown(so_far["path"]),
+        energy=shown(so_far["drawn"] - so_far["returned"]),
+        temperature_winding=shown(winding),
+        temperature_housing=shown(housing),
+        signals=jax.tree.map(shown, every),
+    )

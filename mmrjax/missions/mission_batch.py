@@ -1,0 +1,280 @@
+"""Missions of a batch of runs, and what each comes to: energy, distance, peaks, heat, charge."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from mmrjax.compile.compiling import compiled
+from mmrjax.compile.programs import has_tracer
+from mmrjax.fidelities.base import Run
+from mmrjax.missions.mission import TOLERANCE, Mission, Start, Totals, mission
+from mmrjax.missions.profile import Profile
+from mmrjax.model import energy
+from mmrjax.model.channels import SIDES
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.quantities import MM, RPM
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import BATTERY_EMPTY, CUT_OFF
+
+#: The fidelity that follows profiles.
+MODEL = "drive"
+JOULE_PER_WH = 3600.0
+#: Steps of a segment for which room is kept at first, at least so many in all, and at most of all runs at once.
+ROOM, LEAST_KEPT, MOST_KEPT = 64, 4096, 2**20
+
+
+@dataclasses.dataclass(frozen=True)
+class Output:
+    """One number of a mission.
+
+    Attributes:
+        name: noun; column: in tables, with the unit in the name; unit: of the column; factor: the SI value of one.
+        label: words of tables and reports; resolution: digits after the point that a person wants to see [unit].
+    """
+
+    name: str
+    column: str
+    unit: str
+    factor: float
+    label: str
+    resolution: int
+
+
+def _wh(name: str, label: str) -> Output:
+    return Output(name, f"{name}_Wh", "Wh", JOULE_PER_WH, label, 3)
+
+
+#: Numbers of a mission in the order of columns, in SI by `numbers`.
+OUTPUTS: tuple[Output, ...] = (
+    Output("duration", "duration_s", "s", 1.0, "duration", 1),
+    Output("distance", "distance_m", "m", 1.0, "distance travelled, either way", 2),
+    Output("displacement", "displacement_m", "m", 1.0, "displacement, forward less backward", 2),
+    _wh("energy", "energy"),
+    Output("energy_per_metre", "energy_per_metre_Wh", "Wh/m", JOULE_PER_WH, "energy per metre", 5),
+    _wh("energy_drawn", "energy drawn"),
+    _wh("energy_returned", "energy returned"),
+    Output("rms_current", "rms_current_A", "A", 1.0, "rms current, all motors", 3),
+    Output("peak_current", "peak_current_A", "A", 1.0, "peak current, all motors", 2),
+    Output("rms_torque", "rms_torque_Nm", "N·m", 1.0, "rms torque, one gearbox output", 3),
+    Output("peak_torque", "peak_torque_Nm", "N·m", 1.0, "peak torque, one gearbox output", 3),
+    Output("peak_speed", "peak_speed_mm_s", "mm/s", MM, "peak speed", 1),
+    Output("peak_motor_speed", "peak_motor_speed_rpm", "rpm", RPM, "peak motor speed", 1),
+    Output("winding_peak", "winding_peak_C", "°C", 1.0, "hottest winding", 1),
+    Output("cell_low", "cell_low_V", "V", 1.0, "lowest cell voltage", 3),
+    Output("state_of_charge", "state_of_charge", "-", 1.0, "state of charge at the end", 4),
+    Output("winding_end", "winding_end_C", "°C", 1.0, "winding at the end", 1),
+    Output("housing_end", "housing_end_C", "°C", 1.0, "housing at the end", 1),
+    Output("endurance", "endurance_s", "s", 1.0, "endurance at this duty", 0),
+    Output("range", "range_m", "m", 1.0, "range at this duty", 0),
+    *(_wh(f"energy_to_{name}", f"energy to: {meaning}") for name, meaning in energy.SINKS.items()),
+    _wh("energy_stored", "rise of the energy in motion"),
+    Output("unaccounted_share", "unaccounted_share", "-", 1.0, "energy unaccounted for, of that turned over", 9),
+)
+#: Numbers of a mission with sides beside those.
+OF_TURNS: tuple[Output, ...] = (
+    Output("turned", "turned_deg", "deg", math.pi / 180, "turned by, positive to the left", 1),
+    Output("place_x", "place_x_m", "m", 1.0, "moved uphill, or ahead of the start", 2),
+    Output("place_y", "place_y_m", "m", 1.0, "moved to the left of that", 2),
+    Output("peak_yaw_rate", "peak_yaw_rate_rad_s", "rad/s", 1.0, "peak yaw rate", 3),
+    *(Output(f"rms_current_{s}", f"rms_current_{s}_A", "A", 1.0, f"rms current, {s} motor", 3) for s in SIDES),
+    *(Output(f"peak_current_{s}", f"peak_current_{s}_A", "A", 1.0, f"peak current, {s} motor", 2) for s in SIDES),
+    *(Output(f"winding_peak_{s}", f"winding_peak_{s}_C", "°C", 1.0, f"hottest winding, {s}", 1) for s in SIDES),
+)
+
+
+def names(turns: bool = False) -> tuple[str, ...]:
+    """Columns of a mission's numbers, in order; of one with sides."""
+    return tuple(output.column for output in (*OUTPUTS, *(OF_TURNS if turns else ())))
+
+
+#: Columns that a sweep over a profile stores where none are named.
+USUAL = (
+    "energy_Wh", "energy_per_metre_Wh", "distance_m", "rms_current_A", "peak_current_A", "winding_peak_C",
+    "state_of_charge",
+)  # fmt: skip
+
+
+def _quotient(part: Scalar, whole: Scalar) -> Array:
+    """part / whole; NaN with a finite derivative where `whole` is not above 0."""
+    positive = whole > 0
+    return jnp.where(positive, part / jnp.where(positive, whole, 1.0), jnp.nan)
+
+
+def _root(x: Scalar) -> Array:
+    return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.0 * x)
+
+
+def totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array]:
+    """Numbers of missions or of segments that are in their totals and peaks [SI], by name; any shape.
+
+    A segment that was not reached has NaN.
+    """
+    by_segment, ran = found.of, found.time > 0
+    turned = by_segment["drawn"] + by_segment["returned"] + sum(jnp.abs(by_segment[name]) for name in energy.SINKS)
+    still = by_segment["path"] <= 1e-6  # m
+    numbers = {
+        "duration": found.time,
+        "distance": by_segment["path"],
+        "displacement": by_segment["distance"],
+        "energy": found.energy,
+        "energy_per_metre": jnp.where(
+            still, jnp.nan, _quotient(found.energy, jnp.where(still, 1.0, by_segment["path"]))
+        ),
+        "energy_drawn": by_segment["drawn"],
+        "energy_returned": by_segment["returned"],
+        "rms_current": _root(_quotient(by_segment["current_squared"], found.time)),
+        "peak_current": peaks["current"],
+        "rms_torque": _root(_quotient(by_segment["torque_squared"], found.time)),
+        "peak_torque": peaks["torque"],
+        "peak_speed": peaks["speed"],
+        "peak_motor_speed": peaks["motor_speed"],
+        "winding_peak": peaks["temperature"],
+        "cell_low": jnp.where(jnp.isfinite(peaks["cell_low"]), peaks["cell_low"], jnp.nan),
+        **{f"energy_to_{name}": by_segment[name] for name in energy.SINKS},
+        "energy_stored": found.stored,
+        "unaccounted_share": _quotient(found.unaccounted, turned),
+    }
+    if "turned" in by_segment:
+        numbers |= {name: by_segment[name] for name in ("turned", "place_x", "place_y")} | {
+            "peak_yaw_rate": peaks["yaw_rate"]
+        }
+        for side in SIDES:
+            numbers |= {
+                f"rms_current_{side}": _root(_quotient(by_segment[f"current_squared_{side}"], found.time)),
+                f"peak_current_{side}": peaks[f"current_{side}"],
+                f"winding_peak_{side}": peaks[f"temperature_{side}"],
+            }
+    return {name: jnp.where(ran, value, jnp.nan) for name, value in numbers.items()}
+
+
+def numbers(robot: Robot, conditions: Conditions, found: Mission) -> dict[str, Array]:
+    """What missions come to [SI], by the names of `OUTPUTS`; any shape, NaN where a number does not apply.
+
+    State of charge, endurance and range are of the on-board battery. Endurance is the time from the charge that the
+    mission begins with to empty at the mission's mean current, range the distance in that time; both are exact where
+    the battery has ended within the mission. As the voltage falls a demanded speed takes more current, which they
+    leave out.
+    """
+    on_battery, capacity = conditions.battery > 0.5, robot.battery.capacity
+    used = found.discharge - conditions.discharge
+    time, path = jnp.asarray(found.total.time), jnp.asarray(found.total.of["path"])
+    ended = (found.result.status == BATTERY_EMPTY) | (found.result.status == CUT_OFF)
+    times = jnp.where(ended, 1.0, _quotient(capacity - conditions.discharge, used))  # that the charge lasts
+    return {
+        **totals(found.total, found.peaks),
+        "state_of_charge": jnp.where(on_battery, 1 - found.discharge / capacity, jnp.nan),
+        "winding_end": jnp.asarray(found.temperature_winding),
+        "housing_end": jnp.asarray(found.temperature_housing),
+        "endurance": jnp.where(on_battery, times * time, jnp.nan),
+        "range": jnp.where(on_battery, times * path, jnp.nan),
+    }
+
+
+def begins_below(robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None) -> np.ndarray:
+    """Voltage of a cell as missions on the battery begin [V], where it is below the cut-off, else NaN; shape (runs,).
+
+    Not traceable. The motors draw what they do at the start; at rest that is nothing.
+    """
+    battery, first = robot.battery, jax.tree.map(lambda x: x[..., 0], profile)
+    other = battery.current_other if first.current_other is None else first.current_other
+    duty = conditions.duty if first.duty is None else first.duty
+    motors = robot.sides * (Start() if start is None else start).current * duty
+    cell = battery.voltage_no_load(conditions.discharge) - (motors + other) * battery.resistance
+    below = (conditions.battery > 0.5) & (cell < battery.voltage_cutoff)
+    return np.asarray(jnp.where(below, cell, jnp.nan))
+
+
+def columns(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Numbers [SI] by the columns of tables, in the columns' units."""
+    return {
+        output.column: found[output.name] / output.factor for output in (*OUTPUTS, *OF_TURNS) if output.name in found
+    }
+
+
+def batch(
+    robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None, *, history: bool = False
+) -> Mission:
+    """Missions of a batch of runs; traceable.
+
+    Args:
+        conditions: shape (runs,); profile: fields of shape (rows,), or (runs, rows).
+        start: that all begin in; history: whether the missions over time are kept, see `parts`.
+    """
+    if not history:
+        return simulate_batch(robot, conditions, profile, start, 0)
+    if has_tracer((robot, conditions, profile, start)):
+        return simulate_batch(robot, conditions, profile, start, _room(profile))
+    found = list(simulate_in_parts(robot, conditions, profile, start))
+    return jax.tree.map(lambda *x: np.concatenate(x), *found)
+
+
+def simulate_in_parts(
+    robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None
+) -> Iterator[Mission]:
+    """Missions of a batch of runs, kept over time, some runs after others, so that all their steps fit into memory.
+
+    Where a mission has taken more steps than there was room for it is simulated again with more room, up to
+    `MOST_KEPT`; of a longer mission the course ends there.
+    """
+    (runs,) = conditions.shape
+    keep, first = _room(profile), 0
+    while first < runs:
+        size = max(1, min(runs, MOST_KEPT // keep))
+        rows = np.minimum(np.arange(first, first + size), runs - 1)  # the last ones stand for the last run again
+        some = jax.tree.map(lambda x, rows=rows: jnp.asarray(np.asarray(x)[rows]), conditions)
+        found = jax.device_get(simulate_batch(robot, some, _rows_of(profile, rows), start, keep))
+        steps = int(np.max(found.steps - found.rejected))
+        if steps > keep and keep < MOST_KEPT:
+            keep = min(MOST_KEPT, _power(steps))
+            continue
+        yield jax.tree.map(lambda x, count=runs - first: x[:count], found)
+        first += size
+
+
+def _room(profile: Profile) -> int:
+    return min(MOST_KEPT, max(LEAST_KEPT, _power(ROOM * profile.segments * profile.cycles)))
+
+
+def _power(count: int) -> int:
+    return 1 << (count - 1).bit_length()
+
+
+def _rows_of(profile: Profile, rows: np.ndarray) -> Profile:
+    return jax.tree.map(lambda x: x[rows] if x.ndim == 2 else x, profile)
+
+
+@compiled
+def simulate_batch(
+    robot: Robot,
+    conditions: Conditions,
+    profile: Profile,
+    start: Start | None = None,
+    keep: int = 0,
+    tolerance: Scalar = TOLERANCE,
+) -> Mission:
+    """Missions of a batch in one call, compiled; see `batch`.
+
+    Args:
+        keep: steps that the missions over time have room for; 0 for none.
+    """
+    own = jax.tree.map(lambda x: 0 if x.ndim == 2 else None, profile)
+
+    def one(conditions: Conditions, profile: Profile) -> Mission:
+        return mission(robot, conditions, profile, start, tolerance=tolerance, keep=keep)
+
+    return jax.vmap(one, in_axes=(0, own))(conditions, profile)
+
+
+def run(robot: Robot, conditions: Conditions, profile: Profile) -> Run:
+    """Missions of a batch as a fidelity's runs, their numbers as columns."""
+    found = batch(robot, conditions, profile)
+    return Run(found.result, columns(numbers(robot, conditions, found)))

@@ -1,0 +1,201 @@
+"""A mission of a robot whose sides are alike: its unknowns, what acts at an instant, rates and integrals."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mmrjax.compile.compiling import compiled
+from mmrjax.fidelities import rest, result
+from mmrjax.missions.mission_steps import Asked
+from mmrjax.missions.profile import MOTOR_SPEED, SPEED, Profile
+from mmrjax.model import balances, energy
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals, State
+from mmrjax.numerics import rosenbrock
+from mmrjax.numerics.one_sided import clip
+
+#: Of the unknowns current, motor speed, speed, discharge, temperatures of winding and housing, integral of the
+#: controller and time in the segment; all are then of the order of one. The memories of effects follow.
+UNITS = (10.0, 1000.0, 1.0, 100.0, 50.0, 50.0, 10.0, 1.0)
+CURRENT, MOTOR, GROUND, DISCHARGE, WINDING, HOUSING, INTEGRAL, CLOCK = range(len(UNITS))
+
+#: Unknowns that are 0 at rest; where the heading is: nowhere.
+STOPS, HEADING = (MOTOR, GROUND), slice(0)
+LONG, AT_REST, RESULT = False, rest, result.result
+
+#: What is integrated beside them: name, and unit of a total.
+TOTALS: dict[str, str] = {
+    "distance": "m", "path": "m", "drawn": "J", "returned": "J", "current_squared": "A²·s",
+    "torque_squared": "N²·m²·s", **dict.fromkeys(energy.SINKS, "J"),
+}  # fmt: skip
+
+#: Largest values of a mission, of any instant: name, and unit.
+PEAKS: dict[str, str] = {
+    "current": "A", "torque": "N·m", "temperature": "°C", "motor_speed": "rad/s", "speed": "m/s", "cell_low": "V",
+}  # fmt: skip
+
+
+def units(robot: Robot) -> Float[Array, " unknowns"]:
+    """What the unknowns are measured in."""
+    return jnp.asarray(UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering))
+
+
+def state_of(robot: Robot, y: Float[Array, " unknowns"], stands: Array) -> State:
+    x = y * units(robot).astype(y.dtype)
+    memory = {effect.name: x[len(UNITS) + k] for k, effect in enumerate(robot.remembering)}
+    motor, speed = (jnp.where(stands, 0.0, x[k]) for k in (MOTOR, GROUND))
+    return State(x[CURRENT], motor, speed, x[DISCHARGE], memory, x[WINDING])
+
+
+def with_consumers(robot: Robot, asked: Profile) -> Robot:
+    """The robot with what its other consumers draw at an instant."""
+    if asked.current_other is None:
+        return robot
+    battery = dataclasses.replace(robot.battery, current_other=asked.current_other)
+    return dataclasses.replace(robot, battery=battery)
+
+
+def source(robot: Robot, conditions: Conditions, discharge: Scalar) -> Scalar:
+    """Voltage of which the driver gives the motors a share [V]: of a battery that of no load."""
+    battery = robot.battery.voltage(0.0, discharge)
+    return jnp.where(conditions.battery > 0.5, battery, jnp.abs(conditions.voltage))
+
+
+def driven(
+    robot: Robot, mode: Array, demand: Scalar, conditions: Conditions, state: State, integral: Scalar
+) -> tuple[Array, Array, Array]:
+    """What drives a motor at an instant.
+
+    Args:
+        mode: of the profile; demand: what it demands, of this side [rad/s or m/s].
+        conditions: of this side; state: of it; integral: of its controller [rad].
+
+    Returns:
+        The duty [-], the rate of the controller's integral, and the error of the demand, a ground speed as the motor
+        speed that it takes [rad/s].
+    """
+    per_speed = robot.gearbox.ratio / robot.chassis(conditions.configuration).radius
+    on_ground = mode == SPEED
+    demanded = demand * jnp.where(on_ground, per_speed, 1.0)
+    error = demanded - jnp.where(on_ground, state.speed * per_speed, state.speed_motor)
+    controlled = (mode == MOTOR_SPEED) | (mode == SPEED)
+    voltage_source = source(robot, conditions, state.discharge)
+    voltage = robot.driver.demand(error, integral, demanded, robot.motor.torque_constant)
+    wanted = voltage / jnp.maximum(voltage_source, 1e-3)
+    limited = robot.driver.duty_limited(clip(wanted, -1.0, 1.0), state.current)
+    # What the limits take away, the integral gives back: it does not wind up.
+    excess = (wanted - limited) * voltage_source / (robot.driver.gain * robot.motor.torque_constant + 1e-12)
+    duty = clip(jnp.where(controlled, conditions.polarity * wanted, conditions.duty), -1.0, 1.0)
+    return duty, jnp.where(controlled, error - excess, 0.0), jnp.where(controlled, error, 0.0)
+
+
+def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> Asked:
+    asked = segment.at(y[CLOCK])
+    robot, conditions = with_consumers(robot, asked), asked.conditions(otherwise)
+    state, integral = state_of(robot, y, stands), y[INTEGRAL] * UNITS[INTEGRAL]
+    duty, rate, error = driven(robot, asked.mode, asked.demand, conditions, state, integral)
+    return Asked(robot, dataclasses.replace(conditions, duty=duty), rate, error)
+
+
+@compiled
+def instant(
+    robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
+) -> tuple[Signals, Array, Array, Asked]:
+    """Signals of an instant, rates of the unknowns in their units, and of the totals [1/s]."""
+    asked = asked_at(robot, otherwise, segment, y, stands)
+    state = state_of(robot, y, stands)
+    signals = balances.moving(asked.robot, asked.conditions, state)
+    winding, housing = (y[k] * UNITS[k] for k in (WINDING, HOUSING))
+    copper = robot.motor.voltage_winding(signals.current, winding) * signals.current
+    copper = copper * robot.driver.ripple(signals.duty)
+    heating = robot.heating(copper, winding, housing)
+    still = jnp.where(stands, 0.0, 1.0)
+    rates = [
+        signals.voltage_left / signals.inductance,
+        still * signals.acceleration_wheel * robot.gearbox.ratio,
+        still * signals.acceleration,
+        balances.charge_drawn(asked.robot, asked.conditions, signals.total_current),
+        *heating,
+        asked.integral_rate,
+        1.0,
+        *(effect.rate(robot, signals) for effect in robot.remembering),
+    ]
+    power = energy.source(asked.robot, asked.conditions, signals)
+    current, torque = robot.sides * signals.current, signals.torque_gear
+    goes = energy.sinks(asked.robot, asked.conditions, signals)
+    totals = [
+        signals.speed, jnp.abs(signals.speed), jnp.maximum(power, 0.0), jnp.maximum(-power, 0.0), current**2,
+        torque**2, *goes.values(),
+    ]  # fmt: skip
+    dtype = y.dtype
+    return (
+        signals,
+        jnp.stack([jnp.asarray(r, dtype) for r in rates]) / units(robot).astype(dtype),
+        jnp.stack([jnp.asarray(x, dtype) for x in totals]),
+        asked,
+    )
+
+
+def slowness(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+    load, state = asked.robot.chassis(asked.conditions.configuration), state_of(asked.robot, y, stands)
+    rolling = load.radius * state.speed_motor / asked.robot.gearbox.ratio
+    return 1 - jnp.abs(rolling) / load.speed_still, 1 - jnp.abs(rolling - state.speed) / load.speed_grip
+
+
+def drawn(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+    robot, state = asked.robot, state_of(asked.robot, y, stands)
+    duty = robot.driver.duty_limited(asked.conditions.duty, state.current)
+    motors = robot.sides * state.current * robot.driver.share_drawn(duty)
+    return motors, state.discharge
+
+
+def stored(robot: Robot, found: Signals) -> Scalar:
+    return energy.stored(robot, found)
+
+
+def peaks(robot: Robot, found: Signals) -> dict[str, Scalar]:
+    cell = jnp.where(found.battery > 0.5, found.voltage_source / robot.battery.cells, jnp.inf)
+    assert found.temperature is not None
+    return {
+        "current": jnp.abs(robot.sides * found.current),
+        "torque": jnp.abs(found.torque_gear),
+        "temperature": found.temperature,
+        "motor_speed": jnp.abs(found.speed_motor),
+        "speed": jnp.abs(found.speed),
+        "cell_low": -cell,
+    }
+
+
+def peaks_within(robot: Robot, y: Array, tops: Array) -> dict[str, Scalar]:
+    return {
+        "current": robot.sides * UNITS[CURRENT] * tops[CURRENT],
+        "temperature": jnp.where(y[WINDING] > 0, UNITS[WINDING] * tops[WINDING], -jnp.inf),
+    }
+
+
+def over(robot: Robot, found: Signals) -> dict[str, Scalar]:
+    hot = jnp.asarray(found.temperature) > robot.motor.temperature_limit
+    return {**result.exceeded(robot, found), "too_hot": hot}
+
+
+norm = functools.partial(rosenbrock.norm, own=len(UNITS))
+
+
+def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
+    return segment.demand
+
+
+def status(robot: Robot, conditions: Conditions, found: Signals) -> Array:
+    now = dataclasses.replace(conditions, discharge=jnp.asarray(found.discharge))
+    return rest.status_moving(robot, now, found, found.duty * found.voltage_source)
+
+
+def at_places(signals: Signals, so_far: dict[str, jax.Array]) -> Signals:
+    return signals

@@ -1,0 +1,208 @@
+"""A mission of a robot whose sides are driven apart, as `mission_straight` is of one whose sides are alike.
+
+A demanded speed and yaw rate are those of either side, V_s = v - ω y_s, which its own controller follows; equal sides
+are a mission of straight travel.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mmrjax.compile.compiling import compiled
+from mmrjax.fidelities.rest import least
+from mmrjax.missions import mission_straight as straight
+from mmrjax.missions.mission_steps import Asked
+from mmrjax.missions.profile import SPEED, VOLTAGE, Profile
+from mmrjax.model import balances, channels, energy
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import PlaneMotion, Signals
+from mmrjax.numerics import rosenbrock
+from mmrjax.turning import circling
+from mmrjax.turning.two_sides import SIDES, total
+
+#: Of the unknowns, of either side: current, motor speed, temperatures of winding and housing, integral of the
+#: controller; of the robot: speed, lateral speed, yaw rate, heading, discharge, and time in the segment. The memories
+#: of effects follow, of either side.
+_EACH = tuple(straight.UNITS[k] for k in (
+    straight.CURRENT, straight.MOTOR, straight.WINDING, straight.HOUSING, straight.INTEGRAL
+))  # fmt: skip
+UNITS = (*(unit for unit in _EACH for _ in SIDES), 1.0, 1.0, 1.0, 1.0, straight.UNITS[straight.DISCHARGE], 1.0)
+CURRENT, MOTOR, WINDING, HOUSING, INTEGRAL = (slice(2 * k, 2 * k + 2) for k in range(len(_EACH)))
+GROUND, LATERAL, YAW, HEADING, DISCHARGE, CLOCK = range(2 * len(_EACH), len(UNITS))
+
+STOPS = (MOTOR, GROUND, LATERAL, YAW)
+LONG, AT_REST, RESULT = True, circling, circling.result_of
+
+#: What is integrated beside them: name, and unit of a total; of current and torque the mean over both sides.
+OF_SIDES = tuple(f"current_squared_{side}" for side in channels.SIDES)
+TOTALS: dict[str, str] = {
+    **straight.TOTALS, "place_x": "m", "place_y": "m", "turned": "rad", **dict.fromkeys(OF_SIDES, "A²·s"),
+}  # fmt: skip
+
+#: Largest values of a mission, of any instant: of either side, and of one motor of each.
+PEAKS: dict[str, str] = {
+    **straight.PEAKS, "yaw_rate": "rad/s", "current_left": "A", "current_right": "A", "temperature_left": "°C",
+    "temperature_right": "°C",
+}  # fmt: skip
+
+
+class Found(balances.Travel):
+    """An instant: all that both sides do, and how the robot moves."""
+
+    motion: PlaneMotion
+
+
+def units(robot: Robot) -> Float[Array, " unknowns"]:
+    """What the unknowns are measured in."""
+    return jnp.asarray((*UNITS, *(size for e in robot.remembering for size in (e.memory_size or 1.0,) * 2)))
+
+
+def state_of(robot: Robot, y: Float[Array, " unknowns"], stands: Array) -> PlaneMotion:
+    x = y * units(robot).astype(y.dtype)
+    memory = {e.name: x[len(UNITS) + 2 * k :][:2] for k, e in enumerate(robot.remembering)}
+    motor, ahead, aside, yaw = (jnp.where(stands, 0.0, x[k]) for k in (MOTOR, GROUND, LATERAL, YAW))
+    none = jnp.zeros_like(ahead)
+    return PlaneMotion(x[CURRENT], motor, ahead, aside, yaw, x[HEADING], none, none, x[DISCHARGE], memory, x[WINDING])
+
+
+def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
+    """What is demanded of either side, of each row [rad/s or m/s], shape (rows, 2)."""
+    demand = jnp.stack([segment.demand, segment.demand], -1)
+    if segment.yaw_rate is None:
+        return demand
+    y = SIDES * robot.chassis(otherwise.configuration).turning.width
+    apart = jnp.where(segment.mode == SPEED, segment.yaw_rate, 0.0)
+    return demand - jnp.asarray(apart)[..., None] * y
+
+
+def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> Asked:
+    asked = segment.at(y[CLOCK])
+    robot, conditions = straight.with_consumers(robot, asked), asked.conditions(otherwise)
+    motion, own = state_of(robot, y, stands), conditions.of_sides()
+    state = balances.states_of_sides(robot, conditions, motion)
+    if asked.voltage_left is not None and asked.voltage_right is not None:
+        volts = jnp.stack([asked.voltage_left, asked.voltage_right])
+        share = own.polarity * volts / jnp.maximum(straight.source(robot, own, state.discharge), 1e-3)
+        own = dataclasses.replace(own, duty=jnp.where(asked.mode == VOLTAGE, share, own.duty))
+    demand = demanded(robot, conditions, asked)
+    law = jax.vmap(functools.partial(straight.driven, robot, asked.mode))
+    duty, rate, error = law(demand, own, state, y[INTEGRAL] * _EACH[-1])
+    return Asked(robot, dataclasses.replace(conditions, duty_left=duty[0], duty_right=duty[1]), rate, error)
+
+
+@compiled
+def instant(
+    robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
+) -> tuple[Found, Array, Array, Asked]:
+    """All of an instant, rates of the unknowns in their units, and of the totals [1/s]."""
+    asked = asked_at(robot, otherwise, segment, y, stands)
+    motion = state_of(robot, y, stands)
+    travel = balances.turning(asked.robot, asked.conditions, motion)
+    signals = travel.signals
+    winding, housing = (y[k] * _EACH[2] for k in (WINDING, HOUSING))
+    copper = robot.motor.voltage_winding(signals.current, winding) * signals.current
+    copper = copper * robot.driver.ripple(signals.duty)
+    still = jnp.where(stands, 0.0, 1.0)
+    rates = [
+        signals.voltage_left / signals.inductance,
+        still * signals.acceleration_wheel * robot.gearbox.ratio,
+        *robot.heating(copper, winding, housing),
+        asked.integral_rate,
+        still * travel.acceleration,
+        still * travel.acceleration_lateral,
+        still * travel.acceleration_yaw,
+        motion.yaw_rate,
+        balances.charge_drawn(asked.robot, asked.conditions, jnp.asarray(signals.total_current)[0]),
+        1.0,
+        *(jax.vmap(lambda s, effect=effect: effect.rate(robot, s))(signals) for effect in robot.remembering),
+    ]
+    power = jnp.mean(jnp.asarray(energy.source(asked.robot, asked.conditions, signals)))
+    current, torque = (jnp.asarray(x) ** 2 for x in (signals.current, signals.torque_gear))
+    goes = energy.sinks_turning(asked.robot, asked.conditions, travel)
+    cos, sin = jnp.cos(motion.heading), jnp.sin(motion.heading)
+    totals = [
+        motion.speed, _size(motion), jnp.maximum(power, 0.0), jnp.maximum(-power, 0.0),
+        robot.sides**2 * total(current) / 2, total(torque) / 2,
+        *(goes[name] for name in energy.SINKS),
+        motion.speed * cos - motion.speed_lateral * sin, motion.speed * sin + motion.speed_lateral * cos,
+        motion.yaw_rate, *current,
+    ]  # fmt: skip
+    return (
+        Found(**vars(travel), motion=motion),
+        jnp.concatenate([jnp.atleast_1d(jnp.asarray(r, y.dtype)) for r in rates]) / units(robot).astype(y.dtype),
+        jnp.stack([jnp.asarray(x, y.dtype) for x in totals]),
+        asked,
+    )
+
+
+def _size(motion: PlaneMotion) -> Scalar:
+    """How fast the robot moves over the ground [m/s], with a derivative at rest."""
+    square = jnp.asarray(motion.speed) ** 2 + jnp.asarray(motion.speed_lateral) ** 2
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+
+def slowness(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+    robot, conditions = asked.robot, asked.conditions
+    load, motion = robot.chassis(conditions.configuration), state_of(robot, y, stands)
+    rolling = load.radius * jnp.asarray(motion.speed_motor) / robot.gearbox.ratio
+    along = jnp.abs(rolling - balances.states_of_sides(robot, conditions, motion).speed)
+    across = jnp.abs(motion.speed_lateral) + jnp.abs(motion.yaw_rate) * robot.running_gear.wheelbase / 2
+    slow, grips = 1 - jnp.abs(rolling) / load.speed_still, 1 - along / load.speed_grip
+    return least(*slow), least(*grips, 1 - across / load.speed_grip)
+
+
+def drawn(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+    robot, motion = asked.robot, state_of(asked.robot, y, stands)
+    duty = robot.driver.duty_limited(asked.conditions.of_sides().duty, motion.current)
+    return robot.sides * total(jnp.asarray(motion.current * robot.driver.share_drawn(duty))) / 2, motion.discharge
+
+
+def stored(robot: Robot, found: Found) -> Scalar:
+    return energy.stored_turning(robot, found, found.motion)
+
+
+def peaks(robot: Robot, found: Found) -> dict[str, Scalar]:
+    each = jax.vmap(lambda s: straight.peaks(robot, s))(found.signals)
+    most: dict[str, Scalar] = {name: jnp.max(jnp.asarray(x)) for name, x in each.items()}
+    most |= {"current": total(jnp.asarray(each["current"])) / 2, "speed": _size(found.motion)}
+    return {**most, "yaw_rate": jnp.abs(found.motion.yaw_rate), **_of_sides(robot, each)}
+
+
+def peaks_within(robot: Robot, y: Array, tops: Array) -> dict[str, Scalar]:
+    current = robot.sides * _EACH[0] * tops[CURRENT]
+    temperature = jnp.where(y[WINDING] > 0, _EACH[2] * tops[WINDING], -jnp.inf)
+    either = _of_sides(robot, {"current": current, "temperature": temperature})
+    return {"current": total(current) / 2, "temperature": jnp.max(temperature), **either}
+
+
+def _of_sides(robot: Robot, each: dict[str, Any]) -> dict[str, Scalar]:
+    """Peaks of one motor of either side."""
+    current = jnp.asarray(each["current"]) / robot.sides
+    both = (("current", current), ("temperature", jnp.asarray(each["temperature"])))
+    return {f"{name}_{side}": x[k] for name, x in both for k, side in enumerate(channels.SIDES)}
+
+
+def over(robot: Robot, found: Found) -> dict[str, Scalar]:
+    each = jax.vmap(lambda s: straight.over(robot, s))(found.signals)
+    return {name: jnp.any(x) for name, x in each.items()}
+
+
+norm = functools.partial(rosenbrock.norm_of_sides, whole=slice(GROUND, CLOCK + 1), own=len(straight.UNITS))
+
+
+def status(robot: Robot, conditions: Conditions, found: Found) -> Array:
+    return circling.status_moving(robot, conditions, found, found.motion)
+
+
+def at_places(signals: Signals, so_far: dict[str, jax.Array]) -> Signals:
+    """Signals over time, with the places that the robot has come to."""
+    x, y = (jnp.stack([so_far[name]] * 2, -1) for name in ("place_x", "place_y"))
+    return dataclasses.replace(signals, place_x=x, place_y=y)

@@ -1,0 +1,207 @@
+"""Profiles: what is asked of a robot, and what it meets, over the time of a mission."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from mmrjax.compile.precision import as_array
+from mmrjax.errors import UsageError, counted
+from mmrjax.model.conditions import Conditions, Number
+from mmrjax.model.params import Scalar
+
+#: How the motors are driven in a segment: by a share of the supply's voltage; at a demanded motor speed or ground
+#: speed, by the driver's controller; or not: with their terminals shorted (brake) or their circuit open (coast).
+MODES = ("voltage", "motor_speed", "speed", "brake", "coast")
+VOLTAGE, MOTOR_SPEED, SPEED, BRAKE, COAST = range(len(MODES))
+
+#: What a profile may state for each row besides the mode, and of which a row keeps what the conditions say if not.
+CONDITIONS = (
+    "voltage", "duty", "duty_left", "duty_right", "slope_deg", "payload", "adhesion", "adhesion_lateral",
+    "load_torque",
+)  # fmt: skip
+#: What it may state besides, which is no condition.
+FURTHER = ("voltage_left", "voltage_right", "yaw_rate", "current_other")
+#: What drives the sides apart, stated of both or of none.
+PAIRS = (("duty_left", "duty_right"), ("voltage_left", "voltage_right"))
+#: What makes a robot free to turn where a profile states it.
+APART = (*PAIRS[0], *PAIRS[1], "yaw_rate")
+
+
+class Profile(eqx.Module):
+    """A mission as rows in time; between two rows lies a segment. All numbers differentiable and batchable.
+
+    Attributes:
+        time: of the rows, increasing [s], shape (rows,); the last row ends the mission.
+        mode: index into `MODES` of the segment that a row begins, shape (rows,).
+        demand: motor speed [rad/s] or ground speed [m/s] where the mode asks for one, else not used, shape (rows,).
+        voltage: of the external supply [V]; duty: share of the supply's voltage [-]; slope_deg: [deg]; payload: [kg];
+            adhesion, adhesion_lateral: as a ratio to the robot's surface, along and across [-]; load_torque: of a
+            brake on the output of each drive, of a load on a shaft [N·m]; current_other: of other consumers on the
+            battery [A]. Shape (rows,), or None: as the conditions (the robot, for current_other) say.
+        duty_left, duty_right: as `duty`, of either side; voltage_left, voltage_right: given to the motors of either
+            side [V], as a share of what the source has at no load; yaw_rate: demanded beside a ground speed, positive
+            to the left [rad/s]. Stating any of them makes the robot free to turn.
+        linear: whether values change linearly from a row to the next; else they hold until it.
+        cycles: how often the rows are run through.
+    """
+
+    time: Float[Array, " rows"]
+    mode: Int[Array, " rows"]
+    demand: Float[Array, " rows"]
+    voltage: Float[Array, " rows"] | None = None
+    duty: Float[Array, " rows"] | None = None
+    duty_left: Float[Array, " rows"] | None = None
+    duty_right: Float[Array, " rows"] | None = None
+    slope_deg: Float[Array, " rows"] | None = None
+    payload: Float[Array, " rows"] | None = None
+    adhesion: Float[Array, " rows"] | None = None
+    adhesion_lateral: Float[Array, " rows"] | None = None
+    load_torque: Float[Array, " rows"] | None = None
+    voltage_left: Float[Array, " rows"] | None = None
+    voltage_right: Float[Array, " rows"] | None = None
+    yaw_rate: Float[Array, " rows"] | None = None
+    current_other: Float[Array, " rows"] | None = None
+    linear: bool = eqx.field(default=False, static=True)
+    cycles: int = eqx.field(default=1, static=True)
+
+    @property
+    def segments(self) -> int:
+        """Segments of one cycle."""
+        return self.time.shape[-1] - 1
+
+    @property
+    def stated(self) -> tuple[str, ...]:
+        """Conditions that it states."""
+        return tuple(name for name in CONDITIONS if getattr(self, name) is not None)
+
+    @property
+    def turns(self) -> bool:
+        """Whether it drives the sides apart: the robot is then free to turn."""
+        return any(getattr(self, name) is not None for name in APART)
+
+    @property
+    def duration(self) -> Scalar:
+        """Of the whole mission [s]."""
+        return self.cycles * (self.time[-1] - self.time[0])
+
+    def row(self, k: Index) -> Profile:
+        """The rows `k` and `k + 1`: one segment as a profile of its own."""
+        return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, k, 2), self)
+
+    def at(self, elapsed: Scalar) -> Profile:
+        """What is asked `elapsed` seconds after the first of two rows: its fields are scalars."""
+        share = elapsed / (self.time[1] - self.time[0]) if self.linear else 0.0
+
+        def value(x: Array) -> Array:
+            return x[0] + (x[1] - x[0]) * share if self.linear else x[0]
+
+        still: dict[str, Any] = {"time": self.time[0], "mode": self.mode[0]}
+        nothing: dict[str, Any] = dict.fromkeys(still)
+        values = jax.tree.map(value, dataclasses.replace(self, **nothing))
+        return dataclasses.replace(values, **still)
+
+    def conditions(self, otherwise: Conditions) -> Conditions:
+        """The conditions of an instant, see `at`; `otherwise` where the profile states nothing."""
+        stated = {name: getattr(self, name) for name in CONDITIONS if getattr(self, name) is not None}
+        if "payload" in stated and otherwise.total_mass is not None:
+            stated["total_mass"] = otherwise.total_mass + stated["payload"] - otherwise.payload
+        held = (self.mode == BRAKE) | (self.mode == COAST)
+        for name in ("duty", "duty_left", "duty_right"):
+            duty = stated.get(name, getattr(otherwise, name))
+            stated[name] = None if duty is None else jnp.where(held, 0.0, duty)
+        opened = jnp.where(self.mode == COAST, 1.0, jnp.where(self.mode == BRAKE, -1.0, otherwise.open))
+        return dataclasses.replace(otherwise, **stated, open=opened)
+
+
+Index = Int[Array, ""] | int
+
+
+def profile(
+    time: Sequence[float] | np.ndarray,
+    mode: str | Sequence[str] = "voltage",
+    *,
+    demand: Number = 0.0,
+    linear: bool = False,
+    cycles: int = 1,
+    **values: Number | None,
+) -> Profile:
+    """A profile from plain numbers, each one for all rows or one a row.
+
+    Args:
+        time: of the rows [s]; mode: of `MODES`, one or one a row.
+        demand, linear, cycles: see `Profile`; values: the rest of its fields, by name.
+
+    Raises:
+        UsageError: fewer than two rows, a time that does not increase, an unknown mode or field, a length that is not
+            that of `time`, a value that is not finite, a duty beyond -1..1, cycles below 1.
+    """
+    rows = np.asarray(time, float)
+    if rows.ndim != 1 or len(rows) < 2:
+        raise UsageError(f"profile, time: got {counted(rows.size, 'row')}; expected two or more")
+    if not np.isfinite(rows).all():
+        raise UsageError(f"profile, time: row {int(np.argmax(~np.isfinite(rows))) + 1} is not a finite number")
+    back = np.flatnonzero(np.diff(rows) <= 0)
+    if back.size:
+        k = int(back[0]) + 1
+        raise UsageError(
+            f"profile, time: row {k + 1} has {rows[k]:g} s after {rows[k - 1]:g} s; expected a later time"
+        )
+    if cycles < 1 or cycles != int(cycles):
+        raise UsageError(f"profile, cycles: got {cycles}; expected a whole number from 1")
+    modes = [mode] * len(rows) if isinstance(mode, str) else list(mode)
+    for k, name in enumerate(modes):
+        if name not in MODES:
+            raise UsageError(f"profile, mode, row {k + 1}: got {name}; expected {', '.join(MODES)}")
+    known = (*CONDITIONS, *FURTHER)
+    unknown = sorted(set(values) - set(known))
+    if unknown:
+        raise UsageError(f"profile: no field {unknown[0]}; there are {', '.join(known)}")
+    given: dict[str, Any] = {"demand": demand, **{name: v for name, v in values.items() if v is not None}}
+    if why := sides_refused(list(given), MODES[SPEED] in modes):
+        raise UsageError(f"profile: {why}")
+    arrays = {}
+    for name, value in given.items():
+        x = np.asarray(value, float)
+        if x.ndim > 1 or (x.ndim == 1 and len(x) != len(rows)):
+            raise UsageError(
+                f"profile, {name}: got {counted(x.shape[0] if x.ndim else 1, 'value')}; expected {len(rows)}"
+            )
+        if not np.isfinite(x).all():
+            raise UsageError(
+                f"profile, {name}: row {int(np.argmax(~np.isfinite(np.atleast_1d(x)))) + 1} is not finite"
+            )
+        arrays[name] = as_array(np.broadcast_to(x, rows.shape))
+    for name in ("duty", *PAIRS[0]):
+        duty = np.atleast_1d(np.asarray(arrays.get(name, 0.0)))
+        if (np.abs(duty) > 1).any():
+            raise UsageError(f"profile, {name}: got {duty[np.argmax(np.abs(duty))]:g}; expected -1 to 1")
+    if len(modes) != len(rows):
+        raise UsageError(f"profile, mode: got {counted(len(modes), 'value')}; expected {len(rows)}")
+    index = as_array([MODES.index(name) for name in modes], int)
+    return Profile(time=as_array(rows), mode=index, linear=linear, cycles=int(cycles), **arrays)
+
+
+def sides_refused(stated: Sequence[str], speed: bool, named: Callable[[str], str] = str) -> str | None:
+    """Why fields that a profile states of its sides cannot be: one side without the other, both kinds at once, a yaw
+    rate without a demanded speed; None: they can.
+
+    Args:
+        stated: fields; speed: whether a ground speed is demanded; named: what a field is called where it is stated.
+    """
+    for left, right in (pair for either in PAIRS for pair in (either, either[::-1])):
+        if left in stated and right not in stated:
+            return f"got {named(left)} without {named(right)}; expected both"
+    kinds = [named(name) for name in ("duty", PAIRS[0][0], PAIRS[1][0]) if name in stated]
+    if len(kinds) > 1:
+        return f"got {kinds[0]} beside {kinds[1]}; expected one of the two"
+    if "yaw_rate" in stated and not speed:
+        return f"got {named('yaw_rate')} without {named(MODES[SPEED])}; expected a demanded ground speed beside it"
+    return None

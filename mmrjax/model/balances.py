@@ -1,0 +1,662 @@
+"""The balances: the only place where terms are summed, in the order in which an instant is computed.
+
+Each function takes a robot and the `Signals` so far and returns them with its own quantities filled in.
+All three fidelities are compositions of these functions.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mmrjax.climbing import resting_posture
+from mmrjax.model import channels, contact, ground, masses, power
+from mmrjax.model import chassis as chassis_room
+from mmrjax.model.chassis import Chassis
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Load, Robot
+from mmrjax.model.shaft import Shaft
+from mmrjax.model.signals import GRAVITY, PlaneMotion, Signals, State
+from mmrjax.numerics.one_sided import at_least
+from mmrjax.numerics.trigonometry import cosine, sine
+from mmrjax.turning.two_sides import SIDES, Grip, Stance, grip, total
+
+#: Every balance with its unit and what it closes.
+BALANCES = {
+    "mass": ("kg", "M = robot + payload"),
+    "inertia": ("kg·m^2", "J_w of one side's parts that turn with the driving wheel, eq. (31)"),
+    "inductance": ("H", "L of one armature circuit, eq. (15)"),
+    "supply": ("V", "U_e from battery or external source, eqs. (8)-(13)"),
+    "electrical": ("V", "U_e = E + I R + L dI/dt, eq. (15)"),
+    "motor": ("N·m", "C_m I - M_df = M_d, eqs. (14), (17), (18)"),
+    "gearbox": ("N·m", "M_r at the output shaft, eqs. (19)-(23)"),
+    "track": ("N·m", "loss at the pulley, eqs. (24), (26)"),
+    "ground": ("N", "traction = resistance + gravity + m dV/dt, eqs. (1), (5)"),
+    "slip": ("m/s", "V = r_k ω_k - slip speed, eqs. (32), (33)"),
+    "lateral": ("N", "m (dv_y/dt + ω v_x) = sum of lateral forces, of a robot that turns"),
+    "yaw": ("N·m", "J_ψ dω/dt = sum of x F_y - y F_x, of a robot that turns"),
+    "sensor": ("", "what the instruments show, each channel in its unit"),
+}
+
+#: Of these, those of a robot that turns: they act round the turn, the others along the travel of a side.
+ROUND = ("lateral", "yaw")
+
+
+def absent(robot: Robot) -> frozenset[str]:
+    """Balances that a robot has not, or that nothing of it shows: the ground's of a load on a shaft, those of the
+    voltage where the motors' speed or current is imposed."""
+    supply = set() if robot.rig.imposed == "voltage" else {"supply"}
+    winding = set() if robot.rig.shows_voltage else {"electrical", "inductance"}
+    return robot.lacks | supply | winding | (set() if robot.rig.turns else {*ROUND})
+
+
+def added(robot: Robot, signals: Signals, balance: str, channel: str = "") -> Scalar:
+    """What the robot's effects add to a balance (and in `sensor` to a channel), in its unit; an effect adds nothing
+    in configurations on which it does not act, none where its load lacks the balance."""
+    if balance in robot.lacks:
+        return 0.0
+    entering = [e for e in robot.effects if e.balance == balance and e.channel == channel]
+    terms = [
+        e.term(robot, signals) if e.acts_everywhere else e.acts(robot, signals) * e.term(robot, signals)
+        for e in entering
+    ]
+    return sum(terms) if terms else 0.0
+
+
+def _fill(signals: Signals, **values: Any) -> Signals:
+    return dataclasses.replace(signals, **values)
+
+
+#: What a robot that turns does in the plane of the ground; of straight travel it is nothing.
+IN_PLANE = ("speed_lateral", "yaw_rate", "heading", "place_x", "place_y")
+
+
+def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None = None) -> Signals:
+    """Kinematics and mass of the instant; `direction` None takes it from the speeds, smooth through rest."""
+    chassis = robot.chassis(conditions.configuration)
+    speed_wheel = state.speed_motor * (1 / robot.gearbox.ratio)
+    speed_theoretical = chassis.radius * speed_wheel
+    rest = chassis.speed_still
+    duty = robot.driver.duty_limited(conditions.duty, state.current, conditions.polarity)
+    straight = dict.fromkeys(IN_PLANE, jnp.zeros_like(state.speed))
+    signals = Signals(
+        **straight,
+        configuration=conditions.configuration,
+        on_tracks=chassis.on_tracks,
+        slope=conditions.slope,
+        payload=conditions.payload,
+        adhesion=conditions.adhesion,
+        battery=conditions.battery,
+        discharge=state.discharge,
+        order=conditions.order,
+        load_torque=conditions.load_torque,
+        memory=state.memory,
+        current=state.current,
+        speed_motor=state.speed_motor,
+        speed=state.speed,
+        direction=contact.direction(speed_theoretical, rest) if direction is None else direction,
+        direction_travel=contact.direction(state.speed, rest) if direction is None else direction,
+        speed_wheel=speed_wheel,
+        speed_theoretical=speed_theoretical,
+        speed_output=state.speed / chassis.radius if robot.loose else speed_wheel,
+        angle=state.distance / chassis.radius,
+        temperature=state.temperature,
+        duty=duty,
+        pause=jnp.where(jnp.abs(jnp.asarray(conditions.open)) > 0.5, 0.0, 1 - jnp.abs(duty)),
+        share_drawn=robot.driver.share_drawn(duty),
+        total_current=robot.sides * state.current * robot.driver.share_drawn(duty),
+    )
+    if isinstance(chassis, Shaft):  # no ground carries it
+        return _fill(signals, mass=jnp.zeros_like(state.speed), normal=jnp.zeros_like(state.speed))
+    stated = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
+    mass = stated + added(robot, _fill(signals, mass=stated), "mass")
+    normal = chassis_room.normal_load(mass, conditions.slope, GRAVITY, robot.sides)
+    return _fill(signals, mass=mass, normal=normal)
+
+
+def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
+    """Voltage at the motors [V]: the driver's share of what the supply gives, less the drops on the way to it."""
+    if conditions.voltage_follows:
+        return signals
+    source = power.voltage_source(
+        robot.battery, conditions.voltage, conditions.battery, signals.total_current, signals.discharge
+    )
+    back = robot.motor.voltage_back(signals.speed_motor)
+    voltage = robot.driver.voltage(source - added(robot, signals, "supply"), signals.duty, signals.pause, back)
+    blocked = robot.driver.blocks(signals.duty * conditions.polarity, signals.current, conditions.open)
+    return _fill(signals, voltage_source=source, voltage=jnp.where(blocked, back, voltage))
+
+
+def power_drawn(robot: Robot, signals: Signals) -> Scalar:
+    """Power that all motors take [W], the heat of their current's pulses with it."""
+    pulses = (robot.driver.ripple(signals.duty) - 1) * signals.voltage_drop
+    return robot.sides * (signals.voltage + pulses) * signals.current
+
+
+def charge_drawn(robot: Robot, conditions: Conditions, total_current: Scalar) -> Scalar:
+    """Current out of the on-board battery, by which its charge falls [A], eq. (11); 0 on an external supply."""
+    return robot.battery.current(total_current) * (conditions.battery > 0.5)
+
+
+def electrical(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
+    """What of the supply voltage is left to change the current [V]; or the voltage that an imposed speed takes, or an
+    amplifier gives that brings the current to what is imposed within the winding's time constant."""
+    back = robot.motor.voltage_back(signals.speed_motor)
+    drop = robot.motor.voltage_winding(signals.current, signals.temperature) + added(robot, signals, "electrical")
+    if conditions.voltage_follows:
+        asked = signals.current if conditions.motor_current is None else conditions.motor_current
+        taken = back + drop + robot.motor.resistance * (asked - signals.current)
+        signals = _fill(signals, voltage=taken, voltage_source=taken)
+    return _fill(
+        signals,
+        voltage_back=back,
+        voltage_drop=drop,
+        voltage_left=signals.voltage - back - drop,
+        inductance=robot.motor.inductance + added(robot, signals, "inductance"),
+    )
+
+
+def motor(robot: Robot, signals: Signals) -> Signals:
+    """Torque at the motor shaft [N·m]."""
+    electromagnetic = robot.motor.torque_electromagnetic(signals.current)
+    loss = robot.motor.torque_loss(signals.speed_motor, signals.direction)
+    loss = loss + added(robot, signals, "motor")
+    return _fill(
+        signals,
+        torque_electromagnetic=electromagnetic,
+        torque_motor_loss=loss,
+        torque_motor=electromagnetic - loss,
+    )
+
+
+def torque_held(chassis: Shaft, signals: Signals) -> Scalar:
+    """Torque that acts against forward rotation of a shaft whichever way it turns: its own and a brake's [N·m]."""
+    own = chassis.torque_load(signals.angle)
+    return own if signals.load_torque is None else own + signals.load_torque
+
+
+def travel(robot: Robot, chassis: Load, signals: Signals) -> Signals:
+    """Forces along the slope that traction has to overcome [N]; of a shaft what its load takes at the radius."""
+    if isinstance(chassis, Shaft):
+        demand = torque_held(chassis, signals) / chassis.radius
+        none = jnp.zeros_like(demand)
+        return _fill(signals, resistance=none, gravity=demand, demand=demand, adhesion_limit=none + jnp.inf)
+    resistance = chassis.ground.force_resistance(signals.normal, signals.direction_travel)
+    resistance = resistance + added(robot, signals, "ground")
+    gravity = ground.force_gravity(signals.mass * (1 / robot.sides), signals.slope, GRAVITY)
+    return _fill(
+        signals,
+        resistance=resistance,
+        gravity=gravity,
+        demand=resistance + gravity,
+        adhesion_limit=chassis.ground.force_adhesion(signals.normal, signals.adhesion),
+    )
+
+
+def slip(robot: Robot, signals: Signals) -> Signals:
+    """Speed at which the contact patch slides over the ground [m/s]."""
+    terms = added(robot, signals, "slip")
+    return _fill(signals, speed_slip_terms=terms, speed_sliding=signals.speed_theoretical - signals.speed - terms)
+
+
+def track(robot: Robot, chassis: Load, signals: Signals, guide: Scalar | None = None) -> Signals:
+    """Losses between pulley and ground, at the pulley; of a shaft its load's friction [N·m].
+
+    `guide` is the friction on the lower guide [N]; None takes (26) on the guides' stated share.
+    """
+    if isinstance(chassis, Shaft):
+        loss = chassis.torque_loss(signals.speed_wheel, signals.direction) + added(robot, signals, "track")
+        return _fill(signals, torque_track_loss=loss)
+    loss = chassis.track.torque_loss(signals.speed_wheel, signals.direction)
+    guide = chassis.track.force_guide(signals.normal, signals.direction) if guide is None else guide
+    loss = loss + guide * chassis.radius + added(robot, signals, "track")
+    return _fill(signals, torque_track_loss=loss)
+
+
+#: Of what turns with a wheel [kg·m²]: a rig's file need not state any.
+LEAST_INERTIA = 1e-12
+
+
+def gearbox(robot: Robot, chassis: Load, signals: Signals, mover: Scalar | None = None) -> Signals:
+    """Torques at both shafts and the acceleration of the driving wheel, the armature taking its share.
+
+    `mover` is what the mover takes from the shaft beside the track's losses [N·m]; None: the traction.
+
+    With A the motor torque less idle loss and B the load at the output, the torque transmitted has the
+    sign of A J_w + i J_d B whatever the efficiency, which decides which way the load loss acts.
+    """
+    gear, inertia_motor = robot.gearbox, robot.motor.inertia
+    idle = gear.torque_idle(signals.speed_motor, signals.direction)
+    mover = chassis.radius * signals.traction if mover is None else mover
+    own = added(robot, signals, "gearbox")
+    load = signals.torque_track_loss + mover + own
+    drive = signals.torque_motor - idle
+    inertia_added = added(robot, signals, "inertia")
+    # Of shafts without inertia, the side from which power flows and what they transmit are those of next to none.
+    inertia_wheel = chassis.inertia + inertia_added
+    next_to_none = LEAST_INERTIA + at_least(inertia_wheel, 0.0)  # with a derivative by what is added to none
+    inertia_wheel = jnp.where(inertia_wheel < LEAST_INERTIA, next_to_none, inertia_wheel)
+    through = gear.ratio * inertia_motor
+    side = (drive * inertia_wheel + through * load) / (inertia_wheel + through)
+    efficiency = gear.efficiency_flow(side, signals.direction)
+    net = gear.ratio * efficiency * drive - load
+    inertia = chassis_room.inertia_reduced(inertia_motor, gear.ratio, efficiency, inertia_wheel)
+    acceleration = net / inertia
+    torque_input = signals.torque_motor - inertia_motor * gear.ratio * acceleration
+    torque_gear = gear.ratio * efficiency * (torque_input - idle)
+    return _fill(
+        signals,
+        torque_idle=idle,
+        torque_load=load,
+        inertia_added=inertia_added,
+        efficiency_load=efficiency,
+        torque_net=net,
+        acceleration_wheel=acceleration,
+        torque_input=torque_input,
+        torque_gear=torque_gear,
+        torque_output=torque_gear - own,
+    )
+
+
+def _to_slip(robot: Robot, conditions: Conditions, chassis: Load, signals: Signals) -> Signals:
+    """The balances between kinematics and traction, in their order."""
+    signals = electrical(robot, conditions, supply(robot, conditions, signals))
+    return slip(robot, travel(robot, chassis, motor(robot, signals)))
+
+
+def _pulled(robot: Robot, signals: Signals, traction: Scalar) -> Signals:
+    """Traction [N] and what it leaves to accelerate the robot, eq. (1)."""
+    acceleration = (traction - signals.demand) / (signals.mass / robot.sides)
+    return _fill(signals, traction=traction, acceleration=acceleration)
+
+
+def moving(robot: Robot, conditions: Conditions, state: State, way: Scalar | None = None) -> Signals:
+    """All signals of a robot in motion: traction follows from sliding by the friction law, and the current from
+    torque where the speed of the motors is imposed.
+
+    Args:
+        way: in which dry friction acts as of motion, ±1 [-]; None, or 0: it follows the speeds, smooth through rest.
+    """
+    if conditions.motor_speed is not None:
+        state = dataclasses.replace(state, current=_current(robot, conditions, state, way))
+    return _moving(robot, conditions, state, way)
+
+
+def rolling(robot: Robot, conditions: Conditions, state: State, way: Scalar | None = None) -> Signals:
+    """All signals of a robot in motion whose load follows its wheels: its inertia acts at the driving shaft, and
+    traction is what it and the demand take. Args: as of `moving`.
+    """
+    robot = robot.within(conditions.configuration)
+    chassis = robot.chassis(conditions.configuration)
+    if isinstance(chassis, Shaft):
+        return moving(robot, conditions, state, way)
+    signals = _to_slip(robot, conditions, chassis, _one_way(begin(robot, conditions, state), way))
+    signals = track(robot, chassis, _fill(signals, traction=signals.demand))
+    carried = signals.mass * (1 / robot.sides)
+    heavy = dataclasses.replace(chassis, inertia=chassis.inertia + carried * chassis.radius**2)
+    signals = gearbox(robot, heavy, signals)
+    acceleration = chassis.radius * signals.acceleration_wheel
+    return _fill(signals, acceleration=acceleration, traction=signals.demand + carried * acceleration)
+
+
+def _one_way(signals: Signals, way: Scalar | None) -> Signals:
+    """Signals with the way in which dry friction acts, as of `moving`."""
+    if way is None:
+        return signals
+    directions = "direction", "direction_travel"
+    return _fill(signals, **{d: jnp.where(way == 0, getattr(signals, d), way) for d in directions})
+
+
+#: Newton steps of the current at an imposed speed: its torque is linear but for which way power flows, and effects.
+CURRENT_STEPS = 4
+
+
+def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar | None) -> Scalar:
+    """Current with which the motors accelerate as the imposed speed does [A]."""
+
+    def at(given: tuple[Robot, Conditions, State], current: Scalar) -> Signals:
+        robot, conditions, state = given
+        return _moving(robot, conditions, dataclasses.replace(state, current=current), way)
+
+    return _current_of(at, (robot, conditions, state))
+
+
+def _speed_imposed(robot: Robot, conditions: Conditions, chassis: Chassis, signals: Signals) -> Signals:
+    """The signals of a side whose motor speed is imposed, its traction known."""
+
+    def at(given: tuple[Robot, Conditions, Chassis, Signals], current: Scalar) -> Signals:
+        robot, conditions, chassis, signals = given
+        total = robot.sides * current * signals.share_drawn
+        moved = electrical(robot, conditions, _fill(signals, current=current, total_current=total))
+        return gearbox(robot, chassis, motor(robot, moved))
+
+    given = robot, conditions, chassis, signals
+    return at(given, _current_of(at, given))
+
+
+def _current_of(signals: Callable[[Any, Scalar], Signals], given: tuple) -> Scalar:
+    """Current with which the motors accelerate as the imposed speed does [A].
+
+    Args:
+        signals: of `given` and a current [A]; given: robot, conditions, and what else they depend on. Derivatives by
+            it are those of the last step alone.
+    """
+
+    def lacking(given: tuple, current: Scalar) -> Scalar:
+        robot, conditions, *_ = given
+        asked = 0.0 if conditions.motor_acceleration is None else conditions.motor_acceleration
+        return signals(given, current).acceleration_wheel * robot.gearbox.ratio - asked
+
+    fixed = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, given)
+    current = jnp.zeros_like(jnp.asarray(fixed[1].motor_speed))
+    for step in range(CURRENT_STEPS):
+        left, rise = jax.jvp(lambda x: lacking(fixed, x), (current,), (jnp.ones_like(current),))
+        left = lacking(given, current) if step == CURRENT_STEPS - 1 else left
+        current = current - left / rise
+    return current
+
+
+def _moving(robot: Robot, conditions: Conditions, state: State, way: Scalar | None) -> Signals:
+    robot = robot.within(conditions.configuration)
+    chassis = robot.chassis(conditions.configuration)
+    signals = _to_slip(robot, conditions, chassis, _one_way(begin(robot, conditions, state), way))
+    if isinstance(chassis, Shaft):
+        signals = _fill(signals, traction=signals.demand)
+        if state.gap is not None:
+            return _within_backlash(robot, chassis, signals, state.gap)
+        signals = gearbox(robot, chassis, track(robot, chassis, signals))
+        return _fill(signals, acceleration=chassis.radius * signals.acceleration_wheel)
+    traction = chassis.ground.traction(signals.speed_sliding, signals.normal, signals.adhesion)
+    signals = _pulled(robot, signals, traction)
+    return gearbox(robot, chassis, track(robot, chassis, signals))
+
+
+def _within_backlash(robot: Robot, chassis: Shaft, signals: Signals, gap: Scalar) -> Signals:
+    """Motor and load as two bodies, between which the flanks of the gear carry what they are pressed with [N·m]."""
+    gear = robot.gearbox
+    idle = gear.torque_idle(signals.speed_motor, signals.direction)
+    loss = chassis.torque_loss(signals.speed_output, signals.direction_travel) + added(robot, signals, "track")
+    signals = _fill(signals, torque_track_loss=loss)  # which effects of the gearbox go by
+    own = added(robot, signals, "gearbox")
+    inertia_added = added(robot, signals, "inertia")
+    inertia_motor = robot.motor.inertia * gear.ratio**2
+    mesh = chassis.torque_mesh(gap, signals.speed_wheel - signals.speed_output, inertia_motor)
+    efficiency = gear.efficiency_flow(mesh, signals.direction)
+    drive = signals.torque_motor - idle
+    net = gear.ratio * drive - mesh / efficiency - own
+    acceleration = net / inertia_motor
+    return _fill(
+        signals,
+        torque_idle=idle,
+        torque_load=mesh + own,
+        inertia_added=inertia_added,
+        efficiency_load=efficiency,
+        torque_net=net,
+        acceleration_wheel=acceleration,
+        torque_input=signals.torque_motor - robot.motor.inertia * gear.ratio * acceleration,
+        torque_gear=mesh + own,
+        torque_output=mesh,
+        acceleration=chassis.radius
+        * (mesh - loss - torque_held(chassis, signals))
+        / (chassis.inertia + inertia_added),
+    )
+
+
+class Mover(Protocol):
+    """Movers whose contacts are resolved one by one."""
+
+    @property
+    def normal(self) -> Scalar:
+        """Normal load of one side [N]."""
+        ...
+
+    def pull(self, chassis: Chassis, signals: Signals) -> Any:
+        """What the contacts do, with `traction` [N], `guide` [N], and `load` on the driving shaft [N·m]."""
+        ...
+
+
+def resolved(
+    robot: Robot, conditions: Conditions, state: State, mover: Mover, inertia: Scalar
+) -> tuple[Signals, Any]:
+    """All signals of a robot in motion whose normal load, traction and guide load come from its contacts.
+
+    Args:
+        mover: the contacts at this instant.
+        inertia: of what turns rigidly with the driving shaft, in place of `chassis.inertia` [kg·m²].
+
+    Returns:
+        The signals, and what `mover.pull` gave.
+    """
+    robot = robot.within(conditions.configuration)
+    chassis = dataclasses.replace(robot.chassis(conditions.configuration), inertia=inertia)
+    signals = _fill(begin(robot, conditions, state), normal=mover.normal)
+    signals = _to_slip(robot, conditions, chassis, signals)
+    pull = mover.pull(chassis, signals)
+    return _drawn(robot, chassis, signals, pull), pull
+
+
+def _drawn(robot: Robot, chassis: Chassis, signals: Signals, pull: Any) -> Signals:
+    """The signals of one side, known up to its sliding, that its contacts pull."""
+    traction, guide = pull.traction, jnp.sum(pull.guide)
+    signals = track(robot, chassis, _pulled(robot, signals, traction), guide)
+    return gearbox(robot, chassis, signals, pull.load - guide * chassis.radius)
+
+
+def resolved_sides(
+    robot: Robot, conditions: Conditions, motion: PlaneMotion, mover: Mover, inertia: Scalar
+) -> tuple[Signals, Any]:
+    """`resolved` of a robot free to turn, of left and right side: a leading axis of 2 in the signals, in the normal
+    loads of `mover` and in what it pulls."""
+    robot = robot.within(conditions.configuration)
+    chassis = dataclasses.replace(robot.chassis(conditions.configuration), inertia=inertia)
+    own = conditions.of_sides()
+    signals = _fill(_begin_sides(robot, conditions, own, motion), normal=mover.normal)
+    signals = jax.vmap(lambda c, s: _to_slip(robot, c, chassis, s))(own, signals)
+    pull = mover.pull(chassis, signals)
+    return jax.vmap(lambda s, p: _drawn(robot, chassis, s, p))(signals, pull), pull
+
+
+def driven(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None) -> Signals:
+    """Signals of an instant up to the voltage balance; direction: as of `begin`."""
+    robot = robot.within(conditions.configuration)
+    return electrical(robot, conditions, supply(robot, conditions, begin(robot, conditions, state, direction)))
+
+
+def demanded(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
+    """Signals of an instant up to what traction has to overcome and the sliding of the contact."""
+    robot = robot.within(conditions.configuration)
+    return _to_slip(
+        robot, conditions, robot.chassis(conditions.configuration), begin(robot, conditions, state, direction)
+    )
+
+
+def settled(robot: Robot, conditions: Conditions, state: State, direction: Scalar = 1.0) -> tuple[Signals, Scalar]:
+    """All signals of steady travel: traction is the demand.
+
+    Args:
+        direction: of travel, 1 forward or -1 backward; friction acts against it also at rest.
+
+    Returns:
+        The signals, and the sliding speed at which the friction law carries that demand [m/s], which
+        `signals.speed_sliding` has to meet.
+    """
+    robot = robot.within(conditions.configuration)
+    chassis = robot.chassis(conditions.configuration)
+    signals = demanded(robot, conditions, state, direction * jnp.ones_like(state.speed_motor))
+    # Nothing changes in steady travel: the rates that other fidelities compute are zero.
+    still = jnp.zeros_like(signals.demand)
+    signals = _fill(signals, traction=signals.demand, acceleration=still)
+    if isinstance(chassis, Shaft):
+        creep = still
+    else:
+        creep = chassis.ground.speed_creep(signals.demand, signals.normal, signals.adhesion)
+    return gearbox(robot, chassis, track(robot, chassis, signals)), creep
+
+
+class Travel(eqx.Module):
+    """All of an instant of a robot that turns.
+
+    Attributes:
+        signals: of each side, a leading axis of 2: left, right; totals and what the robot does as a whole alike.
+        grip: what the ground does to each side.
+        acceleration, acceleration_lateral: dv_x/dt and dv_y/dt [m/s²]; acceleration_yaw: dω/dt [rad/s²].
+    """
+
+    signals: Signals
+    grip: Grip
+    acceleration: Scalar
+    acceleration_lateral: Scalar
+    acceleration_yaw: Scalar
+
+
+def stance(robot: Robot, conditions: Conditions, chassis: Chassis, mass: Scalar) -> Stance:
+    """How a robot of this mass with its payload [kg] stands: the centre of mass of all, over axles that are a radius,
+    on tracks and a grouser, above the ground; with levers stated in the posture that it takes on level ground."""
+    length, on_tracks = robot.running_gear.wheelbase, chassis.on_tracks
+    if conditions.states_levers:
+        rests = resting_posture.level(robot, conditions, mass)
+        length, on_tracks, height = rests.length, rests.line, rests.centre_height
+        ahead = rests.centre_ahead - (rests.front + rests.rear) / 2
+    else:
+        ahead, up = masses.masses(robot, conditions, mass).centre
+        height = chassis.radius + chassis.on_tracks * robot.running_gear.grouser_height + up
+    return Stance(
+        length=length,
+        width=chassis.turning.width,
+        height=height,
+        ahead=ahead,
+        on_tracks=on_tracks,
+        lateral=lateral_friction(conditions, chassis),
+        rule=chassis.turning.rule,
+        nodes=chassis.turning.nodes,
+    )
+
+
+def states_of_sides(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> State:
+    """States of left and right side, a leading axis of 2: each travels at V_s = v_x - ω y_s."""
+    speed = motion.speed - motion.yaw_rate * SIDES * robot.chassis(conditions.configuration).turning.width
+    none, drawn = jnp.zeros_like(speed), jnp.broadcast_to(motion.discharge, speed.shape)
+    return State(motion.current, motion.speed_motor, speed, drawn, motion.memory, motion.temperature, distance=none)
+
+
+def lateral_friction(conditions: Conditions, chassis: Chassis) -> Scalar:
+    """Lateral friction over longitudinal on this ground, λ [-]."""
+    own = chassis.turning.lateral
+    stated = conditions.adhesion_lateral
+    return own if stated is None else own * stated / conditions.adhesion
+
+
+def _both(x: Scalar) -> Array:
+    """The same of left and right side."""
+    return jnp.broadcast_to(x, SIDES.shape)
+
+
+def _begin_sides(robot: Robot, conditions: Conditions, own: Conditions, motion: PlaneMotion) -> Signals:
+    """`begin` of left and right side, and what the robot does in the plane; `own` are the sides' conditions."""
+    chassis = robot.chassis(conditions.configuration)
+    signals = jax.vmap(functools.partial(begin, robot))(own, states_of_sides(robot, conditions, motion))
+    return _fill(
+        signals,
+        total_current=_both(total(jnp.asarray(signals.total_current)) / 2),
+        side=jnp.sign(SIDES),
+        direction_turn=_both(contact.direction(motion.yaw_rate * chassis.turning.width / 2, chassis.speed_still)),
+        slope=_both(jnp.arcsin(sine(conditions.slope) * cosine(motion.heading))),
+        **{name: _both(getattr(motion, name)) for name in IN_PLANE},
+    )
+
+
+def added_in_plane(robot: Robot, signals: Signals) -> tuple[Scalar, Scalar]:
+    """What effects add to the balances `lateral` [N] and `yaw` [N·m], of all sides."""
+
+    def of(balance: str) -> Scalar:
+        each = _both(jax.vmap(lambda s: added(robot, s, balance))(signals))
+        return robot.sides / 2 * total(each)
+
+    return of("lateral"), of("yaw")
+
+
+def turning(
+    robot: Robot, conditions: Conditions, motion: PlaneMotion, loads: Float[Array, " 2"] | None = None
+) -> Travel:
+    """All signals of a robot free to turn: both sides by the balances above, the supply and the ground between them.
+
+    Each side is on the part of the slope that lies along its heading. What effects lower the speed of a side by is
+    read at equal loads of both.
+
+    Args:
+        loads: see `turning.grip`.
+    """
+    robot = robot.within(conditions.configuration)
+    chassis, own = robot.chassis(conditions.configuration), conditions.of_sides()
+    y = SIDES * chassis.turning.width
+    signals = _begin_sides(robot, conditions, own, motion)
+    sine_slope, mass = sine(conditions.slope), jnp.maximum(*jnp.asarray(signals.mass))
+    even = jax.vmap(lambda c, s: _to_slip(robot, c, chassis, s))(own, signals)
+    rolling = chassis.ground.force_resistance(1.0, even.direction_travel)
+    units = robot.sides / 2
+    stands = stance(robot, conditions, chassis, mass)
+    load, sliding = total(units * jnp.asarray(even.normal)), jnp.asarray(even.speed_sliding)
+    held = grip(
+        stands, chassis.ground.friction, conditions.adhesion, load, sliding, motion.speed_lateral, motion.yaw_rate,
+        jnp.asarray(rolling), loads,
+    )  # fmt: skip
+    own_load = jax.vmap(lambda s: travel(robot, chassis, s))(
+        _fill(even, normal=held.normal / units, moment_lateral=held.moment / units)
+    )
+    lateral, yaw = added_in_plane(robot, own_load)
+    pull = held.ahead - units * own_load.resistance
+    along = total(pull) - mass * GRAVITY * sine_slope * cosine(motion.heading)
+    across = total(held.aside) + mass * GRAVITY * sine_slope * sine(motion.heading) - lateral
+    turn = (total(held.moment - y * pull) - yaw) / chassis.turning.inertia
+    acceleration = along / mass + motion.yaw_rate * motion.speed_lateral
+    pulled = _fill(own_load, traction=held.ahead / units, acceleration=acceleration - turn * y)
+    pulled = jax.vmap(lambda s: track(robot, chassis, s))(pulled)
+    if own.motor_speed is None:
+        pulled = jax.vmap(lambda s: gearbox(robot, chassis, s))(pulled)
+    else:
+        pulled = jax.vmap(lambda c, s: _speed_imposed(robot, c, chassis, s))(own, pulled)
+        pulled = _fill(pulled, total_current=_both(total(jnp.asarray(pulled.total_current)) / 2))
+    return Travel(
+        pulled,
+        held,
+        acceleration,
+        across / mass - motion.yaw_rate * motion.speed,
+        turn,
+    )
+
+
+def sensor(robot: Robot, signals: Signals) -> dict[str, Scalar]:
+    """What the instruments show of every channel [SI], by its name; NaN where that rests on what is not known."""
+    return {
+        c.name: robot.rig.instrument(c.name).shows(c.read(robot, signals)) + added(robot, signals, "sensor", c.name)
+        if robot.knows(c.rests_on)
+        else jnp.full_like(signals.speed, jnp.nan)
+        for c in channels.EVERY
+    }
+
+
+def shown(robot: Robot, signals: Signals) -> dict[str, Scalar]:
+    """The same of signals whose last axis is that of left and right side: of a side its own, else their mean."""
+    read = sensor(robot, signals)
+    return {
+        c.name: jnp.mean(jnp.asarray(read[c.name]), -1) if c.side is None else jnp.asarray(read[c.name])[..., c.side]
+        for c in channels.EVERY
+    }
+
+
+def together(signals: Signals) -> Signals:
+    """Signals of both sides as those of one motor on average, from which totals follow as of sides alike."""
+    return jax.tree.map(lambda x: jnp.mean(x, axis=-1) if jnp.ndim(x) else x, signals)
+
+
+def signals_of(found: Signals | Travel) -> Signals:
+    """The signals of an instant; of a robot that turns of left and right side."""
+    return found.signals if isinstance(found, Travel) else found

@@ -1,0 +1,391 @@
+"""The table of channels: everything that an instrument can show, one row each. No other room counts them.
+
+Importable without jax. A new channel is a row of `EVERY`. Which of them there are belongs to the rig: a robot
+(`Robot.channels`), a table of its runs (`Runs.channels`) and every result carry theirs, in the order of `EVERY`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any
+
+from mmrjax.model.quantities import DEG, MM, RPM, Quantity
+
+if TYPE_CHECKING:
+    from mmrjax.model.robot import Robot
+    from mmrjax.model.signals import Signals
+
+#: Parameters of the robot that a number may rest on: current where the motors' speed is imposed, the voltage that an
+#: imposed speed or current takes, a winding's temperature at a current after long running, and over time.
+CURRENT = ("motor.torque_constant",)
+VOLTAGE = ("motor.resistance", *CURRENT)
+HEAT = (*VOLTAGE, "motor.resistance_thermal_winding", "motor.resistance_thermal_housing")
+WARMING = (*HEAT, "motor.time_constant_winding", "motor.time_constant_housing")
+
+
+@dataclasses.dataclass(frozen=True)
+class Channel(Quantity):
+    """A quantity that an instrument shows.
+
+    Attributes:
+        word: short name that `--noise` takes.
+        sd_largest: largest sd that a table may hold [unit].
+        read: what of the signals an ideal instrument shows [SI].
+        sd_share: sd that is assumed where none is known, as a share of the reading [-].
+        resolution: digits after the point that a person wants to see [unit].
+        zero_at_rest: whether it shows 0 until the robot moves.
+        directed: whether its sign is that of the motion; an angle counts on from where it was.
+        settled, over_time: whether settled runs and histories can show it.
+        zero_error: sd of what its instrument may show where there is nothing to show [SI]; 0: it counts or times, and
+            misses no zero.
+        side: 0 or 1 of what the left or the right side alone shows; None: what both together do.
+        where: it is measured, where the label does not say.
+        rests_on: parameters of the robot without which it is not known, by dotted name.
+    """
+
+    word: str
+    sd_largest: float
+    read: Callable[[Robot, Signals], Any]
+    sd_share: float
+    resolution: int = 1
+    zero_at_rest: bool = False
+    directed: bool = True
+    settled: bool = True
+    over_time: bool = True
+    zero_error: float = 0.0
+    side: int | None = None
+    where: str = ""
+    rests_on: tuple[str, ...] = ()
+
+    @property
+    def deviation(self) -> Quantity:
+        """The standard deviation of its readings, as a column of tables."""
+        return Quantity(
+            f"{self.stem or self.name}_sd", self.unit, self.factor, f"standard deviation of {self.label}",
+            (0.0, self.sd_largest), other_units=self.other_units,
+        )  # fmt: skip
+
+    @property
+    def sd_column(self) -> str:
+        """The column of its standard deviations."""
+        return self.deviation.column
+
+    @property
+    def misses_zero(self) -> bool:
+        """Whether its instrument may miss zero; that of a temperature is a convention."""
+        return self.zero_error > 0 and self.directed
+
+    def __reduce__(self) -> tuple[Callable[[str], Channel], tuple[str]]:
+        """Pickled by its name, so that tables and results go to other processes and back."""
+        return find, (self.name,)
+
+
+def _winding_temperature(robot: Robot, signals: Signals) -> Any:
+    """Of the winding [°C]: where it is followed as it is, else after long running at this current."""
+    if signals.temperature is not None:
+        return signals.temperature
+    return robot.motor.temperature_settled(signals.current)
+
+
+#: Sides of a robot that turns, in the order of every axis of 2.
+SIDES = ("left", "right")
+
+
+def _of_side(channel: Channel, side: int) -> Channel:
+    """What one side shows of a channel that both sides have."""
+    name = f"{channel.name}_{SIDES[side]}"
+    return dataclasses.replace(
+        channel,
+        name=name,
+        label=f"{channel.label}, {SIDES[side]}",
+        word=name,
+        side=side,
+    )
+
+
+#: Of either kind of travel.
+_EITHER: tuple[Channel, ...] = (
+    Channel(
+        name="total_current",
+        unit="A",
+        factor=1.0,
+        label="total current",
+        word="current",
+        range=(-2000.0, 2000.0),
+        sd_largest=100.0,
+        read=lambda robot, signals: signals.total_current,
+        where="drawn from the supply by all motors, with a duty that share of their current",
+        rests_on=CURRENT,
+        sd_share=0.02,
+        resolution=3,
+        other_units=(("mA", 1e-3),),
+    ),
+    Channel(
+        name="motor_speed",
+        unit="rpm",
+        factor=RPM,
+        label="motor speed",
+        word="motor_speed",
+        range=(-30_000.0, 30_000.0),
+        sd_largest=10_000.0,
+        read=lambda robot, signals: signals.speed_motor,
+        sd_share=0.005,
+        unit_si="rad/s",
+        zero_at_rest=True,
+        other_units=(("rad/s", 1.0), ("turns/s", 2 * math.pi), ("deg/s", DEG)),
+    ),
+    Channel(
+        name="speed",
+        unit="mm/s",
+        factor=MM,
+        label="speed",
+        word="speed",
+        range=(-10_000.0, 10_000.0),
+        sd_largest=5_000.0,
+        read=lambda robot, signals: signals.speed,
+        sd_share=0.01,
+        unit_si="m/s",
+        zero_at_rest=True,
+        other_units=(("m/s", 1.0), ("km/h", 1 / 3.6), ("cm/s", 1e-2), ("m/min", 1 / 60)),
+    ),
+    Channel(
+        name="motor_current",
+        unit="A",
+        factor=1.0,
+        label="motor current",
+        word="motor_current",
+        range=(-2000.0, 2000.0),
+        sd_largest=100.0,
+        read=lambda robot, signals: signals.current,
+        where="in the leads of one motor",
+        rests_on=CURRENT,
+        zero_error=0.05,
+        sd_share=0.02,
+        resolution=3,
+        other_units=(("mA", 1e-3),),
+    ),
+    Channel(
+        name="output_speed",
+        unit="rpm",
+        factor=RPM,
+        label="output speed",
+        word="output_speed",
+        range=(-30_000.0, 30_000.0),
+        sd_largest=10_000.0,
+        read=lambda robot, signals: signals.speed_output,
+        sd_share=0.005,
+        resolution=2,
+        unit_si="rad/s",
+        zero_at_rest=True,
+        other_units=(("rad/s", 1.0), ("turns/s", 2 * math.pi), ("deg/s", DEG)),
+    ),
+    Channel(
+        name="output_angle",
+        unit="deg",
+        factor=DEG,
+        label="output angle",
+        word="output_angle",
+        range=(-1e6, 1e6),
+        sd_largest=360.0,
+        read=lambda robot, signals: signals.angle,
+        sd_share=0.01,
+        resolution=2,
+        unit_si="rad",
+        zero_at_rest=True,
+        directed=False,
+        settled=False,
+        other_units=(("rad", 1.0), ("turns", 2 * math.pi)),
+    ),
+    Channel(
+        name="position",
+        unit="mm",
+        factor=MM,
+        label="position",
+        word="position",
+        range=(-1e7, 1e7),
+        sd_largest=1e4,
+        read=lambda robot, signals: robot.chassis(signals.configuration).radius * signals.angle,
+        sd_share=0.01,
+        resolution=2,
+        unit_si="m",
+        zero_at_rest=True,
+        directed=False,
+        settled=False,
+        other_units=(("m", 1.0), ("cm", 1e-2), ("um", 1e-6)),
+    ),
+    Channel(
+        name="motor_voltage",
+        unit="V",
+        factor=1.0,
+        label="motor voltage",
+        word="motor_voltage",
+        range=(-200.0, 200.0),
+        sd_largest=100.0,
+        read=lambda robot, signals: signals.voltage,
+        rests_on=VOLTAGE,
+        zero_error=0.1,
+        sd_share=0.01,
+        resolution=2,
+        other_units=(("mV", 1e-3),),
+    ),
+    Channel(
+        name="output_torque",
+        unit="Nm",
+        factor=1.0,
+        label="output torque",
+        word="output_torque",
+        range=(-1e4, 1e4),
+        sd_largest=1e3,
+        read=lambda robot, signals: signals.torque_output,
+        zero_error=0.05,
+        sd_share=0.01,
+        resolution=4,
+        unit_si="N·m",
+        other_units=(("mNm", 1e-3), ("kNm", 1e3)),
+    ),
+    Channel(
+        name="winding_temperature",
+        unit="C",
+        factor=1.0,
+        label="winding temperature",
+        word="temperature",
+        range=(-50.0, 500.0),
+        sd_largest=100.0,
+        read=_winding_temperature,
+        rests_on=HEAT,
+        zero_error=2.0,
+        sd_share=0.02,
+        unit_si="°C",
+        over_time=False,
+        directed=False,
+    ),
+)
+
+_BY_NAME = {c.name: c for c in _EITHER}
+#: Those of a robot that turns alone: of each side, and in the plane of the ground.
+OF_TURNS: tuple[Channel, ...] = (
+    *(_of_side(_BY_NAME[f"motor_{what}"], side) for what in ("current", "speed", "voltage") for side in (0, 1)),
+    Channel(
+        name="yaw_rate",
+        unit="rad/s",
+        factor=1.0,
+        label="yaw rate",
+        word="yaw_rate",
+        range=(-100.0, 100.0),
+        sd_largest=10.0,
+        read=lambda robot, signals: signals.yaw_rate,
+        zero_error=0.01,
+        sd_share=0.02,
+        resolution=3,
+        zero_at_rest=True,
+        other_units=(("deg/s", DEG), ("rpm", RPM)),
+    ),
+    Channel(
+        name="lateral_speed",
+        unit="mm/s",
+        factor=MM,
+        label="lateral speed",
+        word="lateral_speed",
+        range=(-10_000.0, 10_000.0),
+        sd_largest=5_000.0,
+        read=lambda robot, signals: signals.speed_lateral,
+        sd_share=0.02,
+        unit_si="m/s",
+        zero_at_rest=True,
+        other_units=(("m/s", 1.0), ("cm/s", 1e-2)),
+    ),
+    Channel(
+        name="yaw",
+        unit="deg",
+        factor=DEG,
+        label="yaw angle from uphill",
+        word="yaw",
+        range=(-1e6, 1e6),
+        sd_largest=360.0,
+        read=lambda robot, signals: signals.heading,
+        sd_share=0.01,
+        resolution=2,
+        unit_si="rad",
+        directed=False,
+        settled=False,
+        other_units=(("rad", 1.0),),
+    ),
+    *(
+        Channel(
+            name=name,
+            stem=name[-1],
+            unit="mm",
+            factor=MM,
+            label=label,
+            word=name,
+            range=(-1e7, 1e7),
+            sd_largest=1e4,
+            read=read,
+            sd_share=0.01,
+            unit_si="m",
+            zero_at_rest=True,
+            directed=False,
+            settled=False,
+            other_units=(("m", 1.0), ("cm", 1e-2)),
+        )
+        for name, label, read in (
+            ("place_x", "place uphill", lambda robot, signals: signals.place_x),
+            ("place_y", "place to the left", lambda robot, signals: signals.place_y),
+        )
+    ),
+)
+#: Every channel that there is.
+EVERY: tuple[Channel, ...] = _EITHER + OF_TURNS
+
+#: Of a robot whose file states none.
+USUAL = ("total_current", "motor_speed", "speed")
+
+
+def rows(names: Iterable[str]) -> tuple[Channel, ...]:
+    """The channels of these names, in the order of columns, arrays and reports, which is that of `EVERY`.
+
+    Raises:
+        KeyError: no such channel.
+    """
+    wanted = set(names)
+    if unknown := wanted - {c.name for c in EVERY}:
+        raise KeyError(f"no channel {min(unknown)}; there are {', '.join(c.name for c in EVERY)}")
+    return tuple(c for c in EVERY if c.name in wanted)
+
+
+def usual() -> tuple[Channel, ...]:
+    """Those of a robot without a rig."""
+    return rows(USUAL)
+
+
+def find(name: str) -> Channel:
+    """The channel of a name.
+
+    Raises:
+        KeyError: no such channel.
+    """
+    return rows((name,))[0]
+
+
+def names(shown: Iterable[Channel]) -> tuple[str, ...]:
+    """Names of channels, in order."""
+    return tuple(c.name for c in shown)
+
+
+def index(name: str, shown: Iterable[Channel]) -> int:
+    """Position of a channel in arrays of those that are shown.
+
+    Raises:
+        KeyError: it is not among them.
+    """
+    known = names(shown)
+    if name not in known:
+        raise KeyError(f"no channel {name}; there are {', '.join(known)}")
+    return known.index(name)
+
+
+def factors(shown: Iterable[Channel]) -> tuple[float, ...]:
+    """SI value of one unit of each channel's column."""
+    return tuple(c.factor for c in shown)

@@ -1,0 +1,281 @@
+"""The conditions of runs: what is set from outside before a robot starts."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from mmrjax.compile.precision import is_double
+from mmrjax.errors import UsageError
+from mmrjax.model.robot import Robot
+
+Number = float | Sequence[float] | np.ndarray | Array
+
+#: Conditions that are stated of either side.
+OF_SIDES = ("duty_left", "duty_right", "open_left", "open_right", "motor_speed_left", "motor_speed_right")
+#: Conditions that free a robot to turn where they are stated.
+OF_TURNS = (*OF_SIDES, "heading_deg")
+
+
+class Named(eqx.Module):
+    """Configurations by name: a pytree, so that conditions by name pass `jax.jit` and `jax.vmap`.
+
+    Attributes:
+        index: of the name of each run among `names`; names: distinct ones.
+    """
+
+    index: Int[Array, "..."] | np.ndarray
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    @staticmethod
+    def of(words: np.ndarray) -> Named:
+        """From an array of names."""
+        # one word for all, as `Conditions` broadcasts it, is looked up once
+        once = np.asarray(words[tuple(slice(1) if stride == 0 else slice(None) for stride in words.strides)])
+        index, names = np.full(once.shape, -1, np.int32), list[str]()
+        while (left := index < 0).any():
+            names.append(str(once[left][0]))
+            index[once == names[-1]] = len(names) - 1
+        return Named(np.broadcast_to(index, words.shape), tuple(names))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the batch."""
+        return self.index.shape
+
+    def among(self, names: Sequence[str]) -> Any:
+        """Returns the place of each run's name among some names.
+
+        Raises:
+            KeyError: a name of some run that is none of them; of conditions that are traced, of any.
+        """
+        places = np.array([names.index(name) if name in names else -1 for name in self.names], int)
+        traced = isinstance(self.index, jax.core.Tracer)
+        for k in np.flatnonzero(places < 0):
+            if traced or (np.asarray(self.index) == k).any():
+                raise KeyError(self.names[k])
+        return jnp.asarray(places)[self.index] if traced else np.asarray(places[np.asarray(self.index)])
+
+
+class Conditions(eqx.Module):
+    """The conditions of one run, or of a batch: every field broadcast to one shape.
+
+    Attributes:
+        configuration: which of the robot's configurations, its index; until `resolved` also by name (`Named`).
+        voltage: of the external supply [V]; not used with `battery`.
+        slope_deg: slope angle, positive uphill [deg].
+        payload: additional load mass m_c [kg].
+        battery: 0 external supply (Source Mode 2), 1 on-board battery (Source Mode 1), eq. (8).
+        discharge: charge C_b already taken from the battery [C].
+        adhesion: adhesion of this surface as a ratio to the one that the robot's friction is stated for [-].
+        total_mass: mass of robot and payload as weighed [kg]; None takes the robot's own mass and the payload.
+        order: place in the sequence of runs; what drifts from run to run depends on it [-].
+        duty: share of the supply's voltage that the driver gives the motors, negative backward [-]; None: 1.
+        open: 1 where the motors' circuit is open, so that they coast; -1 where the driver shorts it, so that they
+            brake whatever it does between pulses.
+        motor_speed: imposed on the motors' shafts [rad/s], whatever voltage that takes; None: the voltage is imposed.
+        motor_acceleration: of an imposed speed [rad/s²]; None: none.
+        motor_current: imposed on each motor [A], whatever voltage that takes; None: it follows.
+        begin: which of the beginnings of `Rig.begins` is a history's, its index; None: it starts from rest.
+        duty_left, duty_right: as `duty`, of either side; None: `duty`. Stating anything of a side makes the robot
+            free to turn.
+        open_left, open_right: as `open`, of either side; None: `open`.
+        motor_speed_left, motor_speed_right: as `motor_speed`, of either side; None: `motor_speed`.
+        heading_deg: at the start, from uphill, positive to the left [deg]; None: 0. It too frees the robot to turn.
+        adhesion_lateral: as `adhesion`, across the travel; None: `adhesion`.
+        levers_front_deg, levers_rear_deg: angles at which the levers stand, 0 along the wheelbase outward, positive
+            up, 180 folded [deg]; None: those of the running gear, as folded as it states them.
+        load_torque: torque of a brake, or of a motor as the load, on the output of each drive [N·m]: positive against
+            forward rotation, whichever way it turns; of a load on a shaft alone; None: none.
+    """
+
+    configuration: Any  # Int[Array, "..."] | Named
+    voltage: Float[Array, "..."]
+    slope_deg: Float[Array, "..."]
+    payload: Float[Array, "..."]
+    battery: Float[Array, "..."]
+    discharge: Float[Array, "..."]
+    adhesion: Float[Array, "..."]
+    total_mass: Float[Array, "..."] | None
+    order: Float[Array, "..."]
+    duty: Float[Array, "..."]
+    open: Float[Array, "..."]
+    motor_speed: Float[Array, "..."] | None
+    motor_acceleration: Float[Array, "..."] | None
+    motor_current: Float[Array, "..."] | None
+    begin: Int[Array, "..."] | None
+    duty_left: Float[Array, "..."] | None
+    duty_right: Float[Array, "..."] | None
+    open_left: Float[Array, "..."] | None
+    open_right: Float[Array, "..."] | None
+    motor_speed_left: Float[Array, "..."] | None
+    motor_speed_right: Float[Array, "..."] | None
+    heading_deg: Float[Array, "..."] | None
+    adhesion_lateral: Float[Array, "..."] | None
+    levers_front_deg: Float[Array, "..."] | None
+    levers_rear_deg: Float[Array, "..."] | None
+    load_torque: Float[Array, "..."] | None
+
+    def __init__(
+        self,
+        configuration: str | int | Sequence[str] | np.ndarray | Array | Named = 0,
+        voltage: Number = 33.0,
+        slope_deg: Number = 0.0,
+        payload: Number = 0.0,
+        battery: Number | bool = 0.0,
+        discharge: Number = 0.0,
+        adhesion: Number = 1.0,
+        total_mass: Number | None = None,
+        order: Number = 0.0,
+        duty: Number | None = None,
+        open: Number | bool = 0.0,
+        motor_speed: Number | None = None,
+        motor_acceleration: Number | None = None,
+        begin: Number | None = None,
+        motor_current: Number | None = None,
+        duty_left: Number | None = None,
+        duty_right: Number | None = None,
+        open_left: Number | bool | None = None,
+        open_right: Number | bool | None = None,
+        motor_speed_left: Number | None = None,
+        motor_speed_right: Number | None = None,
+        heading_deg: Number | None = None,
+        adhesion_lateral: Number | None = None,
+        levers_front_deg: Number | None = None,
+        levers_rear_deg: Number | None = None,
+        load_torque: Number | None = None,
+    ) -> None:
+        # arrays are of other conditions, or of a table; what a user writes down is a number or some
+        if not isinstance(duty, np.ndarray | jax.Array | None) and None not in (duty_left, duty_right):
+            raise UsageError(sides_contradict(("duty", *OF_SIDES[:2])))
+        duty = 1.0 if duty is None else duty
+        which: Any = configuration
+        if not isinstance(configuration, jax.Array | Named):
+            words = np.asarray(configuration)
+            which = Named.of(words) if words.dtype.kind == "U" else words
+        which = which if isinstance(which, Named) else _number(which, int)
+        given = (voltage, slope_deg, payload, battery, discharge, adhesion, order, duty, open)
+        numbers = [_number(v) for v in given]
+        others = {"total_mass": total_mass, "motor_speed": motor_speed, "motor_acceleration": motor_acceleration}
+        others |= {"motor_current": motor_current, "heading_deg": heading_deg, "adhesion_lateral": adhesion_lateral}
+        others |= {"duty_left": duty_left, "duty_right": duty_right, "open_left": open_left, "open_right": open_right}
+        others |= {"motor_speed_left": motor_speed_left, "motor_speed_right": motor_speed_right}
+        others |= {"levers_front_deg": levers_front_deg, "levers_rear_deg": levers_rear_deg}
+        others |= {"load_torque": load_torque}
+        optional = {name: _number(value) for name, value in others.items() if value is not None}
+        shapes = [x.shape for x in (which, *numbers, *optional.values())]
+        try:
+            shape = np.broadcast_shapes(*shapes)
+        except ValueError:
+            names = [f.name for f in dataclasses.fields(type(self)) if f.name not in (*others, "begin")]
+            by_name = dict(zip([*names, *optional], shapes, strict=True))
+            said = ", ".join(f"{name} {s}" for name, s in by_name.items() if s)
+            raise ValueError(f"Conditions: shapes do not broadcast to one another: {said}") from None
+        self.configuration = jax.tree.map(lambda x: _broadcast(x, shape), which)
+        # the same number for all is one array: most fields of a large batch are 0 or 1
+        shared: dict[float, Array] = {}
+        for k, value in enumerate(given):
+            if not isinstance(value, float):
+                numbers[k] = _broadcast(numbers[k], shape)
+                continue
+            if value not in shared:
+                shared[value] = _broadcast(numbers[k], shape)
+            numbers[k] = shared[value]
+        self.voltage, self.slope_deg, self.payload, self.battery, self.discharge, self.adhesion = numbers[:6]
+        self.order, self.duty, self.open = numbers[6:]
+        held = {name: _broadcast(x, shape) for name, x in optional.items()}
+        for name in others:
+            setattr(self, name, held.get(name))
+        self.begin = None if begin is None else _broadcast(_number(begin, int), shape)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the batch; () for one run."""
+        return self.voltage.shape
+
+    @property
+    def voltage_follows(self) -> bool:
+        """Whether the motors' voltage is what an imposed speed or current takes."""
+        return self.motor_speed is not None or self.motor_current is not None
+
+    @property
+    def polarity(self) -> Array:
+        """Sign of a duty that drives forward, ±1: that of the supply's voltage; of a battery 1."""
+        return jnp.where((jnp.asarray(self.battery) < 0.5) & (jnp.asarray(self.voltage) < 0), -1.0, 1.0)
+
+    @property
+    def states_levers(self) -> bool:
+        """Whether it is stated at which angles levers stand: the robot then rests on what they leave it."""
+        return self.levers_front_deg is not None or self.levers_rear_deg is not None
+
+    @property
+    def turns(self) -> bool:
+        """Whether the sides are driven apart, or the robot heads elsewhere than uphill: it is then free to turn."""
+        return any(getattr(self, name) is not None for name in OF_TURNS)
+
+    def straight(self) -> Conditions:
+        """The same of a robot whose sides are driven alike, uphill."""
+        alike: dict[str, Any] = dict.fromkeys(OF_TURNS)
+        return dataclasses.replace(self, **alike)
+
+    def of_sides(self) -> Conditions:
+        """Those of left and right side, a leading axis of 2."""
+
+        def side(name: str) -> Conditions:
+            stated = {key: getattr(self, f"{key}_{name}") for key in ("duty", "open", "motor_speed")}
+            own: dict[str, Any] = dict.fromkeys(OF_SIDES)
+            return dataclasses.replace(self, **own | {k: x for k, x in stated.items() if x is not None})
+
+        return jax.tree.map(lambda left, right: jnp.stack([left, right]), side("left"), side("right"))
+
+    @property
+    def slope(self) -> Float[Array, "..."]:
+        """Slope angle α, positive uphill [rad]."""
+        return self.slope_deg * (math.pi / 180)
+
+    def resolved(self, robot: Robot) -> Conditions:
+        """The same with names of configurations replaced by their indices in `robot`.
+
+        Raises:
+            KeyError: a name that the robot does not have; the message lists those that it has.
+        """
+        if not isinstance(self.configuration, Named):
+            return self
+        try:
+            which = self.configuration.among(robot.configurations.names)
+        except KeyError as error:
+            robot.configurations.index(error.args[0])  # which says what there is
+            raise
+        return dataclasses.replace(self, configuration=which)
+
+
+def sides_contradict(stated: Collection[str]) -> str:
+    """What is wrong where conditions of these names impose the speed of one side's motor and not the other's, or a
+    duty beside those of both sides; empty where nothing is."""
+    if {"duty", *OF_SIDES[:2]} <= {*stated}:
+        return f"duty: got it beside {' and '.join(OF_SIDES[:2])}; expected one of the two"
+    left, right = (name in stated for name in OF_SIDES[-2:])
+    if left == right or "motor_speed" in stated:
+        return ""
+    known, lacking = OF_SIDES[-2:] if left else OF_SIDES[:-3:-1]
+    return f"{known}: got it without {lacking}; state both"
+
+
+def _number(x: Any, kind: type = float) -> Any:
+    """Numbers of that kind, of NumPy where they are not JAX's yet: no operation of JAX is compiled for them."""
+    return jnp.asarray(x, kind) if isinstance(x, jax.Array) else np.asarray(x, kind)
+
+
+def _broadcast(x: Any, shape: tuple[int, ...]) -> Any:
+    """An array of that shape; of numbers that are not JAX's yet where JAX is single NumPy's, which keeps digits."""
+    if isinstance(x, jax.Array):
+        return jnp.broadcast_to(x, shape)
+    return jax.device_put(np.broadcast_to(x, shape)) if is_double() else np.broadcast_to(x, shape)

@@ -1,0 +1,144 @@
+"""Contact laws: the friction law of Fig. 7 with its inverse, the contact force (27)-(29), the step of Fig. 9a."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mmrjax.model.params import Scalar, parameter
+from mmrjax.numerics.trigonometry import sine_third
+
+_SLIPS = "Tables A1, A2 simulated: slip at 5 and 10 deg implies 9-39 mm/s with the adhesion of Table 5"
+_PACKAGE = "10 V_s, the ratio of the defaults of the multibody package of ref. [48]; the paper prints none"
+
+
+def step(x: Scalar, x0: Scalar, y0: Scalar, x1: Scalar, y1: Scalar) -> Scalar:
+    """Cubic step from y0 at x0 to y1 at x1, flat outside, Fig. 9a (ref. [48]).
+
+    y0 + (y1 - y0) u² (3 - 2u) with u = (x - x0) / (x1 - x0) held within 0..1.
+    """
+    u = jnp.clip((x - x0) / (x1 - x0), 0.0, 1.0)
+    return y0 + (y1 - y0) * u**2 * (3 - 2 * u)
+
+
+def direction(speed: Scalar, speed_rest: Scalar) -> Scalar:
+    """Smooth sign of `speed`: the odd cubic x(3 - x²)/2 within ±speed_rest, exactly ±1 beyond [-]."""
+    x = jnp.clip(speed / speed_rest, -1.0, 1.0)
+    return x * (3 - x**2) / 2
+
+
+class Friction(eqx.Module):
+    """Friction coefficient over sliding speed, Fig. 7 (refs. [48, 49]).
+
+    μ = μ_s x (3 - x²) / 2 with x = v / V_s inside V_s; the cubic step from μ_s to μ_d between V_s and
+    V_d; μ_d beyond; odd in v. Static friction thus creeps: the demand sets the sliding speed.
+    """
+
+    static: Scalar = parameter(
+        unit="-",
+        meaning="static coefficient μ_s, the largest adhesion",
+        bounds=(0.01, 3.0),
+        relative_sd=0.3,
+        source="Table 5, φ_x on lacquered wood (surface of the bench)",
+    )
+    dynamic: Scalar = parameter(
+        unit="-",
+        meaning="dynamic coefficient μ_d",
+        bounds=(0.005, 3.0),
+        relative_sd=0.3,
+        source="assumed 0.8 of μ_s; the paper prints none",
+    )
+    speed_static: Scalar = parameter(
+        0.02,
+        unit="m/s",
+        meaning="V_s, sliding speed at which μ_s is reached",
+        bounds=(1e-4, 2.0),
+        relative_sd=1.0,
+        source=_SLIPS,
+    )
+    speed_dynamic: Scalar = parameter(
+        0.2,
+        unit="m/s",
+        meaning="V_d, sliding speed from which μ_d holds",
+        bounds=(1e-3, 20.0),
+        relative_sd=0.5,
+        source=_PACKAGE,
+    )
+
+    @property
+    def speed_rest(self) -> Scalar:
+        """Speed within which a direction fades and a robot is said to stand, a tenth of V_s [m/s].
+
+        Friction at rest is then resolved on the same scale as sliding.
+        """
+        return 0.1 * self.speed_static
+
+    def coefficient(self, speed: Scalar) -> Scalar:
+        """Friction coefficient [-] at sliding `speed` [m/s], of the speed's sign."""
+        size = jnp.abs(speed)
+        falling = step(size, self.speed_static, self.static, self.speed_dynamic, self.dynamic)
+        rising = self.static * direction(speed, self.speed_static)
+        return jnp.where(size < self.speed_static, rising, jnp.sign(speed) * falling)
+
+    def per_speed(self, square: Scalar) -> Scalar:
+        """Coefficient over sliding speed [s/m] at the square of that speed [m²/s²]: finite at rest, with its
+        derivatives."""
+        slow = square < self.speed_static**2
+        creeping = self.static * (3 - square / self.speed_static**2) / (2 * self.speed_static)
+        size = jnp.sqrt(jnp.where(slow, self.speed_static**2, square))
+        falling = step(size, self.speed_static, self.static, self.speed_dynamic, self.dynamic)
+        return jnp.where(slow, creeping, falling / size)
+
+    def per_speed_rise(self, square: Scalar) -> Scalar:
+        """Derivative of `per_speed` by that square [s³/m³]."""
+        slow = square < self.speed_static**2
+        size = jnp.sqrt(jnp.where(slow, self.speed_static**2, square))
+        falling = (self.rise(size) - self.per_speed(square)) / (2 * size**2)
+        return jnp.where(slow, -self.static / (2 * self.speed_static**3), falling)
+
+    def rise(self, speed: Scalar) -> Scalar:
+        """How fast the coefficient rises with sliding `speed` [s/m]; negative between V_s and V_d."""
+        size, width = jnp.abs(speed), self.speed_dynamic - self.speed_static
+        u = jnp.clip((size - self.speed_static) / width, 0.0, 1.0)
+        x = jnp.clip(speed / self.speed_static, -1.0, 1.0)
+        rising = self.static * 1.5 * (1 - x**2) / self.speed_static
+        return jnp.where(size < self.speed_static, rising, (self.dynamic - self.static) * 6 * u * (1 - u) / width)
+
+    def speed_creep(self, coefficient: Scalar) -> Scalar:
+        """Sliding speed [m/s] at which static friction gives `coefficient`: the inverse below V_s.
+
+        x (3 - x²) / 2 = sin 3θ for x = 2 sin θ, so v = 2 V_s sin(asin(μ/μ_s) / 3). Beyond ±μ_s there is
+        none; ±V_s is returned, with a zero derivative.
+        """
+        share = coefficient / self.static
+        within = jnp.abs(share) < 1.0
+        third = sine_third(jnp.where(within, share, 0.0))
+        return self.speed_static * jnp.where(within, 2 * third, jnp.sign(share))
+
+
+def force_contact(
+    gap: Scalar,
+    gap_rate: Scalar,
+    gap_free: Scalar,
+    stiffness: Scalar,
+    exponent: Scalar,
+    damping: Scalar,
+    depth: Scalar,
+) -> Scalar:
+    """Contact force F_c [N], eqs. (27)-(29): max(0, c h^e - b_max q̇ step) for h = q_0 - q > 0, else 0.
+
+    Args:
+        gap: distance q [m]; gap_rate: its rate q̇ [m/s]; gap_free: q_0 = r_1 + r_2 [m], eq. (29).
+        stiffness: c [N/m^e]; exponent: e [-]; damping: b_max [N·s/m]; depth: d [m], at which the damping
+            is full (cubic step of Fig. 9a, from 0 at q_0).
+    """
+    h = gap_free - gap
+    touching = h > 0
+    deep = jnp.where(touching, h, depth)  # a value with a finite derivative where there is no contact
+    force = stiffness * deep**exponent - damping * gap_rate * step(deep, 0.0, 0.0, depth, 1.0)
+    return jnp.where(touching, jnp.maximum(force, 0.0), 0.0)
+
+
+def damping_contact(force: Scalar, gap: Scalar, gap_free: Scalar, damping: Scalar, depth: Scalar) -> Scalar:
+    """How fast a `force` given by `force_contact` falls with the gap's rate [N·s/m]; its arguments."""
+    return jnp.where(force > 0, damping * step(gap_free - gap, 0.0, 0.0, depth, 1.0), 0.0)

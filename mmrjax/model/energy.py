@@ -1,0 +1,93 @@
+"""Energy: where the power of an instant comes from and goes, and what is stored."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from mmrjax.model.balances import Travel, added, power_drawn
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import GRAVITY, PlaneMotion, Signals
+from mmrjax.numerics.trigonometry import sine
+
+#: Where energy goes, in the order of the chain: name, and what it is.
+SINKS: dict[str, str] = {
+    "battery": "heat in the battery's cells",
+    "other": "the other consumers on the battery",
+    "driver": "driver and wiring: open bridge, diode, and drops on the way to the motors",
+    "winding": "heat in windings, leads and brushes",
+    "motor": "friction of the motors",
+    "gearbox": "losses of the gearboxes",
+    "track": "losses of tracks and guides",
+    "sliding": "sliding over the ground",
+    "rolling": "rolling resistance",
+    "lift": "lifting robot and payload (comes back downhill)",
+}
+
+
+def source(robot: Robot, conditions: Conditions, signals: Signals) -> Scalar:
+    """Power that the source gives [W], negative where it takes some back: the battery's charge at no-load voltage, or
+    what the external supply delivers."""
+    battery = robot.battery
+    chemical = battery.cells * battery.voltage_no_load(signals.discharge) * battery.current(signals.total_current)
+    return jnp.where(conditions.battery > 0.5, chemical, signals.voltage_source * signals.total_current)
+
+
+def sinks(robot: Robot, conditions: Conditions, signals: Signals) -> dict[str, Scalar]:
+    """Power that goes each way of `SINKS` [W], of all motors and sides.
+
+    With what drives inductances and masses (`stored`) they add up to `source`, at every instant.
+    """
+    sides, battery, on_battery = robot.sides, robot.battery, conditions.battery > 0.5
+    load = battery.current(signals.total_current)
+    own = signals.torque_load - signals.torque_track_loss  # at the wheel, of the ground and of effects of the gearbox
+    ground = signals.traction * signals.speed_theoretical
+    into = signals.torque_input * signals.speed_motor - signals.torque_gear * signals.speed_wheel
+    return {
+        "battery": jnp.where(on_battery, battery.cells * battery.resistance * load**2, 0.0),
+        "other": jnp.where(on_battery, battery.current_other * signals.voltage_source, 0.0),
+        "driver": signals.voltage_source * signals.total_current - power_drawn(robot, signals),
+        "winding": sides * signals.voltage_drop * signals.current * robot.driver.ripple(signals.duty),
+        "motor": sides * signals.torque_motor_loss * signals.speed_motor,
+        "gearbox": sides * (into + own * signals.speed_wheel - ground),
+        "track": sides * signals.torque_track_loss * signals.speed_wheel,
+        "sliding": sides * signals.traction * (signals.speed_theoretical - signals.speed),
+        "rolling": sides * signals.resistance * signals.speed,
+        "lift": sides * signals.gravity * signals.speed,
+    }
+
+
+def stored(robot: Robot, signals: Signals) -> Scalar:
+    """Energy in the motion of robot, wheels and rotors, and in the motors' inductance [J]."""
+    inertia = robot.chassis(signals.configuration).inertia + signals.inertia_added
+    rotating = robot.motor.inertia * signals.speed_motor**2 + inertia * signals.speed_wheel**2
+    magnetic = signals.inductance * signals.current**2
+    return 0.5 * (signals.mass * signals.speed**2 + robot.sides * (rotating + magnetic))
+
+
+def sinks_turning(robot: Robot, conditions: Conditions, travel: Travel) -> dict[str, Scalar]:
+    """The same of a robot that turns: sliding is Σ F·u over all contacts, lift follows its heading."""
+    signals = travel.signals
+    each = jax.vmap(lambda c, s: sinks(robot, c, s))(conditions.of_sides(), signals)
+    found: dict[str, Scalar] = {name: jnp.mean(jnp.asarray(power)) for name, power in each.items()}
+    weight = jnp.mean(jnp.asarray(signals.mass)) * GRAVITY * sine(conditions.slope)
+    across = jnp.mean(jnp.asarray(signals.speed_lateral)) * sine(jnp.mean(jnp.asarray(signals.heading)))
+    found["sliding"] = found["sliding"] + jnp.sum(travel.grip.across)
+    for balance, rate in (("lateral", signals.speed_lateral), ("yaw", signals.yaw_rate)):
+        taken = jax.vmap(lambda s, balance=balance: added(robot, s, balance) * jnp.ones(()))(signals)
+        found["sliding"] = found["sliding"] + robot.sides / 2 * jnp.sum(taken * jnp.asarray(rate))
+    found["lift"] = found["lift"] - weight * across
+    return found
+
+
+def stored_turning(robot: Robot, travel: Travel, motion: PlaneMotion) -> Scalar:
+    """The same of a robot that turns, lateral and yaw motion with it [J]."""
+    signals = dataclasses.replace(travel.signals, speed=jnp.broadcast_to(motion.speed, (2,)))
+    turning = robot.chassis(jnp.max(jnp.asarray(signals.configuration))).turning
+    own = jnp.mean(jax.vmap(lambda s: stored(robot, s))(signals))
+    across = jnp.mean(jnp.asarray(signals.mass)) * motion.speed_lateral**2
+    return own + 0.5 * (across + turning.inertia * motion.yaw_rate**2)

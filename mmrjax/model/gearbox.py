@@ -1,0 +1,101 @@
+"""Reduction gear: losses at idle and losses with load, eqs. (19)-(23)."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mmrjax.model.params import Scalar, parameter
+from mmrjax.model.signals import quotient
+
+#: Torque below which the gearbox transmits none, so that rounding does not decide which way power flows [N·m].
+NO_TORQUE = 1e-12
+
+
+class Gearbox(eqx.Module):
+    """M_r = i η_rm (M_d - M_rf_idle) with M_rf_idle = M_rf0 sign ω + K_fr ω.
+
+    Driven from the output (overhauling) the load loss turns round: M_r = (i / η_b) (M_d - M_rf_idle) with the
+    efficiency η_b of `efficiency_backward`, which the paper leaves out because it never coasts; without it a descent
+    would gain energy.
+
+    Attributes:
+        mesh_theory: η_b by the theory of the mesh, 2 - 1/η_rm; else equal to η_rm.
+        speed_limit: at the input [rad/s]; torque_limit: for long, at the driving wheel, where the total ratio ends
+            [N·m], None where not stated.
+    """
+
+    ratio: Scalar = parameter(
+        48.0,
+        unit="-",
+        meaning="total ratio motor to driving wheel i_r",
+        bounds=(1.0, 1e4),
+        relative_sd=0.002,
+        source="GP32C 576/25 and a belt stage 25/12; Tables A1, A2 simulated give 47.97-48.04",
+    )
+    efficiency_load: Scalar = parameter(
+        0.74,
+        unit="-",
+        meaning="efficiency for losses proportional to load η_rm, eq. (19)",
+        bounds=(0.05, 1.0),
+        relative_sd=0.03,
+        source="Table 2 (catalogue 0.75)",
+    )
+    friction_coulomb: Scalar = parameter(
+        0.3e-3,
+        unit="N·m",
+        meaning="idle Coulomb torque at the input M_rf0, eq. (20)",
+        bounds=(0.0, 10.0),
+        relative_sd=0.15,
+        source="Table 2",
+    )
+    friction_viscous: Scalar = parameter(
+        1.4e-6,
+        unit="N·m·s",
+        meaning="idle viscous friction at the input K_fr, eq. (20)",
+        bounds=(0.0, 1.0),
+        relative_sd=0.15,
+        source="Table 2: 1.4e-3 mN·m·s",
+    )
+    speed_limit: float = eqx.field(default=8_000 * 0.10471975511965977, static=True)  # 8000 rpm input, catalogue
+    # GP32C 166936, maker's sheet: 3 N·m at its output for long, 3.75 for short; times the belt stage 25/12 [N·m]
+    torque_limit: float | None = eqx.field(default=3.0 * 25 / 12, static=True)
+    mesh_theory: bool = eqx.field(default=False, static=True)
+
+    @property
+    def efficiency_backward(self) -> Scalar:
+        """η_b, load driving the motor [-]: η_rm, or by the theory of the mesh 2 - 1/η_rm, at least 0.02.
+
+        A loss in proportion to the force in the mesh is (1/η - 1) of the power that leaves it, whichever way that
+        flows; from η = 1/2 down such a gear locks itself.
+        """
+        if not self.mesh_theory:
+            return self.efficiency_load
+        return jnp.maximum(2 - 1 / self.efficiency_load, 0.02)
+
+    def torque_idle(self, speed: Scalar, direction: Scalar) -> Scalar:
+        """Idle loss torque at the input M_rf_idle [N·m], eq. (20), at input `speed` [rad/s]."""
+        return self.friction_coulomb * direction + self.friction_viscous * speed
+
+    def efficiency_flow(self, transmitted: Scalar, direction: Scalar) -> Scalar:
+        """η_rm where power flows to the wheels, 1/η_b where it flows back, fading to 1 at rest with `direction` [-].
+
+        `transmitted` is the input torque less the idle torque [N·m]. Without any, the efficiency is that of a load
+        about to grow: power flows to the wheels.
+        """
+        way = jnp.where(jnp.abs(transmitted) > NO_TORQUE, jnp.sign(transmitted), jnp.sign(direction))
+        flow = way * direction
+        return 1 + flow * jnp.where(flow >= 0, self.efficiency_load - 1, 1 - 1 / self.efficiency_backward)
+
+    def torque_output(self, transmitted: Scalar, direction: Scalar) -> Scalar:
+        """Output torque M_r [N·m], eqs. (22), (23)."""
+        return self.ratio * transmitted * self.efficiency_flow(transmitted, direction)
+
+    def efficiency(self, torque_input: Scalar, speed: Scalar) -> Scalar:
+        """Efficiency η_r [-], eq. (19), driving forward at input torque [N·m] and `speed` [rad/s]."""
+        return (1 - quotient(self.torque_idle(speed, 1.0), torque_input)) * self.efficiency_load
+
+    def torque_loss(self, torque_input: Scalar, speed: Scalar) -> Scalar:
+        """Total loss at the output M_rf [N·m], eq. (22), driving forward."""
+        load = torque_input * self.ratio * (1 - self.efficiency_load)
+        return load + self.torque_idle(speed, 1.0) * self.ratio * self.efficiency_load

@@ -1,0 +1,58 @@
+"""Ground: motion resistance (5), adhesion (6), (7), slip (32), (33)."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mmrjax.model.contact import Friction
+from mmrjax.model.params import Scalar, parameter
+from mmrjax.model.signals import quotient
+from mmrjax.numerics.trigonometry import sine
+
+#: Least load by which a demand is divided, beyond what it can hold [N].
+NO_LOAD = 1e-9
+
+
+class Ground(eqx.Module):
+    """What the surface does to one mover: it resists, and it holds."""
+
+    friction: Friction
+    rolling_resistance: Scalar = parameter(
+        unit="-",
+        meaning="rolling resistance coefficient f, eq. (5)",
+        bounds=(0.0, 1.0),
+        relative_sd=0.15,
+        source="Table 4",
+    )
+
+    def force_resistance(self, normal: Scalar, direction: Scalar) -> Scalar:
+        """Motion resistance F_f = f N [N], eq. (5), against `direction` (-1..1)."""
+        return self.rolling_resistance * normal * direction
+
+    def force_adhesion(self, normal: Scalar, adhesion: Scalar) -> Scalar:
+        """Largest traction φ R_z [N], eqs. (6), (7); `adhesion` is the surface's ratio [-]."""
+        return self.friction.static * adhesion * normal
+
+    def traction(self, speed_sliding: Scalar, normal: Scalar, adhesion: Scalar) -> Scalar:
+        """Traction [N] of a contact that slides at `speed_sliding` [m/s], eq. (25) with Fig. 7."""
+        return self.friction.coefficient(speed_sliding) * adhesion * normal
+
+    def traction_rise(self, speed_sliding: Scalar, normal: Scalar, adhesion: Scalar) -> Scalar:
+        """How fast that traction rises with `speed_sliding` [N·s/m]."""
+        return self.friction.rise(speed_sliding) * adhesion * normal
+
+    def speed_creep(self, demand: Scalar, normal: Scalar, adhesion: Scalar) -> Scalar:
+        """Sliding speed [m/s] at which the contact carries `demand` [N]."""
+        # Nothing presses on a vertical ground: a quotient of nothing would make NaN of a whole batch's derivatives.
+        return self.friction.speed_creep(demand / jnp.maximum(adhesion * normal, NO_LOAD))
+
+
+def force_gravity(mass: Scalar, slope: Scalar, gravity: float) -> Scalar:
+    """Downhill pull m g sin α [N], eq. (1)."""
+    return mass * gravity * sine(slope)
+
+
+def slip(speed: Scalar, speed_theoretical: Scalar) -> Scalar:
+    """s = 1 - V / V_theoretical [-], eq. (33); 0 at rest."""
+    return quotient(speed_theoretical - speed, speed_theoretical)

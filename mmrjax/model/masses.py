@@ -1,0 +1,178 @@
+"""Masses of half a robot, summed from its parts in their posture."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.undercarriage.running_gear import RunningGear
+
+
+class Masses(eqx.Module):
+    """Masses of half a robot [kg, m, kg·m²].
+
+    Attributes:
+        chassis: mass of all that does not turn with the pulleys.
+        forward, up: its centre from the middle of the wheelbase.
+        inertia: its moment of inertia in pitch about that centre.
+        body: mass of what neither turns nor is lever, track or payload.
+        pulley: mass of what turns on one axle: main and additional pulley, in 4W2T the wheel.
+        inertia_pulley: about its axle, front and rear alike: half of J_w of eq. (31) each.
+    """
+
+    chassis: Scalar
+    forward: Scalar
+    up: Scalar
+    inertia: Scalar
+    body: Scalar
+    pulley: Scalar
+    inertia_pulley: Scalar
+
+    @property
+    def centre(self) -> tuple[Scalar, Scalar]:
+        """Centre of mass of all, ahead of the middle of the wheelbase and above it [m]; pulleys sit on the axles."""
+        share = self.chassis / (self.chassis + 2 * self.pulley)
+        return share * self.forward, share * self.up
+
+    def pitching(self, wheelbase: Scalar) -> Scalar:
+        """Moment of inertia in pitch of all about the middle of the wheelbase, where pulleys do not turn on their
+        axles [kg·m²]; J of the pulleys about their axles apart."""
+        return self.inertia + self.chassis * (self.forward**2 + self.up**2) + self.pulley * wheelbase**2 / 2
+
+    def inertia_pitch(self, wheelbase: Scalar) -> Scalar:
+        """Moment of inertia in pitch of half a robot about its centre [kg·m²]."""
+        total, moved = self.chassis + 2 * self.pulley, self.chassis**2 * (self.forward**2 + self.up**2)
+        return self.pitching(wheelbase) + 2 * self.inertia_pulley - moved / total
+
+
+class _Part(NamedTuple):
+    """A rigid part: its mass [kg], its centre from the middle of the wheelbase [m], its moment of inertia in pitch
+    about that centre [kg·m²]."""
+
+    mass: Scalar
+    forward: Scalar
+    up: Scalar
+    inertia: Scalar
+
+
+def _together(parts: list[_Part]) -> _Part:
+    """Parts joined rigidly: Σ J + Σ m d² about their common centre (Huygens and Steiner)."""
+    mass = sum(p.mass for p in parts)
+    forward = sum(p.mass * p.forward for p in parts) / mass
+    up = sum(p.mass * p.up for p in parts) / mass
+    inertia = sum(p.inertia + p.mass * ((p.forward - forward) ** 2 + (p.up - up) ** 2) for p in parts)
+    return _Part(mass, forward, up, inertia)
+
+
+def _belt(gear: RunningGear, radius: Scalar) -> _Part:
+    """A main track round its pulleys, its inertia less what turns with them, m r², which is in J_w."""
+    base, mass = gear.wheelbase, gear.belt_mass
+    straights = 2 * base * (base**2 / 12 + radius**2)
+    arcs = 2 * radius * (jnp.pi * base**2 / 4 + 2 * base * radius + jnp.pi * radius**2)
+    loop = mass * (straights + arcs) / (2 * base + 2 * jnp.pi * radius)
+    nothing = jnp.zeros_like(mass)
+    return _Part(mass, nothing, nothing, loop - mass * radius**2)
+
+
+def lever_angles(gear: RunningGear, conditions: Conditions) -> tuple[Scalar, Scalar]:
+    """Angles of front and rear levers, 0 along the wheelbase outward, positive up [rad]: those that the conditions
+    state, else those of the running gear, whose rear one is measured from forward."""
+    front, rear = conditions.levers_front_deg, conditions.levers_rear_deg
+    return (
+        gear.lever_front if front is None else jnp.radians(front),
+        jnp.pi - gear.lever_rear if rear is None else jnp.radians(rear),
+    )
+
+
+def _levers(gear: RunningGear, tracked: Scalar, front: Scalar, rear: Scalar) -> list[_Part]:
+    """The levers of one side at their angles [rad], see `lever_angles`."""
+    mass, inertia, half = gear.lever_mass * tracked, gear.lever_inertia * tracked, gear.wheelbase / 2
+    along = gear.lever_centre
+    return [
+        _Part(mass, side * (half + along * jnp.cos(angle)), along * jnp.sin(angle), inertia)
+        for side, angle in ((1.0, front), (-1.0, rear))
+    ]
+
+
+def masses(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
+    """Masses of half a robot whose total with payload is `mass` [kg], as `balances.begin` gives it.
+
+    The body has what pulleys, wheels, tracks, levers and payload leave of the mass, and its radius of gyration; the
+    moment of inertia follows from the parts, wherever the levers stand. Where the robot states that of the whole with
+    its levers folded and without payload (`inertia_tracked`, `inertia_wheeled`), the body's is what the other parts
+    leave of that.
+    """
+    fixed, levers, body, pulley, inertia_pulley = _of_robot(robot, conditions, mass)
+    return Masses(*_together([*fixed, *levers]), body, pulley, inertia_pulley)
+
+
+def without_levers(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
+    """The same of all but the levers, which stand on their axles."""
+    fixed, _, body, pulley, inertia_pulley = _of_robot(robot, conditions, mass)
+    return Masses(*_together(fixed), body, pulley, inertia_pulley)
+
+
+def _of_robot(
+    robot: Robot, conditions: Conditions, mass: Scalar
+) -> tuple[list[_Part], list[_Part], Scalar, Scalar, Scalar]:
+    """Parts fixed in the chassis, levers, mass of the body, mass and inertia of what turns on an axle."""
+    kind, gear = robot.chassis(conditions.configuration), robot.running_gear
+    tracked = kind.on_tracks
+    wheeled = 1 - tracked
+    pulley = gear.pulley_mass + gear.additional_pulley_mass + gear.wheel_mass * wheeled
+    inertia_pulley = kind.inertia / 2
+    belt = _belt(gear, robot.radius_pulley)
+    levers = _levers(gear, tracked, *lever_angles(gear, conditions))
+    nothing = jnp.zeros_like(belt.mass)
+    payload = _Part(conditions.payload / robot.sides, gear.payload_offset, gear.payload_height, nothing)
+    weighs = mass / robot.sides - 2 * pulley - belt.mass - sum(p.mass for p in levers) - payload.mass
+    body = _Part(weighs, gear.centre_offset, gear.centre_height, weighs * gear.body_gyration**2)
+
+    pulleys = [_Part(pulley, side * gear.wheelbase / 2, nothing, inertia_pulley) for side in (1.0, -1.0)]
+    folded = [
+        body._replace(inertia=nothing),
+        belt,
+        *_levers(gear, tracked, jnp.pi, jnp.pi),
+        *pulleys,
+    ]
+    stated = jnp.where(wheeled > 0.5, gear.inertia_wheeled, gear.inertia_tracked) / robot.sides
+    left = stated - _together(folded).inertia
+    body = body._replace(inertia=jnp.where(left > 0, left, body.inertia))
+
+    return [body, belt, payload], levers, body.mass, pulley, inertia_pulley
+
+
+def check_parts(robot: Robot) -> None:
+    """Refuse a robot of which nothing is left for the body.
+
+    Raises:
+        ValueError: its parts weigh as much as a configuration, or have more inertia than is stated of the whole.
+    """
+    without = {"body_gyration": 0.0, "inertia_tracked": 0.0, "inertia_wheeled": 0.0}
+    folded = {"lever_front": np.pi, "lever_rear": 0.0}
+    gear = params.replace(robot.running_gear, {name: jnp.asarray(x) for name, x in (without | folded).items()})
+    bodiless = dataclasses.replace(robot, running_gear=gear)
+    for k, (name, chassis) in enumerate(robot.configurations.items()):
+        half = masses(bodiless, Conditions(k).resolved(robot), chassis.mass)
+        if np.any(np.asarray(half.body) <= 0):
+            parts = np.max(np.asarray(chassis.mass - robot.sides * half.body))
+            raise ValueError(
+                f"{name}.mass: got {np.min(np.asarray(chassis.mass)):.3g} kg; expected more than {parts:.3g} kg, "
+                "what its pulleys, wheels, tracks and levers weigh (running_gear.pulley_mass and the like)"
+            )
+        whole = "inertia_tracked" if chassis.on_tracks > 0.5 else "inertia_wheeled"
+        stated = np.asarray(getattr(robot.running_gear, whole))
+        least = np.asarray(robot.sides * half.inertia_pitch(gear.wheelbase))
+        if np.any((stated > 0) & (stated <= least)):
+            raise ValueError(
+                f"running_gear.{whole}: got {np.min(stated):.3g} kg·m^2; expected 0, or more than "
+                f"{np.max(least):.3g} kg·m^2, what the parts of {name} have without the body's own"
+            )

@@ -1,0 +1,233 @@
+"""DC motor: back-EMF, winding, torque and its speed-dependent friction, eqs. (14)-(18)."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from mmrjax.model.params import Scalar, parameter
+
+_SHEET = "maker's sheet of RE30 310007 (24 V, 60 W)"
+
+#: Temperature for which makers state the resistance of a winding [°C].
+TEMPERATURE_REFERENCE = 25.0
+UNLIMITED = 1e9  # of a limit that nobody states, in its unit
+_LONG = 1e6  # s, many of a motor's time constants
+
+
+class Motor(eqx.Module):
+    """U_e = C_E ω + I R + L dI/dt; M_d = C_m I - (M_df0 sign ω + K_fd ω)."""
+
+    resistance: Scalar = parameter(
+        0.611,
+        unit="ohm",
+        meaning="terminal resistance R_rot, eq. (15)",
+        bounds=(1e-3, 1e3),
+        relative_sd=0.05,
+        source=_SHEET,
+    )
+    inductance: Scalar = parameter(
+        0.119e-3,
+        unit="H",
+        meaning="terminal inductance L_d, eq. (15)",
+        bounds=(1e-7, 10.0),
+        relative_sd=0.1,
+        source=_SHEET,
+    )
+    torque_constant: Scalar = parameter(
+        25.9e-3,
+        unit="N·m/A",
+        meaning="torque constant C_m, eq. (17), and speed constant C_E in V·s/rad, eq. (16)",
+        bounds=(1e-4, 10.0),
+        relative_sd=0.02,
+        source=f"{_SHEET}; 369 rpm/V is the same number",
+    )
+    friction_coulomb: Scalar = parameter(
+        2.7e-3,
+        unit="N·m",
+        meaning="dry friction torque M_df0, eq. (14)",
+        bounds=(0.0, 10.0),
+        relative_sd=0.15,
+        source="Table 2",
+    )
+    friction_viscous: Scalar = parameter(
+        5.5e-7,
+        unit="N·m·s",
+        meaning="viscous friction K_fd, eq. (14)",
+        bounds=(0.0, 1.0),
+        relative_sd=0.15,
+        source="Table 2: 5.5e-4 mN·m·s",
+    )
+    inertia: Scalar = parameter(
+        33.5e-7,
+        unit="kg·m^2",
+        meaning="rotor inertia J_d, eqs. (3), (31)",
+        bounds=(0.0, 1.0),
+        relative_sd=0.05,
+        source=f"{_SHEET}: 33.5 g·cm^2",
+    )
+    resistance_thermal_winding: Scalar = parameter(
+        1.7,
+        unit="K/W",
+        meaning="thermal resistance winding to housing",
+        bounds=(0.0, 100.0),
+        relative_sd=0.2,
+        source=_SHEET,
+    )
+    resistance_thermal_housing: Scalar = parameter(
+        6.0,
+        unit="K/W",
+        meaning="thermal resistance housing to ambient",
+        bounds=(0.0, 100.0),
+        relative_sd=0.2,
+        source=_SHEET,
+    )
+    time_constant_winding: Scalar = parameter(
+        16.3,
+        unit="s",
+        meaning="thermal time constant of the winding at a constant housing temperature",
+        bounds=(0.1, 1e4),
+        relative_sd=0.2,
+        source=_SHEET,
+    )
+    time_constant_housing: Scalar = parameter(
+        593.0,
+        unit="s",
+        meaning="thermal time constant of the motor: its housing's capacity times the resistance to ambient",
+        bounds=(1.0, 1e5),
+        relative_sd=0.2,
+        source=_SHEET,
+    )
+    temperature_ambient: Scalar = parameter(
+        25.0,
+        unit="°C",
+        meaning="ambient temperature",
+        bounds=(-50.0, 80.0),
+        sd=5.0,
+        source="reference temperature of the maker's sheet",
+    )
+    temperature_limit: float = eqx.field(default=125.0, static=True)  # winding [°C], maker's sheet
+    #: α of copper [1/K]: IEC 60028 (1925), at 20 °C; makers take it from 25 °C, where it is 2 % less
+    temperature_coefficient: float = eqx.field(default=0.00393, static=True)
+    voltage_limit: float | None = eqx.field(default=None, static=True)  # [V], highest for short; not on this sheet
+    speed_limit: float = eqx.field(default=12_000 * 0.10471975511965977, static=True)  # 12 000 rpm, sheet
+
+    def voltage_back(self, speed: Scalar) -> Scalar:
+        """Back-EMF E = C_E ω [V], eq. (16)."""
+        return self.torque_constant * speed
+
+    def voltage_winding(self, current: Scalar, temperature: Scalar | None = None) -> Scalar:
+        """Voltage across the winding's resistance I R [V], eq. (15); R follows the copper where its `temperature`
+        [°C] is given: R (1 + α (T - 25 °C))."""
+        drop = current * self.resistance
+        return (
+            drop
+            if temperature is None
+            else drop * (1 + self.temperature_coefficient * (temperature - TEMPERATURE_REFERENCE))
+        )
+
+    def torque_electromagnetic(self, current: Scalar) -> Scalar:
+        """M_de = C_m I [N·m], eq. (17)."""
+        return self.torque_constant * current
+
+    def torque_loss(self, speed: Scalar, direction: Scalar) -> Scalar:
+        """Friction torque M_df [N·m], eq. (14), at shaft `speed` [rad/s] and its `direction` (-1..1)."""
+        return self.friction_coulomb * direction + self.friction_viscous * speed
+
+    @property
+    def resistance_thermal(self) -> Scalar:
+        """Thermal resistance winding to ambient [K/W]."""
+        return self.resistance_thermal_winding + self.resistance_thermal_housing
+
+    def temperature_cold(self, current: Scalar) -> Scalar:
+        """Winding temperature after long running at `current` if its resistance did not rise [°C]."""
+        return self.temperature_ambient + self.resistance_thermal * self.resistance * current**2
+
+    def temperature_settled(self, current: Scalar) -> Scalar:
+        """Winding temperature after long running at `current` [°C], its resistance risen with it; inf: there is none.
+
+        T = T_a + R_th R I² (1 + α (T - 25 °C)). From R_th R I² α = 1 on every kelvin more brings more than a kelvin.
+        """
+        rise = self.resistance_thermal * self.resistance * current**2
+        left = 1 - self.temperature_coefficient * rise
+        finite = left > 0
+        settled = self.temperature_ambient + rise * (
+            1 + self.temperature_coefficient * (self.temperature_ambient - TEMPERATURE_REFERENCE)
+        ) / jnp.where(finite, left, 1.0)
+        return jnp.where(finite, settled, jnp.inf)
+
+    @property
+    def current_continuous(self) -> Scalar:
+        """Current at which the winding settles at its permissible temperature [A], its resistance risen with it."""
+        allowed = jnp.maximum(self.temperature_limit - self.temperature_ambient, 1.0)
+        hot = self.resistance * (1 + self.temperature_coefficient * (self.temperature_limit - TEMPERATURE_REFERENCE))
+        return jnp.sqrt(allowed / jnp.maximum(self.resistance_thermal * hot, 1e-9))
+
+    def heating(self, power: Scalar, winding: Scalar, housing: Scalar) -> tuple[Scalar, Scalar]:
+        """Rates of the temperatures of winding and housing [K/s], two bodies in a row.
+
+        C_w T_w' = P - (T_w - T_h) / R_wh, C_h T_h' = (T_w - T_h) / R_wh - (T_h - T_a) / R_ha, with C_w = τ_w / R_wh
+        and C_h = τ_h / R_ha as makers state the time constants (maxon, Key information on motor data).
+
+        Args:
+            power: lost in the winding [W]; winding, housing: temperatures [°C].
+        """
+        flow = (winding - housing) / self.resistance_thermal_winding
+        out = (housing - self.temperature_ambient) / self.resistance_thermal_housing
+        return (
+            (power - flow) * self.resistance_thermal_winding / self.time_constant_winding,
+            (flow - out) * self.resistance_thermal_housing / self.time_constant_housing,
+        )
+
+    def temperatures_after(
+        self, current: Scalar, time: Scalar, winding: Scalar, housing: Scalar
+    ) -> tuple[Scalar, Scalar]:
+        """Temperatures of winding and housing [°C] after `time` [s] at `current` [A], in closed form.
+
+        `heating` with P = I² R (1 + α (T_w - 25 °C)) is linear in both temperatures: the exponential of its matrix.
+        """
+        zero = jnp.zeros(())
+
+        def rates(x: Array) -> Array:
+            power = self.voltage_winding(current, x[0]) * current
+            return jnp.stack([jnp.asarray(rate, float) for rate in self.heating(power, x[0], x[1])])
+
+        still = rates(jnp.zeros(2))
+        matrix = jax.jacfwd(rates)(jnp.zeros(2))
+        whole = jnp.block([[matrix, still[:, None]], [jnp.zeros((1, 3))]])
+        begin = jnp.stack([jnp.asarray(x, float) + zero for x in (winding, housing, 1.0)])
+        end = jax.scipy.linalg.expm(whole * time) @ begin
+        return end[0], end[1]
+
+    def time_permissible(
+        self, current: Scalar, winding: Scalar | None = None, housing: Scalar | None = None
+    ) -> Scalar:
+        """How long a `current` [A] may flow before the winding is at its limit [s]; inf: for ever, 0: it is already.
+
+        Args:
+            winding, housing: temperatures at the beginning [°C], None: ambient.
+        """
+        ambient, limit = self.temperature_ambient, self.temperature_limit
+        begin = (ambient if winding is None else winding, ambient if housing is None else housing)
+
+        def excess(time: Scalar) -> Array:
+            reached = self.temperatures_after(current, time, *begin)[0] - limit
+            return jnp.where(jnp.isfinite(reached), reached, jnp.inf)
+
+        def halve(_: int, between: tuple[Array, Array]) -> tuple[Array, Array]:
+            low, high = between
+            middle = jnp.sqrt(low * high)
+            hot = excess(middle) > 0
+            return jnp.where(hot, low, middle), jnp.where(hot, middle, high)
+
+        low, high = jax.lax.fori_loop(0, 60, halve, (jnp.asarray(1e-6), jnp.asarray(_LONG)))
+        found = jax.lax.stop_gradient(jnp.sqrt(low * high))
+        # Newton's step from there is nothing but carries the derivative.
+        hot, around = self.temperatures_after(current, found, *begin)
+        rise = self.heating(self.voltage_winding(current, hot) * current, hot, around)[0]
+        rises = jnp.isfinite(hot) & (rise > 0)
+        found = found - jnp.where(rises, (hot - limit) / jnp.where(rises, rise, 1.0), 0.0)
+        ever = (self.temperature_settled(current) > limit) & (excess(jnp.asarray(_LONG)) > 0)
+        return jnp.where(jnp.asarray(begin[0]) >= limit, 0.0, jnp.where(ever, found, jnp.inf))

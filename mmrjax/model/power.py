@@ -1,0 +1,160 @@
+"""Supply and on-board battery: what voltage reaches the motors, eqs. (8)-(13)."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from mmrjax.model.paper_tables import COULOMB_PER_MAH
+from mmrjax.model.params import Scalar, parameter
+
+__all__ = ["COULOMB_PER_MAH", "Battery"]
+
+
+#: Capacity of the paper's cell [C], whose discharge Table 1 describes.
+CAPACITY = 2200 * COULOMB_PER_MAH
+
+
+class Battery(eqx.Module):
+    """Cells in series, each with a parabola over the share of its capacity that is taken; Tables 1 and A4.
+
+    U_b = n (A q² + B q + U'_b0 - I_b R_b), eqs. (9), (12), (13), with I_b = I_s + I_p, eq. (10), and
+    q = C_b C_n / C: A and B are those of a cell of capacity C_n. The paper's cell has C = C_n, so q = C_b; one of
+    another capacity falls as far over its own.
+    """
+
+    curvature: Scalar = parameter(
+        7e-8 / COULOMB_PER_MAH**2,
+        unit="V/C^2",
+        meaning="A of the cell's no-load voltage, eq. (13)",
+        bounds=(0.0, 1e-6),
+        relative_sd=0.1,
+        source="Table 1: 7e-8 V/mAh^2",
+    )
+    slope: Scalar = parameter(
+        -5e-4 / COULOMB_PER_MAH,
+        unit="V/C",
+        meaning="B of the cell's no-load voltage, eq. (13)",
+        bounds=(-1e-2, 0.0),
+        relative_sd=0.1,
+        source="Table 1: -5e-4 V/mAh",
+    )
+    voltage_full: Scalar = parameter(
+        4.17,
+        unit="V",
+        meaning="no-load voltage of a full cell, eq. (13)",
+        bounds=(0.5, 10.0),
+        relative_sd=0.01,
+        source="Table 1",
+    )
+    resistance: Scalar = parameter(
+        0.049,
+        unit="ohm",
+        meaning="self-resistance of a cell, eq. (12)",
+        bounds=(0.0, 5.0),
+        relative_sd=0.2,
+        source="Table 1 (8 cells: 0.392, Table A4 rounds to 0.4)",
+    )
+    current_other: Scalar = parameter(
+        1.5,
+        unit="A",
+        meaning="current of all other consumers I_p, eq. (10)",
+        bounds=(0.0, 50.0),
+        relative_sd=0.2,
+        source="Table A4",
+    )
+    capacity: Scalar = parameter(
+        CAPACITY,
+        unit="C",
+        meaning="charge at which the battery is empty",
+        bounds=(1.0, 1e6),
+        relative_sd=0.05,
+        source="type designation XP2200SL: 2200 mAh",
+    )
+    capacity_curve: float = eqx.field(default=CAPACITY, static=True)  # C_n, of the cell whose A and B these are [C]
+    cells: int = eqx.field(default=8, static=True)
+    voltage_charge: float = eqx.field(default=4.2, static=True)  # highest of a cell [V], Section 3.3: fully charged
+    voltage_cutoff: float = eqx.field(
+        default=3.0, static=True
+    )  # lowest of a cell [V], usual for Li-Po; not in the paper
+    delay_cutoff: float = eqx.field(default=1.0, static=True)  # how long it may be below [s]; a start draws more
+    current_limit: float | None = eqx.field(default=None, static=True)  # of a cell, discharging [A]
+    current_charge: float | None = eqx.field(default=None, static=True)  # of a cell, charging [A]
+
+    def voltage_no_load(self, discharge: Scalar) -> Scalar:
+        """No-load voltage of one cell [V] after `discharge` [C], eq. (13)."""
+        taken = self._on_curve(discharge)
+        return self.curvature * taken**2 + self.slope * taken + self.voltage_full
+
+    def _on_curve(self, discharge: Scalar) -> Scalar:
+        """Charge at which a cell of capacity C_n has given the same share of its own, q [C]."""
+        return discharge * (self.capacity_curve / self.capacity)
+
+    def rises(self, discharge: Scalar) -> Bool[Array, "..."]:
+        """Whether the no-load voltage rises as the battery discharges further: eq. (13) has turned up."""
+        return jnp.asarray(2 * self.curvature * self._on_curve(discharge) + self.slope > 0)
+
+    def energy(self, discharge: Scalar) -> Scalar:
+        """What the whole battery has given at no-load voltage [J] after `discharge` [C]: the integral of eq. (13)."""
+        taken = self._on_curve(discharge)
+        per_charge = (self.curvature / 3 * taken + self.slope / 2) * taken + self.voltage_full
+        return self.cells * per_charge * discharge
+
+    def current(self, total_current: Scalar) -> Scalar:
+        """Load current of the battery I_b = I_s + I_p [A], eq. (10); also dC_b/dt, eq. (11)."""
+        return total_current + self.current_other
+
+    def voltage_cell(self, total_current: Scalar, discharge: Scalar) -> Scalar:
+        """Voltage of one cell under load [V], eq. (12), for the motors' `total_current` [A]."""
+        return self.voltage_no_load(discharge) - self.current(total_current) * self.resistance
+
+    def voltage(self, total_current: Scalar, discharge: Scalar) -> Scalar:
+        """Voltage of the whole battery U_b [V], eqs. (9), (12), for the motors' `total_current` [A]."""
+        return self.cells * self.voltage_cell(total_current, discharge)
+
+    @property
+    def voltage_empty(self) -> Scalar:
+        """No-load voltage of an empty cell [V]."""
+        return self.voltage_no_load(self.capacity)
+
+    def empty(self, discharge: Scalar) -> Bool[Array, "..."]:
+        """Whether the charge taken [C] has reached the capacity."""
+        return jnp.asarray(discharge >= self.capacity)
+
+
+def cutoff_refused(battery: Battery) -> str | None:
+    """Why no mission can begin on a battery [a sentence without its place]; None: one can. Not traceable."""
+    full = float(battery.voltage_full)
+    if battery.voltage_cutoff < full:
+        return None
+    return (
+        f"got {battery.voltage_cutoff:g} V; expected less than voltage_full, {full:g} V: a full cell would be cut off"
+    )
+
+
+def cutoff_remark(battery: Battery) -> str | None:
+    """What to know of a cut-off that an empty cell is above without load; None of the assumed one. Not traceable."""
+    cutoff, empty, resistance = battery.voltage_cutoff, float(battery.voltage_empty), float(battery.resistance)
+    if cutoff >= empty or cutoff == Battery.voltage_cutoff:
+        return None
+    acts = f"it acts only beyond {(empty - cutoff) / resistance:.3g} A" if resistance > 0 else "it never acts"
+    return f"{cutoff:g} V is below the {empty:.3g} V of an empty cell without load: {acts}"
+
+
+def curve_remark(battery: Battery) -> str | None:
+    """What to know of a parabola (13) that turns up before the battery is empty; None: it falls. Not traceable."""
+    if not bool(battery.rises(battery.capacity)):
+        return None
+    share = -float(battery.slope) / (2 * float(battery.curvature)) / battery.capacity_curve
+    return (
+        f"with this curvature and slope a cell's voltage rises again once {100 * share:.3g} % of its capacity is "
+        f"taken (capacity_curve: {battery.capacity_curve:g} C)"
+    )
+
+
+def voltage_source(
+    battery: Battery, external: Scalar, on_battery: Scalar, total_current: Scalar, discharge: Scalar
+) -> Scalar:
+    """Voltage of the selected source U_e [V], eq. (8): the battery where `on_battery`, else `external`."""
+    return jnp.where(on_battery > 0.5, battery.voltage(total_current, discharge), external)

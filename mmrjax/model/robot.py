@@ -1,0 +1,229 @@
+"""The robot: its drive, its configurations and its effects, one pytree."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mmrjax.model import channels, params
+from mmrjax.model.channels import Channel
+from mmrjax.model.chassis import Chassis
+from mmrjax.model.driver import Driver
+from mmrjax.model.gearbox import Gearbox
+from mmrjax.model.motor import Motor
+from mmrjax.model.paper_tables import RADIUS_PULLEY
+from mmrjax.model.params import Index, Scalar, as_float
+from mmrjax.model.power import Battery
+from mmrjax.model.rig import Rig
+from mmrjax.model.shaft import Shaft
+from mmrjax.undercarriage.running_gear import RunningGear
+
+if TYPE_CHECKING:
+    from mmrjax.effects import Effect
+
+
+#: What the drives of a configuration move: a vehicle's chassis, or a shaft on a bench.
+Load = Chassis | Shaft
+
+
+class Configurations(eqx.Module):
+    """Loads by name, in a fixed order; conditions hold the index of one.
+
+    Attributes:
+        names: in order; members: the loads, all vehicles' or all shafts'.
+        chosen: that of the configuration in hand, within equations of one run (`Robot.within`).
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    members: tuple[Any, ...]  # Load
+    chosen: Any = None  # Load | None
+
+    def __init__(self, by_name: Mapping[str, Load]) -> None:
+        self.names, self.members, self.chosen = tuple(by_name), tuple(by_name.values()), None
+
+    def index(self, name: str) -> int:
+        """Position of a configuration.
+
+        Raises:
+            KeyError: no such configuration; the message lists those that there are.
+        """
+        if name not in self.names:
+            raise KeyError(f"no configuration {name}; the robot has {', '.join(self.names)}")
+        return self.names.index(name)
+
+    def __getitem__(self, name: str) -> Any:
+        return self.members[self.index(name)]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def items(self) -> Iterator[tuple[str, Any]]:
+        """Names with their loads, in order."""
+        return zip(self.names, self.members, strict=True)
+
+
+def _configurations(value: Any) -> Any:
+    return Configurations(value) if isinstance(value, Mapping) else value
+
+
+class Robot(eqx.Module):
+    """Battery, one motor and gearbox per side, a load for each configuration, and effects.
+
+    Attributes:
+        configurations: loads by name, at least one; given as a mapping.
+        effects: terms beyond the paper's model; the empty tuple is the paper's model.
+        sides: how many motors are driven alike; all per-side quantities are of one of them (assumption 3).
+        running_gear: of one side, what the track model needs beside the rest.
+        driver: of the motors.
+        rig: what is imposed on it and what its instruments show.
+    """
+
+    battery: Battery
+    motor: Motor
+    gearbox: Gearbox
+    configurations: Configurations = eqx.field(converter=_configurations)
+    effects: tuple[Effect, ...] = ()
+    sides: Scalar = eqx.field(default=2.0, converter=as_float)
+    running_gear: RunningGear = eqx.field(default_factory=RunningGear)
+    driver: Driver = eqx.field(default_factory=Driver)
+    rig: Rig = eqx.field(default_factory=Rig)
+
+    def __repr__(self) -> str:
+        effects = "".join(f", {e.name}" for e in self.effects)
+        head = f"Robot: {', '.join(self.configurations)}; {params.shown(self.sides)} motors driven alike{effects}"
+        return f"{head}\n{params.table(self)}"
+
+    def for_equations(self) -> Robot:
+        """Without what only files, priors and reports read."""
+        rig, effects = self.rig.for_equations(), tuple(e.for_equations() for e in self.effects)
+        if rig is self.rig and all(a is b for a, b in zip(effects, self.effects, strict=True)):
+            return self
+        return dataclasses.replace(self, rig=rig, effects=effects)
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """Those that its rig's instruments show, in order."""
+        return channels.rows(self.rig.channels)
+
+    def showing_turns(self, columns: Collection[str] | None = None) -> Robot:
+        """With instruments of both sides and of its yaw too; of `columns` those alone that have one there."""
+        own = self.rig.channels
+        read = [c for c in channels.OF_TURNS if (c.settled if columns is None else c.column in columns)]
+        more = [c.name for c in read if c.name not in own]
+        return dataclasses.replace(self, rig=dataclasses.replace(self.rig, channels=(*own, *more)))
+
+    @property
+    def unlike(self) -> tuple[str, ...]:
+        """Names of its effects by which its sides differ; runs that say nothing of either side have none of them."""
+        return tuple(effect.name for effect in self.effects if effect.unlike)
+
+    @property
+    def lacks(self) -> frozenset[str]:
+        """Balances that its loads have not."""
+        return frozenset(self.configurations.members[0].lacks)
+
+    @property
+    def has_ground(self) -> bool:
+        """Whether a ground carries it, on which slope, payload and adhesion act and its movers can slip."""
+        return "ground" not in self.lacks
+
+    def unknown(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Those of some parameters, by dotted name, that are not its own: neither stated nor of its base."""
+        return tuple(name for name in names if name in self.rig.unknown)
+
+    def knows(self, names: Iterable[str]) -> bool:
+        """Whether all of some parameters are its own."""
+        return not self.unknown(names)
+
+    @property
+    def current_continuous(self) -> Scalar:
+        """Current of one motor that its winding bears for long [A]; inf where it is not known how heat leaves it."""
+        return self.motor.current_continuous if self.knows(channels.HEAT) else jnp.inf
+
+    def heating(self, power: Scalar, winding: Scalar, housing: Scalar) -> tuple[Scalar, Scalar]:
+        """Rates of the temperatures of winding and housing [K/s], as of `Motor.heating`; none where it is not known
+        how heat leaves them."""
+        rates = self.motor.heating(power, winding, housing)
+        return rates if self.knows(channels.WARMING) else (jnp.zeros_like(rates[0]), jnp.zeros_like(rates[1]))
+
+    @property
+    def shows_travel(self) -> bool:
+        """Whether anything shows how far it travels: a ground, or a channel of what turns with its shaft."""
+        return self.has_ground or "speed" in self.rig.channels
+
+    @property
+    def loose(self) -> bool:
+        """Whether its load can turn within a backlash, as a body of its own."""
+        return self.rig.loose
+
+    @property
+    def moves_as_one(self) -> bool:
+        """Whether its shafts and its load come to rest at one moment: without a backlash or a ground to slip on."""
+        return not (self.loose or self.has_ground)
+
+    def chassis(self, configuration: Index) -> Any:
+        """The load of the configuration with this index; traceable and batchable."""
+        if self.configurations.chosen is not None:
+            return self.configurations.chosen
+        chosen, *others = self.configurations.members
+        for k, other in enumerate(others, 1):
+            here = jnp.asarray(configuration == k)
+            chosen = jax.tree.map(lambda a, b: jnp.where(here, b, a), chosen, other)  # noqa: B023
+        return chosen
+
+    def within(self, configuration: Index) -> Robot:
+        """This robot in the configuration with this index: its load is chosen here, once, for all equations that ask
+        for it."""
+        if self.configurations.chosen is not None:
+            return self
+        chosen = eqx.tree_at(
+            lambda c: c.chosen, self.configurations, self.chassis(configuration), is_leaf=lambda x: x is None
+        )
+        return dataclasses.replace(self, configurations=chosen)
+
+    @property
+    def radius_pulley(self) -> Scalar:
+        """Pitch radius of the pulleys that carry the belts [m]: the rolling radius of the first configuration on
+        tracks, 48 teeth of 5 mm for a robot that has none."""
+        radius: Scalar = jnp.asarray(RADIUS_PULLEY)
+        for chassis in reversed(self.configurations.members):
+            radius = jnp.where(jnp.asarray(chassis.on_tracks) > 0.5, chassis.radius, radius)
+        return radius
+
+    @property
+    def remembering(self) -> tuple[Effect, ...]:
+        """Its effects whose term depends on the past of the run, in order."""
+        return tuple(effect for effect in self.effects if effect.memory_size is not None)
+
+
+#: Why no torque can be stated on the output of a vehicle.
+NO_BRAKE = "the robot is a vehicle, whose load is its ground, and a brake's torque acts on a shaft"
+
+
+def cannot_turn(robot: Robot, names: Iterable[str]) -> str | None:
+    """Why a robot whose sides are driven apart cannot be computed in these configurations; None where it can."""
+    if not robot.has_ground:
+        return "the robot's load is a shaft, which does not turn over the ground"
+    if float(robot.sides) < 2:
+        return f"got a robot of {float(robot.sides):g} side; expected sides = 2, one motor on each"
+    if robot.rig.imposed == "motor_current":
+        return "the robot's file says that its motors' current is imposed, which says nothing of either side"
+    lacking = [
+        f"{name}.turning.{key} [{unit}]"
+        for name in names
+        if name in robot.configurations
+        for key, unit in (("width", "m"), ("inertia", "kg·m^2"))
+        if not float(getattr(robot.configurations[name].turning, key)) > 0
+    ]
+    return f"{', '.join(lacking)} missing in the robot's file, which a turn needs" if lacking else None

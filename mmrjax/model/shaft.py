@@ -1,0 +1,138 @@
+"""Load on a bench: a shaft with inertia, friction, a constant torque and one that gravity makes of its angle."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mmrjax.model.params import Scalar, parameter
+
+_STATED = "stated by whoever owns the rig"
+#: Of flanks that touch: natural frequency of the two sides on them [Hz], and damping ratio [-].
+MESH_FREQUENCY, MESH_DAMPING = 150.0, 0.4
+
+
+class Shaft(eqx.Module):
+    """J dω/dt = M_r - (M_0 sign ω + K ω) - M_c - m g l sin(θ - θ_0), at the output of one drive.
+
+    One law for bench, winch, screw, pendulum and carriage: a winch has M_c = m g r; a screw of lead p with a carriage
+    of mass m has J = m (p / 2π)² and travels p / 2π a radian. Newton's law for rotation; friction as of the tracks,
+    eq. (24).
+
+    Attributes:
+        speed_rest: of the output, within which friction is smoothed through rest [rad/s].
+        lacks: balances that it has not, as no ground carries it; on_tracks: neither on tracks nor on wheels;
+            mass: of a robot; speed_grip: nothing slides.
+    """
+
+    lacks: ClassVar[frozenset[str]] = frozenset({"ground", "slip", "mass"})
+    on_tracks: ClassVar[float] = 0.0
+    mass: ClassVar[float] = 0.0
+    speed_grip: ClassVar[float] = math.inf
+    inertia: Scalar = parameter(
+        unit="kg·m^2",
+        meaning="inertia J of all that turns with the output of one drive",
+        bounds=(0.0, 1e4),
+        relative_sd=0.2,
+        source=_STATED,
+    )
+    loss_coulomb: Scalar = parameter(
+        unit="N·m",
+        meaning="dry friction torque M_0 at the output",
+        bounds=(0.0, 1e4),
+        relative_sd=0.5,
+        source=_STATED,
+    )
+    loss_viscous: Scalar = parameter(
+        0.0,
+        unit="N·m·s",
+        meaning="viscous friction K at the output",
+        bounds=(0.0, 1e4),
+        relative_sd=0.5,
+        source=_STATED,
+    )
+    torque_constant: Scalar = parameter(
+        0.0,
+        unit="N·m",
+        meaning="torque M_c that acts against forward rotation whatever the speed, as a winch's weight",
+        bounds=(-1e4, 1e4),
+        relative_sd=0.2,
+        source=_STATED,
+    )
+    torque_gravity: Scalar = parameter(
+        0.0,
+        unit="N·m",
+        meaning="largest torque of gravity on an arm m g l",
+        bounds=(0.0, 1e4),
+        relative_sd=0.1,
+        source=_STATED,
+    )
+    angle_zero: Scalar = parameter(
+        0.0,
+        unit="rad",
+        meaning="angle θ_0 at which the arm hangs, from where a run starts",
+        bounds=(-6.3, 6.3),
+        sd=0.05,
+        source=_STATED,
+        scanned=1.0,
+    )
+    backlash: Scalar = parameter(
+        0.0,
+        unit="rad",
+        meaning="backlash of gearbox and couplings at the output, from flank to flank",
+        bounds=(0.0, 1.0),
+        relative_sd=0.3,
+        source=_STATED,
+        scanned=0.0,
+    )
+    radius: Scalar = parameter(
+        1.0,
+        unit="m",
+        meaning="travel per radian of the output: radius of a drum, lead of a screw / 2π",
+        bounds=(1e-6, 10.0),
+        relative_sd=0.005,
+        source=_STATED,
+    )
+    speed_rest: float = eqx.field(default=0.01, static=True)
+
+    @property
+    def speed_still(self) -> Scalar:
+        """Speed within which friction at rest is not resolved [m/s]."""
+        return self.radius * self.speed_rest
+
+    def torque_loss(self, speed: Scalar, direction: Scalar) -> Scalar:
+        """Friction torque M_0 sign ω + K ω [N·m] at `speed` [rad/s] and its `direction` (-1..1)."""
+        return self.loss_coulomb * direction + self.loss_viscous * speed
+
+    def torque_mesh(self, gap: Scalar, closing: Scalar, inertia_motor: Scalar) -> Scalar:
+        """Torque that the flanks carry [N·m], none while they do not touch.
+
+        k s + d ds/dt over the compression s beyond half the backlash, never pulling (a dead zone with compliance:
+        Nordin and Gutman, Controlling mechanical systems with backlash, Automatica 38 (2002) 1633). How stiff the
+        flanks are does not show in what a rig samples: they swing at `MESH_FREQUENCY`, damped by `MESH_DAMPING`.
+
+        Args:
+            gap: of the output's motor side ahead of the load, from the middle [rad]; closing: its rate [rad/s].
+            inertia_motor: of the motor side at the output [kg·m²].
+        """
+        inertia = inertia_motor * self.inertia / (inertia_motor + self.inertia)
+        omega = 2 * jnp.pi * MESH_FREQUENCY
+        ahead = jnp.maximum(gap - 0.5 * self.backlash, 0.0)
+        behind = jnp.minimum(gap + 0.5 * self.backlash, 0.0)
+        damping = 2 * MESH_DAMPING * omega * inertia * closing
+        # Damping sets in over a tenth of the backlash, so that the torque has no jump where flanks meet.
+        full = 0.1 * self.backlash + 1e-4
+        push = jnp.maximum(omega**2 * inertia * ahead + damping * jnp.minimum(ahead / full, 1.0), 0.0)
+        pull = jnp.minimum(omega**2 * inertia * behind + damping * jnp.minimum(-behind / full, 1.0), 0.0)
+        return push + pull
+
+    def torque_weight(self, mass: Scalar, slope: Scalar) -> Scalar:
+        """Torque of gravity at rest against forward rotation [N·m], whatever the mass and slope of a vehicle."""
+        return self.torque_load(0.0)
+
+    def torque_load(self, angle: Scalar) -> Scalar:
+        """Torque that acts against forward rotation M_c + m g l sin(θ - θ_0) [N·m]."""
+        return self.torque_constant + self.torque_gravity * jnp.sin(angle - self.angle_zero)

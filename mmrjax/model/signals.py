@@ -1,0 +1,236 @@
+"""What flows between the rooms: the state, the signals of one instant, and the result of a run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from mmrjax.model.params import Index, Scalar
+
+GRAVITY = 9.80665  # [m/s²], standard gravity
+
+#: Outcomes of one member of a batch, in the order of their codes.
+STATUSES = (
+    "converged", "stalled", "slides", "not_settled", "battery_empty", "failed", "tips", "reverses", "rolls_back",
+    "cut_off",
+)  # fmt: skip
+CONVERGED, STALLED, SLIDES, NOT_SETTLED, BATTERY_EMPTY, FAILED, TIPS, REVERSES, ROLLS_BACK, CUT_OFF = range(
+    len(STATUSES)
+)
+
+#: Statuses of a run that ended as its conditions ask: `reverses` travels backward since its voltage is negative.
+DONE = (CONVERGED, REVERSES)
+
+#: Limits that a run may exceed; that it slides on average though it goes on steadily; that it leaves the ground at
+#: times. Bit k of `Result.flags` is the k-th name; `winding_hot` is after long running at this current, `too_hot`
+#: what a mission really reaches.
+FLAGS = (
+    "motor_overspeed", "gearbox_overspeed", "winding_hot", "slips", "jumps", "overvoltage", "cut_off",
+    "battery_overcurrent", "current_limited", "gearbox_overload", "too_hot", "demand_missed",
+    "voltage_rising", "current_returned",
+)  # fmt: skip
+
+
+#: A quantity that the balances have not computed yet.
+UNSET = math.nan
+
+
+class State(eqx.Module):
+    """What a run remembers, per side of the chassis (the sides are alike, assumption 3).
+
+    Attributes:
+        current: current of one motor I_d [A].
+        speed_motor: motor shaft speed [rad/s].
+        speed: speed of the robot along the slope V [m/s].
+        discharge: charge taken from the battery C_b [C].
+        memory: of each effect that has one, by the effect's name, in its own unit; empty where none is kept.
+        temperature: of the winding [°C], whose resistance follows it; None: not followed, resistance as stated.
+        distance: travelled since the start of the run [m]; read where a load depends on its angle.
+        gap: of the output's motor side ahead of the load within the backlash, from its middle [rad]; None: rigid.
+    """
+
+    current: Scalar
+    speed_motor: Scalar
+    speed: Scalar
+    discharge: Scalar
+    memory: Mapping[str, Scalar] = eqx.field(default_factory=dict)
+    temperature: Scalar | None = None
+    distance: Scalar = 0.0
+    gap: Scalar | None = None
+
+
+class PlaneMotion(eqx.Module):
+    """What a run of a robot that turns remembers: of each side, left and right, and of the robot in the plane.
+
+    Attributes:
+        current: of one motor of each side [A], shape (2,); speed_motor: motor shaft speeds [rad/s], shape (2,).
+        speed, speed_lateral: of the centre of mass, ahead and to the left [m/s]; yaw_rate: to the left [rad/s].
+        heading: from uphill, to the left [rad]; place_x, place_y: uphill of the start, and to the left of it [m].
+        discharge: charge taken from the battery C_b [C].
+        memory: of each effect that has one, by its name, shape (2,).
+        temperature: of the windings of each side [°C], shape (2,); None: not followed.
+    """
+
+    current: Scalar
+    speed_motor: Scalar
+    speed: Scalar
+    speed_lateral: Scalar
+    yaw_rate: Scalar
+    heading: Scalar
+    place_x: Scalar
+    place_y: Scalar
+    discharge: Scalar
+    memory: Mapping[str, Scalar] = eqx.field(default_factory=dict)
+    temperature: Scalar | None = None
+
+
+class Signals(eqx.Module):
+    """Every quantity of one instant, filled in order by `balances`; per side unless `total` is said.
+
+    A field is `UNSET` until the balance that computes it has run.
+    """
+
+    # conditions and state
+    configuration: Index = 0  # index
+    on_tracks: Scalar = UNSET  # 1 on tracks, 0 on wheels
+    slope: Scalar = UNSET
+    payload: Scalar = UNSET
+    adhesion: Scalar = UNSET
+    battery: Scalar = UNSET  # 1 where the on-board battery feeds the motors
+    discharge: Scalar = UNSET
+    order: Scalar = UNSET  # place in the sequence of runs [-]
+    load_torque: Scalar | None = None  # of a brake on the output, against forward rotation [N·m]
+    memory: Mapping[str, Scalar] = eqx.field(default_factory=dict)  # of effects, by name; empty: settled
+    current: Scalar = UNSET  # I_d of one motor [A]
+    speed_motor: Scalar = UNSET  # [rad/s]
+    speed: Scalar = UNSET  # V of the robot [m/s]
+    temperature: Scalar | None = None  # of the winding, where it is followed [°C]
+    # of the robot in the plane of the ground; of one that travels straight nothing
+    side: Scalar = 0.0  # 1 of the left side, -1 of the right one [-]
+    speed_lateral: Scalar = 0.0  # v_y to the left [m/s]
+    yaw_rate: Scalar = 0.0  # ω, positive to the left [rad/s]
+    direction_turn: Scalar = 0.0  # way round, -1..1, positive to the left [-]
+    moment_lateral: Scalar = 0.0  # of the lateral forces about the centre of mass, positive to the left [N·m]
+    heading: Scalar = 0.0  # ψ from uphill, positive to the left [rad]
+    place_x: Scalar = 0.0  # uphill of where the run started [m]
+    place_y: Scalar = 0.0  # to the left of that [m]
+    # kinematics
+    direction: Scalar = UNSET  # of the shafts, -1..1, 0 at rest [-]
+    direction_travel: Scalar = UNSET  # of the robot, -1..1 [-]
+    speed_wheel: Scalar = UNSET  # of driving wheel or pulley [rad/s]
+    speed_theoretical: Scalar = UNSET  # r_k ω_k, eq. (32) [m/s]
+    speed_output: Scalar = UNSET  # of the load's side of the output, within a backlash not the wheel's [rad/s]
+    angle: Scalar = UNSET  # of the output since the start of the run, of a load on a shaft [rad]
+    # mass
+    mass: Scalar = UNSET  # total M [kg]; to effects of balance `mass`, the stated one
+    normal: Scalar = UNSET  # normal load of one side [N]
+    # supply and electrical
+    duty: Scalar = UNSET  # D of the driver, its limit seen to [-]
+    pause: Scalar = UNSET  # share of a period without a pulse, 1 - |D|; 0 where the motors are open or shorted [-]
+    share_drawn: Scalar = UNSET  # of the motors' current, from the supply [-]
+    total_current: Scalar = UNSET  # D I of all motors, from the supply I_s, eq. (10) [A]
+    voltage_source: Scalar = UNSET  # of battery or external supply, eq. (8) [V]
+    voltage: Scalar = UNSET  # U_e at the motors [V]
+    voltage_back: Scalar = UNSET  # E, eq. (16) [V]
+    voltage_drop: Scalar = UNSET  # I R and every further drop [V]
+    voltage_left: Scalar = UNSET  # drives L dI/dt, eq. (15) [V]
+    inductance: Scalar = UNSET  # L_d of the armature circuit, eq. (15) [H]
+    # motor
+    torque_electromagnetic: Scalar = UNSET  # C_m I, eq. (17) [N·m]
+    torque_motor_loss: Scalar = UNSET  # M_df, eq. (14) [N·m]
+    torque_motor: Scalar = UNSET  # M_d, eq. (18), before the armature takes its share [N·m]
+    # ground and slip
+    resistance: Scalar = UNSET  # motion resistance F_f, eq. (5) [N]
+    gravity: Scalar = UNSET  # m_i g sin(slope) [N]
+    demand: Scalar = UNSET  # traction that holds the speed constant [N]
+    speed_slip_terms: Scalar = UNSET  # slip that is not sliding (effects) [m/s]
+    speed_sliding: Scalar = UNSET  # of the contact patch over the ground [m/s]
+    traction: Scalar = UNSET  # P_t [N]
+    adhesion_limit: Scalar = UNSET  # largest traction of the friction law [N]
+    # track and gearbox
+    torque_track_loss: Scalar = UNSET  # eq. (24), (26) at the pulley [N·m]
+    inertia_added: Scalar = UNSET  # by effects, of one side at the driving wheel [kg·m²]
+    torque_load: Scalar = UNSET  # all that the gearbox output carries, inertia apart [N·m]
+    efficiency_load: Scalar = UNSET  # η_rm, or 1/η_rm where power flows back [-]
+    torque_idle: Scalar = UNSET  # M_rf_idle at the gearbox input, eq. (20) [N·m]
+    torque_input: Scalar = UNSET  # into the gearbox, the armature's share taken off [N·m]
+    torque_gear: Scalar = UNSET  # M_r, eq. (23) [N·m]
+    torque_output: Scalar = (
+        UNSET  # that, less what effects of the gearbox take: what a meter at the output reads [N·m]
+    )
+    torque_net: Scalar = UNSET  # drives the rotating masses, at the pulley [N·m]
+    # motion
+    acceleration_wheel: Scalar = UNSET  # [rad/s²]
+    acceleration: Scalar = UNSET  # of the robot [m/s²]
+
+
+class Result(eqx.Module):
+    """One settled operating point (or the end of a run), with its status.
+
+    Attributes:
+        reading: what the instruments show [SI], by the name of the channel (`channels.EVERY`); each is an
+            attribute too: `result.total_current`.
+        theoretical_speed: r_k ω_k, eq. (32) [m/s].
+        slip: 1 - V / V_theoretical, eq. (33) [-]; 0 at rest.
+        voltage: at the motors [V].
+        mass: total [kg].
+        traction: of both sides [N].
+        adhesion_used: size of the demand over the largest traction of the friction law [-]; above 1 the robot slides.
+        power_supply: P_e taken by the motors [W].
+        power_motor: N_d at the motor shafts [W].
+        power_gear: N_r at the gearbox outputs [W].
+        power_ground: N_t from the movers to the ground [W].
+        power_lift: against gravity [W].
+        efficiency_motor, efficiency_gear, efficiency_chassis: N_d/P_e, N_r/N_d, N_t/N_r [-]; 0 at rest
+            and where power does not flow that way.
+        winding_settled: after long running at this current [°C]; inf where none settles.
+        voltage_cell: of one cell of the battery [V]; 0 on the external supply.
+        status: code into `STATUSES`.
+        flags: bit mask over `FLAGS`.
+    """
+
+    reading: Mapping[str, Scalar]
+    theoretical_speed: Scalar
+    slip: Scalar
+    voltage: Scalar
+    mass: Scalar
+    traction: Scalar
+    adhesion_used: Scalar
+    power_supply: Scalar
+    power_motor: Scalar
+    power_gear: Scalar
+    power_ground: Scalar
+    power_lift: Scalar
+    efficiency_motor: Scalar
+    efficiency_gear: Scalar
+    efficiency_chassis: Scalar
+    winding_settled: Scalar
+    voltage_cell: Scalar
+    status: Int[Array, "..."]
+    flags: Int[Array, "..."]
+
+    def __getattr__(self, name: str) -> Any:
+        reading = self.__dict__.get("reading")
+        if isinstance(reading, dict) and name in reading:
+            return reading[name]
+        raise AttributeError(f"{type(self).__name__} has no {name}")
+
+
+def done(status: Any) -> Any:
+    """Whether runs ended as their conditions ask, by their codes: an operating point with numbers."""
+    return (status == CONVERGED) | (status == REVERSES)
+
+
+def quotient(part: Scalar, whole: Scalar) -> Float[Array, "..."]:
+    """part / whole, and 0 with a finite derivative where `whole` is 0 (at rest)."""
+    moving = jnp.abs(whole) > 1e-9
+    return jnp.where(moving, part / jnp.where(moving, whole, 1.0), 0.0)
+
+
+#: Names of what every point has beside its numbers: code into `STATUSES`, bit mask over `FLAGS`.
+CODES = ("status", "flags")

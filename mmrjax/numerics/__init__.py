@@ -1,0 +1,1 @@
+"""Numerical methods written out for small problems in large batches."""

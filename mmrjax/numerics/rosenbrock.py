@@ -1,0 +1,125 @@
+"""The stages of Rodas4, a stiff method for small autonomous ODEs that solves linear systems only.
+
+Source: Hairer and Wanner, Solving Ordinary Differential Equations II (1996), Section IV.7, RODAS.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.numerics.linear_equations import inverse
+
+_GAMMA = 0.25
+_A = (
+    (1.544000000000000,),
+    (0.9466785280815826, 0.2557011698983284),
+    (3.314825187068521, 2.896124015972201, 0.9986419139977817),
+    (1.221224509226641, 6.019134481288629, 12.53708332932087, -0.6878860361058950),
+)
+_C = (
+    (-5.668800000000000,),
+    (-2.430093356833875, -0.2063599157091915),
+    (-0.1073529058151375, -9.594562251023355, -20.47028614809616),
+    (7.496443313967647, -10.24680431464352, -33.99990352819905, 11.70890893206160),
+    (8.083246795921522, -7.981132988064893, -31.52159432874371, 16.31930543123136, -6.058818238834054),
+)
+
+
+def norm(error: Float[Array, " unknowns"], own: int, weight: float | np.ndarray = 1.0) -> Scalar:
+    """Root mean square of an error of the robot's `own` unknowns; memories add to it and never dilute it."""
+    return jnp.sqrt(jnp.sum(weight * error**2) / own)
+
+
+def norm_of_sides(error: Float[Array, " unknowns"], whole: slice, own: int) -> Scalar:
+    """The same where both sides have unknowns but those of the `whole` robot: a pair counts as one, so that steps are
+    those of the `own` unknowns of straight travel where sides are alike."""
+    weight = np.full(error.shape[0], 0.5)
+    weight[whole] = 1.0
+    return norm(error, own, weight)
+
+
+def step_longest(robot: Robot, conditions: Conditions) -> Array | None:
+    """The longest step that still resolves every effect with a memory [s]; None where none has one."""
+    limits = [jnp.asarray(effect.step_longest(robot, conditions)) for effect in robot.remembering]
+    return jax.lax.stop_gradient(jnp.min(jnp.stack(limits))) if limits else None
+
+
+def stages(
+    rates: Callable[[Array], tuple[Array, Array]],
+    y0: Float[Array, " n"],
+    q0: Float[Array, " m"],
+    h: Array,
+    looped: bool = False,
+) -> tuple[Array, Array, Array | list[Array], Array | list[Array]]:
+    """One step over `h`, with integrals that do not act back on what they are integrals of.
+
+    The equations of the integrals q' = g(y) need no system to be solved: their part of the matrix is triangular.
+
+    Args:
+        rates: f(y) and g(y).
+        looped: hold `rates` once for all stages but the first: a program that compiles in less time.
+
+    Returns:
+        y and q at the end of the step, and the stages of both; the last stage estimates the error.
+    """
+
+    def both(y: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        found = rates(y)
+        return found, found
+
+    (jacobian, jacobian_q), (f, g) = jax.jacfwd(both, has_aux=True)(y0)
+    # A pivot that vanishes spoils the step, which the control of the error then rejects: a shorter one makes the
+    # diagonal dominate.
+    inverted = inverse(jnp.eye(y0.shape[0], dtype=y0.dtype) / (h * _GAMMA) - jacobian)[0]
+    u, v, y, q = [inverted @ f], [], y0, q0
+    v.append(h * _GAMMA * (g + jacobian_q @ u[0]))
+    if looped:
+        return _looped(rates, inverted, jacobian_q, y0, q0, h, u[0], v[0])
+    for stage in range(1, 6):
+        y = y + u[-1] if stage == 5 else y0 + sum(a * x for a, x in zip(_A[stage - 1], u, strict=True))
+        q = q + v[-1] if stage == 5 else q0 + sum(a * x for a, x in zip(_A[stage - 1], v, strict=True))
+        f, g = rates(y)
+        u.append(inverted @ (f + sum(c * x for c, x in zip(_C[stage - 1], u, strict=True)) / h))
+        v.append(
+            h * _GAMMA * (g + sum(c * x for c, x in zip(_C[stage - 1], v, strict=True)) / h + jacobian_q @ u[-1])
+        )
+    return y + u[-1], q + v[-1], u, v
+
+
+def _looped(
+    rates: Callable[[Array], tuple[Array, Array]],
+    inverted: Array,
+    jacobian_q: Array,
+    y0: Array,
+    q0: Array,
+    h: Array,
+    first: Array,
+    first_q: Array,
+) -> tuple[Array, Array, Array, Array]:
+    """The stages after the first, see `stages`, one after the other by one loop."""
+    reach = np.zeros((5, 6))  # of the second stage to the sixth, which begins where the fifth ends
+    for row, weights in enumerate((*_A, (*_A[-1], 1.0))):
+        reach[row, : len(weights)] = weights
+    turns = np.zeros((5, 6))
+    for row, weights in enumerate(_C):
+        turns[row, : len(weights)] = weights
+
+    def stage(k: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
+        u, v = found
+        a, c = jnp.asarray(reach)[k], jnp.asarray(turns)[k]
+        f, g = rates(y0 + a @ u)
+        now = inverted @ (f + (c @ u) / h)
+        return u.at[k + 1].set(now), v.at[k + 1].set(h * _GAMMA * (g + (c @ v) / h + jacobian_q @ now))
+
+    begun = [jnp.zeros((6, *x.shape), x.dtype).at[0].set(x) for x in (first, first_q)]
+    u, v = jax.lax.fori_loop(0, 5, stage, (begun[0], begun[1]))
+    last = jnp.asarray(reach)[4].at[5].set(1.0)
+    return y0 + last @ u, q0 + last @ v, u, v

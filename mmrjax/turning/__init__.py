@@ -1,0 +1,1 @@
+"""Robots whose sides are driven apart."""

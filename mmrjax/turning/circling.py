@@ -1,0 +1,491 @@
+"""Robots whose sides are driven apart: circling as a root, and turning over time, of the same equations.
+
+Both are parts of the fidelities `steady` and `drive`, which come here where conditions say more of one side
+(`Conditions.turns`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from mmrjax.compile.compiling import compiled
+from mmrjax.effects.base import Effect
+from mmrjax.fidelities import rest
+from mmrjax.fidelities.rest import SHARE, TIME, voltage_at_rest
+from mmrjax.fidelities.result import efficiency, known, result, withhold
+from mmrjax.model import balances, ground
+from mmrjax.model.chassis import Chassis
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import (
+    BATTERY_EMPTY,
+    CONVERGED,
+    FAILED,
+    GRAVITY,
+    NOT_SETTLED,
+    STALLED,
+    TIPS,
+    PlaneMotion,
+    Result,
+    Signals,
+    State,
+)
+from mmrjax.numerics import lanes
+from mmrjax.numerics.linear_equations import inverse
+from mmrjax.numerics.rosenbrock import norm_of_sides
+from mmrjax.turning.two_sides import SIDES
+
+# Units of the unknowns: currents, motor speeds, speed, lateral speed, yaw rate; heading, place; discharge.
+_UNITS = (10.0, 10.0, 1000.0, 1000.0, 1.0, 1.0, 10.0, 1.0, 1.0, 1.0, 10.0)
+#: Of the whole robot, in the order of the unknowns, after the currents and the motor speeds.
+_OF_ROBOT = ("speed", "speed_lateral", "yaw_rate", "heading", "place_x", "place_y", "discharge")
+#: Unknowns of a robot that travels straight.
+OF_STRAIGHT = 5
+#: Unknowns that settle on level ground.
+SETTLING = 7
+
+#: Of the first search for a settled turn: by how much an unknown is moved to look along it, a change so small that
+#: it has ended [units]; looks after which it is given up; and how far the last step may be from where it ended.
+ALONG, NEAR, SOON, CLOSE = 1e-6, 1e-7, 60, 1e-6
+#: Of the second: implicit Euler's first step, its shortest and longest [s]; by what the next is longer, and shorter
+#: where the rates grew by more than `WORSE`, or an unknown changed by more than `FAR` units. The shortest is taken
+#: whatever the rates do: it follows the run, along which they may grow, as where friction or the gearbox's flow of
+#: power turns round.
+FIRST, SHORTEST, LONGEST, LONGER, SHORTER, WORSE, FAR = 0.05, 1e-4, 1e9, 3.0, 0.25, 1.05, 0.1
+#: So many are followed at once, as few members of a batch need it.
+FEW = 32
+#: It has ended at a change so small where the rates are small too [1/s] or the step is long [s]; and failed after so
+#: many.
+SMALL, SMALL_RATE, LONG, TURNS = 1e-9, 1e-7, 10.0, 200
+
+
+def _kept(robot: Robot, size: int) -> tuple[Effect, ...]:
+    """The effects of which so many unknowns hold a memory: all that have one, or none, which are then settled."""
+    return robot.remembering if size > len(_UNITS) else ()
+
+
+def _units(kept: tuple[Effect, ...]) -> Array:
+    return jnp.asarray((*_UNITS, *(size for e in kept for size in (e.memory_size or 1.0,) * 2)))
+
+
+def motion_of(robot: Robot, y: Float[Array, " unknowns"]) -> PlaneMotion:
+    """The motion that a vector of unknowns stands for."""
+    kept = _kept(robot, y.shape[0])
+    y = y * _units(kept).astype(y.dtype)
+    memory = {e.name: y[len(_UNITS) + 2 * k :][:2] for k, e in enumerate(kept)}
+    return PlaneMotion(y[:2], y[2:4], y[4], y[5], y[6], y[7], y[8], y[9], y[10], memory)
+
+
+_turning = compiled(balances.turning)
+
+
+@compiled
+def rates(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+    """Rates of the unknowns, in their units [1/s]; those of a motor whose speed is imposed are 0."""
+    return _rates(robot, conditions, y, _turning(robot, conditions, motion_of(robot, y)))
+
+
+def _rates(robot: Robot, conditions: Conditions, y: Array, travel: balances.Travel) -> Array:
+    motion, kept = motion_of(robot, y), _kept(robot, y.shape[0])
+    signals = travel.signals
+    free = conditions.of_sides().motor_speed is None
+    cos, sin = jnp.cos(motion.heading), jnp.sin(motion.heading)
+    found = [
+        *jnp.asarray(free * signals.voltage_left / signals.inductance),
+        *jnp.asarray(free * signals.acceleration_wheel * robot.gearbox.ratio),
+        travel.acceleration,
+        travel.acceleration_lateral,
+        travel.acceleration_yaw,
+        motion.yaw_rate,
+        motion.speed * cos - motion.speed_lateral * sin,
+        motion.speed * sin + motion.speed_lateral * cos,
+        balances.charge_drawn(robot, conditions, jnp.asarray(signals.total_current)[0]),
+    ]
+    for effect in kept:
+        found.extend(jax.vmap(lambda s, effect=effect: effect.rate(robot, s))(signals))
+    return jnp.stack([jnp.asarray(x, y.dtype) for x in found]) / _units(kept).astype(y.dtype)
+
+
+def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[Array, " unknowns"]:
+    """At rest, headed as the conditions say; or settled in its turn, at rest where there is none. Motors turn where
+    their speed is imposed."""
+    heading = 0.0 if conditions.heading_deg is None else jnp.radians(conditions.heading_deg)
+    size, own = _units(robot.remembering), conditions.of_sides()
+    y = jnp.zeros_like(size).at[7].set(heading).at[10].set(conditions.discharge)
+    if own.motor_speed is not None:
+        y = y.at[2:4].set(own.motor_speed)
+    if not rolling:
+        return y / size
+    unknowns, solved = _unknowns(robot, conditions)
+    settled, loads = _motion(robot, conditions, unknowns)
+    signals = balances.turning(robot, conditions, settled, loads).signals
+    memory = [jax.vmap(lambda s, e=e: e.settled(robot, s))(signals) for e in robot.remembering]
+    flat = [settled.current, settled.speed_motor, *(jnp.reshape(getattr(settled, name), 1) for name in _OF_ROBOT)]
+    rolls = jnp.concatenate([*flat, *memory]).at[7].set(y[7])
+    return jnp.where(solved & jnp.all(jnp.isfinite(rolls)), rolls, y) / size
+
+
+# --- circling
+
+
+def _guess(robot: Robot, conditions: Conditions) -> Float[Array, " 11"]:
+    """Motors near their no-load speed, the robot turning as one twice as wide that does not slip."""
+    own, chassis = conditions.of_sides(), robot.chassis(conditions.configuration)
+    shafts = 0.9 * jax.vmap(lambda c: voltage_at_rest(robot, c))(own) / robot.motor.torque_constant
+    if own.motor_speed is not None:
+        shafts = own.motor_speed
+    speeds = chassis.radius * shafts / robot.gearbox.ratio
+    turn = (speeds[1] - speeds[0]) / (2 * chassis.turning.width)
+    y = jnp.zeros(len(_UNITS)).at[2:4].set(shafts).at[4].set(jnp.mean(speeds)).at[6].set(turn)
+    return y.at[10].set(conditions.discharge) / jnp.asarray(_UNITS)
+
+
+class _Secant(eqx.Module):
+    """A search for a settled turn by Broyden's method.
+
+    Attributes:
+        y: those of the unknowns that settle, and the loads; rates: what `_balance` gives there.
+        inverse: of minus its Jacobian, as it is known so far.
+        looks: how often `_balance` was asked; solved: whether the search has ended.
+    """
+
+    y: Float[Array, " 9"]
+    rates: Float[Array, " 9"]
+    inverse: Float[Array, "9 9"]
+    looks: Scalar
+    solved: Array
+
+
+class _Linear(eqx.Module):
+    """`_balance` where a search has ended.
+
+    Attributes:
+        jacobian: of `_balance`; sound: whether that is a turn, and a stable one; known: whether this is known yet.
+    """
+
+    jacobian: Float[Array, "9 9"]
+    sound: Array
+    known: Array
+
+
+class _Search(eqx.Module):
+    """A search for a settled turn along a run.
+
+    Attributes:
+        y: those of the unknowns that settle, and the loads; rates: what `_balance` gives; jacobian: of these by y.
+        step: length of the next step [s]; turns: steps taken; solved: whether it has ended well.
+    """
+
+    y: Float[Array, " 9"]
+    rates: Float[Array, " 9"]
+    jacobian: Float[Array, "9 9"]
+    step: Scalar
+    turns: Scalar
+    solved: Array
+
+
+def _balance(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> Float[Array, " 9"]:
+    """Rates of the unknowns that settle [1/s], and minus what the loads are too large by."""
+    travel = _turning(robot, conditions, *_motion(robot, conditions, y))
+    return _left(robot, conditions, y, travel)
+
+
+def _left(robot: Robot, conditions: Conditions, y: Float[Array, " 9"], travel: balances.Travel) -> Float[Array, " 9"]:
+    """`_balance` where all that both sides do is known."""
+    lacking = travel.grip.lacking / _load_units(robot, conditions)
+    return jnp.concatenate([_rates(robot, conditions, _whole(conditions, y), travel)[:SETTLING], -lacking])
+
+
+def _whole(conditions: Conditions, y: Float[Array, " 9"]) -> Float[Array, " 11"]:
+    """All unknowns of a robot that has not moved from its place."""
+    charge = jnp.zeros(len(_UNITS) - SETTLING).at[-1].set(conditions.discharge / _UNITS[-1])
+    return jnp.concatenate([y[:SETTLING], charge])
+
+
+def _turning_round(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> Float[Array, " 4"]:
+    """The speeds with whose sign friction turns round, of both sides and of their movers, over that within which it
+    does [-]."""
+    chassis = robot.chassis(conditions.configuration)
+    _, shafts, ahead, _, yaw = jnp.split(y[:SETTLING] * jnp.asarray(_UNITS[:SETTLING]), [2, 4, 5, 6])
+    sides, movers = ahead - yaw * SIDES * chassis.turning.width, shafts * chassis.radius / robot.gearbox.ratio
+    return jnp.concatenate([sides, movers]) / chassis.speed_still
+
+
+def _share(robot: Robot, conditions: Conditions, y: Array, step: Array) -> Scalar:
+    """Share of a step that goes no farther than `FAR`, nor beyond where friction turns round."""
+    share = jnp.minimum(1.0, FAR / jnp.max(jnp.abs(step[:SETTLING])))
+    now, then = (_turning_round(robot, conditions, at) for at in (y, y + share * step))
+    across = (now * then < 0) & (jnp.minimum(jnp.abs(now), jnp.abs(then)) > 1)
+    return share * jnp.min(jnp.where(across, now / jnp.where(across, now - then, 1.0), 1.0))
+
+
+def _load_units(robot: Robot, conditions: Conditions) -> Float[Array, " 2"]:
+    """Units of the load that moves to a side [N] and of the centre of pressure [m]."""
+    return jnp.stack([robot.chassis(conditions.configuration).mass * GRAVITY, robot.running_gear.wheelbase])
+
+
+def _loads(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> Float[Array, " 2"]:
+    return y[SETTLING:] * _load_units(robot, conditions)
+
+
+def _moves(conditions: Conditions) -> np.ndarray:
+    """True for the unknowns of a search, False for imposed speeds and their currents; shape (9,)."""
+    return np.arange(SETTLING + len(SIDES)) >= (0 if conditions.of_sides().motor_speed is None else 4)
+
+
+def _begins(robot: Robot, conditions: Conditions) -> Float[Array, " 9"]:
+    """Unknowns where a search begins; imposed speeds keep these values."""
+    return jnp.concatenate([_guess(robot, conditions)[:SETTLING], jnp.zeros(len(SIDES))])
+
+
+def _unknowns(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 9"], Bool[Array, ""]]:
+    """The unknowns of a settled turn on level ground, see `_Search`, and whether it was found.
+
+    Broyden's method, which looks along each unknown first, finds most. Where it does not end, or at a turn that is
+    not stable, implicit Euler's steps, longer and longer, follow a run to where it settles. Only the shortest of them
+    may let the rates grow. The last step is Newton's and carries the derivatives, the implicit ones.
+    """
+    moves = _moves(conditions)
+    size = len(moves)
+    still, slow = -np.eye(size), np.diag(np.arange(size) < SETTLING)
+
+    def guess(held: tuple[Robot, Conditions]) -> Float[Array, " 9"]:
+        return _begins(*held)
+
+    def secant(held: tuple[Robot, Conditions]) -> _Secant:
+        start = guess(held)
+        return _Secant(start, jnp.zeros_like(start), jnp.eye(size), jnp.asarray(0), jnp.asarray(False))
+
+    def look(held: tuple[Robot, Conditions], search: _Secant) -> _Secant:
+        """At where it begins, then along each unknown from there, then where the secants lead."""
+        aside = search.looks <= size
+        step = (search.inverse * search.rates).sum(-1)
+        taken = step * _share(*held, search.y, step)
+        taken = jnp.where(aside, ALONG * (np.arange(size) == search.looks - 1), taken)
+        found = _balance(*held, search.y + taken)
+        found = jnp.where(moves, found, guess(held) - search.y - taken)
+        gone = search.inverse @ (search.rates - found)
+        row = taken @ search.inverse
+        change = jnp.outer(taken - gone, row) / (taken @ gone)
+        inverse = jnp.where(
+            (search.looks > 0) & jnp.all(jnp.isfinite(change)), search.inverse + change, search.inverse
+        )
+        y = jnp.where(aside, search.y, search.y + taken)
+        rates = jnp.where(aside & (search.looks > 0), search.rates, found)
+        return _Secant(y, rates, inverse, search.looks + 1, ~aside & (jnp.max(jnp.abs(step)) < NEAR))
+
+    def around(robot: Robot, conditions: Conditions, y: Array) -> tuple[Array, Array]:
+        """The Jacobian of `_balance`, and itself; what does not move has no equation of its own."""
+        slope, found = jax.jacfwd(lambda y: (_balance(robot, conditions, y),) * 2, has_aux=True)(y)
+        return jnp.where(moves[:, None], slope, still), found
+
+    def unknown(_: tuple[Robot, Conditions, Array, Array]) -> _Linear:
+        return _Linear(jnp.asarray(still), jnp.asarray(False), jnp.asarray(False))
+
+    def linear(held: tuple[Robot, Conditions, Array, Array], _: _Linear) -> _Linear:
+        y, solved = held[2:]
+        slope, found = around(*held[:2], y)
+        inverted, determinant = inverse(-slope)
+        close = jnp.max(jnp.abs(inverted @ found)) < CLOSE
+        return _Linear(slope, solved & close & (determinant > 0), jnp.asarray(True))
+
+    def follow(held: tuple[Robot, Conditions, Array, _Linear]) -> _Search:
+        """Its first step goes nowhere: it only looks round."""
+        y, known = held[2:]
+        y = jnp.where(known.sound, y, guess(held[:2]))
+        first, turns = jnp.asarray(FIRST), jnp.asarray(0)
+        return _Search(y, jnp.zeros_like(y), jnp.where(known.sound, known.jacobian, still), first, turns, known.sound)
+
+    def turn(held: tuple[Robot, Conditions, Array, _Linear], search: _Search) -> _Search:
+        step = inverse(jnp.asarray(slow) / search.step - search.jacobian)[0] @ search.rates
+        largest, next_y = jnp.max(jnp.abs(step)), search.y + step
+        slope, found = around(*held[:2], next_y)
+        before, after = jnp.linalg.norm(search.rates), jnp.linalg.norm(found)
+        worse = (~(after <= WORSE * before + SMALL) | (largest > FAR)) & (search.turns > 0)
+        worse &= search.step > SHORTEST
+        ended = ~worse & (largest < SMALL) & ((search.step > LONG) | (after < SMALL_RATE))
+        y, found, slope = (
+            jnp.where(worse, old, new)
+            for old, new in ((search.y, next_y), (search.rates, found), (search.jacobian, slope))
+        )
+        length = jnp.clip(search.step * jnp.where(worse, SHORTER, LONGER), SHORTEST, LONGEST)
+        return _Search(y, found, slope, length, search.turns + 1, ended)
+
+    held = robot, conditions
+    first = lanes.until(secant, look, lambda s: (s.looks >= SOON) | s.solved, held, lambda s: (s.y, s.solved))
+    known = lanes.until(unknown, linear, lambda s: s.known, (*held, *first))
+    end = lanes.until(follow, turn, lambda s: (s.turns >= TURNS) | s.solved, (*held, first[0], known), most=FEW)
+    sound = end.solved & jnp.all(jnp.isfinite(end.jacobian))
+    slope = jnp.where(sound, end.jacobian, jnp.asarray(still))
+    return end.y + inverse(-slope)[0] @ jnp.where(sound, _balance(robot, conditions, end.y), 0.0), sound
+
+
+def _motion(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> tuple[PlaneMotion, Float[Array, " 2"]]:
+    """The motion of a settled turn and its loads, see `turning.grip`."""
+    return motion_of(robot, _whole(conditions, y)), _loads(robot, conditions, y)
+
+
+def solve(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 9"], Bool[Array, ""]]:
+    """The unknowns of a settled turn, and whether they were found, see `Implicit.solve`."""
+    return jax.lax.stop_gradient(_unknowns(*jax.lax.stop_gradient((robot, conditions))))
+
+
+def shown(
+    robot: Robot, conditions: Conditions, unknowns: Float[Array, " 9"], found: Bool[Array, ""]
+) -> tuple[Result, Signals, Float[Array, " 9"]]:
+    """Result, signals of both sides and what the balances leave at some unknowns, see `Implicit.shown`."""
+    motion, loads = _motion(robot, conditions, unknowns)
+    travel = balances.turning(robot, conditions, motion, loads)
+    stays = unknowns - jax.lax.stop_gradient(_begins(robot, conditions))
+    left = jnp.where(_moves(conditions), _left(robot, conditions, unknowns, travel), stays)
+    status = _status(robot, conditions, travel, motion, found)
+    return result_of(robot, travel, status), travel.signals, left
+
+
+def circling(robot: Robot, conditions: Conditions) -> tuple[balances.Travel, PlaneMotion, Array]:
+    """All of a settled turn on level ground, and its status; numbers whatever that is.
+
+    Args:
+        conditions: one run, scalar fields, on level ground.
+
+    Returns:
+        What both sides do, how the robot moves, and `converged`; `stalled` where neither shafts nor robot move faster
+        than friction at rest is resolved; `tips` where no load is left on a side or at an end; `battery_empty`;
+        `not_settled` where no settled turn was found: it may be that there is none, as friction falls with sliding.
+    """
+    unknowns, solved = _unknowns(robot, conditions)
+    motion, loads = _motion(robot, conditions, unknowns)
+    travel = balances.turning(robot, conditions, motion, loads)
+    return travel, motion, _status(robot, conditions, travel, motion, solved)
+
+
+def _status(
+    robot: Robot, conditions: Conditions, travel: balances.Travel, motion: PlaneMotion, found: Array
+) -> Array:
+    """Status of a settled turn, whether or not it was found."""
+    status = status_keeping(robot, conditions, travel, motion)
+    return jnp.where(found | (status == BATTERY_EMPTY), status, NOT_SETTLED)
+
+
+def _size(chassis: Chassis, ahead: Scalar, aside: Scalar, yaw: Scalar) -> Array:
+    """Of a motion in the plane, or of its change, where the sides are [m/s], [m/s²]."""
+    return jnp.abs(ahead) + jnp.abs(aside) + jnp.abs(yaw) * chassis.turning.width / 2
+
+
+def status_keeping(robot: Robot, conditions: Conditions, travel: balances.Travel, motion: PlaneMotion) -> Array:
+    """Status of a robot that keeps its motion."""
+    chassis = robot.chassis(conditions.configuration)
+    shafts = jnp.max(jnp.abs(travel.signals.speed_theoretical))
+    along = _size(chassis, motion.speed, motion.speed_lateral, motion.yaw_rate)
+    status = jnp.where(jnp.minimum(shafts, along) < chassis.speed_still, STALLED, CONVERGED)
+    status = jnp.where(tips(robot, travel), TIPS, status)
+    empty = (conditions.battery > 0.5) & robot.battery.empty(motion.discharge)
+    return jnp.where(empty, BATTERY_EMPTY, status)
+
+
+def status_moving(robot: Robot, conditions: Conditions, travel: balances.Travel, motion: PlaneMotion) -> Array:
+    """Status at the end of a run over time: `not_settled` while its motion in its own frame changes, else what it is
+    of a robot that keeps it."""
+    chassis = robot.chassis(conditions.configuration)
+    size = _size(chassis, motion.speed, motion.speed_lateral, motion.yaw_rate)
+    change = _size(chassis, travel.acceleration, travel.acceleration_lateral, travel.acceleration_yaw)
+    status = status_keeping(robot, conditions, travel, motion)
+    return jnp.where((change * TIME > SHARE * size) & (status == CONVERGED), NOT_SETTLED, status)
+
+
+def at_rest(y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+    """1 for those unknowns that change of a robot that friction holds: currents and charge."""
+    return jnp.zeros_like(y).at[jnp.asarray([0, 1, 10])].set(1.0)
+
+
+norm = functools.partial(norm_of_sides, whole=slice(4, len(_UNITS)), own=OF_STRAIGHT)
+
+
+def _of_sides(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> tuple[Conditions, State]:
+    """Conditions of either side, the slope that along its heading, and its state."""
+    own = conditions.of_sides()
+    along = jnp.degrees(jnp.arcsin(jnp.sin(own.slope) * jnp.cos(motion.heading)))
+    return (
+        dataclasses.replace(own, slope_deg=along, heading_deg=None),
+        balances.states_of_sides(robot, conditions, motion),
+    )
+
+
+def current_at_rest(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Float[Array, " 2"]:
+    """Currents to which those of a standing robot settle [A]."""
+    own, state = _of_sides(robot, conditions, motion)
+    return jnp.asarray(jax.vmap(lambda c, s: rest.current_at_rest(robot, c, s))(own, state))
+
+
+def firmness(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Scalar:
+    """How firmly friction would hold the robot at rest, headed as it is, negative where it cannot [-]: each side
+    against its motors and its share of gravity, the ground against all of gravity."""
+    own, state = _of_sides(robot, conditions, motion)
+    sides = jnp.asarray(jax.vmap(lambda c, s: rest.firmness(robot, c, s))(own, state))
+    chassis = robot.chassis(conditions.configuration)
+    level = chassis.ground.friction.static * conditions.adhesion * balances.lateral_friction(conditions, chassis)
+    aside = jnp.abs(jnp.tan(conditions.slope) * jnp.sin(motion.heading))
+    return rest.least(sides[0], sides[1], jnp.where(aside > 0, level - aside, jnp.inf))
+
+
+def holds(robot: Robot, conditions: Conditions) -> Array:
+    """Whether friction at rest holds a robot that stands, at the currents that flow a millisecond after the start."""
+    motion = motion_of(robot, start(robot, conditions))
+    settled = dataclasses.replace(motion, current=current_at_rest(robot, conditions, motion))
+    return jnp.asarray(jax.lax.stop_gradient(firmness(robot, conditions, settled)) >= 0)
+
+
+def tips(robot: Robot, travel: balances.Travel) -> Array:
+    """Whether no load is left on a side, or all of it is at an end of the contact."""
+    load = jnp.sum(travel.grip.normal)
+    return (jnp.abs(travel.grip.moved) >= load / 2) | (
+        jnp.abs(travel.grip.centre) >= robot.running_gear.wheelbase / 2
+    )
+
+
+def result_of(robot: Robot, travel: balances.Travel, status: Array) -> Result:
+    """Readings, powers and exceeded limits of an instant: means over both sides, and the worse of them."""
+    signals = travel.signals
+    each = jax.vmap(lambda s: result(robot, s, status))(signals)
+    mean = jax.tree.map(lambda x: jnp.mean(x, axis=0), each)
+    flags = each.flags[0] | each.flags[1]
+    limit = robot.sides / 2 * signals.adhesion_limit
+    found = dataclasses.replace(
+        mean,
+        reading=balances.shown(robot, signals),
+        slip=ground.slip(mean.speed, mean.theoretical_speed),
+        adhesion_used=jnp.max(jnp.hypot(travel.grip.ahead, travel.grip.aside) / limit),
+        efficiency_motor=efficiency(mean.power_motor, mean.power_supply),
+        efficiency_gear=efficiency(mean.power_gear, mean.power_motor),
+        efficiency_chassis=efficiency(mean.power_ground, mean.power_gear),
+        winding_settled=jnp.max(each.winding_settled),
+        status=status,
+        flags=flags,
+    )
+    return known(robot, found)
+
+
+def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array]:
+    """A settled turn, see `circling`, and whether its conditions are sound; with numbers whatever the status."""
+    sound = jnp.asarray(True)
+    for number in jax.tree.leaves(conditions):
+        sound &= jnp.isfinite(number)
+    conditions = jax.tree.map(lambda x: jnp.where(sound, x, jnp.ones_like(x)), conditions)
+    travel, _, status = circling(robot, conditions)
+    # On a slope the heading changes all the time.
+    status = jnp.where(conditions.slope_deg == 0, status, NOT_SETTLED)
+    return result_of(robot, travel, jnp.where(sound, status, FAILED)), sound
+
+
+def steady(robot: Robot, conditions: Conditions) -> Result:
+    """`steady` of a robot that turns: see `circling`; NaN where it has no settled turn."""
+    point, sound = operating_point(robot, conditions)
+    return withhold(point, (point.status == CONVERGED) | (point.status == STALLED), sound)

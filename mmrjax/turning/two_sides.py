@@ -1,0 +1,357 @@
+"""Two sides: how a robot whose sides are driven apart stands on the ground and slides over it.
+
+Frame of the robot, its origin the centre of mass: x ahead, y to the left, yaw positive to the left. Sides are in the
+order left, right (leading axis 2), their contact lines at y = ±B/2. A contact at (x, y_s) slides over the ground by
+
+    u_x = r ω_k,s - V_s - slip, V_s = v_x - ω y_s,    u_y = -v_y - ω x,
+
+and is held by N μ(|u|) (u_x, λ^a u_y) / |(u_x, λ^(a-1) u_y)|, with μ the law of Fig. 7 and λ = φ_y / φ_x: at u_y = 0
+the law of straight travel, and on the friction ellipse whatever a, the rule of direction. At a = 1 the force is along
+(φ_x u_x, φ_y u_y), at a = 2 it takes the most power that the ellipse allows. Which holds is an assumption; so is that
+loads are those of a rigid robot in balance at every instant.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mmrjax.model.contact import Friction
+from mmrjax.model.params import Scalar, parameter
+from mmrjax.numerics.rarely import rarely
+
+#: Of a side's contact line from the middle of the robot, in shares of B [-]: left, right.
+SIDES = np.array([0.5, -0.5])
+#: Widths of the packaged robot between and over its tracks, between which its contact lines are [m] (Table 6).
+BETWEEN, OVER = 0.208, 0.278
+#: Square of a sliding speed too small to have a direction [m²/s²].
+STILL = 1e-16
+#: Newton steps of the transfer of load; the contact's forces are nearly bilinear in it.
+LOAD_STEPS = 3
+
+
+def _nodes(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places of nodes on -1..1 and their weights, Gauss and Legendre's; and the weights of two wheels at the ends,
+    which have the first and the last of them."""
+    place, weight = np.polynomial.legendre.leggauss(count)
+    ends = np.zeros(count)
+    ends[[0, -1]] = 0.5
+    return place, weight / 2, ends
+
+
+def total(sides: Float[Array, "2 ..."]) -> Array:
+    """Sum over both sides, as two numbers: XLA makes a call of every reduction, however short."""
+    return sides[0] + sides[1]
+
+
+class Turning(eqx.Module):
+    """What straight travel does not show of a robot with two sides.
+
+    Attributes:
+        nodes: of a track's contact, see `Stance`.
+    """
+
+    width: Scalar = parameter(
+        0.243,
+        unit="m",
+        meaning="distance B of the contact lines of left and right side",
+        bounds=(0.0, 5.0),
+        sd=0.012,
+        source=f"middle of {BETWEEN:g} and {OVER:g} m, the widths between and over the tracks (Table 6: B_b, B_T)",
+    )
+    lateral: Scalar = parameter(
+        1.0,
+        unit="-",
+        meaning="lateral friction over longitudinal φ_y/φ_x",
+        bounds=(0.02, 10.0),
+        relative_sd=0.2,
+        source="Table 5, lacquered wood (surface of the bench)",
+    )
+    rule: Scalar = parameter(
+        1.0,
+        unit="-",
+        meaning="rule of the direction of friction, a: 1 along (φ_x u_x, φ_y u_y), 2 maximum dissipation",
+        bounds=(0.0, 3.0),
+        sd=0.5,
+        source="assumed; the paper has no lateral sliding",
+    )
+    inertia: Scalar = parameter(
+        0.2,
+        unit="kg·m^2",
+        meaning="moment of inertia in yaw J_ψ of the robot without payload",
+        bounds=(0.0, 1e4),
+        relative_sd=0.2,
+        source="sum of Table 7's parts in their places of Table 6",
+    )
+    nodes: int = eqx.field(default=16, static=True)
+
+
+class Stance(eqx.Module):
+    """How a robot stands on its contacts.
+
+    Attributes:
+        length: of the contact, or the wheelbase [m]; width: B [m].
+        height: of the centre of mass above the ground [m]; ahead: of it from the middle of the contact [m].
+        on_tracks: 1 on tracks, whose contact is a line, 0 on wheels, which bear at its ends [-].
+        lateral: λ on this ground [-]; rule: a [-].
+        nodes: of a track's contact, even. With 16 the width of a turn on the spot under dry friction is 3e-5 off,
+            with 32 1e-8.
+    """
+
+    length: Scalar
+    width: Scalar
+    height: Scalar
+    ahead: Scalar
+    on_tracks: Scalar
+    lateral: Scalar
+    rule: Scalar
+    nodes: int = eqx.field(default=16, static=True)
+
+
+class Grip(eqx.Module):
+    """What the ground does to each side, shape (2,): left, right.
+
+    Attributes:
+        normal: load of a side [N]; ahead, aside: forces along x and y [N]; moment: of the lateral forces about the
+            centre of mass, positive to the left [N·m].
+        across: power that lateral sliding turns into heat [W].
+        moved: load that has moved from the left side to the right one [N]; centre: of pressure, ahead of the middle
+            of the contact [m].
+        lacking: by how much both are above what these forces move: nothing, but in a search for them [N, m].
+    """
+
+    normal: Float[Array, " 2"]
+    ahead: Float[Array, " 2"]
+    aside: Float[Array, " 2"]
+    moment: Float[Array, " 2"]
+    across: Float[Array, " 2"]
+    moved: Scalar
+    centre: Scalar
+    lacking: Float[Array, " 2"]
+
+
+def footprint(stance: Stance, centre: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+    """Middle of what a contact bears on, from its own middle [m], half the length of that [m], and how much more than
+    the mean its front end bears [-].
+
+    Tracks: p = (N/L)(1 + 12 x_p x / L²), and from |x_p| = L/6 on a triangle of length 3 (L/2 - |x_p|), its foot where
+    the contact lifts off (middle third rule). Wheels: by the lever.
+    """
+    tracks, length = stance.on_tracks > 0.5, stance.length
+    tilt = jnp.clip(jnp.where(tracks, 6.0, 2.0) * centre / length, -1.0, 1.0)
+    borne = jnp.where(tracks, jnp.clip(3 * (length / 2 - jnp.abs(centre)), 1e-6 * length, length), length)
+    return jnp.sign(centre) * (length - borne) / 2, borne / 2, tilt
+
+
+class Law(eqx.Module):
+    """What of a contact's law nodes share.
+
+    Attributes:
+        friction: along; ratio: λ^(2a-2), by which sliding across weighs more than along in a direction [-].
+        on_tracks, nodes: see `Stance`.
+    """
+
+    friction: Friction
+    ratio: Scalar
+    on_tracks: Scalar
+    nodes: int = eqx.field(static=True)
+
+    def places(self) -> Array:
+        """Nodes on -1..1."""
+        line = _nodes(self.nodes)[0]
+        return jnp.where(self.on_tracks > 0.5, line, np.sign(line))
+
+    def over(self, x: Scalar, most: int) -> Float[Array, "2 powers"]:
+        """Σ w zᵏ x over the nodes z with their weights w, for k from 0 to `most`."""
+        line, share, ends = _nodes(self.nodes)
+        powers = np.arange(most + 1)
+        of_line = share[:, None] * line[:, None] ** powers
+        of_ends = ends[:, None] * np.sign(line)[:, None] ** powers
+        both = jnp.asarray(x) @ np.concatenate([of_line, of_ends], axis=1)
+        return jnp.where(self.on_tracks > 0.5, both[..., : most + 1], both[..., most + 1 :])
+
+    def per_speed(self, along: Scalar, across: Scalar) -> Scalar:
+        """Force along over load and sliding speed [s/m], at the squares of the sliding speeds [m²/s²]."""
+        square, weighed = along + across, along + self.ratio * across
+        return jnp.sqrt((square + STILL) / (weighed + STILL)) * self.friction.per_speed(square)
+
+    def per_speed_rise(self, along: Scalar, across: Scalar) -> tuple[Scalar, Scalar]:
+        """Derivatives of `per_speed` by those squares [s³/m³]."""
+        square, weighed = along + across, along + self.ratio * across
+        turned, held = jnp.sqrt((square + STILL) / (weighed + STILL)), self.friction.per_speed(square)
+        slower = turned * self.friction.per_speed_rise(square)
+        share = held * turned / 2
+        return (
+            slower + share * (1 / (square + STILL) - 1 / (weighed + STILL)),
+            slower + share * (1 / (square + STILL) - self.ratio / (weighed + STILL)),
+        )
+
+    def rises(self, along: Scalar, across: Scalar) -> tuple[tuple[Scalar, Scalar], tuple[Scalar, Scalar]]:
+        """How fast forces over load, `per_speed` times the sliding speeds, rise with these [s/m], by rows.
+
+        A force that falls as all of the sliding grows is taken as one that stays.
+        """
+        square, other, both = along**2, across**2, along * across
+        held, (by_along, by_across) = self.per_speed(square, other), self.per_speed_rise(square, other)
+        grows = held + 2 * (square * by_along + other * by_across)
+        stays = jnp.maximum(-grows, 0.0) / (square + other + STILL)
+        first, second = 2 * by_along + stays, 2 * by_across + stays
+        return (held + square * first, both * second), (both * first, held + other * second)
+
+
+@eqx.filter_custom_jvp
+def moments(law: Law, sliding: Float[Array, " 2"], middle: Scalar, end: Scalar) -> Float[Array, "2 4"]:
+    """Moments of order 0 to 3 of `Law.per_speed` over a contact that is even loaded, from its middle and in halves of
+    its length [s/m]; of each side.
+
+    Args:
+        sliding: along, of each side [m/s]; middle: across, at the middle of the contact [m/s]; end: by how much
+            more at its front end [m/s].
+    """
+    across = middle + end * law.places()
+    return law.over(law.per_speed(sliding[:, None] ** 2, across**2), 3)
+
+
+@moments.def_jvp
+def _moments_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    """By the speeds in closed form, once for however many directions; by the law's own numbers as it is computed."""
+    law, sliding, middle, end = primals
+    across = middle + end * law.places()
+    along = sliding[:, None] ** 2
+    found = law.over(law.per_speed(along, across**2), 3)
+    by_along, by_across = law.per_speed_rise(along, across**2)
+    change = jnp.zeros_like(found)
+    if tangents[1] is not None:
+        change += 2 * (sliding * tangents[1])[:, None] * law.over(by_along, 3)
+    if tangents[2] is not None or tangents[3] is not None:
+        first = law.over(by_across * across, 4)
+        for tangent, part in ((tangents[2], first[:, :4]), (tangents[3], first[:, 1:])):
+            change += 0.0 if tangent is None else 2 * tangent * part
+    if any(x is not None for x in jax.tree.leaves(tangents[0])):
+        change += eqx.filter_jvp(lambda law: law.over(law.per_speed(along, across**2), 3), (law,), (tangents[0],))[1]
+    return found, change
+
+
+class _Given(NamedTuple):
+    """What `grip` is of."""
+
+    stance: Stance
+    friction: Friction
+    adhesion: Scalar
+    load: Scalar
+    sliding: Array
+    lateral_speed: Scalar
+    yaw_rate: Scalar
+    resistance: Array
+
+
+def grip(
+    stance: Stance,
+    friction: Friction,
+    adhesion: Scalar,
+    load: Scalar,
+    sliding: Float[Array, " 2"],
+    lateral_speed: Scalar,
+    yaw_rate: Scalar,
+    resistance: Float[Array, " 2"],
+    loads: Float[Array, " 2"] | None = None,
+) -> Grip:
+    """Forces and loads of both sides, which hang together.
+
+    The load moves to the outer side, T = h ΣF_y / B, and to the rear, N x_p = N x_c - h (ΣF_x - ΣR); no side bears
+    less than nothing.
+
+    Args:
+        stance: how it stands; friction: of the ground; adhesion: the surface's ratio [-].
+        load: normal to the ground, of both sides [N].
+        sliding: u_x of each side [m/s]; lateral_speed: v_y [m/s]; yaw_rate: ω [rad/s].
+        resistance: rolling resistance over the normal load, with its sign, of each side [-].
+        loads: T [N] and x_p [m] where a search that holds more unknowns finds them too; None: found here.
+    """
+    given = _Given(stance, friction, adhesion, load, sliding, lateral_speed, yaw_rate, resistance)
+    if loads is not None:
+        return _at_loads(loads, None, given)
+    held = jax.lax.stop_gradient(given)
+    at, rise = _loads(held)
+    found = _at_loads(at, None, given)
+    # The last step alone carries the derivatives, which are the implicit ones; it is so small that lines will do.
+    change = _step(found.lacking, rise.lacking)
+    return jax.tree.map(lambda x, slope: x - slope @ change, found, rise)
+
+
+def _step(lacking: Float[Array, " 2"], slope: Float[Array, "2 2"]) -> Float[Array, " 2"]:
+    """Newton's of the loads, to be taken off."""
+    (a, b), (c, d) = slope
+    first, second = lacking
+    return jnp.stack([d * first - b * second, a * second - c * first]) / (a * d - b * c)
+
+
+def _loads(given: _Given) -> tuple[Float[Array, " 2"], Grip]:
+    """The load that has moved [N] and the centre of pressure [m], and how all rises with them; without derivatives.
+
+    As long as all of the contact bears, the moments of its law do not depend on them.
+    """
+    stance, load = given.stance, given.load
+
+    def steps(loads: Array, given: _Given, even: Array | None) -> tuple[Array, Grip]:
+        def step(_: int, loads: Array) -> Array:
+            def lacking(x: Array) -> tuple[Array, Array]:
+                return (_at_loads(x, even, given).lacking,) * 2
+
+            slope, left = jax.jacfwd(lacking, has_aux=True)(loads)
+            return loads - _step(left, slope)
+
+        found = jax.lax.fori_loop(0, LOAD_STEPS, step, loads, unroll=even is not None)
+        return found, jax.jacfwd(lambda x: _at_loads(x, even, given))(found)
+
+    nothing = load * given.sliding[0]
+    begun = jnp.stack([jnp.zeros_like(nothing), stance.ahead * jnp.ones_like(nothing)])
+    even = moments(*_along(begun[1], given))
+    found = steps(begun, given, even)
+    lifts = (stance.on_tracks > 0.5) & (jnp.maximum(jnp.abs(begun[1]), jnp.abs(found[0][1])) > stance.length / 6)
+    return rarely(lifts, lambda at, given: steps(at, given, None), (begun, given), found)
+
+
+def _along(centre: Scalar, given: _Given) -> tuple[Law, Array, Scalar, Scalar]:
+    """Arguments of `moments` where the centre of pressure is there."""
+    stance, yaw = given.stance, given.yaw_rate
+    place, half, _ = footprint(stance, centre)
+    law = Law(given.friction, stance.lateral ** (2 * stance.rule - 2), stance.on_tracks, stance.nodes)
+    return law, given.sliding, -given.lateral_speed - yaw * (place - stance.ahead), -yaw * half
+
+
+def _at_loads(loads: Array, even: Array | None, given: _Given) -> Grip:
+    """What the ground does where so much load has moved, and the centre of pressure is there.
+
+    The lateral speed of a contact is linear along it, and so is the load that it bears: its forces and moments are
+    sums of four moments of the law over an even load; `even` are these, where they are known.
+    """
+    (moved, centre), stance, adhesion, load = loads, given.stance, given.adhesion, given.load
+    normal = jnp.maximum(load / 2 - 2 * SIDES * moved, 0.0)
+    place, half, tilt = footprint(stance, centre)
+    arm = place - stance.ahead
+    law, sliding, middle, end = _along(centre, given)
+    even = moments(law, sliding, middle, end) if even is None else even
+    zeroth, first, second = (even[:, k] + tilt * even[:, k + 1] for k in range(3))
+    held, across = adhesion * normal, adhesion * normal * stance.lateral**stance.rule
+    aside = across * (middle * zeroth + end * first)
+    turned = across * (middle * first + end * second)
+    ahead = held * zeroth * sliding
+    outward = stance.height * total(aside) / stance.width
+    # Nothing presses on a vertical ground.
+    behind = stance.height * total(ahead - given.resistance * normal) / jnp.maximum(load, 1e-9)
+    return Grip(
+        normal=normal,
+        ahead=ahead,
+        aside=aside,
+        moment=arm * aside + half * turned,
+        across=middle * aside + end * turned,
+        moved=moved,
+        centre=centre,
+        lacking=loads - jnp.stack([outward, stance.ahead - behind]),
+    )

@@ -1,0 +1,1 @@
+"""Belts, grousers and contacts resolved one by one, in MJX, and pictures of them."""

@@ -1,0 +1,189 @@
+"""The main track of one side: its path around two pulleys, its elastic runs, its tooth mesh.
+
+The belt does not hang as a chain of bodies: it runs on its path. A point of it is told by how far it has
+come along the path, counted from where the belt leaves the front pulley downwards, in the direction of
+forward running: lower run (backwards), rear pulley (up), upper run (forwards), front pulley (down).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mmrjax.model.contact import step
+from mmrjax.model.params import Scalar
+from mmrjax.numerics.trigonometry import cosine, sine
+from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_PULLEY, RunningGear
+
+#: Relative swing of the pulley's radius: links of a chain lie on a polygon of as many sides as teeth.
+POLYGON = (1 - math.cos(math.pi / TEETH_PULLEY)) / 2
+
+
+class Path(eqx.Module):
+    """The belt's closed path in the frame of the chassis (origin midway between the axles).
+
+    Attributes:
+        radius: pitch radius of the pulleys [m].
+        gear: the running gear.
+    """
+
+    radius: Scalar
+    gear: RunningGear
+
+    @property
+    def length(self) -> Scalar:
+        """Length of the path 2 L_b + 2 π r [m]; 840 mm on the paper's robot."""
+        return 2 * self.gear.wheelbase + 2 * jnp.pi * self.radius
+
+    @property
+    def pitch(self) -> Scalar:
+        """Pitch of the grousers S_g [m]; 35 mm on the paper's robot."""
+        return self.length / GROUSERS
+
+    def weight(self, place: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Share of the rear pulley's motion in a belt point's: 0 on the front pulley, 1 on the rear one.
+
+        Between them a run stretches evenly, so the share is linear; a force on the point loads the
+        pulleys in the same shares (virtual work), which is exact for a uniform elastic run.
+        """
+        run, arc = self.gear.wheelbase, jnp.pi * self.radius
+        return jnp.clip(place / run, 0.0, 1.0) - jnp.clip((place - run - arc) / run, 0.0, 1.0)
+
+    def place(self, front: Scalar, rear: Scalar) -> tuple[Float[Array, " 24"], Float[Array, " 24"]]:
+        """Where the grousers are [m along the path] at pulley angles [rad], and their `weight`."""
+        at_front = jnp.mod(jnp.arange(GROUSERS) * self.pitch + self.radius * front, self.length)
+        weight = self.weight(at_front)
+        return jnp.mod(at_front + self.radius * weight * (rear - front), self.length), weight
+
+
+class Tips(eqx.Module):
+    """Tips of grousers in the frame of the chassis, each field of shape (grousers,).
+
+    Attributes:
+        forward, up: position [m].
+        rate_forward, rate_up: displacement per displacement of the belt [-].
+        guided: share of a load on the grouser that passes to the lower guide, the rest to a pulley [-].
+        compliance: of the free belt between pulley and guide at unit tension [m], see `tips`.
+    """
+
+    forward: Float[Array, " n"]
+    up: Float[Array, " n"]
+    rate_forward: Float[Array, " n"]
+    rate_up: Float[Array, " n"]
+    guided: Float[Array, " n"]
+    compliance: Float[Array, " n"]
+
+
+def tips(path: Path, place: Float[Array, " n"]) -> Tips:
+    """Tips of the grousers at `place` [m along the path].
+
+    A grouser stands on a rigid base: it turns with the mean direction of the path under that base, so its
+    tip speeds up from r to r + height over one base length instead of at once. From the end of an arc the
+    belt rises to the guide over the free gap; there a load divides between pulley and guide (cubic step,
+    in place of the lever's straight line, for a continuous slope) and the belt yields as a string,
+    x (gap - x) / gap per unit of tension. Both ends of the lower run are alike: x counts from the nearer.
+    """
+    gear, radius = path.gear, path.radius
+    run, arc, base = gear.wheelbase, jnp.pi * radius, gear.grouser_length
+    ahead = (place < run / 2) | (place > run + arc + run / 2)
+    side = jnp.where(ahead, 1.0, -1.0)
+    x = jnp.where(ahead, jnp.where(place < run / 2, place, place - path.length), run - place)
+    turned = jnp.clip(-x / radius, 0.0, jnp.pi)  # on the arc, from its bottom
+    share = jnp.clip((base / 2 - x) / base, 0.0, 1.0)  # of the base that lies on the arc
+    tilt = jnp.minimum(jnp.where(x < -base / 2, -x / radius, share**2 * base / (2 * radius)), jnp.pi)
+    tilt_rate = -jnp.where(tilt < jnp.pi, share, 0.0) / radius
+    rise = gear.guide_recess * step(x, 0.0, 0.0, gear.guide_gap, 1.0)
+    u = jnp.clip(x / gear.guide_gap, 0.0, 1.0)
+    rise_rate = gear.guide_recess * 6 * u * (1 - u) / gear.guide_gap
+    straight = jnp.where(x > 0, -x, jnp.where(turned < jnp.pi, 0.0, x + arc))
+    height = gear.grouser_height
+    return Tips(
+        forward=side * (run / 2 + straight + radius * sine(turned) + height * sine(tilt)),
+        up=-radius * cosine(turned) - height * cosine(tilt) + rise,
+        rate_forward=-cosine(turned) + height * cosine(tilt) * tilt_rate,
+        rate_up=side * (-sine(turned) + height * sine(tilt) * tilt_rate + rise_rate),
+        guided=jnp.where(x > 0, step(x, 0.0, 0.0, gear.guide_gap, 1.0), 0.0),
+        compliance=u * (1 - u) * gear.guide_gap,
+    )
+
+
+class Runs(eqx.Module):
+    """Tension of the two straight runs and the torque they put on the pulleys.
+
+    Attributes:
+        upper, lower: total tension, mean over the run [N].
+        centrifugal: what of it turns the belt's own mass round the pulleys, P_ct = m v² / length [N].
+        torque_front, torque_rear: on the pulleys, in the direction of running [N·m].
+    """
+
+    upper: Scalar
+    lower: Scalar
+    centrifugal: Scalar
+    torque_front: Scalar
+    torque_rear: Scalar
+
+
+def travel(radius: Scalar, angle: Scalar) -> tuple[Scalar, Scalar]:
+    """Belt drawn by a pulley turned by `angle` [m], and per radian [m]: s = r (φ + ε sin(nφ) / n).
+
+    The links lie on a polygon of n = 48 sides, so the lever swings by ±ε with each tooth (chordal action;
+    ε from the geometry): the tooth mesh, whose period is S_t.
+    """
+    phase = TEETH_PULLEY * angle
+    return radius * (angle + POLYGON * sine(phase) / TEETH_PULLEY), radius * (1 + POLYGON * cosine(phase))
+
+
+def runs(path: Path, angles: Sequence[Scalar], rates: Sequence[Scalar]) -> Runs:
+    """Tensions from the angles [rad] and rates [rad/s] of front and rear pulley, relative to the chassis.
+
+    P = max(0, P_0 ± k Δs ± b Δṡ), Δs the belt drawn by the front pulley less that of the rear one: the
+    upper run pulls, the lower one slackens. The teeth transmit, so P_0 only keeps the runs from slack.
+    """
+    gear = path.gear
+    drawn_front, lever_front = travel(path.radius, angles[0])
+    drawn_rear, lever_rear = travel(path.radius, angles[1])
+    stretch = drawn_front - drawn_rear
+    rate = lever_front * rates[0] - lever_rear * rates[1]
+    pull = gear.span_stiffness * stretch + gear.span_damping * rate
+    upper = jnp.maximum(gear.pretension + pull, 0.0)
+    lower = jnp.maximum(gear.pretension - pull, 0.0)
+    speed = path.radius * (rates[0] + rates[1]) / 2
+    return Runs(
+        upper=upper,
+        lower=lower,
+        centrifugal=gear.belt_mass / path.length * speed**2,
+        torque_front=-lever_front * (upper - lower),
+        torque_rear=lever_rear * (upper - lower),
+    )
+
+
+def tension_along(
+    path: Path, tension: Runs, place: Float[Array, " n"], force: Float[Array, " n"], stations: Float[Array, " s"]
+) -> Float[Array, " s"]:
+    """Tension [N] at `stations` [m along the path] under forces [N] on the belt against its running.
+
+    A force F at x of the lower run leaves P - F (1 - x/L) ahead of it and P + F x/L behind; the arcs carry
+    the tension of one run over to the other along the engaged teeth, evenly.
+    """
+    run, arc = path.gear.wheelbase, jnp.pi * path.radius
+    on_run = place < run
+    x = jnp.where(on_run, place / run, 0.0)
+    load = jnp.where(on_run, force, 0.0)
+
+    def lower(at: Scalar) -> Scalar:
+        return tension.lower + jnp.sum(load * (x - (at < place)))
+
+    def one(at: Float[Array, ""]) -> Float[Array, ""]:
+        rear = jnp.clip((at - run) / arc, 0.0, 1.0)
+        front = jnp.clip((at - 2 * run - arc) / arc, 0.0, 1.0)
+        # from the lower run's end over the rear arc to the upper run, and over the front arc down again
+        up = lower(run) * (1 - rear) + tension.upper * rear
+        down = tension.upper * (1 - front) + lower(-1.0) * front
+        return jnp.where(at < run, lower(at), jnp.where(at < run + arc + run, up, down))
+
+    return jax.vmap(one)(stations)

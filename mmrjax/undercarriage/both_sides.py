@@ -1,0 +1,435 @@
+"""A robot free to turn, in motion: its state, all its forces at an instant, one step, and where a run starts.
+
+Coordinates q: place x uphill and y to the left [m], height z of the middle of the wheelbase over the ground [m], yaw,
+pitch (nose down) and roll (left side up) [rad], then the angles of driving and driven pulley of the left and of the
+right side [rad], relative to the chassis. Velocities v alike. MJX carries chassis and pulleys (`mjcf`). Each side is
+the half robot's belt, contacts and drive (`undercarriage`, `balances.resolved_sides`) at its own height z + y_s roll
+and speed v_x - ω y_s; `turning.Law` at each contact takes the place of Fig. 7 along the travel alone. Roll is small.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mmrjax.model import balances
+from mmrjax.model.chassis import Chassis
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.signals import CONVERGED, NOT_SETTLED, PlaneMotion, Result, Signals
+from mmrjax.numerics.linear_equations import factorise, solution
+from mmrjax.numerics.trigonometry import cosine, sine
+from mmrjax.turning import circling
+from mmrjax.turning.two_sides import SIDES, Grip, Law
+from mmrjax.undercarriage import half_robot
+from mmrjax.undercarriage import side_contacts as undercarriage
+from mmrjax.undercarriage.belt import Path
+from mmrjax.undercarriage.half_robot import Average, Motion, Steady, System
+from mmrjax.undercarriage.mjcf import mjx
+from mmrjax.undercarriage.side_contacts import Pull, Reactions, Touch
+
+X, Y, HEIGHT, YAW, PITCH, ROLL = range(6)
+#: Driving and driven pulley of left and right side.
+PULLEYS = np.array([[6, 7], [8, 9]])
+SHAFTS = PULLEYS[:, 0]
+COORDINATES = 10
+#: Coordinates on which the contacts of left and right side act.
+OF_SIDE = np.array([[*range(6), *pulleys] for pulleys in PULLEYS])
+
+
+class _Sides(eqx.Module):
+    """The contacts of both sides, a leading axis of 2, as `balances.resolved_sides` asks for them."""
+
+    path: Path
+    law: Law
+    lateral: Scalar
+    at: Touch
+    aside: Float[Array, "2 contacts"]  # velocity of each contact to the left [m/s]
+    height: Float[Array, " 2"]
+
+    @property
+    def normal(self) -> Float[Array, " 2"]:
+        return jnp.sum(self.at.force, axis=-1)
+
+    def pull(self, chassis: Chassis, signals: Signals) -> Pull:
+        def side(signals: Signals, at: Touch, aside: Array, height: Scalar) -> Pull:
+            along = undercarriage.sliding(signals, at)
+            held = signals.adhesion * at.force * self.law.per_speed(along**2, aside**2)
+            pulled = undercarriage.pull(self.path, chassis, signals, at, height, held * along)
+            return dataclasses.replace(pulled, aside=-self.lateral * held * aside)
+
+        return jax.vmap(side)(signals, self.at, self.aside, self.height)
+
+
+def _width(run: System) -> Scalar:
+    return run.chassis.turning.width
+
+
+def _ahead(run: System, v: Float[Array, " 10"], yaw: Scalar) -> tuple[Scalar, Scalar]:
+    """Speeds of the middle of the wheelbase in the frame of the robot, ahead and to the left [m/s]."""
+    cos, sin = cosine(yaw), sine(yaw)
+    return cos * v[X] + sin * v[Y], cos * v[Y] - sin * v[X]
+
+
+def plane_motion(run: System, motion: Motion) -> PlaneMotion:
+    """The same motion as the other fidelities have it: speeds of the centre of mass, the robot level."""
+    q, v = motion.q, motion.v
+    speed, lateral = _ahead(run, v, q[YAW])
+    forward, up = run.half.centre
+    return PlaneMotion(
+        current=motion.current,
+        speed_motor=run.robot.gearbox.ratio * v[SHAFTS],
+        speed=speed,
+        speed_lateral=lateral + forward * v[YAW] - up * v[ROLL],
+        yaw_rate=v[YAW],
+        heading=q[YAW],
+        place_x=q[X],
+        place_y=q[Y],
+        discharge=motion.discharge,
+        memory=motion.memory,
+    )
+
+
+def _contacts(run: System, motion: Motion) -> _Sides:
+    q, v = motion.q, motion.v
+    speed, lateral = _ahead(run, v, q[YAW])
+    y = SIDES * _width(run)
+    heights, rises = q[HEIGHT] + y * q[ROLL], v[HEIGHT] + y * v[ROLL]
+    nothing = jnp.zeros_like(y)
+    of_q = jnp.stack([nothing, heights, q[PITCH] + nothing, *q[PULLEYS].T], axis=1)
+    of_v = jnp.stack([speed - v[YAW] * y, rises, v[PITCH] + nothing, *v[PULLEYS].T], axis=1)
+    at = jax.vmap(lambda q, v: undercarriage.touch(run.path, run.chassis, q, v))(of_q, of_v)
+    own, ratio = run.chassis.turning, balances.lateral_friction(run.conditions, run.chassis)
+    law = Law(run.chassis.ground.friction, ratio ** (2 * own.rule - 2), run.chassis.on_tracks, own.nodes)
+    aside = lateral + v[YAW] * at.lever_x - v[ROLL] * at.lever_z
+    return _Sides(run.path, law, ratio**own.rule, at, aside, heights)
+
+
+def _resolved(run: System, motion: PlaneMotion, sides: _Sides) -> tuple[Signals, Pull]:
+    return balances.resolved_sides(run.robot, run.conditions, motion, sides, run.half.inertia_pulley)
+
+
+def instant(run: System, motion: Motion) -> tuple[Signals, Touch, Pull]:
+    """All signals, contacts and forces of an instant, a leading axis of left and right side."""
+    sides = _contacts(run, motion)
+    signals, pulled = _resolved(run, plane_motion(run, motion), sides)
+    return signals, sides.at, pulled
+
+
+def _losses(run: System, motion: PlaneMotion, sides: _Sides) -> Float[Array, "2 2"]:
+    """See `half_robot._losses`: by the speed of each side, and by that of its driving shaft."""
+
+    def along(change: Scalar) -> Array:
+        signals, pulled = _resolved(run, dataclasses.replace(motion, speed=motion.speed + change), sides)
+        return jnp.sum(pulled.force, axis=-1) - signals.resistance
+
+    def shaft(change: Scalar) -> Array:
+        faster = motion.speed_motor + run.robot.gearbox.ratio * change
+        return jnp.asarray(_resolved(run, dataclasses.replace(motion, speed_motor=faster), sides)[0].torque_net)
+
+    zero, one = jnp.zeros_like(motion.speed), jnp.ones_like(motion.speed)
+    return jnp.stack([jnp.maximum(-jax.jvp(f, (zero,), (one,))[1], 0.0) for f in (along, shaft)])
+
+
+class _Levers(eqx.Module):
+    """How each contact of a side moves along the robot, to its left and off the ground with velocities `OF_SIDE`."""
+
+    along: Float[Array, "2 contacts 8"]
+    across: Float[Array, "2 contacts 8"]
+    off: Float[Array, "2 contacts 8"]
+
+
+def _levers(run: System, motion: Motion, at: Touch) -> _Levers:
+    cos, sin = cosine(motion.q[YAW]), sine(motion.q[YAW])
+    one, y = jnp.ones_like(at.gap), (SIDES * _width(run))[:, None]
+    none = jnp.zeros_like(one)
+    front, rear = run.path.radius * (1 - at.weight), run.path.radius * at.weight
+    x, z = at.lever_x, at.lever_z
+    along: list[Any] = [cos * one, sin * one, none, -y * one, z, none, at.rate_x * front, at.rate_x * rear]
+    across: list[Any] = [-sin * one, cos * one, none, x, none, -z, none, none]
+    off: list[Any] = [none, none, one, none, -x, y * one, at.rate_z * front, at.rate_z * rear]
+    return _Levers(*(jnp.stack(rows, axis=-1) for rows in (along, across, off)))
+
+
+def generalized(run: System, motion: Motion, signals: Signals, at: Touch, pulled: Pull) -> Float[Array, " 10"]:
+    """Generalized forces on q [N, N·m]."""
+    cos, sin = cosine(motion.q[YAW]), sine(motion.q[YAW])
+    y, several = SIDES * _width(run), run.robot.sides / 2
+    lateral, yaw = balances.added_in_plane(run.robot, _turned(run, signals, at, pulled))
+    forward, normal, moment, rear = pulled.generalized.T
+    assert pulled.aside is not None
+    ahead, aside = several * jnp.sum(forward), several * jnp.sum(pulled.aside) - lateral
+    turn = several * (jnp.sum(pulled.aside * at.lever_x) - y @ forward) - yaw
+    tilt = several * (y @ normal - jnp.sum(pulled.aside * at.lever_z))
+    body = [cos * ahead - sin * aside, sin * ahead + cos * aside, several * jnp.sum(normal), turn]
+    shafts = several * jnp.asarray(signals.torque_net), several * rear
+    pulleys = [x[k] for k in range(2) for x in shafts]
+    return jnp.stack([*body, several * jnp.sum(moment), tilt, *pulleys])
+
+
+def _turned(run: System, signals: Signals, at: Touch, pulled: Pull) -> Signals:
+    """The signals with the moment of the lateral forces about the centre of mass."""
+    assert pulled.aside is not None
+    moment = jnp.sum(pulled.aside * (at.lever_x - run.half.centre[0]), axis=-1)
+    return dataclasses.replace(signals, moment_lateral=moment)
+
+
+def resistance(
+    run: System, motion: Motion, signals: Signals, sides: _Sides, pulled: Pull
+) -> tuple[Float[Array, "10 10"], _Levers, Array]:
+    """How the forces on v fall with v, see `half_robot.resistance`; of friction with both of its directions. With it
+    the levers, and how fast each contact's forces rise with its sliding [N·s/m], shape (2, 2, 2, contacts)."""
+    levers, at = _levers(run, motion, sides.at), sides.at
+    assert pulled.aside is not None
+    sliding = jax.vmap(undercarriage.sliding)(signals, at)
+    weight = jnp.asarray(signals.adhesion)[:, None] * at.force
+    rises = jnp.stack([jnp.stack(row) for row in sides.law.rises(sliding, -sides.aside)])
+    rises = rises * jnp.stack([weight, sides.lateral * weight])[:, None]
+    least = jnp.maximum(at.force, 1e-9)
+    moves = jnp.concatenate([levers.along, levers.across, levers.off], axis=1)
+    falls = at.damped[..., None] * levers.off
+    pushes = [
+        rises[k, 0][..., None] * levers.along
+        + rises[k, 1][..., None] * levers.across
+        + (f / least)[..., None] * falls
+        for k, f in enumerate((pulled.force, pulled.aside))
+    ]
+    each = jnp.einsum("sci,scj->sij", moves, jnp.concatenate([*pushes, falls], axis=1))
+    losses = _losses(run, plane_motion(run, motion), sides)
+    # Rolling resistance acts where a side is, along the robot.
+    cos, sin = cosine(motion.q[YAW]), sine(motion.q[YAW])
+    found = jnp.zeros((COORDINATES, COORDINATES), motion.v.dtype)
+    for k, y in enumerate(SIDES):
+        way = jnp.zeros(8).at[jnp.asarray([X, Y, YAW])].set(jnp.stack([cos, sin, -y * _width(run)]))
+        own = each[k] + losses[0, k] * jnp.outer(way, way)
+        own = own.at[6, 6].add(losses[1, k])
+        found = found.at[np.ix_(OF_SIDE[k], OF_SIDE[k])].add(own)
+    return run.robot.sides / 2 * found, levers, rises
+
+
+def dynamics(
+    run: System, motion: Motion, armature: Float[Array, " 2"]
+) -> tuple[Float[Array, "10 10"], Float[Array, " 10"]]:
+    """Mass matrix and bias of MJX, with the rotors' `armature` at the driving shafts [kg·m²] in the first."""
+    model = run.model.replace(dof_armature=jnp.zeros(COORDINATES).at[SHAFTS].set(armature))
+    data = run.data.replace(qpos=motion.q, qvel=motion.v)
+    data = mjx.com_pos(model, mjx.kinematics(model, data))
+    data = mjx.rne(model, mjx.com_vel(model, mjx.crb(model, data)))
+    return mjx.full_m(model, data), data.qfrc_bias
+
+
+class _Forces(eqx.Module):
+    """Of an instant, all that a step is made of: mass matrix M, damping K, and `push`, Δt (Q - c)."""
+
+    sides: _Sides
+    signals: Signals
+    pulled: Pull
+    levers: _Levers
+    rises: Array
+    mass: Float[Array, "10 10"]
+    damping: Float[Array, "10 10"]
+    push: Float[Array, " 10"]
+
+
+def _forces(run: System, motion: Motion, stored: bool = False) -> _Forces:
+    """All of an instant; contacts and signals `stored`, or XLA computes their derivatives again for each that reads
+    them."""
+
+    def found(x: Any) -> Any:
+        return jax.lax.optimization_barrier(x) if stored else x
+
+    sides = found(_contacts(run, motion))
+    signals, pulled = found(_resolved(run, plane_motion(run, motion), sides))
+    damping, levers, rises = resistance(run, motion, signals, sides, pulled)
+    mass, bias = dynamics(run, motion, jnp.asarray(run.robot.sides / 2 * half_robot.rotating(run, signals)))
+    push = run.step * (generalized(run, motion, signals, sides.at, pulled) - bias)
+    return _Forces(sides, signals, pulled, levers, rises, mass, damping, push)
+
+
+def _solver(run: System, found: _Forces) -> Callable[[Float[Array, " 10"]], Float[Array, " 10"]]:
+    factors = factorise(found.mass + run.step * found.damping)
+    return functools.partial(solution, factors)
+
+
+@eqx.filter_custom_jvp
+def advance(run: System, motion: Motion) -> tuple[Motion, balances.Travel, Float[Array, " 2"]]:
+    """One step, see `half_robot.advance`: (M + Δt K) Δv = Δt (Q - c).
+
+    Returns:
+        The motion after it; all of an instant before it, with forces and accelerations of the step; the load on each
+        lower guide before it [N].
+    """
+    found = _forces(run, motion)
+    return _moved(run, motion, found, _solver(run, found)(found.push))
+
+
+@advance.def_jvp
+def _differentiated(primals: tuple[System, Motion], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
+    """See `half_robot.advance`; of K its product with Δv alone."""
+    found = _forces(*primals)
+    solve = _solver(primals[0], found)
+    gained = solve(found.push)
+
+    def held(run: System, motion: Motion) -> tuple[Array, _Forces]:
+        forces = _forces(run, motion, stored=True)
+        fallen = _fallen(run, motion, forces, gained)
+        return forces.push - forces.mass @ gained - run.step * fallen, forces
+
+    _, (left, changed) = eqx.filter_jvp(held, primals, tangents)
+    return eqx.filter_jvp(_moved, (*primals, found, gained), (*tangents, changed, solve(left)))
+
+
+def _fallen(run: System, motion: Motion, found: _Forces, gained: Float[Array, " 10"]) -> Float[Array, " 10"]:
+    """K Δv, see `resistance`, without K."""
+    at, pulled, levers = found.sides.at, found.pulled, found.levers
+    assert pulled.aside is not None
+    after = forces_after(at, pulled, levers, found.rises, gained)
+    losses, shafts = _losses(run, plane_motion(run, motion), found.sides)
+    cos, sin, y = cosine(motion.q[YAW]), sine(motion.q[YAW]), SIDES * _width(run)
+    ahead, turn = cos * gained[X] + sin * gained[Y], gained[YAW]
+    rolls = losses * (ahead - y * turn)
+    own = jnp.zeros(COORDINATES, motion.v.dtype).at[SHAFTS].set(shafts * gained[SHAFTS])
+    own = own.at[jnp.asarray([X, Y, YAW])].add(jnp.stack([cos * jnp.sum(rolls), sin * jnp.sum(rolls), -y @ rolls]))
+    for lever, now, then in zip(
+        (levers.along, levers.across, levers.off), (pulled.force, pulled.aside, at.force), after, strict=True
+    ):
+        each = jnp.einsum("sci,sc->si", lever, now - then)
+        own = own.at[OF_SIDE[0]].add(each[0]).at[OF_SIDE[1]].add(each[1])
+    return run.robot.sides / 2 * own
+
+
+def _moved(
+    run: System, motion: Motion, found: _Forces, gained: Float[Array, " 10"]
+) -> tuple[Motion, balances.Travel, Float[Array, " 2"]]:
+    v = motion.v + gained
+
+    def later(own: Conditions, signals: Signals, memory: Mapping[str, Scalar]) -> Any:
+        of_side = dataclasses.replace(run, conditions=own), dataclasses.replace(motion, memory=memory)
+        return half_robot.later(*of_side, signals)
+
+    each = jax.vmap(later)(run.conditions.of_sides(), found.signals, motion.memory)
+    after = Motion(motion.q + run.step * v, v, each.current, each.discharge[0], each.memory)
+    return after, _travel(run, motion, found, gained), found.pulled.guided
+
+
+def forces_after(
+    at: Touch, pulled: Pull, levers: _Levers, rises: Array, gained: Float[Array, " 10"]
+) -> tuple[Array, Array, Array]:
+    """Forces of the contacts ahead, to the left and off the ground [N] with which a step that gains Δv is made, each
+    of shape (2, contacts)."""
+    own = gained[OF_SIDE]
+    along, across, off = (jnp.einsum("sci,si->sc", x, own) for x in (levers.along, levers.across, levers.off))
+    down, least = at.damped * off, jnp.maximum(at.force, 1e-9)
+    assert pulled.aside is not None
+    ahead, aside = (
+        force - (rises[k, 0] * along + rises[k, 1] * across + force / least * down)
+        for k, force in enumerate((pulled.force, pulled.aside))
+    )
+    return ahead, aside, at.force - down
+
+
+def _travel(run: System, motion: Motion, found: _Forces, gained: Float[Array, " 10"]) -> balances.Travel:
+    """All of a step, its forces those at its end to first order."""
+    sides, signals, at, several = found.sides, found.signals, found.sides.at, run.robot.sides / 2
+    ahead, aside, normal = forces_after(at, found.pulled, found.levers, found.rises, gained)
+    forward = run.half.centre[0]
+    arm = at.lever_x - forward
+    load, moment = jnp.sum(normal, axis=-1), jnp.sum(aside * arm, axis=-1)
+    signals = dataclasses.replace(signals, traction=jnp.sum(ahead, axis=-1), normal=load, moment_lateral=moment)
+    # Of the centre of mass, in the frame of the robot that turns.
+    speed, lateral = _ahead(run, motion.v, motion.q[YAW])
+    ahead_gained, aside_gained = _ahead(run, gained / run.step, motion.q[YAW])
+    turn = gained[YAW] / run.step
+    y = SIDES * _width(run)
+    acceleration = ahead_gained + motion.v[YAW] * lateral
+    signals = dataclasses.replace(signals, acceleration=acceleration - turn * y)
+    grip = Grip(
+        normal=several * load,
+        ahead=several * jnp.sum(ahead, axis=-1),
+        aside=several * jnp.sum(aside, axis=-1),
+        moment=several * moment,
+        across=-several * jnp.sum(aside * sides.aside, axis=-1),
+        moved=several * (load[1] - load[0]) / 2,
+        centre=jnp.sum(normal * at.lever_x) / jnp.maximum(jnp.sum(load), 1e-9),
+        lacking=jnp.zeros_like(y),
+    )
+    return balances.Travel(signals, grip, acceleration, aside_gained - motion.v[YAW] * speed + forward * turn, turn)
+
+
+def stand(run: System) -> Motion:
+    """At rest on the ground, headed as the conditions say: see `half_robot.stand`, on the slope along its heading.
+    Load has not moved yet to the side that is lower."""
+    heading = _heading(run)
+    along = jnp.degrees(jnp.arcsin(sine(run.conditions.slope) * cosine(heading)))
+    half = half_robot.stand(dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, slope_deg=along)))
+    q = (
+        jnp.zeros(COORDINATES, half.q.dtype)
+        .at[jnp.asarray([HEIGHT, PITCH, YAW])]
+        .set(jnp.stack([half.q[1], half.q[2], heading + jnp.zeros_like(half.q[1])]))
+    )
+    memory = {name: jnp.stack([x, x]) for name, x in half.memory.items()}
+    return Motion(q, jnp.zeros_like(q), jnp.zeros(len(SIDES), q.dtype), half.discharge, memory)
+
+
+def _heading(run: System) -> Scalar:
+    stated = run.conditions.heading_deg
+    return jnp.zeros(()) if stated is None else jnp.radians(stated)
+
+
+def roll(run: System) -> Motion:
+    """In the settled turn of the steady fidelity, at rest where that has none."""
+    begins = stand(run)
+    rolls = circling.motion_of(run.robot, circling.start(run.robot, run.conditions, rolling=True))
+    cos, sin = cosine(rolls.heading), sine(rolls.heading)
+    lateral = rolls.speed_lateral - run.half.centre[0] * rolls.yaw_rate
+    shafts = rolls.speed_motor / run.robot.gearbox.ratio
+    plane = [cos * rolls.speed - sin * lateral, sin * rolls.speed + cos * lateral, rolls.yaw_rate]
+    v = begins.v.at[jnp.asarray([X, Y, YAW])].set(jnp.stack(plane)).at[PULLEYS].set(jnp.asarray(shafts)[:, None])
+    return dataclasses.replace(begins, v=v, current=rolls.current, memory=rolls.memory)
+
+
+def loads(run: System, at: Touch, pulled: Pull) -> Reactions:
+    """See `half_robot.loads`, of either side."""
+    return jax.vmap(lambda at, pulled: half_robot.loads(run, at, pulled))(at, pulled)
+
+
+def away(q: Array, reactions: Reactions) -> tuple[Array, Reactions | None]:
+    """See `half_robot.away`: from where it started; a history has no loads of both sides."""
+    return jnp.hypot(q[..., X], q[..., Y]), None
+
+
+def averaged(average: Average, travelled: Array, passed: balances.Travel, guided: Array) -> Steady:
+    """See `half_robot.averaged`: what is of the whole robot over the periods of either side."""
+    both = jax.tree.map(lambda x: jnp.broadcast_to(x.reshape(*x.shape[:1], -1), (*x.shape[:1], 2)), passed)
+    found, load, periods, changes = jax.vmap(average, in_axes=1)(jnp.abs(travelled), (both, guided))
+    travel = jax.tree.map(lambda x, like: x if like.ndim > 1 else jnp.mean(x), found, passed)
+    share = jnp.sum(load) / jnp.maximum(jnp.sum(travel.signals.normal), 1e-9)
+    # A side that hardly moves has settled where its changes are small beside what the other one does.
+    larger = [(change, jnp.max(size)) for change, size in changes]
+    return Steady(travel.signals, share, periods, jnp.max(half_robot.relative(larger)), travel)
+
+
+def status(run: System, averages: Steady, end: Motion) -> Array:
+    """See `half_robot.status`."""
+    travel, signals = averages.travel, jax.tree.map(jnp.mean, averages.signals)
+    assert travel is not None
+    over = {name: getattr(signals, name) for name in ("speed", "speed_lateral", "yaw_rate")}
+    keeps = dataclasses.replace(plane_motion(run, end), **over)
+    status = circling.status_keeping(run.robot, run.conditions, travel, keeps)
+    status = jnp.where((averages.change > half_robot.SETTLED) & (status == CONVERGED), NOT_SETTLED, status)
+    tilt = jnp.maximum(jnp.abs(end.q[PITCH]), jnp.abs(end.q[ROLL]))
+    return half_robot.unless_lost(run, status, end, end.q[HEIGHT], tilt, signals.total_current)
+
+
+def result_of(run: System, averages: Steady, status: Array) -> Result:
+    """See `half_robot.result_of`."""
+    assert averages.travel is not None
+    return circling.result_of(run.robot, averages.travel, status)

@@ -1,0 +1,453 @@
+"""What all contacts of one side add up to, and the exact derivatives of those sums, a column for each input.
+
+A step of the track model needs a dozen sums over its contacts. Their derivatives are taken once for every input and
+not once for every parameter that a run is differentiated by: along each tangent what is left is a small product.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mmrjax.model.chassis import Chassis
+from mmrjax.model.params import Scalar
+from mmrjax.model.signals import Signals
+from mmrjax.numerics.trigonometry import cosine, sine
+from mmrjax.undercarriage.belt import Path, runs, tips
+from mmrjax.undercarriage.side_contacts import WHEEL, Touch, bearing, of_contacts, tension_free, touch
+
+#: What contacts read of the running gear, of the friction of the ground and of a chassis.
+GEAR = (
+    "wheelbase",
+    "grouser_height",
+    "grouser_length",
+    "guide_recess",
+    "guide_gap",
+    "pretension",
+    "span_stiffness",
+    "span_damping",
+    "belt_mass",
+    "contact_stiffness",
+    "contact_exponent",
+    "contact_damping",
+    "contact_depth",
+)
+FRICTION = ("static", "dynamic", "speed_static", "speed_dynamic")
+CHASSIS = ("radius", "on_tracks")
+#: Coordinates and velocities (see `undercarriage`) but for the travel, on which nothing depends.
+MOTION = ("z", "pitch", "front", "rear", "v_x", "v_z", "v_pitch", "v_front", "v_rear")
+#: Of each contact: F, R, F~ and R~ [N] (see `Sums`) and how fast F rises with sliding [N·s/m].
+Forces = tuple[Array, ...]
+
+
+class Sums(eqx.Module):
+    """Sums over the contacts of one side, with a step's change of velocity Δv as given.
+
+    A contact's traction is F, its normal force R; by the damping of the step (`half_robot.resistance`, but for the
+    drive's part of it) they fall by F~ and R~. On the pulleys they act with their levers, front and rear.
+
+    Attributes:
+        traction, normal: F and R [N].
+        moment, rear: of F - F~ and R - R~ on pitch and driven pulley [N·m].
+        front: of F and R on the driving pulley [N·m].
+        guide_front, guide_rear: of R's share on the guide, on both pulleys, at a coefficient of friction of 1 [N·m].
+        fallen_x, fallen_z, fallen_front: F~ and R~ along the ground and off it [N] and on the driving pulley [N·m].
+        rise, rise_front: how fast F rises with all sliding speeds [N·s/m], and so does its part of `front` [N·s].
+    """
+
+    traction: Scalar
+    normal: Scalar
+    moment: Scalar
+    rear: Scalar
+    front: Scalar
+    guide_front: Scalar
+    guide_rear: Scalar
+    fallen_x: Scalar
+    fallen_z: Scalar
+    fallen_front: Scalar
+    rise: Scalar
+    rise_front: Scalar
+
+
+ROWS = tuple(f.name for f in dataclasses.fields(Sums))
+
+
+def inputs(path: Path, chassis: Chassis, adhesion: Any) -> dict[str, Any]:
+    """What contacts depend on beside the motion, by name; of tangents alike (None: constant)."""
+    gear, friction = path.gear, chassis.ground.friction
+    return {
+        "pulley": path.radius,
+        "adhesion": adhesion,
+        **{name: getattr(gear, name) for name in GEAR},
+        **{f"friction_{name}": getattr(friction, name) for name in FRICTION},
+        **{f"chassis_{name}": getattr(chassis, name) for name in CHASSIS},
+    }
+
+
+def _with(path: Path, chassis: Chassis, values: Mapping[str, Any]) -> tuple[Path, Chassis]:
+    gear = dataclasses.replace(path.gear, **{name: values[name] for name in GEAR})
+    ground = chassis.ground
+    friction = dataclasses.replace(ground.friction, **{name: values[f"friction_{name}"] for name in FRICTION})
+    ground = dataclasses.replace(ground, friction=friction)
+    changed = {name: values[f"chassis_{name}"] for name in CHASSIS}
+    return Path(values["pulley"], gear), dataclasses.replace(chassis, ground=ground, **changed)
+
+
+def shares(
+    path: Path, chassis: Chassis, at: Touch, slip: Scalar, adhesion: Scalar, gained: Float[Array, " 5"]
+) -> Float[Array, "sums contacts"]:
+    """Share of each contact in the `Sums`; `slip` shifts all sliding speeds [m/s], `gained` is Δv."""
+    sliding = -at.speed_x - slip
+    ground = chassis.ground
+    coefficient = ground.traction(sliding, 1.0, adhesion)
+    rise = ground.traction_rise(sliding, at.force, adhesion)
+    traction = coefficient * at.force
+    front, rear = path.radius * (1 - at.weight), path.radius * at.weight
+    drawn = front * gained[3] + rear * gained[4]
+    along = gained[0] + gained[2] * at.lever_z + at.rate_x * drawn
+    off = at.damped * (gained[1] - gained[2] * at.lever_x + at.rate_z * drawn)
+    fallen = jnp.maximum(rise, 0.0) * along + jnp.where(at.force > 0, coefficient, 0.0) * off
+    left, bears = traction - fallen, at.force - off
+    guided = at.guided * at.force
+    return jnp.stack(
+        [
+            traction,
+            at.force,
+            left * at.lever_z - bears * at.lever_x,
+            (left * at.rate_x + bears * at.rate_z) * rear,
+            (traction * at.rate_x + at.force * at.rate_z) * front,
+            guided * front,
+            guided * rear,
+            fallen,
+            off,
+            (fallen * at.rate_x + off * at.rate_z) * front,
+            rise,
+            rise * at.rate_x * front,
+        ]
+    )
+
+
+class Linearized(eqx.Module):
+    """The sums and their derivatives by motion, slip and whichever inputs are differentiated.
+
+    Attributes:
+        values: the sums; slopes: their derivatives, a row for each of `names`.
+        at: values of what the rows are by.
+    """
+
+    values: Sums
+    slopes: Float[Array, "names sums"]
+    at: Mapping[str, Scalar]
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def near(self, now: Mapping[str, Any]) -> Sums:
+        """The sums where inputs are `now` (those not in it as they were), to first order."""
+        moved = [now[name] - self.at[name] if name in now else jnp.zeros(()) for name in self.names]
+        return jax.tree.map(jnp.add, self.values, _sums(jnp.stack(moved) @ self.slopes))
+
+    def slope(self, name: str) -> Sums:
+        """Derivatives of the sums by one of `names`."""
+        return _sums(self.slopes[self.names.index(name)])
+
+
+def _sums(row: Float[Array, " sums"]) -> Sums:
+    return Sums(*(row[k] for k in range(len(ROWS))))
+
+
+def linearize(
+    path: Path,
+    chassis: Chassis,
+    given: Mapping[str, Any],
+    gained: Float[Array, " 5"],
+    constants: tuple[str, ...] = (),
+) -> Linearized:
+    """Sums and their derivatives: by the motion and the slip written out, by what contacts are made of by forward
+    differentiation of `shares`, one at a time.
+
+    Args:
+        path, chassis: of the run.
+        given: values of `MOTION`, of `inputs` and of `slip`.
+        gained: Δv of the step, held.
+        constants: which of `inputs` to have derivatives by.
+    """
+
+    def each(values: Mapping[str, Any]) -> Float[Array, "sums contacts"]:
+        path_now, chassis_now = _with(path, chassis, values)
+        z, pitch, front, rear, *v = (values[name] for name in MOTION)
+        at = touch(path_now, chassis_now, (0.0, z, pitch, front, rear), v)
+        return shares(path_now, chassis_now, at, values["slip"], values["adhesion"], gained)
+
+    def along(name: str) -> Float[Array, "sums contacts"]:
+        value = jnp.asarray(given[name])
+        return jax.jvp(lambda x: each({**given, name: x}), (value,), (jnp.ones_like(value),))[1]
+
+    values, slopes = _by_motion(path, chassis, given, gained)
+    if constants:
+        others = jnp.stack([along(name) for name in constants])
+        slopes = jnp.concatenate([slopes, others @ jnp.ones(others.shape[-1])])
+    # Slip shifts the sliding of every contact as the robot's own speed does.
+    slopes = jnp.concatenate([slopes, slopes[None, MOTION.index("v_x")]])
+    names = (*MOTION, *constants, "slip")
+    return Linearized(_sums(values), slopes, {name: given[name] for name in names}, names)
+
+
+def _total(*products: tuple[Any, ...]) -> Any:
+    """Sum of products; those with a factor None are left out, which XLA would not do with zeros."""
+    terms = [math.prod(factors[1:], start=factors[0]) for factors in products if all(f is not None for f in factors)]
+    return sum(terms[1:], start=terms[0]) if terms else None
+
+
+class _Law(eqx.Module):
+    """How forces follow a contact's own motion, Δv of the step held."""
+
+    at: Touch
+    by_depth: Array  # of R [N/m]
+    damped_by_depth: Array  # of D, how fast R falls with the gap's rate [N·s/m²]
+    share: Array  # both fall by this much of themselves with the belt's compliance [N/m]
+    coefficient: Array  # F = μ R
+    rise: Array  # dμ/dv
+    bend: Array  # d²μ/dv²
+    along: Array  # what the step changes the contact's velocity by [m/s]
+    off: Array
+
+    def forces(self) -> Forces:
+        """F, R, F~, R~ [N] and the rise of F [N·s/m]."""
+        force, down = self.at.force, self.at.damped * self.off
+        fallen = jnp.maximum(self.rise, 0.0) * force * self.along + self.coefficient * down
+        return self.coefficient * force, force, fallen, down, self.rise * force
+
+    def moved(
+        self,
+        gap: Any = None,
+        gap_rate: Any = None,
+        slide: Any = None,
+        along: Any = None,
+        off: Any = None,
+        compliance: Any = None,
+    ) -> Forces:
+        """How `forces` change with the gap, its rate, the sliding speed, what a step changes velocities by and the
+        compliance of the belt; None: not at all."""
+        at, sinks = self.at, None if gap is None else -gap
+        yields = None if compliance is None else -self.share * compliance
+        force = _total((self.by_depth, sinks), (-at.damped, gap_rate), (at.force, yields))
+        damped = _total((self.damped_by_depth, sinks), (at.damped, yields))
+        turned = _total((self.bend * at.force, slide), (self.rise, force))
+        down = _total((damped, self.off), (at.damped, off))
+        fallen = _total(
+            (jnp.where(self.rise > 0, self.along, 0.0), turned),
+            (jnp.maximum(self.rise, 0.0) * at.force, along),
+            (self.rise * at.damped * self.off, slide),
+            (self.coefficient, down),
+        )
+        pulled = _total((self.rise * at.force, slide), (self.coefficient, force))
+        found = (pulled, force, fallen, down, turned)
+        return tuple(jnp.zeros_like(at.force) if a is None else a for a in found)
+
+
+def _law(path: Path, chassis: Chassis, at: Touch, given: Mapping[str, Any], gained: Array) -> _Law:
+    gear, friction = path.gear, chassis.ground.friction
+    depth = jnp.maximum(-at.gap, 1e-9)
+    stiff = gear.contact_stiffness * depth ** (gear.contact_exponent - 1)
+    yields = 1 / (1 + at.compliance * stiff)
+    u = jnp.clip(depth / gear.contact_depth, 0.0, 1.0)
+    deepens = gear.contact_damping * 6 * u * (1 - u) / gear.contact_depth
+    bears = jnp.where(at.force > 0, bearing(chassis), 0.0) * yields
+    softens = at.compliance * stiff * yields * (gear.contact_exponent - 1) / depth
+    sliding = -at.speed_x - given["slip"]
+    rise, bend = jax.jvp(friction.rise, (sliding,), (jnp.ones_like(sliding),))
+    drawn = path.radius * ((1 - at.weight) * gained[3] + at.weight * gained[4])
+    return _Law(
+        at=at,
+        by_depth=bears * (gear.contact_exponent * stiff - deepens * at.gap_rate) - softens * at.force,
+        damped_by_depth=bears * deepens - softens * at.damped,
+        share=stiff * yields,
+        coefficient=given["adhesion"] * friction.coefficient(sliding),
+        rise=given["adhesion"] * rise,
+        bend=given["adhesion"] * bend,
+        along=gained[0] + gained[2] * at.lever_z + at.rate_x * drawn,
+        off=gained[1] - gained[2] * at.lever_x + at.rate_z * drawn,
+    )
+
+
+class _Levers(eqx.Module):
+    """Levers with which forces along the ground and off it enter the sums, each of shape (levers, contacts)."""
+
+    level: Array
+    steep: Array
+
+    @classmethod
+    def of(cls, unit: Any, x: Array, z: Array, front: tuple[Array, ...], rear: tuple[Array, ...]) -> _Levers:
+        """From levers of the pitch [m], and on each pulley those of F, R [m] and of friction on the guide [m]."""
+        return cls(jnp.stack([unit, z, front[0], rear[0]]), jnp.stack([unit, x, *front[1:], *rear[1:]]))
+
+
+def _weighed(forces: Sequence[Forces], levers: Sequence[_Levers]) -> Float[Array, "forces levers sums"]:
+    """The sums over all contacts of forces with levers, each with each."""
+    level, steep = jnp.stack([a.level for a in levers]), jnp.stack([a.steep for a in levers])
+    pulls = jnp.stack([jnp.stack([row[0], row[2], row[4]]) for row in forces])
+    bears = jnp.stack([jnp.stack([row[1], row[3]]) for row in forces])
+    # (forces, kind, levers, lever)
+    pulls, bears = jnp.tensordot(pulls, level, ((2,), (2,))), jnp.tensordot(bears, steep, ((2,), (2,)))
+    pull, fallen, rise = (pulls[:, k] for k in range(3))
+    force, down = (bears[:, k] for k in range(2))
+    left, held = pull - fallen, force - down
+    sums = Sums(
+        traction=pull[..., 0],
+        normal=force[..., 0],
+        moment=left[..., 1] - held[..., 1],
+        rear=left[..., 3] + held[..., 4],
+        front=pull[..., 2] + force[..., 2],
+        guide_front=force[..., 3],
+        guide_rear=force[..., 5],
+        fallen_x=fallen[..., 0],
+        fallen_z=down[..., 0],
+        fallen_front=fallen[..., 2] + down[..., 2],
+        rise=rise[..., 0],
+        rise_front=rise[..., 2],
+    )
+    return jnp.stack([getattr(sums, name) for name in ROWS], axis=-1)
+
+
+def _by_motion(
+    path: Path, chassis: Chassis, given: Mapping[str, Any], gained: Array
+) -> tuple[Float[Array, " sums"], Float[Array, "motion sums"]]:
+    """The sums, and their derivatives by `MOTION`.
+
+    Each contact is moved along ten directions: its height, the pitch, the place of the belt as each pulley turns,
+    five velocities and the yielding of the belt. What its forces change by is weighed with the levers of the sums,
+    and what the levers change by with its forces.
+    """
+    height, pitch, front, rear, *v = (given[name] for name in MOTION)
+    at = touch(path, chassis, (0.0, height, pitch, front, rear), v)
+    law = _law(path, chassis, at, given, gained)
+    x, z, rate_x, rate_z, guided, one = at.lever_x, at.lever_z, at.rate_x, at.rate_z, at.guided, jnp.ones_like(at.gap)
+    on_front, on_rear = path.radius * (1 - at.weight), path.radius * at.weight
+    speed, drawn = (on_front * a[3] + on_rear * a[4] for a in (v, gained))
+
+    def turned(dx: Array, dz: Array, ahead: Array, rise: Array, compliance: Array | None = None) -> Forces:
+        """Change of the forces as contact points and their rates change."""
+        return law.moved(
+            gap=dz,
+            gap_rate=rise * speed - v[2] * dx,
+            slide=-v[2] * dz - ahead * speed,
+            along=gained[2] * dz + ahead * drawn,
+            off=rise * drawn - gained[2] * dx,
+            compliance=compliance,
+        )
+
+    def levers(dx: Array, dz: Array, ahead: Array, rise: Array, share: Array) -> _Levers:
+        """Change of the levers as they do."""
+        rates = (ahead, rise, share)
+        return _Levers.of(
+            jnp.zeros_like(x), dx, dz, tuple(a * on_front for a in rates), tuple(a * on_rear for a in rates)
+        )
+
+    # Along the belt the tips move in the frame of the chassis, which is pitched; their share of the pulleys changes.
+    unit = jnp.ones_like(front)
+    (place, _), (by_front, shared) = jax.jvp(lambda a: path.place(a, rear), (front,), (unit,))
+    by_front, shared, by_rear = of_contacts(by_front), of_contacts(shared), at.weight * path.radius
+    tip = jax.tree.map(of_contacts, jax.jvp(lambda p: tips(path, p), (place,), (jnp.ones_like(place),))[1])
+    cos, sin = cosine(pitch), sine(pitch)
+    belt = (
+        tip.forward * cos + tip.up * sin,
+        tip.up * cos - tip.forward * sin,
+        tip.rate_forward * cos + tip.rate_up * sin,
+        tip.rate_up * cos - tip.rate_forward * sin,
+    )
+    below = jnp.where(WHEEL, chassis.radius, 0.0)
+    pitched = (z + below, -x, rate_z, -rate_x - below / path.radius)
+
+    def free(motion: Sequence[Scalar]) -> Scalar:
+        return tension_free(path, runs(path, motion[:2], motion[2:]))
+
+    pulleys = (front, rear, v[3], v[4])
+    taut = free(pulleys)
+    drawn_belt = turned(*belt, tip.compliance / taut)
+    over, gains = (path.radius * (a[4] - a[3]) for a in (v, gained))
+    handed = law.moved(gap_rate=rate_z * over, slide=-rate_x * over, along=rate_x * gains, off=rate_z * gains)
+    changes = [
+        law.moved(gap=one),
+        turned(*pitched),
+        tuple(a * by_front + b * shared for a, b in zip(drawn_belt, handed, strict=True)),
+        tuple(a * by_rear for a in drawn_belt),
+        law.moved(slide=-one),
+        law.moved(gap_rate=one),
+        law.moved(gap_rate=-x, slide=-z),
+        law.moved(gap_rate=rate_z * on_front, slide=-rate_x * on_front),
+        law.moved(gap_rate=rate_z * on_rear, slide=-rate_x * on_rear),
+        law.moved(compliance=-at.compliance / taut),
+    ]
+    forces, rates = law.forces(), (rate_x, rate_z, guided)
+    here = _Levers.of(one, x, z, tuple(a * on_front for a in rates), tuple(a * on_rear for a in rates))
+    rows = _weighed([*changes, forces], [here])[:, 0]
+    over_belt = levers(*belt, tip.guided)
+    shift = tuple(path.radius * a * shared for a in rates)
+    by_share = _Levers.of(jnp.zeros_like(x), 0 * x, 0 * x, tuple(-a for a in shift), shift)
+    moved = [
+        levers(*pitched, jnp.zeros_like(x)),
+        jax.tree.map(lambda a, b: a * by_front + b, over_belt, by_share),
+        jax.tree.map(lambda a: a * by_rear, over_belt),
+    ]
+    slopes = rows[: len(MOTION)].at[1:4].add(_weighed([forces], moved)[0])
+    for k, name in enumerate(("front", "rear", "v_front", "v_rear")):
+        by = jax.jvp(lambda a, k=k: free((*pulleys[:k], a, *pulleys[k + 1 :])), (pulleys[k],), (unit,))[1]
+        slopes = slopes.at[MOTION.index(name)].add(by * rows[-2])
+    return rows[-1], slopes
+
+
+class Drawn(eqx.Module):
+    """What the contacts do at an instant, by their sums; see `undercarriage.Pull`."""
+
+    traction: Scalar
+    moment: Scalar
+    rear: Scalar
+    guide: Scalar
+    guided: Scalar
+    load: Scalar
+
+
+class Mover(eqx.Module):
+    """The contacts as `balances.resolved` asks for them, by their sums near an instant.
+
+    What they do follows `speed_slip_terms` too: traction and load to second order, so that the first derivatives of
+    how they change with it are exact as well.
+    """
+
+    linearized: Linearized
+    sums: Sums
+    radius: Scalar
+    torque_front: Scalar
+
+    @property
+    def normal(self) -> Scalar:
+        """Normal load of one side [N]."""
+        return self.sums.normal
+
+    def shifted(self, slip: Scalar) -> Sums:
+        """The sums with the sliding speeds shifted by `slip` [m/s]."""
+        by, was = self.linearized.slope("slip"), self.linearized.values
+        moved = slip - self.linearized.at["slip"]
+        sums = jax.tree.map(lambda a, b: a + b * moved, self.sums, by)
+        rise, rise_front = self.sums.rise - was.rise, self.sums.rise_front - was.rise_front
+        return dataclasses.replace(
+            sums,
+            traction=sums.traction - (rise + by.rise * moved / 2) * moved,
+            front=sums.front - (rise_front + by.rise_front * moved / 2) * moved,
+        )
+
+    def pull(self, chassis: Chassis, signals: Signals) -> Drawn:
+        """What they do at these signals."""
+        sums = self.shifted(signals.speed_slip_terms)
+        friction = chassis.track.guide_friction * signals.direction
+        guided = (sums.guide_front + sums.guide_rear) / self.radius
+        load = -(sums.front - friction * sums.guide_front + self.torque_front)
+        return Drawn(
+            sums.traction, sums.moment, sums.rear - friction * sums.guide_rear, friction * guided, guided, load
+        )

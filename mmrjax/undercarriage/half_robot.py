@@ -1,0 +1,520 @@
+"""Half a robot in motion: its state, all its forces at an instant, one step, and where a run starts.
+
+MJX carries chassis and pulleys (5 degrees of freedom, `mjcf`); grousers or wheels, guides and belt
+(`undercarriage`, `belt`) and the drive (`balances`) enter as generalized forces.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from mmrjax.fidelities.rest import STARTS, creeps, direction, unless_slipping, voltage_at_rest
+from mmrjax.fidelities.result import result, travels
+from mmrjax.fidelities.steady import steady
+from mmrjax.model import balances
+from mmrjax.model.chassis import Chassis, inertia_reduced
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.masses import Masses, masses
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import (
+    BATTERY_EMPTY,
+    FAILED,
+    GRAVITY,
+    NOT_SETTLED,
+    ROLLS_BACK,
+    STALLED,
+    TIPS,
+    Result,
+    Signals,
+    State,
+    done,
+)
+from mmrjax.numerics.linear_equations import Factors, factorise, solution
+from mmrjax.undercarriage import contact_sums, mjcf
+from mmrjax.undercarriage import side_contacts as undercarriage
+from mmrjax.undercarriage.belt import Path, runs
+from mmrjax.undercarriage.contact_sums import Linearized
+from mmrjax.undercarriage.mjcf import mjx
+from mmrjax.undercarriage.side_contacts import Pull, Reactions, Touch
+
+#: Coordinate of the driving pulley.
+SHAFTS = 3
+#: Pitch beyond which a robot has turned over [rad], and height within which that is a number [axle heights].
+OVER, HIGH = 0.5, 20.0
+SETTLED = 1e-3  # largest relative change of the speeds from one half of the window to the other
+#: Changes of some signals, and their sizes.
+Changes = Sequence[tuple[Scalar, Scalar]]
+#: Means of signals (or `balances.Travel`) and of the guides' load, periods averaged, and of three signals the change
+#: and size, of the places of a belt over time and of what has means.
+Average = Callable[[Array, tuple[Any, Array]], tuple[Any, Array, Array, Changes]]
+
+
+class Motion(eqx.Module):
+    """State of half a robot: what a step advances.
+
+    Attributes:
+        q, v: coordinates and velocities, see `undercarriage`.
+        current: of one motor [A].
+        discharge: charge taken from the battery [C].
+        memory: of each effect that has one, by its name.
+    """
+
+    q: Float[Array, " 5"]
+    v: Float[Array, " 5"]
+    current: Scalar
+    discharge: Scalar
+    memory: Mapping[str, Scalar] = eqx.field(default_factory=dict)
+
+
+class Steady(eqx.Module):
+    """Averages over the last whole number of grouser periods of a run; of a robot that turns a leading axis of left
+    and right side, each over periods of its own.
+
+    Attributes:
+        signals: means.
+        guide_share: of the ground's normal reaction that the lower guides carry [-]: an output here, a
+            parameter in the other fidelities.
+        periods: grouser periods averaged [-]; 0: the plain window, the belt hardly moved.
+        change: largest relative change of current, motor speed and speed between the window's halves [-].
+        travel: means of all of an instant, of a robot that turns.
+    """
+
+    signals: Signals
+    guide_share: Scalar
+    periods: Int[Array, "..."]
+    change: Scalar
+    travel: balances.Travel | None = None
+
+
+class System(eqx.Module):
+    """One run's constants: what `rate` and `advance` need beside the motion.
+
+    Attributes:
+        chassis: of the run's configuration.
+        model, data: MJX model with this member's constants, and the data whose structure it needs.
+        step: interval of integration [s].
+    """
+
+    robot: Robot
+    conditions: Conditions
+    path: Path
+    half: Masses
+    chassis: Chassis
+    model: Any
+    data: Any
+    step: Scalar
+
+
+def system(robot: Robot, conditions: Conditions, step: Scalar) -> System:
+    """Constants of one run (scalar fields), of all of a robot that is free to turn; the robot may hold tracers."""
+    zero = jnp.zeros_like(conditions.voltage)
+    mass = balances.begin(robot, conditions, State(zero, zero, zero, zero)).mass
+    half = masses(robot, conditions, mass)
+    model, data = mjcf.template(conditions.turns)
+    model = mjcf.member(model, mjcf.bodies(robot, half, conditions), conditions.slope, step)
+    path, chassis = Path(robot.radius_pulley, robot.running_gear), robot.chassis(conditions.configuration)
+    return System(robot, conditions, path, half, chassis, model, data, jnp.asarray(step, float))
+
+
+class _Mover(eqx.Module):
+    path: Path
+    at: Touch
+    height: Scalar
+
+    @property
+    def normal(self) -> Scalar:
+        return self.at.normal
+
+    def pull(self, chassis: Chassis, signals: Signals) -> Pull:
+        return undercarriage.pull(self.path, chassis, signals, self.at, self.height)
+
+
+def instant(run: System, motion: Motion) -> tuple[Signals, Touch, Pull]:
+    """All signals, contacts and forces of an instant."""
+    at = undercarriage.touch(run.path, run.chassis, motion.q, motion.v)
+    signals, pulled = _resolved(run, motion, _Mover(run.path, at, motion.q[1]), motion.v[0], motion.v[3])
+    return signals, at, pulled
+
+
+def _resolved(
+    run: System, motion: Motion, mover: balances.Mover, speed: Scalar, speed_shaft: Scalar
+) -> tuple[Signals, Any]:
+    """Signals and forces with the contacts as they are, the robot [m/s] and the driving shaft [rad/s] at a speed."""
+    ratio = run.robot.gearbox.ratio
+    state = State(motion.current, ratio * speed_shaft, speed, motion.discharge, motion.memory)
+    return balances.resolved(run.robot, run.conditions, state, mover, run.half.inertia_pulley)
+
+
+def _losses(run: System, motion: Motion, mover: balances.Mover) -> tuple[Scalar, Scalar]:
+    """How the resistance of the ground rises with the robot's speed [N·s/m], and the drive's losses with that of the
+    driving shaft [N·m·s]: none where they fall."""
+
+    def forward(speed: Scalar) -> Scalar:
+        signals, pulled = _resolved(run, motion, mover, speed, motion.v[3])
+        return pulled.traction - signals.resistance
+
+    def shaft(speed: Scalar) -> Scalar:
+        return jnp.asarray(_resolved(run, motion, mover, motion.v[0], speed)[0].torque_net)
+
+    one = jnp.ones_like(motion.v[0])
+    fall_x, fall_shaft = (jax.jvp(f, (motion.v[k],), (one,))[1] for f, k in ((forward, 0), (shaft, 3)))
+    return jnp.maximum(-fall_x, 0.0), jnp.maximum(-fall_shaft, 0.0)
+
+
+def generalized(run: System, signals: Signals, pulled: Pull) -> tuple[Float[Array, " 5"], Float[Array, " 5"]]:
+    """Generalized forces on q [N, N·m], and the armature's inertia seen at each joint [kg·m²], eq. (31)."""
+    force = jnp.insert(pulled.generalized, 3, signals.torque_net)
+    return force, jnp.zeros_like(force).at[3].set(rotating(run, signals))
+
+
+def rotating(run: System, signals: Signals) -> Scalar:
+    """The armature's inertia seen at the driving shaft [kg·m²], eq. (31)."""
+    motor, ratio = run.robot.motor.inertia, run.robot.gearbox.ratio
+    return inertia_reduced(motor, ratio, signals.efficiency_load, signals.inertia_added)
+
+
+def current_after(robot: Robot, conditions: Conditions, step: Scalar, signals: Signals) -> Scalar:
+    """Motor current one step on [A]: exponential Euler, exact for a winding at constant speed.
+
+    L dI/dt = U_left(I); I + Δt U_left / L · (e^z - 1) / z with z = Δt U_left' / L. The electrical time
+    constant (0.2 ms) is of the order of the step, so the winding's own decay is integrated exactly; U_left'
+    comes from the balances, so a battery or an effect that changes the slope is in it.
+    """
+
+    def left(current: Scalar) -> Scalar:
+        total = signals.total_current + robot.sides * signals.share_drawn * (current - signals.current)
+        shifted = dataclasses.replace(signals, current=current, total_current=total)
+        return balances.electrical(robot, conditions, balances.supply(robot, conditions, shifted)).voltage_left
+
+    voltage, slope = jax.jvp(left, (signals.current,), (jnp.ones_like(signals.current),))
+    z = step * slope / signals.inductance
+    return signals.current + step / signals.inductance * voltage * jnp.expm1(z) / z
+
+
+def resistance(run: System, motion: Motion, signals: Signals, at: Touch, pulled: Pull) -> Float[Array, "5 5"]:
+    """How the forces on v fall with v, K, by which a step is damped.
+
+    Friction rises with sliding and is in proportion to the normal force, which falls with the rate of the gap:
+    K = Σ k g gᵀ + d (μ g + h) hᵀ, with g and h the change of a contact's speed along the ground and off it with v.
+    Friction that falls with sliding, beyond V_s, is an instability of the robot and not of the step: it is left out.
+    The drive's losses and the resistance of the ground rise steeply from rest: those are on K's diagonal.
+    """
+    losses = _losses(run, motion, _Mover(run.path, at, motion.q[1]))
+    rises = jnp.maximum(undercarriage.friction_rise(run.chassis, signals, at), 0.0)
+    front, rear = run.path.radius * (1 - at.weight), run.path.radius * at.weight
+    one, none = jnp.ones_like(rises), jnp.zeros_like(rises)
+    along = jnp.stack([one, none, at.lever_z, at.rate_x * front, at.rate_x * rear], axis=1)
+    off = jnp.stack([none, one, -at.lever_x, at.rate_z * front, at.rate_z * rear], axis=1)
+    none = jnp.zeros_like(losses[0])
+    own = jnp.diag(jnp.stack([losses[0], none, none, losses[1], none]))
+    return contacts_resist(along, off, pulled.force, at.force, rises, at.damped) + own
+
+
+def contacts_resist(
+    along: Float[Array, "contacts n"], off: Float[Array, "contacts n"], pulled: Array, force: Array, rises: Array,
+    damped: Array,
+) -> Float[Array, "n n"]:  # fmt: skip
+    """K of the contacts, see `resistance`: they move `along` the ground and `off` it with v, pulled by friction [N]
+    under a normal force [N]."""
+    pushes = (pulled / jnp.maximum(force, 1e-9))[:, None] * along + off
+    return (along.T * rises) @ along + (pushes.T * damped) @ off
+
+
+def _pushed(
+    run: System, motion: Motion, signals: Signals, pulled: Pull
+) -> tuple[Float[Array, " 5"], Float[Array, "5 5"]]:
+    """Velocities one explicit step on, and the mass matrix."""
+    force, armature = generalized(run, signals, pulled)
+    data = run.data.replace(qpos=motion.q, qvel=motion.v, qfrc_applied=force)
+    model = run.model.replace(dof_armature=armature)
+    data = mjx.step(model, data)
+    return data.qvel, mjx.full_m(model, data)
+
+
+def mass_matrix(run: System, motion: Motion) -> Float[Array, "5 5"]:
+    """Mass matrix M on v, the rotors' armature in it [kg, kg·m, kg·m²]."""
+    signals, _, pulled = instant(run, motion)
+    return _pushed(run, motion, signals, pulled)[1]
+
+
+class _Step(eqx.Module):
+    """A step as it was computed, and what its derivatives need: K, factors of M + Δt K, and Δv."""
+
+    after: Motion
+    signals: Signals
+    guided: Scalar
+    damping: Float[Array, "5 5"]
+    factors: Factors
+    gained: Float[Array, " 5"]
+    slip: Scalar
+
+
+def _step(run: System, motion: Motion) -> _Step:
+    signals, at, pulled = instant(run, motion)
+    pushed, mass = _pushed(run, motion, signals, pulled)
+    damping = resistance(run, motion, signals, at, pulled)
+    factors = factorise(mass + run.step * damping)
+    gained = solution(factors, mass @ (pushed - motion.v))
+    after, over = _moved(motion, run.step, later(run, motion, signals), damping @ gained, gained, signals)
+    return _Step(after, over, pulled.guided, damping, factors, gained, jnp.asarray(signals.speed_slip_terms))
+
+
+class _Later(eqx.Module):
+    """What a step does to the state beside coordinates and velocities."""
+
+    current: Scalar
+    discharge: Scalar
+    memory: Mapping[str, Scalar]
+
+
+def later(run: System, motion: Motion, signals: Signals) -> _Later:
+    """Currents, charge and memories one step on."""
+    charge = balances.charge_drawn(run.robot, run.conditions, signals.total_current)
+    memory = {
+        effect.name: motion.memory[effect.name] + run.step * effect.rate(run.robot, signals)
+        for effect in run.robot.remembering
+    }
+    return _Later(
+        current_after(run.robot, run.conditions, run.step, signals), motion.discharge + run.step * charge, memory
+    )
+
+
+def _moved(
+    motion: Motion, step: Scalar, later: _Later, fallen: Array, gained: Array, signals: Signals
+) -> tuple[Motion, Signals]:
+    v = motion.v + gained
+    after = Motion(motion.q + step * v, v, later.current, later.discharge, later.memory)
+    traction, normal = signals.traction - fallen[0], signals.normal - fallen[1]
+    return after, dataclasses.replace(signals, traction=traction, normal=normal, acceleration=gained[0] / step)
+
+
+@eqx.filter_custom_jvp
+def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Scalar]:
+    """One step of MJX (semi-implicit Euler) and of the winding.
+
+    Forces of the contacts are taken at the step's end as far as they depend on v, to first order: (M + Δt K) Δv =
+    Δt M a with MJX's mass matrix M and acceleration a (linearly implicit Euler; Hairer and Wanner 1996, IV.7). Within
+    V_s the time constant of a contact is m V_s / (μ_s R_z), microseconds for a small V_s.
+
+    Derivatives are those of the step as computed, written once: with Δv held, what the step leaves of Δt τ - Δt c -
+    (M + Δt K) Δv = 0 is differentiated (τ the forces of `generalized`, c MJX's bias), and the same factors solve for
+    the change of Δv.
+
+    Returns:
+        The motion after it; the signals before it, but traction, normal load and acceleration those of the step; the
+        load on the lower guide before it [N].
+    """
+    step = _step(run, motion)
+    return step.after, step.signals, step.guided
+
+
+@advance.def_jvp
+def _differentiated(
+    primals: tuple[System, Motion], tangents: tuple[Any, Any]
+) -> tuple[tuple[Motion, Signals, Scalar], tuple[Motion, Signals, Scalar]]:
+    run, motion = primals
+    step = _step(run, motion)
+    # The model's constants follow from the rest of the run.
+    run, d_run = (dataclasses.replace(x, model=None, data=None) for x in (run, tangents[0]))
+    d_motion = tangents[1]
+    linearized = _linearized(run, motion, step, d_run)
+
+    def held(run: System, motion: Motion) -> tuple[Array, Array, _Later, Signals, Scalar]:
+        return _held(run, motion, step.gained, linearized)
+
+    (left, fallen, later, signals, _), d_held = eqx.filter_jvp(held, (run, motion), (d_run, d_motion))
+    d_left, d_fallen, d_later, d_signals, d_guided = d_held
+    # None: what is differentiated does not enter.
+    d_gained = jnp.zeros_like(left) if d_left is None else solution(step.factors, d_left)
+    through = step.damping[:2] @ d_gained
+    d_fallen = through if d_fallen is None else d_fallen + through
+    _, (d_after, d_over) = eqx.filter_jvp(
+        _moved,
+        (motion, run.step, later, fallen, step.gained, signals),
+        (d_motion, d_run.step, d_later, d_fallen, d_gained, d_signals),
+    )
+    return (step.after, step.signals, step.guided), (d_after, d_over, d_guided)
+
+
+def _inputs(run: System, motion: Motion) -> dict[str, Scalar]:
+    """What the contacts depend on, by name."""
+    moving = dict(zip(contact_sums.MOTION, (*motion.q[1:], *motion.v), strict=True))
+    return moving | contact_sums.inputs(run.path, run.chassis, run.conditions.adhesion)
+
+
+def _linearized(run: System, motion: Motion, step: _Step, changed: System) -> Linearized:
+    """The contacts' sums with derivatives by the motion, and by what else is `changed`."""
+    constants = contact_sums.inputs(changed.path, changed.chassis, changed.conditions.adhesion)
+    differentiated = tuple(name for name, change in constants.items() if change is not None)
+    given = _inputs(run, motion) | {"slip": step.slip}
+    return contact_sums.linearize(run.path, run.chassis, given, step.gained, differentiated)
+
+
+def _held(
+    run: System, motion: Motion, gained: Float[Array, " 5"], linearized: Linearized
+) -> tuple[Array, Array, _Later, Signals, Scalar]:
+    """What a step with Δv held leaves of Δt τ - Δt c - (M + Δt K) Δv, K Δv of x and z, and the rest of a step."""
+    q, v = motion.q, motion.v
+    belt = runs(run.path, (q[3], q[4]), (v[3], v[4]))
+    sums = linearized.near(_inputs(run, motion))
+    mover = contact_sums.Mover(linearized, sums, run.path.radius, belt.torque_front)
+    signals, drawn = _resolved(run, motion, mover, v[0], v[3])
+    sums = mover.shifted(signals.speed_slip_terms)
+    losses = [loss * gained[k] for k, loss in zip((0, 3), _losses(run, motion, mover), strict=True)]
+    force = jnp.stack(
+        [
+            drawn.traction - signals.resistance - sums.fallen_x - losses[0],
+            sums.normal - sums.fallen_z,
+            drawn.moment + signals.resistance * q[1],
+            signals.torque_net - sums.fallen_front - losses[1],
+            drawn.rear + belt.torque_rear,
+        ]
+    )
+    gear, spins = run.path.gear, rotating(run, signals)
+    spent = mjcf.impulse(run.half, gear.wheelbase, run.conditions, q[2], v[2], spins, gained, run.step)
+    fallen = jnp.stack([sums.fallen_x + losses[0], sums.fallen_z])
+    return run.step * force - spent, fallen, later(run, motion, signals), signals, drawn.guided
+
+
+def margin(run: System) -> Scalar:
+    """How far the line of gravity meets the ground inside the outermost contacts [m]; negative: it tips."""
+    forward, up, _ = centre(run)
+    meets = forward - jnp.tan(run.conditions.slope) * (up + axle_height(run))
+    return run.path.gear.wheelbase / 2 - jnp.abs(meets)
+
+
+def centre(run: System) -> tuple[Scalar, Scalar, Scalar]:
+    """Centre of mass ahead of and above the middle of the wheelbase [m], and the mass of half a robot [kg]."""
+    return *run.half.centre, run.half.chassis + 2 * run.half.pulley
+
+
+def axle_height(run: System) -> Scalar:
+    """Height of the axles over the ground where the contacts just touch [m]."""
+    tracked = run.path.radius + run.path.gear.grouser_height
+    return jnp.where(run.chassis.on_tracks > 0.5, tracked, run.chassis.radius)
+
+
+def stand(run: System, turned: Scalar = 0.0) -> Motion:
+    """At rest on the ground, the contacts bearing the weight: Newton in height and pitch.
+
+    Newton begins where every contact that could bear touches, for from there it does not overshoot. A robot that
+    tips starts level, its lowest contacts just touching.
+
+    Args:
+        turned: angle of both pulleys [rad], which is where the belt stands.
+    """
+    forward, up, total = centre(run)
+    weight = total * GRAVITY
+    cos, sin = jnp.cos(run.conditions.slope), jnp.sin(run.conditions.slope)
+    axle = axle_height(run)
+    rest = jnp.zeros(5, jnp.result_type(axle))
+    zeros = rest.at[3:5].set(turned)
+
+    def unbalanced(y: Float[Array, " 2"]) -> Float[Array, " 2"]:
+        q = zeros.at[1].set(axle - y[0]).at[2].set(y[1])
+        at = undercarriage.touch(run.path, run.chassis, q, rest)
+        moment = weight * (cos * (forward + y[1] * up) - sin * (up + axle)) - jnp.sum(at.force * at.lever_x)
+        return jnp.stack([(at.normal - weight * cos) / weight, moment / weight])
+
+    def newton(y: Float[Array, " 2"], _: None) -> tuple[Float[Array, " 2"], None]:
+        residual, jacobian = unbalanced(y), jax.jacfwd(unbalanced)(y)
+        (a, b), (c, d) = jacobian
+        det = a * d - b * c
+        det = jnp.where(jnp.abs(det) > 1e-9, det, 1e-9)
+        move = jnp.stack([d * residual[0] - b * residual[1], a * residual[1] - c * residual[0]]) / det
+        limit = jnp.asarray([2e-4, 2e-3])
+        return y - jnp.clip(move, -limit, limit), None
+
+    recess = jnp.maximum(run.path.gear.guide_recess, 0.0) * run.chassis.on_tracks
+    y0 = jnp.stack([2e-4 + recess, jnp.zeros_like(recess)])
+    y, _ = jax.lax.scan(newton, y0, None, length=30)
+    y = jnp.where(margin(run) > 0, y, jnp.zeros_like(y))
+    q = zeros.at[1].set(axle - y[0]).at[2].set(y[1])
+    memory = {effect.name: jnp.zeros_like(axle) for effect in run.robot.remembering}
+    return Motion(q, rest, jnp.zeros_like(axle), run.conditions.discharge * jnp.ones_like(axle), memory)
+
+
+def roll(run: System) -> Motion:
+    """Rolling on its contacts at the speed of the steady fidelity, or at no load where that has none.
+
+    Derivatives pass through it, so that those of a short run are those of what was run.
+    """
+    start = stand(run)
+    guess = steady(run.robot, run.conditions)
+    solved = done(guess.status) | (guess.status == ROLLS_BACK)
+    ratio, radius = run.robot.gearbox.ratio, run.chassis.radius
+    no_load = voltage_at_rest(run.robot, run.conditions) / run.robot.motor.torque_constant
+    speed_wheel = guess.theoretical_speed / radius  # the reading may carry a sensor's error
+    motor = jnp.where(solved, ratio * speed_wheel, no_load)
+    speed = jnp.where(solved, guess.theoretical_speed * (1 - guess.slip), radius * no_load / ratio)
+    current = jnp.where(solved, guess.reading["total_current"] / run.robot.sides, 0.0)
+    v = jnp.zeros(5, start.q.dtype).at[0].set(speed).at[3:5].set(motor / ratio)
+    start = dataclasses.replace(start, v=v, current=current)
+    signals, _, _ = instant(run, start)  # what effects remember is settled too
+    memory = {e.name: e.settled(run.robot, signals) * jnp.ones_like(current) for e in run.robot.remembering}
+    return dataclasses.replace(start, memory=memory)
+
+
+def loads(run: System, at: Touch, pulled: Pull) -> Reactions:
+    """Loads inside the running gear at an instant."""
+    return undercarriage.reactions(run.path, at, pulled)
+
+
+def away(q: Array, reactions: Reactions) -> tuple[Array, Reactions | None]:
+    """How far a robot has come [m], and the loads inside its running gear."""
+    return q[..., 0], reactions
+
+
+def averaged(average: Average, travelled: Array, passed: Any, guided: Array) -> Steady:
+    """Averages at the end of a run, of its record."""
+    signals, load, periods, changes = average(travelled, (passed, guided))
+    return Steady(signals, load / jnp.maximum(signals.normal, 1e-9), periods, jnp.max(relative(changes)))
+
+
+def relative(changes: Changes) -> Array:
+    """Changes over their sizes [-]."""
+    return jnp.stack([change / jnp.maximum(size, 1e-3) for change, size in changes])
+
+
+def status(run: System, averages: Steady, end: Motion) -> Array:
+    """How a run has ended, by its averages and its last motion."""
+    robot, conditions, signals = run.robot, run.conditions, averages.signals
+    status = jnp.where(averages.change > SETTLED, NOT_SETTLED, travels(signals.speed, signals.voltage))
+    sense, rest = direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
+    stands = creeps(sense, voltage_at_rest(robot, conditions), signals.speed_theoretical, signals.speed, rest)
+    parked = (jnp.abs(signals.direction) < 0.999) | (stands & (sense * signals.acceleration < STARTS))
+    status = jnp.where(parked, STALLED, status)
+    # On average over the window.
+    status = unless_slipping(status, robot, signals, signals.acceleration * jnp.sign(signals.direction), 1e-2, stands)
+    empty = (conditions.battery > 0.5) & robot.battery.empty(end.discharge)
+    status = jnp.where(empty, BATTERY_EMPTY, status)
+    status = jnp.where(margin(run) < 0, TIPS, status)
+    return unless_lost(run, status, end, end.q[1], jnp.abs(end.q[2]), signals.total_current)
+
+
+def unless_lost(run: System, status: Array, end: Motion, height: Array, tilt: Array, current: Scalar) -> Array:
+    """The status of a run; of one that has left the ground, sunk through it or turned over, whose numbers mean
+    nothing, `tips` or `failed`.
+
+    Args:
+        end: its last motion, with the `height` of the middle of the wheelbase [m] and its `tilt`, 0 or more [rad].
+    """
+    level = axle_height(run)
+    finite = jnp.all(jnp.isfinite(end.q)) & jnp.all(jnp.isfinite(end.v)) & jnp.isfinite(current)
+    turned = (tilt > OVER) & (tilt < 2 * jnp.pi)
+    status = jnp.where(turned & (jnp.abs(height) < HIGH * level), TIPS, status)
+    grounded = (jnp.abs(height - level) < 0.5 * level) & (tilt < OVER)
+    return jnp.where(finite & (grounded | (status == TIPS)), status, FAILED)
+
+
+def result_of(run: System, averages: Steady, status: Array) -> Result:
+    """What is observed of a run that ends so."""
+    return result(run.robot, averages.signals, status)

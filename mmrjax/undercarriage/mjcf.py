@@ -1,0 +1,237 @@
+"""Half a robot, or all of one free to turn, as MJCF for MuJoCo, and as an MJX model whose mass constants follow each
+batch member.
+
+MJX owns the multibody dynamics alone: contacts and constraints are switched off and every force of the
+running gear enters as a generalized force. The same text loads in C MuJoCo and its viewer.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import io
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mmrjax.model import channels
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.masses import Masses, masses
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import GRAVITY
+from mmrjax.numerics.trigonometry import cosine, sine
+from mmrjax.turning.two_sides import SIDES
+from mmrjax.undercarriage.side_contacts import lever_tips
+
+with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+    import mujoco
+    from mujoco import mjx  # says on stdout which optional back ends are missing
+
+
+#: Joints of the chassis: of half a robot in its plane of travel, and of a robot free to turn. Name, type, axis.
+_JOINTS = {
+    False: (("travel", "slide", "1 0 0"), ("height", "slide", "0 0 1"), ("pitch", "hinge", "0 1 0")),
+    True: (
+        ("travel", "slide", "1 0 0"), ("aside", "slide", "0 1 0"), ("height", "slide", "0 0 1"),
+        ("yaw", "hinge", "0 0 1"), ("pitch", "hinge", "0 1 0"), ("roll", "hinge", "1 0 0"),
+    ),
+}  # fmt: skip
+
+
+class Bodies(NamedTuple):
+    """Bodies in the order of the model: chassis, then driving and driven pulley of each side.
+
+    Attributes:
+        names: of the bodies.
+        mass: [kg]; inertia: about its own centre by x, y, z [kg·m²]; centre: in its own frame [m].
+        place: of its frame in that of the chassis, whose origin is the middle of the wheelbase [m].
+    """
+
+    names: tuple[str, ...]
+    mass: Float[Array, " bodies"]
+    inertia: Float[Array, "bodies 3"]
+    centre: Float[Array, "bodies 3"]
+    place: Float[Array, "bodies 3"]
+
+
+def bodies(robot: Robot, half: Masses, conditions: Conditions) -> Bodies:
+    """The bodies of half a robot, or of all of one that is free to turn (`Conditions.turns`).
+
+    In the plane of travel the moments about y alone count, and the others are the same. That of yaw is
+    `turning.inertia` of all about its centre, payload apart as in the other fidelities. That of roll, which decides
+    how fast load moves between the sides and not how much, is of the parts: a body as wide as the tracks stand apart,
+    evenly filled, and the parts of the sides where these are; at least what a flat robot of its yaw and pitch has.
+    """
+    zero, base = jnp.zeros_like(half.chassis), robot.running_gear.wheelbase
+    ends = (("driving", base / 2), ("driven", -base / 2))
+    if not conditions.turns:
+        names = tuple(name for name, _ in ends)
+        mass, turning = [half.chassis, half.pulley, half.pulley], [half.inertia] + [half.inertia_pulley] * 2
+        inertia = jnp.stack([jnp.stack([x] * 3) for x in turning])
+        places = [jnp.stack([x + zero, zero, zero]) for _, x in ends]
+    else:
+        turning = robot.chassis(conditions.configuration).turning
+        several, aside = robot.sides / 2, turning.width / 2
+        pulley, spins = several * half.pulley, several * half.inertia_pulley
+        mass = [2 * several * half.chassis] + [pulley] * 4
+        names = tuple(f"{name}_{side}" for side in channels.SIDES for name, _ in ends)
+        places = [jnp.stack([x + zero, y * turning.width + zero, zero]) for y in SIDES for _, x in ends]
+        centre = half.centre[0]
+        apart = mass[0] * (half.forward - centre) ** 2 + 4 * (spins + pulley * (base**2 / 4 + aside**2 + centre**2))
+        pitch, yaw = 2 * several * half.inertia, turning.inertia - apart
+        payload = conditions.payload / robot.sides
+        roll = 2 * several * (half.body / 3 + half.chassis - half.body - payload) * aside**2
+        rows = [jnp.stack([jnp.maximum(roll, yaw - pitch), pitch, yaw])] + [jnp.stack([spins] * 3)] * 4
+        inertia = jnp.stack(rows)
+    own = jnp.stack([half.forward, zero, half.up])
+    return Bodies(
+        ("chassis", *names),
+        jnp.stack(mass),
+        inertia,
+        jnp.zeros_like(inertia).at[0].set(own),
+        jnp.stack([jnp.zeros_like(own), *places]),
+    )
+
+
+def text(robot: Robot, conditions: Conditions, mass: float, step: float = 1e-4) -> str:
+    """MJCF of half a robot under some conditions (scalar fields), of all of it where these free it to turn; `mass`
+    total [kg], `step` [s].
+
+    The shapes are for the eye and show both sides; masses and inertias are stated, of half a robot those of one side.
+    """
+    gear = robot.running_gear
+    parts = bodies(robot, masses(robot, conditions, jnp.asarray(mass)), conditions)
+    chassis = robot.chassis(conditions.configuration)
+    wheeled = bool(chassis.on_tracks < 0.5)
+    stand = " 0 0 0 0" if conditions.turns else ""
+    radius, base = float(robot.radius_pulley), float(gear.wheelbase)
+    axle = float(chassis.radius) if wheeled else radius + float(gear.grouser_height)
+    outer = float(chassis.radius) if wheeled else radius
+    sin, cos = float(jnp.sin(conditions.slope)), float(jnp.cos(conditions.slope))
+    levers = ""
+    if not wheeled:
+        for side, (x, z) in zip((1.0, -1.0), lever_tips(gear, conditions), strict=True):
+            for y in (-0.15, 0.15):
+                ends = f"{side * base / 2:.9g} {y} 0 {float(x):.9g} {y} {float(z):.9g}"
+                levers += f'<geom type="capsule" size="0.012" fromto="{ends}" rgba=".35 .4 .45 1"/>\n      '
+    pulleys = ""
+    for k, name in enumerate(parts.names[1:], 1):
+        disc = f'<geom type="cylinder" size="{outer:.9g} 0.018" euler="90 0 0" rgba=".2 .2 .2 1"'
+        middles = (0.0,) if conditions.turns else (0.122, -0.122)
+        shown = "".join(f'{disc} pos="0 {y} 0"/>\n        ' for y in middles)
+        across = 0.019 if conditions.turns else 0.141
+        pulleys += f"""
+      <body name="{name}" pos="{_row(parts.place[k])}">
+        <inertial pos="0 0 0" mass="{float(parts.mass[k]):.17g}" diaginertia="{_row(parts.inertia[k])}"/>
+        <joint name="{name}" type="hinge" axis="0 1 0"/>
+        {shown}<geom type="box" size="{outer:.9g} {across} 0.003" rgba=".8 .8 .2 1"/>
+      </body>"""
+    joints = "".join(f'<joint name="{n}" type="{t}" axis="{a}"/>\n      ' for n, t, a in _JOINTS[conditions.turns])
+    belts = "".join(
+        f'<geom type="box" size="{base / 2:.9g} 0.014 0.0015" pos="0 {y} {z:.9g}" rgba=".2 .2 .2 1"/>\n      '
+        for y in (-0.122, 0.122)
+        for z in (-radius, radius)
+    )
+    titled = f"{'' if conditions.turns else 'half '}robot {robot.configurations.names[int(conditions.configuration)]}"
+    return f"""<mujoco model="{titled}">
+  <compiler inertiafromgeom="false"/>
+  <option timestep="{step:.9g}" integrator="Euler" gravity="{-GRAVITY * sin:.17g} 0 {-GRAVITY * cos:.17g}">
+    <flag contact="disable" constraint="disable" eulerdamp="disable"/>
+  </option>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <visual><global offwidth="1280" offheight="720"/></visual>
+  <asset><texture type="skybox" builtin="gradient" rgb1=".9 .95 1" rgb2=".6 .7 .8" width="64" height="64"/></asset>
+  <worldbody>
+    <light pos="0 -2 3" dir="0 .5 -1" directional="true"/>
+    <geom name="ground" type="plane" size="20 2 .1" rgba=".8 .78 .72 1"/>
+    <body name="chassis" pos="0 0 0">
+      <inertial pos="{_row(parts.centre[0])}" mass="{float(parts.mass[0]):.17g}"
+        diaginertia="{_row(parts.inertia[0])}"/>
+      {joints}<geom type="box" size="{base / 2:.9g} 0.104 0.038" pos="0 0 {0.043 - 0.038:.9g}" rgba=".3 .5 .7 1"/>
+      {belts}{levers}{pulleys}
+    </body>
+  </worldbody>
+  <keyframe><key name="stand" qpos="{"0 0" if conditions.turns else "0"} {axle:.9g} 0 0 0{stand}"/></keyframe>
+</mujoco>
+"""
+
+
+def _row(numbers: Array) -> str:
+    return " ".join(f"{float(x):.17g}" for x in numbers)
+
+
+def impulse(
+    half: Masses,
+    wheelbase: Scalar,
+    conditions: Conditions,
+    pitch: Scalar,
+    rate: Scalar,
+    rotating: Scalar,
+    gained: Float[Array, " 5"],
+    step: Scalar,
+) -> Float[Array, " 5"]:
+    """Generalized impulse that changes velocities by `gained` in a `step`, M Δv + Δt c, in closed form.
+
+    M is the mass matrix and c the bias (gravity and centrifugal forces) of the model that `text` writes: MJX has them
+    too, but the derivatives of its general tree cost many times those of this one. No other force depends on v here.
+
+    Args:
+        half, wheelbase: masses and distance of the pulleys.
+        conditions: for the slope.
+        pitch: of the chassis [rad]; rate: its rate [rad/s]; rotating: the armature's inertia at its joint [kg·m²].
+        gained: Δv; step: Δt [s].
+    """
+    cos, sin = cosine(pitch), sine(pitch)
+    ahead = half.chassis * (half.forward * cos + half.up * sin)  # times the mass: the pulleys' cancel
+    above = half.chassis * (half.up * cos - half.forward * sin)
+    mass, turning = half.chassis + 2 * half.pulley, half.inertia_pulley
+    pitching = half.pitching(wheelbase)
+    gravity_x, gravity_z = GRAVITY * jnp.sin(conditions.slope), GRAVITY * jnp.cos(conditions.slope)
+    x, z, turn, front, rear = (gained[k] for k in range(5))
+    return jnp.stack(
+        [
+            mass * x + above * turn + step * (mass * gravity_x - ahead * rate**2),
+            mass * z - ahead * turn + step * (mass * gravity_z - above * rate**2),
+            above * x - ahead * z + pitching * turn + turning * (2 * turn + front + rear)
+            + step * (gravity_x * above - gravity_z * ahead),
+            turning * (turn + front) + rotating * front,
+            turning * (turn + rear),
+        ]
+    )  # fmt: skip
+
+
+@functools.cache
+def _template(double: bool, turns: bool) -> tuple[Any, Any]:
+    from mmrjax.model.paper_robots import nominal  # topology only: every number is replaced per member
+
+    with jax.ensure_compile_time_eval():
+        run = Conditions(heading_deg=0.0 if turns else None)
+        model = mujoco.MjModel.from_xml_string(text(nominal(), run, 13.1))
+        return mjx.put_model(model), mjx.make_data(model)
+
+
+def template(turns: bool = False) -> tuple[Any, Any]:
+    """The MJX model and data that all members share in structure, of half a robot or one free to turn."""
+    return _template(jnp.result_type(float) == jnp.float64, turns)
+
+
+def member(model: Any, parts: Bodies, slope: Scalar, step: Scalar) -> Any:
+    """The MJX `model` with this member's bodies, gravity and time step.
+
+    Every constant that the smooth dynamics read and that mass decides is set here (mujoco issue 1607); the
+    derived ones that only the constraint solver and the sensors read are set where they are sums.
+    """
+    zero = jnp.zeros_like(parts.mass[0])
+    total = jnp.sum(parts.mass)
+    gravity = -GRAVITY * jnp.stack([jnp.sin(slope), zero, jnp.cos(slope)])
+    return model.replace(
+        body_mass=jnp.concatenate([zero[None], parts.mass]),
+        body_subtreemass=jnp.concatenate([jnp.stack([total, total]), parts.mass[1:]]),
+        body_inertia=jnp.concatenate([jnp.zeros((1, 3)), parts.inertia]),
+        body_ipos=jnp.concatenate([jnp.zeros((1, 3)), parts.centre]),
+        body_pos=jnp.concatenate([jnp.zeros((1, 3)), parts.place]),
+        opt=model.opt.replace(gravity=gravity, timestep=jnp.asarray(step)),
+    )

@@ -1,0 +1,123 @@
+"""Natural frequencies of half a robot on its contacts: bounce, pitch, and what swings in the drive."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.optimize import linear_sum_assignment
+
+from mmrjax.compile.compiling import compiled
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.robot import Robot
+from mmrjax.undercarriage.half_robot import mass_matrix, roll, stand, system
+from mmrjax.undercarriage.stability import PROBE, step_derivative
+
+POSITIONS = 12  # of the belt within a pitch of the grousers
+#: A mode has the name of the coordinate that holds most of its kinetic energy.
+NAMES = ("surge", "bounce", "pitch", "drive", "driven pulley")
+#: Damping ratio below which a mode amplifies at its own frequency: 1 / 2ζ above 1.
+RESONANT = 0.5
+_SWINGS = 0.95  # damping ratio above which a motion creeps back rather than swings
+
+
+class Mode(NamedTuple):
+    """A natural vibration, over the positions of the belt within a pitch.
+
+    Attributes:
+        name: one of `NAMES`, by the kinetic energy in its eigenvector.
+        frequency: damped natural frequency, mean over the positions at which there is one [Hz].
+        low, high: its range over them [Hz].
+        natural: undamped, |λ| / 2π, mean [Hz].
+        damping: ratio ζ = -Re λ / |λ|, mean [-]; negative: it grows by itself.
+        share: of the kinetic energy that is in the coordinate of its name, mean [-].
+        positions: share of the positions at which there is one [-].
+    """
+
+    name: str
+    frequency: float
+    low: float
+    high: float
+    natural: float
+    damping: float
+    share: float
+    positions: float
+
+    @property
+    def amplifies(self) -> bool:
+        """Whether it is lightly damped, at most positions of the belt."""
+        return self.damping < RESONANT and self.positions > 0.5
+
+    @property
+    def resonant(self) -> bool:
+        """Whether it amplifies at a frequency that the belt's position does not change by an octave or more.
+
+        Over an octave some harmonic is always within the range, and a peak there would confirm nothing.
+        """
+        return self.amplifies and self.high < 2 * self.low
+
+    @property
+    def band(self) -> tuple[float, float]:
+        """Frequencies at which it resonates [Hz]: its range or its half-power width f ± ζ f, whichever is wider."""
+        width = abs(self.damping) * self.frequency
+        return min(self.low, self.frequency - width), max(self.high, self.frequency + width)
+
+
+def modes(robot: Robot, conditions: Conditions, positions: int = POSITIONS) -> list[list[Mode]]:
+    """Oscillatory modes of each run of a batch, the lowest first.
+
+    The robot rolls at the speed of the steady fidelity, its height and pitch in balance. The derivative J of a step h
+    by the state, the one that the largest stable step is found with, gives dy/dt = (J - 1) y / h and its eigenvalues
+    λ; friction, belt, motor and winding are in it.
+
+    Args:
+        robot, conditions: a batch of runs.
+        positions: of the belt, evenly over a pitch of the grousers.
+    """
+    rates, masses = jax.device_get(_linearised(params.strong(robot), conditions, positions))
+    return [_named(rate, mass) for rate, mass in zip(rates, masses, strict=True)]
+
+
+@compiled
+def _linearised(
+    robot: Robot, conditions: Conditions, positions: int
+) -> tuple[Float[Array, "runs positions 11 11"], Float[Array, "runs positions 5 5"]]:
+    def one(conditions: Conditions) -> tuple[Array, Array]:
+        run = system(robot, conditions, PROBE)
+        rolling = roll(run)
+
+        def at(turned: Array) -> tuple[Array, Array]:
+            motion = eqx.tree_at(lambda m: m.q, rolling, stand(run, turned).q)
+            return (step_derivative(run, motion) - jnp.eye(11)) / PROBE, mass_matrix(run, motion)
+
+        return jax.vmap(at)(jnp.arange(positions) / positions * run.path.pitch / run.path.radius)
+
+    return jax.vmap(one)(conditions)
+
+
+def _named(rates: Float[np.ndarray, "positions 11 11"], masses: Float[np.ndarray, "positions 5 5"]) -> list[Mode]:
+    """The modes of one run, from its linearisation at each position."""
+    found: dict[str, list[tuple[complex, float]]] = {}
+    for rate, mass in zip(rates, masses, strict=True):
+        if not np.isfinite(rate).all():
+            continue
+        values, vectors = np.linalg.eig(rate)
+        swings = (values.imag > 0) & (-values.real < _SWINGS * np.abs(values))
+        velocity = vectors[5:10, swings]
+        energy = np.abs(np.real(velocity.conj() * (mass @ velocity)))
+        shares = (energy / energy.sum(axis=0)).T
+        for k, name in zip(*linear_sum_assignment(-shares), strict=True):
+            found.setdefault(NAMES[name], []).append((values[swings][k], shares[k, name]))
+    answer = []
+    for name, members in found.items():
+        value, share = np.array([m[0] for m in members]), np.array([m[1] for m in members])
+        damped, size = value.imag / (2 * np.pi), np.abs(value)
+        numbers = (damped.mean(), damped.min(), damped.max(), (size / (2 * np.pi)).mean())
+        ratios = ((-value.real / size).mean(), share.mean(), len(members) / len(rates))
+        answer.append(Mode(name, *map(float, numbers), *map(float, ratios)))
+    return sorted(answer, key=lambda mode: mode.frequency)

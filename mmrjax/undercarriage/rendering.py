@@ -1,0 +1,336 @@
+"""Pictures and video of the track model: the robot on its slope, its track running, forces drawn; headless."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from pathlib import Path as File
+from typing import Any, NamedTuple, Protocol
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from mmrjax.fidelities.track import Trajectory
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_tables import BODY_HEIGHT
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import GRAVITY
+from mmrjax.undercarriage.belt import Path, tips
+from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT
+from mmrjax.undercarriage.side_contacts import lever_tips
+
+FORMATS = (".png", ".gif", ".mp4")
+FORCE = 1 / 800  # length of an arrow [m/N]
+RATE = 20  # frames a second
+FRAMES = 10_000  # of a film at most; each takes about a third of a second to draw
+
+_INK, _BODY, _BELT, _GROUND = "#1f2933", "#5b8db8", "#2f3437", "#b8a98f"
+_NORMAL, _TRACTION, _RESISTANCE, _GUIDE, _WEIGHT = "#d1495b", "#2e933c", "#b07d12", "#7048a8", "#1f2933"
+
+
+class Scene(NamedTuple):
+    """What the pictures of one run need, as plain arrays.
+
+    Attributes:
+        slope: [rad]; name: of the configuration; wheeled: whether on wheels; axle: half the wheelbase [m];
+            wheel: its radius [m].
+        path: of the belt; levers: tips in the chassis frame, empty on wheels.
+        time, q, total_current, speed, theoretical: over the run.
+        place, normal, guided, support: reactions over the run, of one side.
+        traction, resistance: of one side [N]; weight: of half the robot [N].
+    """
+
+    slope: float
+    name: str
+    wheeled: bool
+    axle: float
+    wheel: float
+    path: Path
+    levers: list[tuple[float, float]]
+    time: Float[np.ndarray, " n"]
+    q: Float[np.ndarray, "n 5"]
+    total_current: Float[np.ndarray, " n"]
+    speed: Float[np.ndarray, " n"]
+    theoretical: Float[np.ndarray, " n"]
+    place: Float[np.ndarray, "n 24"]
+    normal: Float[np.ndarray, "n 24"]
+    guided: Float[np.ndarray, "n 24"]
+    support: Float[np.ndarray, "n 2"]
+    traction: Float[np.ndarray, " n"]
+    resistance: Float[np.ndarray, " n"]
+    weight: float
+
+    def sheet(self, k: int) -> Any:
+        """A figure of sample `k`."""
+        return figure(self, k)
+
+
+class View(Protocol):
+    """A run that can be drawn: its samples' times [s], and a figure of each."""
+
+    @property
+    def time(self) -> np.ndarray:
+        """Of the samples [s]."""
+        ...
+
+    def sheet(self, k: int) -> Any:
+        """A figure of sample `k`."""
+        ...
+
+
+def check_finite(run: Trajectory) -> None:
+    """Refuse a run of which nothing can be drawn.
+
+    Raises:
+        ValueError: it holds numbers that are not finite (a failed member).
+    """
+    if not np.isfinite(np.asarray(run.q)).all():
+        raise ValueError("run: its coordinates are not finite, there is nothing to draw; expected a run that ended")
+
+
+def scene(robot: Robot, conditions: Conditions, run: Trajectory) -> Scene:
+    """Gather one run (scalar conditions, one member of a batch) for drawing.
+
+    Raises:
+        ValueError: the run holds numbers that are not finite (a failed member).
+    """
+    gear = robot.running_gear
+    check_finite(run)
+    chassis = robot.chassis(conditions.configuration)
+    path, wheeled = Path(robot.radius_pulley, gear), bool(chassis.on_tracks < 0.5)
+    levers = [] if wheeled else lever_tips(gear, conditions)
+    signals, reactions = run.signals, run.reactions
+    return Scene(
+        slope=float(conditions.slope),
+        name=robot.configurations.names[int(conditions.configuration)],
+        wheeled=wheeled,
+        axle=float(gear.wheelbase) / 2,
+        wheel=float(chassis.radius),
+        path=path,
+        levers=[(float(x), float(z)) for x, z in levers],
+        time=np.asarray(run.time),
+        q=np.asarray(run.q),
+        total_current=np.asarray(signals.total_current),
+        speed=np.asarray(signals.speed),
+        theoretical=np.asarray(signals.speed_theoretical),
+        place=np.asarray(reactions.place),
+        normal=np.asarray(reactions.grouser),
+        guided=np.asarray(reactions.guided),
+        support=np.asarray(reactions.support),
+        traction=np.asarray(signals.traction),
+        resistance=np.asarray(signals.resistance),
+        weight=float(np.asarray(signals.mass)[0]) / float(robot.sides) * GRAVITY,
+    )
+
+
+def _turn(points: Any, angle: float, about: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.asarray(points) @ np.array([[cos, sin], [-sin, cos]]) + np.asarray(about)
+
+
+def outline(path: Path, height: float, places: np.ndarray) -> np.ndarray:
+    """Points of the belt (height 0) or of grouser tips in the chassis frame [m], at places on its path."""
+    gear = params.replace(path.gear, {"grouser_height": jnp.asarray(height)})
+    at = tips(Path(path.radius, gear), jnp.asarray(places))
+    return np.stack([np.asarray(at.forward), np.asarray(at.up)], axis=1)
+
+
+def draw(axes: Any, view: Scene, k: int) -> None:
+    """Draw sample `k` of a scene into Matplotlib `axes`, uphill to the right."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.patches import Circle, Polygon
+
+    q, radius = view.q[k], float(view.path.radius)
+    axle_x, height = q[0], q[1]
+
+    def world(points: Any) -> np.ndarray:  # chassis frame -> slope -> page
+        return _turn(_turn(points, -q[2], (0.0, height)), view.slope)
+
+    def ground(points: Any) -> np.ndarray:
+        return _turn(points, view.slope)
+
+    strip = ground([(-0.6, 0.0), (0.6, 0.0), (0.6, -0.2), (-0.6, -0.2)])
+    axes.add_patch(Polygon(strip, color=_GROUND, alpha=0.45, lw=0))
+    axes.plot(*ground([(-0.6, 0), (0.6, 0)]).T, color=_INK, lw=1)
+    first = np.ceil((axle_x - 0.6) / 0.05) * 0.05
+    marks = np.arange(first, axle_x + 0.6, 0.05) - axle_x  # fixed to the ground: they show the travel
+    axes.add_collection(LineCollection([ground([(m, 0), (m - 0.008, -0.012)]) for m in marks], colors=_INK, lw=0.8))
+
+    gear = view.path.gear
+    under = float(gear.clearance - view.path.radius - gear.grouser_height)
+    top = under + BODY_HEIGHT
+    body = [(-view.axle, under), (view.axle, under), (view.axle + 0.01, top), (-view.axle - 0.01, top)]
+    body = [(x, max(z, -radius + 0.008)) for x, z in body]
+    axes.add_patch(Polygon(world(body), facecolor=_BODY, edgecolor=_INK, lw=1, alpha=0.85))
+    for (x, z), start in zip(view.levers, (view.axle, -view.axle), strict=False):
+        axes.plot(*world([(start, 0), (x, z)]).T, color="#8fa3b0", lw=7, solid_capstyle="round", alpha=0.7, zorder=2)
+    belt = world(outline(view.path, 0.0, np.linspace(0.0, float(view.path.length), 400)))
+    axes.plot(*belt.T, color=_BELT, lw=2.2, zorder=3)
+    if view.wheeled:
+        for x, phi in ((view.axle, q[3]), (-view.axle, q[4])):
+            _disc(axes, Circle, world, x, view.wheel, phi, "#9aa5ad")
+    else:
+        base = world(outline(view.path, 0.0, view.place[k]))
+        tip = world(outline(view.path, float(view.path.gear.grouser_height), view.place[k]))
+        axes.add_collection(LineCollection(list(np.stack([base, tip], axis=1)), colors=_BELT, lw=4, zorder=3))
+    teeth = (view.place[k][:, None] + np.arange(7) * float(view.path.pitch) / 7).ravel() % float(view.path.length)
+    root, inner = (world(outline(view.path, h, teeth[:TEETH_BELT])) for h in (0.0, -0.0022))
+    axes.add_collection(LineCollection(list(np.stack([root, inner], axis=1)), colors=_BELT, lw=0.9, zorder=3))
+    for x, phi in ((view.axle, q[3]), (-view.axle, q[4])):
+        _disc(axes, Circle, world, x, radius - 0.003, phi, "#d9dee2")
+    _forces(axes, view, k, world, ground)
+
+
+def _disc(axes: Any, circle: Any, world: Any, x: float, radius: float, angle: float, colour: str) -> None:
+    centre = world([(x, 0.0)])[0]
+    axes.add_patch(circle(centre, radius, facecolor=colour, edgecolor=_INK, lw=1, zorder=4))
+    for turn in (0.0, np.pi / 2):  # spokes turn clockwise when it rolls uphill to the right
+        arm = radius * np.array([np.cos(turn - angle), np.sin(turn - angle)])
+        axes.plot(*world(np.array([arm, -arm]) + np.array([x, 0.0])).T, color=_INK, lw=0.8, zorder=4)
+
+
+def _forces(axes: Any, view: Scene, k: int, world: Any, ground: Any) -> None:
+    def arrow(start: Any, along: Any, colour: str) -> None:
+        tail, head = ground([start])[0], ground([np.asarray(start) + np.asarray(along) * FORCE])[0]
+        if np.hypot(*(head - tail)) > 2e-3:
+            style = dict(arrowstyle="-|>", color=colour, lw=1.6, shrinkA=0, shrinkB=0, mutation_scale=9)
+            axes.annotate("", head, tail, arrowprops=style, zorder=6)
+
+    q = view.q[k]
+    if view.wheeled:
+        for x, force in zip((view.axle, -view.axle), view.support[k], strict=True):
+            arrow((x, -force * FORCE), (0.0, force), _NORMAL)
+    else:
+        tip = outline(view.path, float(view.path.gear.grouser_height), view.place[k])
+        for j in range(GROUSERS):
+            force = view.normal[k, j]
+            x = _turn([tip[j]], -q[2])[0, 0]
+            arrow((x, -force * FORCE), (0.0, force), _NORMAL)
+        arrow((-view.axle / 2, 0.012), (0.0, view.guided[k].sum()), _GUIDE)
+    arrow((0.0, -0.012), (view.traction[k], 0.0), _TRACTION)
+    arrow((0.0, -0.024), (-view.resistance[k], 0.0), _RESISTANCE)
+    down = _turn([(0.0, -view.weight)], -view.slope)[0]
+    arrow((0.0, q[1]), down, _WEIGHT)
+
+
+_LEGEND = (
+    ("normal reactions", _NORMAL),
+    ("traction", _TRACTION),
+    ("motion resistance", _RESISTANCE),
+    ("load on the lower guide", _GUIDE),
+    ("weight", _WEIGHT),
+)
+
+
+def figure(view: Scene, k: int) -> Any:
+    """A figure of sample `k`: the robot above, current and speeds of the whole run below."""
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    sheet = Figure(figsize=(9.6, 7.2), dpi=100, layout="constrained")
+    upper, current, speed = sheet.subplots(3, 1, gridspec_kw=dict(height_ratios=[4.6, 1, 1]))
+    draw(upper, view, k)
+    span, rise = 0.31, 0.31 * np.sin(abs(view.slope))
+    upper.set(xlim=(-span, span), ylim=(-0.15 - rise * 0.55, 0.16 + rise * 0.55), aspect="equal")
+    upper.axis("off")
+    upper.set_title(
+        f"{view.name}, slope {np.degrees(view.slope):.0f}°, t = {view.time[k]:.3f} s, x = {view.q[k, 0]:.3f} m, "
+        f"V = {view.speed[k]:.2f} m/s",
+        fontsize=11,
+    )
+    shown = [entry for entry in _LEGEND if not (view.wheeled and "guide" in entry[0])]
+    handles = [Line2D([], [], color=colour, lw=2.5, label=label) for label, colour in shown]
+    upper.legend(handles=handles, loc="upper left", fontsize=8, frameon=False, ncols=len(shown))
+    foot = -0.14 - rise * 0.5
+    upper.plot([span - 0.02 - 50 * FORCE, span - 0.02], [foot] * 2, color=_INK, lw=2)
+    upper.text(span - 0.02 - 25 * FORCE, foot + 0.004, "50 N", fontsize=8, va="bottom", ha="center")
+    current.plot(view.time, view.total_current, color=_NORMAL, lw=0.9)
+    top = 1.3 * np.percentile(view.total_current, 98)
+    current.set(ylabel="I, A", ylim=(0.0, max(top, 0.1)), xlim=(view.time[0], view.time[-1]), xticklabels=[])
+    speed.plot(view.time, view.theoretical, color="#888888", lw=0.9, label="theoretical")
+    speed.plot(view.time, view.speed, color=_TRACTION, lw=1.2, label="robot")
+    speed.set(xlabel="time, s", ylabel="V, m/s", xlim=(view.time[0], view.time[-1]))
+    speed.legend(fontsize=8, frameon=False, loc="lower right")
+    for axes in (current, speed):
+        axes.axvline(view.time[k], color=_INK, lw=0.8)
+        axes.grid(alpha=0.25)
+        axes.spines[["top", "right"]].set_visible(False)
+    return sheet
+
+
+def _pixels(sheet: Any) -> np.ndarray:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas = FigureCanvasAgg(sheet)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def instants(
+    file: File, begin: float, end: float | None, slow: float, length: float, rate: int = RATE
+) -> Float[np.ndarray, " frames"]:
+    """Times [s] that `render` draws of a run that lasts `length` [s]; asked before a run, it spares a vain one.
+
+    Raises:
+        ValueError: the suffix is none of `FORMATS`; no time of the run lies between `begin` and `end`; the film
+            has more than `FRAMES` pictures.
+    """
+    if file.suffix not in FORMATS:
+        raise ValueError(f"file: got {file.name}; expected a name that ends in {', '.join(FORMATS)}")
+    if file.suffix == ".png" and end is not None:
+        raise ValueError(f"end: got {end:g} s for {file.name}, a picture of the instant begin; leave it out")
+    film, last = file.suffix != ".png", length if end is None else end
+    until = min(last, length)
+    if not 0 <= begin <= length or (film and not begin < until):
+        given = f"begin, end: got {begin:g} to {last:g} s" if film else f"begin: got {begin:g} s"
+        raise ValueError(f"{given}; expected times within 0 to {length:g} s, the run's")
+    if not film:
+        return np.asarray([begin])
+    pictures = (until - begin) * rate * slow
+    if not 0 < pictures <= FRAMES:
+        raise ValueError(f"slow: got {slow:g}, a film of {pictures:.0f} pictures; expected at most {FRAMES}")
+    return np.arange(begin, until, 1 / (rate * slow))
+
+
+def render(
+    view: View, file: str | File, begin: float = 0.0, end: float | None = None, slow: float = 10.0, rate: int = RATE
+) -> File:
+    """Write a picture (.png, of the instant `begin`) or a film (.gif, .mp4) of a scene.
+
+    Args:
+        view: from `scene`, of this module or of `render_above`.
+        file: its suffix decides what is written.
+        begin, end: part of the run to film [s]; None: to its end.
+        slow: how many times slower than life; a pitch lasts 36 ms at 1 m/s.
+        rate: frames a second.
+
+    Raises:
+        ValueError: as `instants`.
+    """
+    file = File(file)
+    times = instants(file, begin, end, slow, float(view.time[-1]), rate)
+    frames = [int(np.argmin(np.abs(view.time - t))) for t in times]
+    if file.suffix == ".png":
+        view.sheet(frames[0]).savefig(file)
+        return file
+    if file.suffix == ".gif":
+        from PIL import Image
+
+        images = [Image.fromarray(_pixels(view.sheet(k))).quantize(256) for k in frames]
+        images[0].save(file, save_all=True, append_images=images[1:], duration=round(1000 / rate), loop=0)
+        return file
+    pictures = (_pixels(view.sheet(k)) for k in frames)
+    first = next(pictures)
+    import imageio_ffmpeg
+
+    writer = imageio_ffmpeg.write_frames(str(file), (first.shape[1], first.shape[0]), fps=rate, quality=7)
+    with warnings.catch_warnings():
+        # jax warns of every fork; this one becomes ffmpeg at once and never touches jax's threads
+        warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
+        writer.send(None)
+    for picture in itertools.chain([first], pictures):
+        writer.send(picture.tobytes())
+    writer.close()
+    return file

@@ -1,0 +1,276 @@
+"""Where ripple peaks over speed, and whether a harmonic of the running gear meets a natural frequency there."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.signal import find_peaks, peak_widths
+
+from mmrjax.fidelities.track import Trajectory
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import CONVERGED, NOT_SETTLED
+from mmrjax.undercarriage.belt import Path
+from mmrjax.undercarriage.modes import Mode
+from mmrjax.undercarriage.ripple import fluctuation
+from mmrjax.undercarriage.running_gear import TEETH_PULLEY
+
+
+class Signal(NamedTuple):
+    """What ripples: the signal's field, words for it, its unit for people and the SI value of one such unit."""
+
+    field: str
+    label: str
+    unit: str
+    factor: float
+
+
+#: By name.
+SIGNALS = {
+    "reaction": Signal("normal", "ground reaction", "N", 1.0),
+    "current": Signal("total_current", "current", "A", 1.0),
+    "speed": Signal("speed", "speed", "mm_s", 1e-3),
+    "motor_speed": Signal("speed_motor", "motor speed", "rpm", 2 * np.pi / 60),
+}
+TAIL = 0.5  # share of a run at its end in which ripple is read
+PERIODS = 3  # fewest passings in it from which ripple is read
+#: A peak over speed stands out of its surroundings by this share of itself, and is no smaller than this [-].
+STANDS_OUT, NOTICEABLE = 0.05, 2e-4
+MATTERS = 0.01  # ripple for which a speed is to be avoided [-]
+MOVES = 0.03  # share by which a mode moves with payload so that its peaks have to follow
+_SAME = 0.2  # of an order: how near to a whole order the strongest line has to be
+
+
+class Passing(NamedTuple):
+    """What passes the chassis at a pitch.
+
+    Attributes:
+        name: grousers or teeth; pitch: of the belt [m]; travel: of the robot from one to the next, without slip [m].
+    """
+
+    name: str
+    pitch: float
+    travel: float
+
+
+def passing(robot: Robot, configuration: int) -> Passing:
+    """What shakes a configuration: the grousers S_g on tracks; on wheels, which have none, the tooth mesh S_t."""
+    chassis, radius = robot.configurations.members[configuration], float(robot.radius_pulley)
+    if float(chassis.on_tracks) > 0.5:
+        pitch = float(Path(robot.radius_pulley, robot.running_gear).pitch)
+        return Passing("grousers", pitch, pitch)
+    pitch = 2 * np.pi * radius / TEETH_PULLEY
+    return Passing("teeth", pitch, pitch * float(chassis.radius) / radius)
+
+
+@dataclasses.dataclass(frozen=True)
+class Vibrations:
+    """What ripples in each run of a batch; NaN where it is not `read`.
+
+    Attributes:
+        status: codes into `STATUSES`.
+        read: whether its ripple is: it travels and at least `PERIODS` pitches passed.
+        speed: mean [m/s]; passing: frequency at which grousers or teeth pass [Hz].
+        mean, deviation, frequency: of each of `SIGNALS`, see `ripple.Fluctuation`.
+    """
+
+    status: np.ndarray
+    read: np.ndarray
+    speed: np.ndarray
+    passing: np.ndarray
+    mean: dict[str, np.ndarray]
+    deviation: dict[str, np.ndarray]
+    frequency: dict[str, np.ndarray]
+
+    @property
+    def settled(self) -> np.ndarray:
+        """Whether a run is read and goes on steadily."""
+        return self.read & (self.status == CONVERGED)
+
+
+def vibrations(robot: Robot, runs: Trajectory, pitch: float) -> Vibrations:
+    """Ripple at the end of each run of a batch.
+
+    Args:
+        runs: fields have shape (runs, samples, ...).
+        pitch: of what passes [m].
+    """
+    time, status = np.asarray(runs.time[0]), np.asarray(runs.result.status)
+    tail = time > time[-1] - TAIL * (time[-1] - time[0])
+    at = time[tail]
+    found = {
+        name: np.array([fluctuation(at, x) for x in np.asarray(getattr(runs.signals, signal.field))[:, tail]])
+        for name, signal in SIGNALS.items()
+    }
+    rates = np.asarray(runs.signals.speed_wheel)[:, tail].mean(axis=1) * float(robot.radius_pulley) / pitch
+    travels = np.isin(status, (CONVERGED, NOT_SETTLED)) & np.isfinite([x[:, 1] for x in found.values()]).all(axis=0)
+    read = travels & (rates * (at[-1] - at[0]) >= PERIODS)
+    column = {name: np.where(read[:, None], x, np.nan).T for name, x in found.items()}
+    mean, deviation, frequency = ({name: x[k] for name, x in column.items()} for k in range(3))
+    return Vibrations(status, read, mean["speed"], np.where(read, rates, np.nan), mean, deviation, frequency)
+
+
+class Peak(NamedTuple):
+    """A peak of ripple over speed at one payload.
+
+    Attributes:
+        signal: of `SIGNALS`; payload: [kg].
+        speed, low, high: where it is highest, and where it is above 70 % of its rise [m/s].
+        ripple: the highest, standard deviation over mean [-].
+        rise: of the ripple over the higher of its two valleys [-].
+        order: of the passing frequency that is strongest there; 0: it is no whole one.
+        frequency: of the strongest line [Hz].
+        mode: natural vibration at that frequency, which confirms the crossing; empty: none.
+    """
+
+    signal: str
+    payload: float
+    speed: float
+    low: float
+    high: float
+    ripple: float
+    rise: float
+    order: int
+    frequency: float
+    mode: str
+
+
+def peaks(
+    signal: str,
+    payload: float,
+    speed: Float[np.ndarray, " runs"],
+    passing: Float[np.ndarray, " runs"],
+    deviation: Float[np.ndarray, " runs"],
+    frequency: Float[np.ndarray, " runs"],
+    modes: Sequence[Mode],
+) -> list[Peak]:
+    """Peaks of ripple over speed at one payload, with the mode that each is at.
+
+    A crossing of a harmonic and a natural frequency counts where ripple peaks and its strongest line is that harmonic
+    and within the mode's band: neither is assumed from the other.
+
+    Args:
+        speed, passing, deviation, frequency: of the runs that are read, in the order of `speed`.
+        modes: at this payload.
+    """
+    if len(speed) < 3:
+        return []
+    tops, facts = find_peaks(deviation, prominence=1e-12)
+    widths = peak_widths(deviation, tops, rel_height=0.3)
+    index, answer = np.arange(len(speed)), []
+    for k, top in enumerate(tops):
+        height, rise = float(deviation[top]), float(facts["prominences"][k])
+        if rise < STANDS_OUT * height or height < NOTICEABLE:
+            continue
+        low, high = (float(np.interp(widths[side][k], index, speed)) for side in (2, 3))
+        ratio = frequency[top] / passing[top]
+        bend, slope, _ = np.polyfit(speed[top - 1 : top + 2] - speed[top], deviation[top - 1 : top + 2], 2)
+        at = float(np.clip(speed[top] - slope / (2 * bend), low, high))
+        whole = round(float(ratio)) if np.isfinite(ratio) else 0
+        order = whole if whole and abs(ratio - whole) < _SAME else 0
+        near = [m for m in modes if order and m.resonant and m.band[0] <= frequency[top] <= m.band[1]]
+        mode = min(near, key=lambda m: abs(m.frequency - frequency[top])).name if near else ""
+        answer.append(Peak(signal, payload, at, low, high, height, rise, order, float(frequency[top]), mode))
+    return answer
+
+
+def confirmed(found: Sequence[Peak], modes: Mapping[float, Sequence[Mode]]) -> list[Peak]:
+    """The peaks, without their mode where they do not follow it over the payloads.
+
+    Where a mode's frequency changes with payload by more than `MOVES`, the lines of the peaks of one order have to
+    change the same way; a peak that moves against it only crosses its band.
+
+    Args:
+        modes: by payload [kg].
+    """
+    answer = list(found)
+    for key in dict.fromkeys((p.mode, p.order, p.signal) for p in found if p.mode):
+        alike = [k for k, p in enumerate(found) if (p.mode, p.order, p.signal) == key]
+        natural = np.array([next(m.frequency for m in modes[found[k].payload] if m.name == key[0]) for k in alike])
+        if np.ptp(natural) < MOVES * natural.mean():
+            continue
+        if np.polyfit(natural, [found[k].frequency for k in alike], 1)[0] <= 0:
+            for k in alike:
+                answer[k] = found[k]._replace(mode="")
+    return answer
+
+
+class Crossing(NamedTuple):
+    """Where a harmonic of the passing frequency meets a natural frequency.
+
+    Attributes:
+        mode, order, payload: which [kg]; speed: at the mode's mean frequency [m/s].
+        signals: whose ripple peaks there; empty: the crossing does not show.
+    """
+
+    mode: str
+    order: int
+    payload: float
+    speed: float
+    signals: tuple[str, ...]
+
+
+def crossings(
+    modes: Sequence[Mode], payload: float, travel: float, slowest: float, fastest: float, found: Sequence[Peak]
+) -> list[Crossing]:
+    """Crossings at one payload between two speeds [m/s], and which peaks of ripple confirm them.
+
+    Args:
+        travel: of the robot from one passing to the next [m].
+    """
+    answer = []
+    for mode in modes:
+        if not mode.resonant:
+            continue
+        first = max(int(np.ceil(mode.frequency * travel / fastest)), 1)
+        for order in range(first, int(mode.frequency * travel / slowest) + 1):
+            shows = tuple(p.signal for p in found if (p.payload, p.mode, p.order) == (payload, mode.name, order))
+            answer.append(Crossing(mode.name, order, payload, mode.frequency * travel / order, shows))
+    return answer
+
+
+class Resonance(NamedTuple):
+    """Peaks of one mode, order and signal over the payloads.
+
+    Attributes:
+        mode: natural vibration that confirms them; empty: none does.
+        speeds: least and greatest speed of the peaks [m/s]; avoid: of their widths.
+        frequencies: least and greatest of their lines [Hz].
+        payloads: at which it shows [kg]; ripple: the largest [-]; rise: the largest over its surroundings [-].
+    """
+
+    mode: str
+    order: int
+    signal: str
+    speeds: tuple[float, float]
+    avoid: tuple[float, float]
+    frequencies: tuple[float, float]
+    payloads: tuple[float, ...]
+    ripple: float
+    rise: float
+
+
+def resonances(found: Sequence[Peak]) -> list[Resonance]:
+    """Peaks by mode, order and signal: signals in the order of `SIGNALS`, their largest ripple first."""
+    keys = dict.fromkeys((p.mode, p.order, p.signal) for p in found)
+    answer = []
+    for key in keys:
+        alike = [p for p in found if (p.mode, p.order, p.signal) == key]
+        speeds, lines = [p.speed for p in alike], [p.frequency for p in alike]
+        avoid = min(p.low for p in alike), max(p.high for p in alike)
+        ends = (min(speeds), max(speeds)), avoid, (min(lines), max(lines))
+        answer.append(
+            Resonance(
+                *key, *ends, tuple(p.payload for p in alike), max(p.ripple for p in alike), max(p.rise for p in alike)
+            )
+        )
+    return sorted(answer, key=lambda r: (list(SIGNALS).index(r.signal), -r.ripple))
+
+
+def strongest(found: Sequence[Resonance]) -> list[Resonance]:
+    """What is to be avoided: of each signal the resonances that rise at least half as far as its largest, to 1 %."""
+    largest = {s: max((r.rise for r in found if r.signal == s), default=0.0) for s in SIGNALS}
+    return [r for r in found if r.rise >= largest[r.signal] / 2 and r.ripple >= MATTERS]

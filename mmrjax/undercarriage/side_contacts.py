@@ -1,0 +1,270 @@
+"""Contacts of one side with the ground and the guides, and the generalized forces they put on the chassis.
+
+Coordinates q of half a robot in its plane of travel: travel x [m] uphill, height z [m] of the middle of the
+wheelbase (axle line) over the ground, pitch θ [rad] nose down, angles φ_1, φ_2 [rad] of driving (front) and
+driven pulley, relative to the chassis. Velocities v alike. A wheel of 4W2T sits on its pulley's shaft.
+
+Contact pairs of one side: 24 grousers with the ground, 168 teeth with each of two guides (720 in all for
+6T2A); 2 wheels with the ground for 4W2T.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mmrjax.model.chassis import Chassis
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.contact import damping_contact, force_contact
+from mmrjax.model.masses import lever_angles
+from mmrjax.model.params import Scalar
+from mmrjax.model.signals import GRAVITY, Signals
+from mmrjax.numerics.trigonometry import cosine, sine
+from mmrjax.undercarriage.belt import Path, Runs, Tips, runs, tension_along, tips
+from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT, WHEELS, RunningGear
+
+CONTACTS = GROUSERS + WHEELS  # with the ground, of one side; those of the other configuration bear nothing
+TEETH_GROUSER = TEETH_BELT // GROUSERS  # teeth under one grouser's pitch
+
+WHEEL = np.arange(CONTACTS) >= GROUSERS
+_END = np.where(WHEEL, np.where(np.arange(CONTACTS) == GROUSERS, 1.0, -1.0), 0.0)  # of the wheelbase: front, rear
+
+
+class Touch(eqx.Module):
+    """Where the contacts are at an instant, how they move, and what they bear; first the grousers.
+
+    Attributes:
+        lever_x, lever_z: contact point from the middle of the wheelbase [m].
+        rate_x, rate_z: its velocity per belt speed [-].
+        weight: share of the driven pulley in that belt speed [-].
+        speed_x: its velocity over the ground, uphill [m/s].
+        gap, gap_rate: height over the ground [m] and its rate [m/s].
+        compliance: of the belt under it at its tension [m/N].
+        force: normal force R_z [N]; damped: how fast it falls with the gap's rate [N·s/m].
+        guided: share of the force that passes to the lower guide [-].
+        belt: tensions of the runs.
+    """
+
+    lever_x: Float[Array, " contacts"]
+    lever_z: Float[Array, " contacts"]
+    rate_x: Float[Array, " contacts"]
+    rate_z: Float[Array, " contacts"]
+    weight: Float[Array, " contacts"]
+    speed_x: Float[Array, " contacts"]
+    gap: Float[Array, " contacts"]
+    gap_rate: Float[Array, " contacts"]
+    compliance: Float[Array, " contacts"]
+    force: Float[Array, " contacts"]
+    damped: Float[Array, " contacts"]
+    guided: Float[Array, " contacts"]
+    place: Float[Array, " 24"]
+    belt: Runs
+
+    @property
+    def normal(self) -> Scalar:
+        """Normal reaction of the ground on one side [N]."""
+        return jnp.sum(self.force)
+
+
+def of_contacts(grousers: Float[Array, " 24"], wheels: Array | np.ndarray | float = 0.0) -> Float[Array, " contacts"]:
+    """One array of grousers and wheels, padded and masked: XLA vectorises that and not a concatenation."""
+    return jnp.where(WHEEL, wheels, jnp.pad(grousers, (0, WHEELS)))
+
+
+def _geometry(
+    path: Path, where: Tips, weight: Array, pitch: Scalar, radius_wheel: Scalar
+) -> tuple[Array, Array, Array, Array, Array]:
+    cos, sin = cosine(pitch), sine(pitch)
+    forward, up = of_contacts(where.forward, path.gear.wheelbase / 2 * _END), of_contacts(where.up)
+    ahead, rise = of_contacts(where.rate_forward), of_contacts(where.rate_up)
+    # The lowest point of a wheel is below its axle, however the robot is pitched.
+    below = jnp.where(WHEEL, radius_wheel, 0.0)
+    return (
+        forward * cos + up * sin,
+        up * cos - forward * sin - below,
+        ahead * cos + rise * sin - below / path.radius,
+        rise * cos - ahead * sin,
+        of_contacts(weight, jnp.where(_END < 0, 1.0, 0.0)),
+    )
+
+
+def bearing(chassis: Chassis) -> Float[Array, " contacts"]:
+    """1 for contacts that bear in this configuration, else 0 [-]."""
+    return jnp.where(WHEEL, 1 - chassis.on_tracks, chassis.on_tracks)
+
+
+def tension_free(path: Path, belt: Runs) -> Scalar:
+    """Tension under which the lower run yields where it hangs free, P - P_ct [N], kept from slack."""
+    return jnp.maximum(belt.lower - belt.centrifugal, 0.01 * path.gear.pretension)
+
+
+def touch(path: Path, chassis: Chassis, q: Sequence[Scalar] | Array, v: Sequence[Scalar] | Array) -> Touch:
+    """Contact points and normal forces (27)-(29) at coordinates `q`, velocities `v`.
+
+    Where the belt hangs free between pulley and guide it yields under the grouser as a string of tension
+    P - P_ct: the force falls by h / (h + its deflection under the unyielding contact's force), exact at e = 1.
+
+    Args:
+        path: the belt's path.
+        chassis: on tracks the grousers bear, on wheels the wheels, of its radius.
+        q, v: coordinates and velocities, see the module.
+    """
+    gear = path.gear
+    belt = runs(path, (q[3], q[4]), (v[3], v[4]))
+    place, weight = path.place(q[3], q[4])
+    where = tips(path, place)
+    x, z, rate_x, rate_z, weight = _geometry(path, where, weight, q[2], chassis.radius)
+    speed = path.radius * ((1 - weight) * v[3] + weight * v[4])
+    gap = q[1] + z
+    gap_rate = v[1] - v[2] * x + rate_z * speed
+    compliance = of_contacts(where.compliance / tension_free(path, belt))
+    depth = jnp.maximum(-gap, 1e-9)
+    yields = 1 / (1 + compliance * gear.contact_stiffness * depth ** (gear.contact_exponent - 1))
+    bears = bearing(chassis)
+    stiffness, damping = gear.contact_stiffness * yields, gear.contact_damping * yields
+    force = force_contact(gap, gap_rate, 0.0, stiffness, gear.contact_exponent, damping, gear.contact_depth)
+    return Touch(
+        lever_x=x,
+        lever_z=z,
+        rate_x=rate_x,
+        rate_z=rate_z,
+        weight=weight,
+        speed_x=v[0] + v[2] * z + rate_x * speed,
+        gap=gap,
+        gap_rate=gap_rate,
+        compliance=compliance,
+        force=jnp.asarray(force * bears),
+        damped=damping_contact(force, gap, 0.0, damping, gear.contact_depth) * bears,
+        guided=of_contacts(where.guided),
+        place=place,
+        belt=belt,
+    )
+
+
+class Pull(eqx.Module):
+    """What the contacts do at an instant.
+
+    Attributes:
+        force: traction of each contact, uphill on the robot [N].
+        guide: friction of the teeth on the lower guide F'_t, against forward running [N], eq. (26).
+        guided: load on the lower guide [N].
+        load: of the belt, the ground and the guides on the driving shaft [N·m].
+        generalized: forces on (x, z, θ, φ_2) [N, N, N·m, N·m]; the shaft's own torque is the gearbox's.
+        aside: lateral force of each contact, to the left on a robot free to turn [N]; None: of straight travel.
+    """
+
+    force: Float[Array, " contacts"]
+    guide: Float[Array, " contacts"]
+    guided: Float[Array, ""]
+    load: Scalar
+    generalized: Float[Array, " 4"]
+    aside: Float[Array, " contacts"] | None = None
+
+    @property
+    def traction(self) -> Scalar:
+        """Traction P_t of one side [N]."""
+        return jnp.sum(self.force)
+
+
+def sliding(signals: Signals, at: Touch) -> Float[Array, " contacts"]:
+    """How fast each contact slides backward over the ground [m/s]; `speed_slip_terms` shifts it."""
+    return -at.speed_x - signals.speed_slip_terms
+
+
+def friction_rise(chassis: Chassis, signals: Signals, at: Touch) -> Float[Array, " contacts"]:
+    """How fast the traction of each contact rises with its sliding [N·s/m]."""
+    return jnp.asarray(chassis.ground.traction_rise(sliding(signals, at), at.force, signals.adhesion))
+
+
+def pull(
+    path: Path, chassis: Chassis, signals: Signals, at: Touch, height: Scalar, force: Array | None = None
+) -> Pull:
+    """Friction of the contacts (25) by Fig. 7, of the guide (26), and all generalized forces.
+
+    The motion resistance (5) acts on the chassis at the ground. Friction of the upper guide is part of the
+    loss (24), which was measured with the tracks lifted.
+
+    Args:
+        path: the belt's path.
+        chassis: friction and guide coefficients.
+        signals: those up to `balances.slip`; `speed_slip_terms` shifts the sliding of every contact.
+        at: the contacts.
+        height: of the axle line over the ground [m].
+        force: traction of each contact where contacts slide aside too [N]; None: by Fig. 7.
+    """
+    if force is None:
+        force = jnp.asarray(chassis.ground.traction(sliding(signals, at), at.force, signals.adhesion))
+    guide = chassis.track.guide_friction * at.guided * at.force * signals.direction
+    # Power of the contact forces per belt speed, then on the pulleys in the shares of that speed.
+    along = force * at.rate_x + at.force * at.rate_z - guide
+    front = path.radius * jnp.sum(along * (1 - at.weight)) + at.belt.torque_front
+    rear = path.radius * jnp.sum(along * at.weight) + at.belt.torque_rear
+    forward = jnp.sum(force) - signals.resistance
+    moment = jnp.sum(force * at.lever_z - at.force * at.lever_x) + signals.resistance * height
+    return Pull(force, guide, jnp.sum(at.guided * at.force), -front, jnp.stack([forward, at.normal, moment, rear]))
+
+
+class Reactions(eqx.Module):
+    """Loads inside one side's running gear at an instant.
+
+    Attributes:
+        grouser: normal reaction of the ground on each grouser R_z [N].
+        guided: what of it passes to the lower guide [N].
+        support: on front and rear pulley (6T2A) or wheel (4W2T) [N].
+        place: of the grousers on the belt's path [m].
+        tension: of the belt at as many places as grousers, half a pitch from the path's start on [N].
+        centrifugal: P_ct of it [N].
+    """
+
+    grouser: Float[Array, "... 24"]
+    guided: Float[Array, "... 24"]
+    support: Float[Array, "... 2"]
+    place: Float[Array, "... 24"]
+    tension: Float[Array, "... 24"]
+    centrifugal: Scalar
+
+    @property
+    def guide(self) -> Float[Array, "..."]:
+        """Load on the lower guide [N]."""
+        return jnp.sum(self.guided, axis=-1)
+
+    def teeth(self, path: Path) -> tuple[Float[Array, "... 168"], Float[Array, "... 168"]]:
+        """Load R_g of the lower and of the upper guide on each tooth [N].
+
+        A grouser's load on the lower guide spreads evenly over the teeth of its pitch; the upper guide
+        carries the weight of the belt on it.
+        """
+        lower = jnp.repeat(self.guided / TEETH_GROUSER, TEETH_GROUSER, axis=-1)
+        across = (jnp.arange(TEETH_GROUSER) - TEETH_GROUSER // 2) * path.pitch / TEETH_GROUSER
+        place = jnp.mod(self.place[..., None] + across, path.length).reshape(lower.shape)
+        begins = path.gear.wheelbase + jnp.pi * path.radius
+        over = (place > begins) & (place < begins + path.gear.wheelbase)
+        return lower, jnp.where(over, path.gear.belt_mass * GRAVITY / TEETH_BELT, 0.0)
+
+
+def reactions(path: Path, at: Touch, pulled: Pull) -> Reactions:
+    """Loads on guides, pulleys and belt at an instant."""
+    guided = at.guided * at.force
+    to_support = at.force - guided
+    ahead = at.lever_x > 0
+    against = (-pulled.force * at.rate_x + pulled.guide)[:GROUSERS]
+    return Reactions(
+        grouser=at.force[:GROUSERS],
+        guided=guided[:GROUSERS],
+        support=jnp.stack([jnp.sum(jnp.where(ahead, to_support, 0.0)), jnp.sum(jnp.where(ahead, 0.0, to_support))]),
+        place=at.place,
+        tension=tension_along(path, at.belt, at.place, against, (jnp.arange(GROUSERS) + 0.5) * path.pitch),
+        centrifugal=at.belt.centrifugal,
+    )
+
+
+def lever_tips(gear: RunningGear, conditions: Conditions) -> list[tuple[Scalar, Scalar]]:
+    """Tips of the front and the rear lever, in the chassis frame [m]."""
+    return [
+        (side * (gear.wheelbase / 2 + gear.lever_length * jnp.cos(angle)), gear.lever_length * jnp.sin(angle))
+        for side, angle in zip((1.0, -1.0), lever_angles(gear, conditions), strict=True)
+    ]

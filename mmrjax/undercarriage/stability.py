@@ -1,0 +1,140 @@
+"""What is said before a run of the track model: postures that cannot be, and the largest stable step."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mmrjax.compile.compiling import compiled
+from mmrjax.model import balances, masses, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import State
+from mmrjax.undercarriage import mjcf
+from mmrjax.undercarriage.half_robot import Motion, System, advance, roll, stand, system
+from mmrjax.undercarriage.side_contacts import lever_tips
+
+SAFETY = 0.75  # of the linear limit: contacts bear more than when standing, by their ripple
+LEAST = 0.01  # [m/s], V_s that the linear limit is found with at least
+PROBE = 1e-6  # [s], step from which rates are taken
+
+
+def step_derivative(run: System, at: Motion) -> Float[Array, "11 11"]:
+    """Derivative of (q, v, current) one step on by (q, v, current), of one run."""
+
+    def after(y: Float[Array, " 11"]) -> Float[Array, " 11"]:
+        moved, _, _ = advance(run, Motion(y[:5], y[5:10], y[10], at.discharge, at.memory))
+        return jnp.concatenate([moved.q, moved.v, jnp.asarray(moved.current)[None]])
+
+    return jax.jacfwd(after)(jnp.concatenate([at.q, at.v, jnp.asarray(at.current)[None]]))
+
+
+@compiled
+def _maps(
+    robot: Robot, conditions: Conditions, steps: Float[Array, "runs starts"]
+) -> Float[Array, "runs starts 11 11"]:
+    """Derivatives of (q, v, current) one step on by (q, v, current), standing and rolling."""
+
+    def one(conditions: Conditions, steps: Float[Array, " starts"]) -> Float[Array, "starts 11 11"]:
+        run = system(robot, conditions, PROBE)
+        starts = jax.tree.map(lambda *at: jnp.stack(at), stand(run), roll(run))
+        return jax.vmap(lambda at, step: step_derivative(system(robot, conditions, step), at))(starts, steps)
+
+    return jax.vmap(one)(conditions, steps)
+
+
+def _unhurried(robot: Robot) -> Robot:
+    """The robot with every V_s at least `LEAST`."""
+    laws = [p for p in params.walk(robot) if p.name.endswith("ground.friction.speed_static")]
+    return params.replace(robot, {p.name: jnp.maximum(p.value, LEAST) for p in laws})
+
+
+def _roll_period(robot: Robot, conditions: Conditions) -> Scalar:
+    """Period of rolling over that of bouncing, of a robot on contacts at ±B/2 [-]."""
+    zero = jnp.zeros_like(conditions.voltage)
+    mass = balances.begin(robot, conditions, State(zero, zero, zero, zero)).mass
+    parts = mjcf.bodies(robot, masses.masses(robot, conditions, mass), conditions)
+    aside = robot.chassis(conditions.configuration).turning.width / 2
+    inertia = jnp.sum(parts.inertia[:, 0] + parts.mass * parts.place[:, 1] ** 2)
+    return jnp.sqrt(inertia / jnp.sum(parts.mass)) / aside
+
+
+def largest_step(robot: Robot, conditions: Conditions) -> Float[np.ndarray, " runs"]:
+    """Largest stable step [s] of each run of a batch of `conditions`.
+
+    Three quarters of the step that, linearised about the robot standing and rolling, would make a small disturbance
+    grow; the quarter is for the ripple of the contacts. A small V_s is no limit: friction is implicit in a step, and
+    what is left of its chatter stays within V_s. A robot free to turn has that of one that travels straight, less by
+    as much as it rolls faster on its contacts than it bounces.
+    """
+    if conditions.turns:
+        slower = np.asarray(jax.vmap(lambda c: _roll_period(robot, c))(conditions))
+        return np.minimum(slower, 1.0) * largest_step(robot, conditions.straight())
+    robot = params.strong(_unhurried(robot))
+
+    def maps(steps: Float[np.ndarray, "runs starts"]) -> Float[np.ndarray, "runs starts 11 11"]:
+        found = np.asarray(_maps(robot, conditions, jnp.asarray(steps)))
+        usable = np.isfinite(found).all(axis=(-2, -1), keepdims=True)
+        return np.where(usable, found, 0.0)
+
+    low, high = np.full((*conditions.shape, 2), -7.0), np.full((*conditions.shape, 2), -2.0)  # powers of ten
+    # What grows in continuous time too (a robot about to tip, friction that falls with speed) is no matter of
+    # the step; slow drifts neither.
+    rates = (maps(np.full_like(low, PROBE)) - np.eye(11)) / PROBE
+    physical = 20.0 + 2 * np.maximum(np.linalg.eigvals(rates).real.max(axis=-1), 0.0)
+    for _ in range(16):
+        middle = (low + high) / 2
+        growth = np.abs(np.linalg.eigvals(maps(10**middle))).max(axis=-1)
+        stable = growth < 1 + physical * 10**middle
+        low, high = np.where(stable, middle, low), np.where(stable, high, middle)
+    return np.asarray(SAFETY * (10**low).min(axis=1))
+
+
+def refuse(robot: Robot, conditions: Conditions, step: float, sample: float) -> None:
+    """Raise for what no run can be made of.
+
+    Args:
+        robot, conditions: a batch of runs.
+        step, sample: intervals of integration and of the record [s].
+
+    Raises:
+        ValueError: a lever reaches below the ground, or the step is too large for the stiffness; the message
+            then names a step that is neither too large nor at odds with `sample`.
+    """
+    on_tracks = np.array([float(chassis.on_tracks) for chassis in robot.configurations.members])
+    tracked = on_tracks[np.asarray(conditions.configuration, int)] > 0.5
+    gear = robot.running_gear
+    height = float(robot.radius_pulley + gear.grouser_height)  # levers are on tracks alone
+    for name, (_, up) in zip(("lever_front", "lever_rear"), lever_tips(gear, conditions), strict=True):
+        tips = np.ravel(np.asarray(up))
+        tip = float(np.min(tips))
+        if tracked.any() and tip < -height:
+            of_run = f"levers_{name.removeprefix('lever_')}_deg"
+            stated = getattr(conditions, of_run)
+            stands = np.degrees(float(getattr(gear, name))) if stated is None else np.ravel(stated)[np.argmin(tips)]
+            name = name if stated is None else of_run
+            raise ValueError(
+                f"{name}: got {stands:.0f} deg, its tip {1e3 * (-tip - height):.0f} mm below the "
+                "ground; expected a posture on the main tracks, with both tips above the ground"
+            )
+    limits = largest_step(robot, conditions)
+    worst = int(np.argmin(limits))
+    if step > limits[worst]:
+        raise ValueError(
+            f"step: got {step:g} s; contacts, belt or friction are too stiff for it, the largest stable step is "
+            f"{limits[worst]:.2g} s (run {worst + 1} of {len(limits)}); take {_whole(sample, limits[worst]):g} s, a "
+            "softer contact or a larger V_s"
+        )
+
+
+def _whole(sample: float, limit: float) -> float:
+    # The largest step up to `limit` that divides `sample` and that six digits write down in full.
+    count = math.ceil(sample / limit)
+    while abs(float(f"{sample / count:.6g}") * count / sample - 1) > 1e-12:
+        count += 1
+    return sample / count

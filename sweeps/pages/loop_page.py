@@ -1,0 +1,261 @@
+"""The report of the loop: verdict, residual before and after, and the next experiment on one page; then the rest."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import mmrjax as mm
+from calibration.data.columns import Layout
+from calibration.discovery.result import DiscoveryResult
+from calibration.inference import blocks
+from calibration.inference.details import Detail, EquationDefects, TimeStatistics
+from calibration.inference.fit_notes import Copied, FarFromPrior, Repeats
+from calibration.inference.simulation_errors import root_mean_square
+from calibration.words import fit_words
+from calibration.words import loop_words as words
+from calibration.words.note_words import sentence
+from mmrjax.effects import BY_NAME
+from mmrjax.model import params
+from mmrjax.model.channels import Channel
+from mmrjax.model.robot import Robot
+from sweeps.pages import cluster_figures, loop_figures
+from sweeps.pages.page import Album, columns, conditions, curves, first_rows, render, words_shown
+from sweeps.pages.words import GLOSSARY
+
+#: Change of an rms error that is marked [%].
+NOTABLE = 0.05
+
+Section = Callable[[Album, DiscoveryResult], None]
+
+
+def rows_of(found: DiscoveryResult) -> dict[str, np.ndarray]:
+    """Rows of the result as figures and page show them: of a rig each surface is a configuration of its own."""
+    table = found.rows_table()
+    if Layout.of(found.robot).crosses_zero:
+        table["configuration"] = found.runs.configurations_named(found.robot)
+    return table
+
+
+def _drawn(found: DiscoveryResult) -> str:
+    """The verdict as figures take it, which is `none` where they show the refit alone."""
+    return "none" if found.refit_alone else found.verdict
+
+
+def _run_by_run(album: Album, found: DiscoveryResult) -> None:
+    table = rows_of(found)
+    album.add("before_after", lambda: loop_figures.before_after(table, found.channels, _drawn(found)))
+    album.add("defects", lambda: loop_figures.defects(table, _drawn(found), Layout.of(found.robot).crosses_zero))
+
+
+def _over_time(album: Album, found: DiscoveryResult) -> None:
+    assert isinstance(found.detail, TimeStatistics)
+    detail = found.detail
+    album.add(
+        "before_after", lambda: loop_figures.over_time(found.runs, rows_of(found), found.channels, _drawn(found))
+    )
+    album.add("series", lambda: loop_figures.time_statistics(detail, found.channels, _drawn(found)))
+
+
+#: What a page shows of one kind of data, by the type of the result's detail.
+SECTIONS: dict[type[Detail], Section] = {EquationDefects: _run_by_run, TimeStatistics: _over_time}
+
+
+def alike(found: DiscoveryResult) -> list[str]:
+    """Of each effect, and of a discrepancy without a name, what these data cannot tell from it, in words."""
+    curve = [] if found.unnamed is None else [found.unnamed]
+    without_name = [", ".join(b for b in c.balances_alike if b != c.balance) for c in curve]
+    return [*(words.alike(found, e) for e in found.effects), *without_name]
+
+
+def findings(found: DiscoveryResult, changed: Mapping[str, Change]) -> list[dict[str, str]]:
+    """Each effect of the model for the first screen: what it is, how large, how sure, what else it could be."""
+    listed = []
+    for e in found.effects:
+        size = words.size(e)
+        if (change := changed.get(e.name)) is not None:
+            size += f", which changes the {change.channel.label} by {change.rms:.2g} %"
+        sure, other = words.how_sure(found, e), words.alike(found, e)
+        listed.append({"name": e.name, "what": ", or ".join(e.families), "size": size, "sure": sure, "alike": other})
+    return listed
+
+
+@dataclasses.dataclass(frozen=True)
+class Change:
+    """What an effect of the robot that is written changes in the readings of the runs.
+
+    Attributes:
+        channel: the one that it changes most; rms: by how much [% of its measured rms].
+        without, with_it: simulated without and with it, all else alike [SI], shape (rows,).
+    """
+
+    channel: Channel
+    rms: float
+    without: np.ndarray
+    with_it: np.ndarray
+
+
+def changes(found: DiscoveryResult) -> dict[str, Change]:
+    """What each effect changes in settled runs; nothing of histories, and of effects that the written robot lacks."""
+    added = [e.name for e in found.effects if e.name in {x.name for x in found.robot.effects}]
+    if not isinstance(found.detail, EquationDefects) or not added:
+        return {}
+    conditions = found.runs.conditions(found.robot)
+
+    def shown(robot: Robot) -> dict[str, np.ndarray]:
+        results = mm.simulate(robot, conditions)
+        return {c.name: np.asarray(getattr(results, c.name)) for c in found.channels}
+
+    with_it, most, measured = shown(found.robot), {}, found.readings_of_rows.measured
+    for name in added:
+        without = shown(params.replace(found.robot, {f"effects.{name}.amplitude": params.as_float(0.0)}))
+        moved = []
+        for k, c in enumerate(found.channels):
+            a, b = without[c.name], with_it[c.name]
+            size = root_mean_square(measured[found.included, k])
+            if np.isfinite(size) and size > 0:
+                moved.append(Change(c, 100 * root_mean_square((b - a)[found.included]) / size, a, b))
+        if moved:
+            most[name] = max(moved, key=lambda change: change.rms)
+    return most
+
+
+def would_be_seen(found: DiscoveryResult) -> list[dict[str, Any]]:
+    """From what size each effect of the library would have been noticed, the first in its typical sizes first."""
+    level, listed = found.before.kinds["single"].threshold, []
+    for s in found.scores:
+        if s.name in BY_NAME and s.sigmas_per_prior_sd > 0:
+            spec = next(p.spec for p in params.walk(BY_NAME[s.name]()) if p.spec.amplitude)
+            times = level / s.sigmas_per_prior_sd
+            size = f"{times * spec.prior_sd(0.0):.2g} {spec.unit}"
+            listed.append({"name": s.name, "what": BY_NAME[s.name].family(), "size": size, "times": times})
+    return sorted(listed, key=lambda one: one["times"])
+
+
+def unseen(found: DiscoveryResult) -> list[dict[str, Any]]:
+    """Errors of the refit and with what was found, by kind of block held out, with the rows that each reaches; marked
+    where they are better or worse."""
+    total, many = len(found.runs), not found.refit_alone
+    lines = []
+    for kind, both in {"": found.errors, **found.errors_held_out}.items():
+        worse = {w.channel for w in found.held_out_worse if w.kind == kind}
+        cells = []
+        for c in both[0]:
+            texts = [f"{e[c]['rms_percent']:.1f}" if e[c]["rows"] else "-" for e in both[: 1 + many]]
+            change = both[1][c]["rms_percent"] - both[0][c]["rms_percent"] if many else 0.0
+            up = c in worse if kind else change > NOTABLE
+            mark = "bad" if up else "good" if change < -NOTABLE else ""
+            arrow = {"bad": " ↑", "good": " ↓", "": ""}[mark]
+            cells.append({"text": " → ".join(texts) + arrow, "mark": mark})
+        rows = max(int(e["rows"]) for e in both[0].values())
+        what = f"unseen: another {blocks.in_words(kind)}" if kind else "seen by the fit"
+        lines.append({"what": what, "cells": cells, "reached": f"{rows} of {total}"})
+    blank = [{"text": "-", "mark": ""} for _ in found.channels]
+    for kind in found.held_out_unpredictable:
+        if kind not in found.errors_held_out:
+            what, why = f"unseen: another {blocks.in_words(kind)}", "not predictable from the others"
+            lines.append({"what": what, "cells": blank, "reached": why})
+    return lines
+
+
+def summary(found: DiscoveryResult) -> list[dict[str, Any]]:
+    """Errors as stated, fitted again, and with what was found: seen, and unseen by the first kind of block, marked
+    where those seen are better or worse than in the line before."""
+    unseen = next(iter(found.errors_held_out.values()), ({}, {}))
+    lines = [("as stated", found.errors_as_stated, {}), ("fitted again", found.errors[0], unseen[0])]
+    if not found.refit_alone:
+        lines.append(("with what was found", found.errors[1], unseen[1]))
+    shown, before = [], dict[str, float]()
+    for what, seen, held in lines:
+        cells = []
+        for c, e in seen.items():
+            other = f" ({held[c]['rms_percent']:.1f} %)" if c in held and held[c]["rows"] else ""
+            change = e["rms_percent"] - before.get(c, e["rms_percent"])
+            arrow, mark = ("", "") if not abs(change) >= NOTABLE else (" ↓", "good") if change < 0 else (" ↑", "bad")
+            cells.append({"text": f"{e['rms_percent']:.1f} %{other}{arrow}" if e["rows"] else "-", "mark": mark})
+        before = {c: float(e["rms_percent"]) for c, e in seen.items()}
+        reached = max((int(e["rows"]) for e in seen.values()), default=0)
+        shown.append({"what": what, "cells": cells, "reached": f"{reached}/{len(found.runs)}"})
+    return shown
+
+
+def check_first(found: DiscoveryResult) -> list[str]:
+    """What to look at before the robot is used: the reading that weighs most, parameters that moved too far, and what
+    the table contradicts."""
+    far = [sentence(note) for note in found.remarks if isinstance(note, FarFromPrior | Repeats | Copied)]
+    against = [note for note in found.remarks if isinstance(note, str)]
+    said = [words.largest_share(found), *far, *against[:1]]
+    # a sentence begins with a capital, a parameter's name does not
+    return [f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in said if text]
+
+
+def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
+    """Write `report.html` and `figures/` for a pass of the loop.
+
+    Args:
+        folder: an existing run folder.
+        robot_name: name or file of the robot that it began with.
+
+    Returns:
+        The path of the page.
+    """
+    album = Album(Path(folder))
+    table, sized = rows_of(found), Layout.of(found.robot).crosses_zero
+    SECTIONS[type(found.detail)](album, found)
+    if found.residual_clusters:
+        album.add("clusters", lambda: cluster_figures.clusters(found.residual_clusters))
+    album.add("errors", lambda: loop_figures.errors(found))
+    changed = changes(found)
+    if changed:
+        album.add("laws", lambda: loop_figures.laws(found, table, changed))
+    if found.unnamed is not None:
+        curve = found.unnamed
+        album.add("curve", lambda: loop_figures.curve(curve))
+    album.add("ladder", lambda: loop_figures.ladder(found))
+    album.add("null", lambda: loop_figures.null(found.before))
+    album.add("look_alikes", lambda: loop_figures.look_alikes(found))
+    album.add("base_shift", lambda: loop_figures.base_shift(found))
+    return render(
+        Path(folder),
+        "loop.html.j2",
+        album,
+        of_channels=found.channels,
+        title=f"Is the {words_shown(Path(robot_name).name)} model complete?",
+        answer=words.answer(found),
+        findings=findings(found, changed),
+        summary=summary(found),
+        unseen=unseen(found),
+        would_be_seen=would_be_seen(found),
+        glossary=GLOSSARY,
+        curves=curves(found.robot),
+        files={
+            "robot.toml": f"the robot {'with what was found' if found.written and found.effects else 'refitted'}",
+            "fitted.toml": "the robot refitted, with nothing added",
+        },
+        seen_by=next((blocks.in_words(kind) for kind in found.errors_held_out), "nothing"),
+        use_it=words.use_it(found),
+        check_first=check_first(found),
+        document=found.to_json(),
+        p=words.p_value(found.before.p_value),
+        cluster="" if found.cluster is None else words.cluster(found.cluster),
+        standing=words.standing(found),
+        ruled_out=words.ruled_out(found),
+        alike=alike(found),
+        doubts=[words.tentative(found, e) for e in found.effects] + [""] * (found.unnamed is not None),
+        other_noise=words.at_other_noise(found.sensitivity),
+        worse=words.worse(found.held_out_worse, found.predicted),
+        rows=first_rows(rows_of(found)),
+        conditions=conditions(rows_of(found)),
+        columns=columns(found.channels),
+        sized=sized,
+        has_ground=found.robot.has_ground,
+        sides=max(1, len(loop_figures.defects_of(table, "before", "track"))),
+        closed=loop_figures.closed(table) if sized and isinstance(found.detail, EquationDefects) else [],
+        rms=found.rms,
+        determined={n: fit_words.determined(n, p.held_by_prior, found.together) for n, p in found.base_shift.items()},
+        shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",
+    )

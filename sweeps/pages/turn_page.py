@@ -1,0 +1,194 @@
+"""The page of a turn: what either side takes, the path from above, and what other turns take."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from calibration.data.robot_file import RobotFile
+from mmrjax.fidelities.base import History
+from mmrjax.model.quantities import MM, RPM
+from mmrjax.model.robot import Robot
+from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, figure
+from sweeps.pages.page import Album, columns, conditions, named, render
+from sweeps.pages.turn_words import FULL, Turn
+
+SIDES = (("left", BLUE), ("right", VERMILION))
+#: Settled turns of a larger radius are drawn as an arc of so many lengths of the robot.
+ARC = 20.0
+#: A path bends by no more between two points that are drawn [rad].
+BEND = 0.05
+
+
+def write(
+    folder: Path,
+    file: RobotFile,
+    *,
+    model: str,
+    run: Mapping[str, np.ndarray],
+    facts: Turn,
+    history: History | None,
+    turns: dict[str, np.ndarray] | None,
+) -> Path:
+    """Write `report.html` and `figures/` for one turn.
+
+    Args:
+        run: its row of `runs.csv`; facts: what is said of it.
+        history: over time, of a fidelity that keeps it; turns: settled ones of other duties of the slower side.
+
+    Returns:
+        The path of the page.
+    """
+    album, robot = Album(folder), file.robot
+    row = {name: values[0] for name, values in run.items()}
+    imposed = {name: values for name, values in run.items() if name not in columns(robot.channels).values()}
+    if history is None:
+        album.add("path", lambda: circle(robot, row))
+    else:
+        place = {c: np.asarray(history.reading[c])[0] for c in ("place_x", "place_y", "yaw")}
+        album.add("path", lambda: path(robot, row, place["place_x"], place["place_y"], place["yaw"]))
+        album.add("course", lambda: course(history))
+    if turns is not None:
+        album.add("turns", lambda: over_yaw_rate(turns, row))
+    return render(
+        folder,
+        "turn.html.j2",
+        album,
+        of_channels=robot.channels,
+        title=facts.answer,
+        model=model,
+        facts=facts,
+        about={heading: form.format(row[c]) for c, (heading, form) in conditions(imposed, mass=True).items()},
+        settled=history is None,
+        **named(file),
+    )
+
+
+def _outline(axes: Axes, robot: Robot, row: Mapping[str, Any], x: float, y: float, yaw: float, color: str) -> None:
+    """The robot from above: its contact lines, a bar between them and an arrow ahead."""
+    length = float(robot.running_gear.wheelbase)
+    width = float(robot.configurations[str(row["configuration"])].turning.width)
+    ahead, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+    middle = np.array([x, y])
+    for side in (0.5, -0.5):
+        ends = [middle + side * width * left + s * length * ahead for s in (0.5, -0.5)]
+        axes.plot([-e[1] for e in ends], [e[0] for e in ends], color=color, lw=3.5, solid_capstyle="round")
+    tip = middle + 0.5 * length * ahead
+    axes.annotate("", (-tip[1], tip[0]), (-y, x), arrowprops={"arrowstyle": "-|>", "color": color})
+
+
+def _plan(axes: Axes) -> None:
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("to the right of the start [m]", color=INK)
+    axes.set_ylabel("uphill, or ahead of the start [m]", color=INK)
+
+
+def circle(robot: Robot, row: Mapping[str, Any]) -> Figure:
+    """The circle of a settled turn from above, or an arc of it, with the robot and the centre of rotation."""
+    rate, speed, across = (float(row[c]) for c in ("yaw_rate_rad_s", "speed_mm_s", "lateral_speed_mm_s"))
+    fig, grid = figure(1, 1, 4.6)
+    axes = grid[0, 0]
+    length = float(robot.running_gear.wheelbase)
+    velocity = np.array([speed, across]) * MM
+    size = float(np.hypot(*velocity))
+    # A whole turn, unless it is longer than a few robots.
+    time = ARC * length / max(size, 1e-9)
+    if abs(rate) > 1e-9:
+        time = min(time, FULL / abs(rate))
+        center = np.array([-velocity[1], velocity[0]]) / rate
+        axes.plot(-center[1], center[0], marker="+", color=FAINT, ms=12, mew=2, ls="none")
+        axes.annotate("centre of rotation", (-center[1], center[0]), xytext=(8, 6), textcoords="offset points",
+                      color=INK, fontsize=9)  # fmt: skip
+    times = np.linspace(0.0, time if np.isfinite(time) else 0.0, 200)
+    turned = rate * times
+    if abs(rate) > 1e-9:
+        x = (velocity[0] * np.sin(turned) - velocity[1] * (1 - np.cos(turned))) / rate
+        y = (velocity[0] * (1 - np.cos(turned)) + velocity[1] * np.sin(turned)) / rate
+    else:
+        x, y = velocity[0] * times, velocity[1] * times
+    axes.plot(-y, x, color=BLUE)
+    _outline(axes, robot, row, 0.0, 0.0, 0.0, INK)
+    _plan(axes)
+    return fig
+
+
+def arcs(
+    x: np.ndarray, y: np.ndarray, yaw: np.ndarray
+) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
+    """A path between places, each stretch at a speed and yaw rate of its own: an arc; steps of a run may be long.
+
+    Args:
+        x, y: places [m]; yaw: there, counted on over a turn [rad]; shape (rows,).
+    """
+    place, turned = x + 1j * y, np.diff(yaw)
+    pieces = np.ceil(np.abs(turned) / BEND).clip(1, 100).astype(int)
+    k = np.repeat(np.arange(len(pieces)), pieces)
+    share = (np.arange(len(k)) - np.repeat(np.cumsum(pieces) - pieces, pieces)) / pieces[k]
+    bent = np.where(pieces[k] > 1, turned[k], BEND)  # else share is 0 and any will do
+    between = place[k] + np.diff(place)[k] * np.expm1(1j * share * bent) / np.expm1(1j * bent)
+    whole = np.append(between, place[-1])
+    return whole.real, whole.imag
+
+
+def path(robot: Robot, row: Mapping[str, Any], x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> Figure:
+    """A path from above, the robot at its beginning and its end, and between."""
+    finite = np.isfinite(x)
+    x, y, yaw = x[finite], y[finite], yaw[finite]
+    fig, grid = figure(1, 1, 4.6)
+    axes = grid[0, 0]
+    ahead, aside = arcs(x, y, yaw)
+    axes.plot(-aside, ahead, color=BLUE)
+    for k, color in ((0, FAINT), (len(x) // 2, FAINT), (len(x) - 1, INK)):
+        _outline(axes, robot, row, x[k], y[k], yaw[k], color)
+    _plan(axes)
+    return fig
+
+
+def course(history: History) -> Figure:
+    """Currents and motor speeds of both sides, and the yaw rate, over time."""
+    time = np.asarray(history.time)[0]
+    read = {name: np.asarray(values)[0] for name, values in history.reading.items()}
+    fig, grid = figure(3, 1, 6.0, sharex=True)
+    for side, color in SIDES:
+        for axes, name, factor in ((grid[0, 0], "motor_current", 1.0), (grid[1, 0], "motor_speed", RPM)):
+            axes.plot(time, read[f"{name}_{side}"] / factor, color=color, label=side)
+    grid[2, 0].plot(time, read["yaw_rate"], color=INK)
+    for axes, label in zip(grid[:, 0], ("current [A]", "motor speed [rpm]", "yaw rate [rad/s]"), strict=True):
+        axes.set_ylabel(label, color=INK)
+    steady = read["motor_current_left"][time > 0.1 * time[-1]], read["motor_current_right"][time > 0.1 * time[-1]]
+    most = float(np.nanmax(np.abs(np.concatenate(steady)), initial=0.1))
+    grid[0, 0].set_ylim(-2.5 * most, 2.5 * most)
+    grid[0, 0].legend(ncols=2)
+    grid[-1, 0].set_xlabel("time [s]", color=INK)
+    return fig
+
+
+def over_yaw_rate(turns: dict[str, np.ndarray], row: Mapping[str, Any]) -> Figure:
+    """Current of either side and power over the yaw rate of settled turns, the one asked for marked."""
+    fig, grid = figure(1, 2, 3.4)
+
+    def rate(motion: Mapping[str, Any]) -> np.ndarray:
+        # On the spot the curvature is without limit, the yaw rate is not.
+        return np.asarray(motion["yaw_rate_rad_s"], float)
+
+    rest = {name: np.asarray(values)[1:] for name, values in turns.items()}
+    order = np.argsort(rate(rest))
+    for side, color in SIDES:
+        column = f"motor_current_{side}_A"
+        grid[0, 0].plot(rate(rest)[order], rest[column][order], color=color, label=side)
+        grid[0, 0].plot(rate(row), float(row[column]), marker="o", color=color, ls="none")
+    grid[0, 0].set_ylabel("current of a motor [A]", color=INK)
+    grid[0, 0].legend()
+    grid[0, 1].plot(rate(rest)[order], rest["power_supply_W"][order], color=INK)
+    grid[0, 1].plot(rate(row), float(row["power_supply_W"]), marker="o", color=INK, ls="none")
+    grid[0, 1].set_ylabel("power of the supply [W]", color=INK)
+    for axes in grid[0]:
+        axes.axhline(0, color=FAINT, lw=0.8)
+        axes.set_xlabel("yaw rate, positive to the left [rad/s]", color=INK)
+    return fig

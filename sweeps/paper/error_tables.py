@@ -1,0 +1,139 @@
+"""Tables of the paper: errors against the bench, and the paper against itself, row by row."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.data import runs as records
+from calibration.inference import simulation_errors as residual
+from mmrjax.model.paper_tables import CONFIGURATIONS, TRACKED, WHEELED
+from mmrjax.model.quantities import MM, RPM
+from mmrjax.model.robot import Robot
+from sweeps.pages.page import reading
+from sweeps.paper import data
+
+
+def errors(variants: dict[str, np.ndarray], rows: data.Rows) -> list[dict[str, Any]]:
+    """Rms and worst error (35) of each variant (errors of shape (rows, channels)), all rows and by group."""
+    kind = rows.conditions["configuration"]
+    answer = []
+    for name, values in variants.items():
+        for group in ("all", *rows.ratio):
+            pick = np.ones(len(kind), bool) if group == "all" else kind == group
+            cells = [residual.summary(values[pick, k]) for k in range(values.shape[1])]
+            answer.append(
+                {"variant": name, "group": group, "rows": cells[0]["rows"], "of": int(pick.sum()), "cells": cells}
+            )
+    return answer
+
+
+def implied_resistance(robot: Robot, table: records.Runs) -> np.ndarray:
+    """Resistance [Ω] in series with each motor that current and speed of each row imply by (15)."""
+    current = table["total_current_A"]
+    back = np.asarray(robot.motor.voltage_back(jnp.asarray(table["motor_speed_rpm"] * RPM)))
+    return robot.sides * (table["supply_voltage_V"] - back) / current
+
+
+def row_by_row(nominal: Robot, rows: data.Rows) -> list[dict[str, Any]]:
+    """The 20 rows: bench, the paper's simulation, the nominal robot three ways, and letters that say why."""
+    table = rows.conditions
+    own, raised, weighed = (data.stacked(t) for t in (rows.plain, rows.raised, rows.weighed))
+    resistance = implied_resistance(nominal, records.read("simulated_by_paper"))
+    limit = float(nominal.motor.resistance)
+    answer = []
+    for k in range(len(table)):
+        wheeled = table["configuration"][k] == WHEELED
+        reasons = []
+        if rows.plain["status"][k] == "slides":
+            reasons.append("A")
+        if wheeled and abs(rows.weighed["total_mass_kg"][k] - table["total_mass_kg"][k]) > 0.05:
+            reasons.append("M")
+        if wheeled and abs(weighed[k, 0] - rows.paper[k, 0]) > 0.03 * rows.paper[k, 0]:
+            reasons.append("W")
+        if not wheeled and abs(raised[k, 0] - rows.paper[k, 0]) > 0.01 * rows.paper[k, 0]:
+            reasons.append("G")
+        if resistance[k] > 1.1 * limit:
+            reasons.append("E")
+        if raised[k, 1] > 1.03 * rows.measured[k, 1]:
+            reasons.append("B")
+        following = (table["slope_deg"] == table["slope_deg"][k] + 5) & _same_mode(table, k)
+        if following.any() and rows.paper[following, 1][0] > rows.paper[k, 1]:
+            reasons.append("N")
+        creep = rows.raised["theoretical_speed_mm_s"][k] * rows.raised["slip"][k]
+        radius = float(nominal.configurations[str(table["configuration"][k])].radius) / float(nominal.gearbox.ratio)
+        creep_paper = rows.paper[k, 1] * RPM * radius / MM - rows.paper[k, 2]
+        if creep_paper > 1.5 * creep + 2:
+            reasons.append("S")
+        answer.append(
+            {
+                "configuration": table["configuration"][k],
+                "voltage": table["supply_voltage_V"][k],
+                "mass": table["total_mass_kg"][k],
+                "own_mass": float(rows.weighed["total_mass_kg"][k]),
+                "slope": table["slope_deg"][k],
+                "status": str(rows.plain["status"][k]),
+                "reasons": reasons,
+                "channels": [
+                    _cells(
+                        channel.name, rows.measured[k, c], rows.paper[k, c], own[k, c], raised[k, c], weighed[k, c]
+                    )
+                    for c, channel in enumerate(data.channels_of_paper())
+                ],
+            }
+        )
+    return answer
+
+
+def _same_mode(table: records.Runs, k: int) -> np.ndarray:
+    return (table["configuration"] == table["configuration"][k]) & (
+        table["supply_voltage_V"] == table["supply_voltage_V"][k]
+    )
+
+
+def _cells(channel: str, measured: float, paper: float, own: float, raised: float, weighed: float) -> dict[str, Any]:
+    """Texts of one channel in a row; differences by (35) of the nominal (raised, own mass) from paper and bench."""
+    return {
+        "measured": reading(measured, channel),
+        "paper": reading(paper, channel),
+        "own": reading(own, channel) if np.isfinite(own) else "slides",
+        "raised": reading(raised, channel) if np.isfinite(raised) else "no number",
+        "weighed": reading(weighed, channel) if np.isfinite(weighed) else "no number",
+        "to_paper": float(residual.relative_error(np.array(raised), np.array(paper))),
+        "to_paper_weighed": float(residual.relative_error(np.array(weighed), np.array(paper))),
+        "to_measured": float(residual.relative_error(np.array(raised), np.array(measured))),
+        "to_measured_weighed": float(residual.relative_error(np.array(weighed), np.array(measured))),
+    }
+
+
+def facts(nominal: Robot, rows: data.Rows) -> dict[str, Any]:
+    """The numbers behind the letters of `row_by_row`, for the page to put into words."""
+    measured = rows.conditions
+    of_paper = implied_resistance(nominal, records.read("simulated_by_paper"))
+    tracked = measured["configuration"] == TRACKED
+    slow, slope = measured["supply_voltage_V"] == 15.0, measured["slope_deg"]
+    used = rows.plain["adhesion_used"]
+    extra = rows.weighed["total_current_A"] - rows.paper[:, 0]
+    gap = 100 * (rows.raised["total_current_A"] - rows.paper[:, 0])[tracked] / rows.paper[tracked, 0]
+
+    def span(values: np.ndarray) -> tuple[float, float]:
+        return float(values.min()), float(values.max())
+
+    return {
+        "adhesion": tuple(float(nominal.configurations[c].ground.friction.static) for c in CONFIGURATIONS),
+        "used_tracked_15": float(used[tracked & (slope == 15)][0]),
+        "used_tracked_20": float(used[tracked & (slope == 20)][0]),
+        "used_wheeled_20": float(used[~tracked & (slope == 20)][0]),
+        "extra_slow": span(extra[~tracked & slow]),
+        "extra_fast": span(extra[~tracked & ~slow]),
+        "extra_flat": span(extra[~tracked & (slope == 0)]),
+        "guide_share": float(nominal.configurations[TRACKED].track.guide_share),
+        "gap": span(gap),
+        "resistance": float(nominal.motor.resistance),
+        "paper_slow": span(of_paper[tracked & slow]),
+        "paper_fast": span(of_paper[tracked & ~slow]),
+        "paper_wheeled": float(np.median(of_paper[~tracked])),
+        "bench": float(np.median(implied_resistance(nominal, measured))),
+    }

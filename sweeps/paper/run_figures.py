@@ -1,0 +1,247 @@
+"""Figures of the paper's runs: over slope (Figs. 28, 29), row by row, and where the energy goes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from calibration.inference import simulation_errors as residual
+from mmrjax.model.paper_tables import TRACKED, WHEELED
+from mmrjax.model.robot import Robot
+from sweeps.pages import words
+from sweeps.pages.figure_style import (
+    BLUE,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    axis_label,
+    figure,
+    label_end,
+    note,
+)
+from sweeps.pages.page import words_shown
+from sweeps.paper import data
+from sweeps.paper.look import CONFIGURATION, MODEL
+
+_MODES = {1: (BLUE, "o"), 2: (SKY, "v"), 3: (GREEN, "^"), 4: (VERMILION, "s")}
+
+
+def current_over_slope(robot: Robot, rows: data.Rows) -> tuple[Figure, list[dict[str, Any]]]:
+    """Fig. 28: total current over slope in four loading modes, with the measured points and R² (A1)."""
+    slopes = np.linspace(0, 20, 81)
+    lines = data.current_over_slope(robot, rows.ratio, slopes)
+    fig, grid = figure(1, len(rows.ratio), 4.4, sharey=True)
+    certainty = []
+    for axes, kind in zip(grid[0], rows.ratio, strict=True):
+        for mode, (voltage, payload) in data.MODES.items():
+            colour, marker = _MODES[mode]
+            own, raised = lines[kind, mode]
+            axes.plot(slopes, raised, "--", color=colour, lw=1.3)
+            axes.plot(slopes, own, color=colour)
+            stop = np.nonzero(np.isfinite(own))[0]
+            if stop.size and stop[-1] < len(slopes) - 1:
+                axes.plot(slopes[stop[-1]], own[stop[-1]], "x", color=colour, ms=7, mew=2)
+            label_end(axes, slopes, raised, f"{mode}", colour, fontweight="bold", offset=(5 + 9 * (mode % 2), 0))
+            table = rows.conditions
+            pick = (
+                (table["configuration"] == kind)
+                & (table["supply_voltage_V"] == voltage)
+                & (table["payload_kg"] == payload)
+            )
+            if pick.any():
+                measured = rows.measured[pick, 0]
+                axes.plot(table["slope_deg"][pick], measured, marker, color=colour, ms=6.5, mec=INK, mew=0.8)
+                _, straight = data.fit_line(table["slope_deg"][pick], measured)
+                certainty.append(
+                    {
+                        "configuration": kind,
+                        "mode": mode,
+                        "straight": straight,
+                        "own": residual.certainty(measured, rows.plain["total_current_A"][pick]),
+                        "own_rows": int(np.isfinite(rows.plain["total_current_A"][pick]).sum()),
+                        "raised": residual.certainty(measured, rows.raised["total_current_A"][pick]),
+                        "weighed": residual.certainty(measured, rows.weighed["total_current_A"][pick]),
+                    }
+                )
+        axes.set(xlabel="slope [°]", xticks=[0, 5, 10, 15, 20], xlim=(-0.5, 20.9))
+        axes.set_title(kind)
+        fits = [r for r in certainty if r["configuration"] == kind]
+        texts = [f"mode {r['mode']}: R² {r['weighed']:.3f} (straight fit {r['straight']:.3f})" for r in fits]
+        note(axes, "markers: measured\n" + "\n".join(texts), fontsize=8.5)
+    grid[0, 0].set_ylim(0, 1.2 * grid[0, 0].dataLim.y1 if np.isfinite(grid[0, 0].dataLim.y1) else 1.0)
+    grid[0, 0].set_ylabel("total current [A]")
+    modes = "     ".join(f"{m}: {u:g} V, {p:g} kg" for m, (u, p) in data.MODES.items())
+    fig.supxlabel(
+        f"loading modes   {modes}\nsolid: own adhesion, × where the robot begins to slide; dashed: adhesion raised",
+        fontsize=9,
+    )
+    return fig, certainty
+
+
+def model_errors(robots: dict[str, Robot], rows: dict[str, data.Rows]) -> tuple[Figure, dict[str, Any]]:
+    """Fig. 29: errors (35) in current and speed over slope, 6T2A, modes 1 and 2, adhesion raised."""
+    fig, grid = figure(2, 2, 6.2, sharex=True)
+    slopes = np.array([0.0, 5.0, 10.0, 15.0, 20.0])
+    errors: dict[str, Any] = {}
+    for name, robot in robots.items():
+        ratio = rows[name].ratio[TRACKED]
+        colour = MODEL.get(name, PURPLE)
+        for battery in (False, True):
+            if battery and name == "sm1":
+                continue  # SM-1 and SM-2 share the constant battery; the paper draws one
+            for mode, error in data.supply_errors(robot, ratio, rows[name], battery).items():
+                errors[f"{name}{' battery' if battery else ''} mode {mode}"] = error
+                for row, channel in ((0, 0), (1, 2)):
+                    axes = grid[row, mode - 1]
+                    axes.plot(slopes, error[:, channel], ":" if battery else "-", color=colour, marker="o", ms=4)
+    from matplotlib.lines import Line2D
+
+    handles = [Line2D([], [], color=MODEL.get(n, PURPLE), marker="o", ms=4, label=words_shown(n)) for n in robots]
+    handles.append(Line2D([], [], color=INK, ls=":", marker="o", ms=4, label="on a full battery (mode 2)"))
+    paper = residual.relative_error(next(iter(rows.values())).paper, next(iter(rows.values())).measured)
+    table = next(iter(rows.values())).conditions
+    for mode, voltage in ((1, 15.0), (2, 33.0)):
+        pick = (table["configuration"] == TRACKED) & (table["supply_voltage_V"] == voltage)
+        for row, channel in ((0, 0), (1, 2)):
+            grid[row, mode - 1].plot(slopes, paper[pick, channel], "-", color=INK, marker="d", ms=5, lw=1)
+    handles.append(Line2D([], [], color=INK, marker="d", ms=5, lw=1, label="the paper's own simulation"))
+    for row, label in ((0, "error in current [%]"), (1, "error in speed [%]")):
+        for mode in (1, 2):
+            axes = grid[row, mode - 1]
+            axes.axhspan(-7, 7, color="#eef3ee", zorder=0)
+            axes.axhline(0, color="#666666", lw=0.9)
+            axes.set_xticks(slopes)
+        low = min(a.get_ylim()[0] for a in grid[row])
+        high = max(a.get_ylim()[1] for a in grid[row])
+        for axes in grid[row]:
+            axes.set_ylim(low, high)
+        grid[row, 0].set_ylabel(label)
+    grid[0, 0].set_title("mode 1: 15 V, 0 kg")
+    grid[0, 1].set_title("mode 2: 33 V, 8 kg")
+    note(grid[0, 0], "shaded: ±7 %, the paper's claim", x=0.02, y=0.04, va="bottom", fontsize=8, color="#447744")
+    for axes in grid[1]:
+        axes.set_xlabel("slope [°]")
+    fig.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+    return fig, errors
+
+
+_SPLIT_COLOURS = {
+    "winding": VERMILION,
+    "motor friction": ORANGE,
+    "gearbox": PURPLE,
+    "track and guides": BLUE,
+    "slip": INK,
+    "rolling resistance": SKY,
+    "lift": GREEN,
+    "other": "#cccccc",
+}
+
+
+def energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[dict[str, Any]]]:
+    """Where the supply's power goes at twelve operating points, in percent, with watts at the end."""
+    asked = [(c, u, p, s) for c in ratio for u, p in ((15.0, 0.0), (33.0, 8.0)) for s in (0.0, 10.0, 20.0)]
+    kind, voltage, payload, slope = (np.array(v) for v in zip(*asked, strict=True))
+
+    def at(adhesion: np.ndarray) -> tuple[data.Columns, data.Columns]:
+        return data.energy_split(
+            robot,
+            data.conditions(robot, kind, voltage=voltage, payload=payload, slope_deg=slope, adhesion=adhesion),
+        )
+
+    points, _ = at(np.ones(len(asked)))
+    slides = points["status"] == "slides"
+    lifted_points, lifted = at(np.where(slides, [ratio[k] for k in kind], 1.0))
+    fig, grid = figure(1, 1, 5.2)
+    axes = grid[0, 0]
+    table = []
+    height = [float(k) + 0.6 * (k // 3) for k in range(len(asked))]
+    left = np.zeros(len(asked))
+    total = lifted_points["power_supply_W"]
+    for item in (*data.SPLIT, "other"):
+        share = 100 * lifted[item] / total
+        share = np.where(np.isfinite(share), share, 0.0)
+        if np.abs(share).max() < 0.05:  # not to be seen, and in no legend
+            continue
+        axes.barh(height, share, left=left, height=0.82, color=_SPLIT_COLOURS[item], label=item, ec="white", lw=0.6)
+        for y, x, width in zip(height, left, share, strict=True):
+            if width >= 4:
+                dark = item in ("winding", "track and guides", "slip", "gearbox", "lift")
+                axes.text(
+                    x + width / 2,
+                    y,
+                    f"{width:.0f}",
+                    ha="center",
+                    va="center",
+                    fontsize=8,
+                    color="white" if dark else INK,
+                )
+        left = left + share
+    labels = []
+    for k, (c, u, _p, s) in enumerate(asked):
+        labels.append(f"{c}  {u:.0f} V  {_p:.0f} kg  {s:.0f}°" + (" *" if slides[k] else ""))
+        alive = np.isfinite(total[k])
+        text = f"{total[k]:.0f} W" if alive else words.short(str(lifted_points["status"][k]))
+        axes.text(101 if alive else 1, height[k], text, va="center", fontsize=8.5)
+        table.append(
+            {"point": labels[-1], "total": float(total[k])}
+            | {item: float(lifted[item][k]) for item in (*data.SPLIT, "other")}
+        )
+    axes.set_yticks(height, labels, fontsize=8.5)
+    axes.invert_yaxis()
+    axes.grid(False)
+    remark = "\n* slides on its own adhesion; shown with adhesion raised" if slides.any() else ""
+    axes.set(xlabel=f"share of the power taken from the supply [%]{remark}", xlim=(0, 108), xticks=range(0, 101, 20))
+    fig.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=8)
+    return fig, table
+
+
+def row_parity(rows: data.Rows, name: str) -> Figure:
+    """Simulated over measured for the rows, every channel, adhesion raised, both masses for 4W2T."""
+    shown = data.channels_of_paper()
+    fig, grid = figure(1, len(shown), 3.7)
+    kind = rows.conditions["configuration"]
+    raised, weighed = data.stacked(rows.raised), data.stacked(rows.weighed)
+    moved = (kind == WHEELED) & (np.abs(rows.raised["total_mass_kg"] - rows.weighed["total_mass_kg"]) > 0.05)
+    slides = rows.plain["status"] == "slides"
+    for k, (axes, channel) in enumerate(zip(grid[0], shown, strict=True)):
+        measured = rows.measured[:, k]
+        span = np.array([0.0, 1.1 * max(measured.max(), np.nanmax(raised[:, k], initial=0))])
+        axes.fill_between(span, span * 0.95, span * 1.05, color="#eef3ee", lw=0)
+        axes.plot(span, span, color="#666666", lw=0.9)
+        for c in rows.ratio:
+            for pick, face, label in (
+                ((kind == c) & ~slides, CONFIGURATION[c], c),
+                ((kind == c) & slides, "white", f"{c}, adhesion raised"),
+            ):
+                axes.plot(
+                    measured[pick],
+                    raised[pick, k],
+                    "o" if c == TRACKED else "s",
+                    color=CONFIGURATION[c],
+                    mfc=face,
+                    ms=6,
+                    ls="",
+                    label=label if pick.any() else None,
+                )
+        if moved.any():
+            axes.plot(
+                measured[moved],
+                weighed[moved, k],
+                "+",
+                color=INK,
+                ms=8,
+                mew=1.4,
+                label="4W2T with the robot's own mass",
+            )
+        axes.set(xlabel=f"measured {axis_label(channel)}", ylabel=f"simulated {axis_label(channel)}")
+        axes.set_xlim(*span)
+        axes.set_ylim(*span)
+        axes.locator_params(nbins=5)
+    note(grid[0, 0], f"{words_shown(name)}; band ±5 %", fontsize=8.5)
+    fig.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
+    return fig

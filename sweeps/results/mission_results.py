@@ -1,0 +1,54 @@
+"""What `simulate` over a profile found: numbers, segments and course of every run."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from calibration.data import profiles
+from calibration.data.profiles import ProfileTable
+from mmrjax.missions import mission_batch
+from mmrjax.model.energy import SINKS
+
+
+@dataclasses.dataclass(frozen=True)
+class Missions:
+    """Runs over one profile, as tables.
+
+    Attributes:
+        table: a row a run, `runs.csv`; segments: a row a segment, `segments.csv`; course: a row an accepted step that
+            is kept, `history.csv`.
+        source: the profile that they follow.
+        whole: whether the course of every run reaches its end.
+    """
+
+    table: dict[str, np.ndarray]
+    segments: dict[str, np.ndarray]
+    course: dict[str, np.ndarray]
+    source: ProfileTable
+    whole: bool
+
+    def to_json(self) -> dict[str, Any]:
+        """What `result.json` says: of one run its numbers by name, of several a list of them."""
+        each = [self._one(k) for k in range(len(self.table["status"]))]
+        about = {
+            "name": self.source.source, "sha256": self.source.digest, "duration_s": self.source.duration,
+            "segments": self.source.segments, "cycles": self.source.cycles,
+            "between_rows": profiles.BETWEEN[self.source.linear],
+        }  # fmt: skip
+        return {"profile": about, **(each[0] if len(each) == 1 else {"missions": each})}
+
+    def _one(self, row: int) -> dict[str, Any]:
+        to = {name: f"energy_to_{name}_Wh" for name in SINKS}
+        numbers = {
+            c: float(self.table[c][row]) for c in mission_batch.names(self.source.turns) if c not in to.values()
+        }
+        flags = str(self.table["flags"][row])
+        return {
+            **numbers,
+            "energy_by_where_Wh": {name: float(self.table[column][row]) for name, column in to.items()},
+            "status": str(self.table["status"][row]),
+            "flags_raised": flags.split(";") if flags else [],
+        }

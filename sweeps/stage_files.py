@@ -1,0 +1,258 @@
+"""Results of stages in files: JSON of values, of names of our own classes and of places of arrays, and their bytes.
+
+A file is an archive as `np.savez` writes it, whose checksum covers both. Reading one runs no code that it brings: it
+can name only dataclasses of `mmrjax` and `calibration`, effects that the user has loaded, and the functions of
+`FUNCTIONS`, and sets fields without calling a constructor.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib
+import inspect
+import json
+import math
+import sys
+import types
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from calibration.data.effect_file import OWN_MODULE
+from mmrjax.effects.scaled import scaled
+from mmrjax.model import channels
+from mmrjax.model.channels import Channel
+
+#: Packages whose dataclasses a file may name, and modules whose functions it may.
+PACKAGES = ("mmrjax", "calibration")
+FUNCTIONS = ("calibration.discovery.setups", "calibration.discovery.menu")
+#: Kinds of arrays that are bytes alone.
+KINDS = "biufcSU"
+
+
+class Unwritable(Exception):
+    """A value whose type has no place in such a file."""
+
+
+class Unreadable(Exception):
+    """A file that is damaged, or not one of a stage."""
+
+
+def write(file: Path, value: Any) -> None:
+    """Write a value.
+
+    Raises:
+        Unwritable: something in it is neither a value, an array nor an instance of our own dataclasses.
+        OSError: the file cannot be written.
+    """
+    writer = _Writer()
+    try:
+        tree = json.dumps(writer.encoded(value), separators=(",", ":"), allow_nan=False).encode()
+    except (RecursionError, TypeError, ValueError) as error:  # nested too deeply, without attributes, a huge number
+        raise Unwritable(f"{type(error).__name__}: {error}") from error
+    with file.open("wb") as stream:
+        data = np.frombuffer(b"".join(writer.data), np.uint8)
+        np.savez(stream, allow_pickle=False, tree=np.frombuffer(tree, np.uint8), data=data)
+
+
+def read(file: Path) -> Any:
+    """Value that `write` wrote.
+
+    Raises:
+        Unreadable: it cannot be read, or names what it may not.
+    """
+    try:
+        found = read_arrays(file)
+        return _Reader(found["data"].tobytes()).decoded(json.loads(found["tree"].tobytes()))
+    except Exception as error:  # whatever a damaged or a made-up file comes to
+        raise Unreadable(f"{type(error).__name__}: {error}") from error
+
+
+def read_arrays(file: Path) -> dict[str, np.ndarray]:
+    """Arrays of a file of `np.savez`, none of which is of objects; raises whatever a damaged file comes to."""
+    with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
+        return {key: arrays[key] for key in arrays.files}
+
+
+#: Weakly typed arrays of more values are read as arrays of the other kind.
+FEW = 256
+
+
+class _Writer:
+    """Encodes values: JSON has lists and plain values as they are, everything else as [KIND, ...]."""
+
+    def __init__(self) -> None:
+        self.data: list[bytes] = []
+        self._size = 0
+        self._number: dict[int, int] = {}
+        self._alive: list[Any] = []  # so that no two have one id
+
+    def encoded(self, x: Any) -> Any:
+        if x is None or type(x) in (bool, int, str) or (type(x) is float and math.isfinite(x)):
+            return x
+        if type(x) is float:
+            return ["float", str(x)]
+        if id(x) in self._number:
+            return ["again", self._number[id(x)]]
+        made = self._compound(x)
+        self._number[id(x)] = len(self._alive)
+        self._alive.append(x)
+        return made
+
+    def _compound(self, x: Any) -> list[Any]:
+        import jax
+
+        if isinstance(x, Channel):
+            return ["channel", x.name]
+        if type(x) in (list, tuple, set, frozenset):
+            return [type(x).__name__, [self.encoded(item) for item in x]]
+        if type(x) is dict:
+            return ["dict", [[self.encoded(key), self.encoded(item)] for key, item in x.items()]]
+        if isinstance(x, np.ndarray | np.generic):
+            return ["scalar" if isinstance(x, np.generic) else "array", *self._array(np.asarray(x))]
+        if isinstance(x, jax.Array) and not jax.dtypes.issubdtype(x.dtype, jax.dtypes.extended):
+            return ["jax", bool(x.aval.weak_type), *self._array(np.asarray(x))]
+        if isinstance(x, type):
+            return ["type", *_named_class(x)]
+        if isinstance(x, types.FunctionType) and x.__module__ in FUNCTIONS:
+            return ["function", x.__module__, x.__qualname__]
+        if dataclasses.is_dataclass(x):
+            held = {name: self.encoded(value) for name, value in vars(x).items() if _holds(type(x), name)}
+            return ["instance", *_named_class(type(x)), held]
+        if isinstance(x, tuple) and hasattr(x, "_fields"):
+            return ["named", *_named_class(type(x)), [self.encoded(item) for item in x]]
+        raise Unwritable(f"{type(x).__module__}.{type(x).__qualname__}")
+
+    def _array(self, x: np.ndarray) -> list[Any]:
+        if x.dtype.kind == "O":
+            return ["O", list(x.shape), [self.encoded(item) for item in x.ravel()]]
+        if x.dtype.kind not in KINDS:
+            raise Unwritable(f"array of {x.dtype}")
+        order: Literal["F", "C"] = (
+            "F" if x.flags.f_contiguous and not x.flags.c_contiguous else "C"
+        )  # which sums depend on
+        content = x.tobytes(order)
+        at, self._size = self._size, self._size + len(content)
+        self.data.append(content)
+        return [x.dtype.str, list(x.shape), order, at]
+
+
+class _Reader:
+    """Decodes what `_Writer` encoded."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self._known: list[Any] = []
+
+    def decoded(self, x: Any) -> Any:
+        if not isinstance(x, list):
+            if isinstance(x, dict):
+                raise Unreadable("a JSON object without a kind")
+            return x
+        kind, *rest = x
+        if kind == "float":
+            return float(rest[0])
+        if kind == "again":
+            return self._known[rest[0]]
+        made = self._compound(kind, *rest)
+        self._known.append(made)
+        return made
+
+    def _compound(self, kind: str, *rest: Any) -> Any:
+        if kind == "channel":
+            return channels.find(rest[0])
+        if kind in ("list", "tuple", "set", "frozenset"):
+            items = [self.decoded(item) for item in rest[0]]
+            return {"list": list, "tuple": tuple, "set": set, "frozenset": frozenset}[kind](items)
+        if kind == "dict":
+            return {self.decoded(key): self.decoded(item) for key, item in rest[0]}
+        if kind == "scalar":
+            return self._array(*rest)[()]
+        if kind == "array":
+            return self._array(*rest)
+        if kind == "jax":
+            return _on_device(self._array(*rest[1:]), weak=rest[0])
+        if kind == "type":
+            return _class(*rest)
+        if kind == "function":
+            return _function(*rest)
+        if kind == "instance":
+            return self._instance(*rest)
+        if kind == "named":
+            return _class(*rest[:3])(*map(self.decoded, rest[3]))
+        raise Unreadable(f"no such kind: {kind}")
+
+    def _array(self, dtype: str, shape: list[int], *rest: Any) -> np.ndarray:
+        if dtype == "O":
+            made = np.empty(math.prod(shape), object)
+            made[:] = [self.decoded(item) for item in rest[0]]
+            return made.reshape(shape)
+        order, at = rest
+        kind = np.dtype(dtype)
+        if kind.kind not in KINDS:
+            raise Unreadable(f"array of {dtype}")
+        return np.frombuffer(self._data, kind, math.prod(shape), at).reshape(shape, order=order).copy("K")
+
+    def _instance(self, module: str, name: str, factors: list[float] | None, fields: dict[str, Any]) -> Any:
+        kind = _class(module, name, factors)
+        if not dataclasses.is_dataclass(kind) or not all(_holds(kind, name) for name in fields):
+            raise Unreadable(f"{module}.{name} has other fields")
+        made: Any = object.__new__(kind)
+        for field, value in fields.items():
+            object.__setattr__(made, field, self.decoded(value))
+        return made
+
+
+def _holds(kind: type, name: str) -> bool:
+    """True if instances of a dataclass hold a value by that name: a field, or what they compute once and keep."""
+    kept = inspect.getattr_static(kind, name, None)
+    fields: dict[str, Any] = getattr(kind, "__dataclass_fields__", {})
+    return name in fields or isinstance(kept, functools.cached_property)
+
+
+def _on_device(x: np.ndarray, weak: bool) -> Any:
+    import jax.numpy as jnp
+
+    if not weak or not 0 < x.size <= FEW:
+        return jnp.asarray(x)
+    # Scalars of Python are of the weak kind, for which another program would be compiled, and so is what they make.
+    scalars = [jnp.asarray(value) for value in x.ravel().tolist()]
+    return scalars[0] if x.shape == () else jnp.stack(scalars).reshape(x.shape)
+
+
+def _named_class(kind: type) -> tuple[str, str, list[float] | None]:
+    """Module and name of a class, and the factors of an effect that differs from it by its priors alone."""
+    plain = getattr(kind, "plain", None)
+    known, factors = (kind, None) if plain is None else (plain, list(vars(kind)["factors"]))
+    name = known.__module__, known.__qualname__
+    if _class(*name, None) is not known:
+        raise Unwritable(".".join(name))
+    return *name, factors
+
+
+def _class(module: str, name: str, factors: list[float] | None) -> type:
+    """Class by its name, of our packages or of effects that the user has loaded.
+
+    Raises:
+        Unreadable: no such class there.
+    """
+    if module.partition(".")[0] in PACKAGES:
+        found: Any = importlib.import_module(module)
+    elif module.startswith(OWN_MODULE) and module in sys.modules:
+        found = sys.modules[module]
+    else:
+        raise Unreadable(f"a class of {module}")
+    for part in name.split("."):
+        found = getattr(found, part)
+    if not isinstance(found, type) or found.__module__ != module:
+        raise Unreadable(f"{module}.{name} is no class there")
+    return found if factors is None else scaled(found, tuple(factors))
+
+
+def _function(module: str, name: str) -> types.FunctionType:
+    found = getattr(importlib.import_module(module), name) if module in FUNCTIONS else None
+    if not isinstance(found, types.FunctionType) or found.__module__ != module:
+        raise Unreadable(f"{module}.{name} is no function of a stage")
+    return found
