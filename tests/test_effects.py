@@ -764,7 +764,7 @@ def test_library_keeps_its_order():
 
 def test_every_effect_stands_in_the_file_of_its_balance():
     for effect in ALL:
-        assert effect.__module__ == f"mmrjax.effects.{effect.balance}"
+        assert effect.__module__ == f"mmrjax.effects.{effect.balance}_effects"
     found = {e for name in MODULES for e in effects.defined_in(importlib.import_module(name))}
     assert found == {*ALL, *effects.OF_TURNS.values()}
 

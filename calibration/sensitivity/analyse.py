@@ -24,8 +24,7 @@ from calibration.sensitivity.result import METHODS, Input, OutputStudy, Sensitiv
 from calibration.sensitivity.sensitivity_notes import Inert, PointsLeftOut, SampleLeftOut, Sampling, Tied
 from calibration.sensitivity.study import Study
 from calibration.sensitivity.uncertain_inputs import Inputs
-from mmrjax import fidelities
-from mmrjax.derived import Derived
+from mmrjax import derived, fidelities
 
 #: Model evaluations in all where none are stated: of solves, of solves for Shapley effects, whose design costs as
 #: much again, and where a run over time is among the outputs.
@@ -36,9 +35,7 @@ LEAST = 1_000
 
 def default_evaluations(outputs: tuple[OutputRow, ...], model: str, method: str) -> int:
     """Model evaluations where none are stated."""
-    long = fidelities.facts(model).rollout or any(
-        isinstance(o, Derived) and o.module.endswith(".start") for o in outputs
-    )
+    long = fidelities.facts(model).rollout or any(o in derived.OF_START for o in outputs)
     return EVALUATIONS_LONG if long else EVALUATIONS_SHAPLEY if method == "shapley" else EVALUATIONS
 
 

@@ -87,7 +87,7 @@ def chosen_outputs(words: tuple[str, ...], robot: Robot, turns: bool = False) ->
             where it travels straight, or of straight travel where it turns.
     """
     known, found = known_outputs(robot), []
-    start = tuple(d.name for d in derived.TABLE if d.module.endswith(".start"))
+    start = tuple(d.name for d in derived.OF_START)
     of_turns = {*(o.name for o in derived.OF_TURNS), *(c.name for c in channels.OF_TURNS if c.settled)}
     for word in words or default_outputs(robot, turns):
         for name in start if word == "start" else (word,):
@@ -138,7 +138,7 @@ class Model:
 
     def chunk(self, source: str, points: int, differentiated: bool = False) -> int:
         """Points of one call, of so many in all."""
-        long = source.endswith(".start") or (source in fidelities.TABLE and fidelities.facts(source).rollout)
+        long = source == derived.START or (source in fidelities.TABLE and fidelities.facts(source).rollout)
         kind = ("derivatives of runs" if long else "derivatives") if differentiated else "runs" if long else "solves"
         few, many = CHUNKS[kind]
         return few if points <= 4 * few else many

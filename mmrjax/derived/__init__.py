@@ -40,7 +40,7 @@ class Derived:
     rests_on: tuple[str, ...] = ()
 
 
-_SLOPE, _START = "mmrjax.derived.steepest_slope", "mmrjax.derived.start_figures"
+_SLOPE, START = "mmrjax.derived.steepest_slope", "mmrjax.derived.start_figures"
 _POSTURE, _TURN = "mmrjax.derived.pitch_and_step", "mmrjax.derived.turning_figures"
 
 #: Read through the module, so that a line more is an output more everywhere.
@@ -54,14 +54,12 @@ TABLE: tuple[Derived, ...] = (
         "A",
         1.0,
         "peak current of the start, all motors",
-        _START,
+        START,
         2,
         rests_on=CURRENT,
     ),
-    Derived("time_to_speed", "time_to_speed_s", "s", 1.0, "time to 95 % of speed", _START, 3),
-    Derived(
-        "energy_start", "energy_start_J", "J", 1.0, "electrical energy of the start", _START, 2, rests_on=VOLTAGE
-    ),
+    Derived("time_to_speed", "time_to_speed_s", "s", 1.0, "time to 95 % of speed", START, 3),
+    Derived("energy_start", "energy_start_J", "J", 1.0, "electrical energy of the start", START, 2, rests_on=VOLTAGE),
     Derived("pitch", "pitch_deg", "deg", math.pi / 180, "pitch at rest, nose up", _POSTURE, 2),
     Derived("highest_step", "highest_step_mm", "mm", 1e-3, "highest step of the posture", _POSTURE, 1),
     Derived("best_step", "best_step_mm", "mm", 1e-3, "highest step in any posture", _POSTURE, 1),
@@ -70,9 +68,11 @@ TABLE: tuple[Derived, ...] = (
 #: Those of a stance, and of a robot on a ground.
 OF_POSTURE = tuple(d for d in TABLE if d.module == _POSTURE)
 OF_GROUND = (*OF_POSTURE, *(d for d in TABLE if d.module in (_SLOPE, _TURN)))
+#: Those of a start from standstill.
+OF_START = tuple(d for d in TABLE if d.module == START)
 #: Those of a robot that turns alone, and of straight travel alone.
 OF_TURNS = tuple(d for d in TABLE if d.module == _TURN)
-OF_STRAIGHT = tuple(d for d in TABLE if d.module in (_SLOPE, _START))
+OF_STRAIGHT = tuple(d for d in TABLE if d.module in (_SLOPE, START))
 
 
 def names() -> tuple[str, ...]:
