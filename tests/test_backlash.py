@@ -108,7 +108,7 @@ def test_the_derivative_by_the_backlash_is_the_difference():
 
 
 FILE = """
-schema = "mmrjax.model.robot/2"
+schema = "mmrjax.robot/2"
 base = "none"
 imposed = "voltage"
 channels = ["motor_speed", "output_angle"]

@@ -355,7 +355,7 @@ REFUSED = {
     "winding_C = 30\n[envelope]\nambient_C = [0, 40]": r"^r.toml: winding_C of at most 30 contradicts the envelope, whose ambient_C goes up to 40$",
     "envelope = 3\nspeed_m_s = 1": r"^r.toml, envelope: got 3; expected a table of configuration, ",
     "speed_m_s = ": r"^r.toml: not a readable TOML file \(",
-    "schema = 'mmrjax.derived.requirements/9'": r"^r.toml, schema: got 'mmrjax.derived.requirements/9'; expected mmrjax.derived.requirements/1$",
+    "schema = 'mmrjax.requirements/9'": r"^r.toml, schema: got 'mmrjax.requirements/9'; expected mmrjax.requirements/1$",
 }
 
 

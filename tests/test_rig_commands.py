@@ -355,7 +355,7 @@ def test_loop_takes_one_channel_both_ways(mmrjax, tmp_path, bench):
 
 
 MOTOR = """
-schema = "mmrjax.model.robot/2"
+schema = "mmrjax.robot/2"
 base = "none"
 sides = 1
 imposed = "voltage"

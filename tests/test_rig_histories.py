@@ -26,7 +26,7 @@ from mmrjax.model.rig import Begin, Begins, Rig
 from mmrjax.model.signals import State
 
 DRIVE = """
-schema = "mmrjax.model.robot/2"
+schema = "mmrjax.robot/2"
 base = "none"
 imposed = "{imposed}"
 channels = [{channels}]

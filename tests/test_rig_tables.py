@@ -594,7 +594,7 @@ def test_a_vehicle_on_two_surfaces_is_calibrated(tmp_path):
 
 
 RIG = """
-schema = "mmrjax.model.robot/2"
+schema = "mmrjax.robot/2"
 base = "none"
 sides = 1
 imposed = "motor_speed"

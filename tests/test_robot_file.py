@@ -100,7 +100,7 @@ def test_movers_start_from_the_defaults_of_the_fields(tmp_path):
 def test_former_names_load_with_a_note(tmp_path):
     path, notes = tmp_path / "old.toml", []
     path.write_text(
-        'schema = "mmrjax.model.robot/1"\n[tracked]\nmass = 12.5\n[tracked.ground]\nrolling_resistance = 0.05\n'
+        'schema = "mmrjax.robot/1"\n[tracked]\nmass = 12.5\n[tracked.ground]\nrolling_resistance = 0.05\n'
         "[wheeled]\nmass = 11\n"
     )
     robot = robot_file.load(str(path), notes=notes)

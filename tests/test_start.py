@@ -35,7 +35,7 @@ def written(mmrjax, tmp_path):
     """Run folder of a start on the flat, with the rig's lines of the robot's file."""
 
     def left(rig=""):
-        (tmp_path / "own.toml").write_text(f'schema = "mmrjax.model.robot/2"\nbase = "nominal"\n{rig}')
+        (tmp_path / "own.toml").write_text(f'schema = "mmrjax.robot/2"\nbase = "nominal"\n{rig}')
         asked = ("--model", "drive", "--robot", "own.toml", "--voltage", VOLTAGE, "--no-report", "--force")
         assert mmrjax("simulate", *asked, "--out", "d")[0] == 0
         return table(tmp_path / "d" / "history.csv"), json.loads((tmp_path / "d" / "result.json").read_text())

@@ -15,7 +15,7 @@ from mmrjax.derived.requirements import AXES, QUANTITIES, Quantity
 from mmrjax.model.paper_tables import BENCH, SURFACES
 from mmrjax.model.quantities import CONDITIONS
 
-SCHEMA = "mmrjax.derived.requirements/1"
+SCHEMA = "mmrjax.requirements/1"
 #: The packaged file: the paper's aims.
 PAPER = "paper"
 

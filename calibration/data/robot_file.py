@@ -30,9 +30,9 @@ from mmrjax.model.shaft import Shaft
 
 T = TypeVar("T")
 
-SCHEMA = "mmrjax.model.robot/2"
+SCHEMA = "mmrjax.robot/2"
 #: Schemas that are read; in the first, configurations had the names of OLD_NAMES.
-SCHEMAS = ("mmrjax.model.robot/1", SCHEMA)
+SCHEMAS = ("mmrjax.robot/1", SCHEMA)
 #: Former name of a configuration's parameters, and the configuration.
 OLD_NAMES = {"tracked": TRACKED, "wheeled": WHEELED}
 #: Whole numbers of a robot, which no fit can free: least, greatest, meaning.

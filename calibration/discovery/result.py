@@ -31,7 +31,7 @@ from calibration.words.note_words import sentence, sentences
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 
-SCHEMA = "mmrjax.climbing.belt_loop/3"
+SCHEMA = "mmrjax.loop/3"
 #: The robot whose running gear the track model found.
 TRACK_FILE = "robot_track.toml"
 #: The robot fitted with nothing added.

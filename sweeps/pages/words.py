@@ -106,7 +106,7 @@ LOOP_VERDICTS = {
     "undescribed": "the refitted model misses a channel by more than a quarter of its measured rms, or noise is "
     "estimated as that large: the statement says what to check first, and no effect is named",
     "place": "something is missing in one equation, or in those that act alike, and no more is established",
-    "unnamed": "former word for place; a mechanism was called so too until schema mmrjax.climbing.belt_loop/3",
+    "unnamed": "former word for place; a mechanism was called so too until schema mmrjax.loop/3",
     "mechanism": "what drives the missing term is established, and its equation; its exact law is not",
     "class": "laws are established, and of at least one these data cannot tell which it is",
     "named": "one law of the library is established for each thing that is missing",

@@ -461,7 +461,7 @@ def _fits(
 
 def toml(r: Rig) -> str:
     """The rig's file as its owner writes it."""
-    top = {"schema": "mmrjax.model.robot/2", "base": "none", "imposed": r.imposed}
+    top = {"schema": "mmrjax.robot/2", "base": "none", "imposed": r.imposed}
     top |= {"start": "measured" if r.imposed == "motor_speed" else "rest", "channels": r.channels}
     tables: dict[str, dict[str, Any]] = {
         "": top, "motor": {}, "gearbox": {"ratio": f"{r.ratio} ± 0"}, "bench": {"load": "shaft"},

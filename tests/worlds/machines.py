@@ -170,7 +170,7 @@ def machine(rng: np.random.Generator, roles: Sequence[str]) -> Machine:
 
 def toml(p: Mapping[str, float], names: Mapping[str, str]) -> str:
     """The robot's file as its user writes it: every number that the maker states, V_s and V_d left at their defaults."""
-    top = {"schema": "mmrjax.model.robot/2", "configurations": list(names.values())}
+    top = {"schema": "mmrjax.robot/2", "configurations": list(names.values())}
     tables: dict[str, dict[str, Any]] = {"": top, "motor": {}, "gearbox": {}}
     for name, value in p.items():
         head, _, rest = name.partition(".")

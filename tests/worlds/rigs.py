@@ -678,7 +678,7 @@ def toml(r: Rig) -> str:
     load = {"load": "vehicle" if r.vehicle else "linear" if r.kind == "linear" else "shaft"}
     if r.vehicle:
         load["movers"] = "tracks" if r.kind == "tracked" else "wheels"
-    top = {"schema": "mmrjax.model.robot/2", "base": "none", "sides": r.sides}
+    top = {"schema": "mmrjax.robot/2", "base": "none", "sides": r.sides}
     top |= {"imposed": "motor_speed" if r.wide else "voltage", "channels": r.channels, "configurations": [r.name]}
     tables: dict[str, dict[str, Any]] = {"": top, "motor": {}, "gearbox": {}, r.name: load}
     for name, value in r.stated.items():
