@@ -13,7 +13,7 @@ import re
 import threading
 import warnings
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -42,7 +42,7 @@ from calibration.inference.linearization import (
 )
 from calibration.inference.noise import Noise
 from calibration.inference.observers import settled_ends
-from calibration.inference.observers.base import Observer, SearchPolicy
+from calibration.inference.observers.base import Diagnosis, Observer, SearchPolicy
 from calibration.inference.optimizers import (
     CORES,
     Evaluate,
@@ -88,9 +88,6 @@ from mmrjax.model.rig import Begin, Begins, Rig
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, FAILED, Signals, State
 from mmrjax.numerics.linear_equations import solved
-
-if TYPE_CHECKING:
-    from calibration.discovery.adequacy import Diagnosis
 
 #: Most knots of a run's defect in time, and most of knots times steps of all runs: 2 GB while they are computed.
 KNOTS, KNOT_STEPS = 256, 1e7
