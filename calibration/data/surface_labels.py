@@ -16,7 +16,7 @@ def named(configuration: str, surface: str) -> str:
 
 
 def scaled(robot: Robot, configurations: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Whether a row's adhesion is the robot's times the ratio of Table 5, shape (rows,)."""
+    """True for rows whose adhesion is the robot's times the ratio of Table 5, shape (rows,)."""
     pairs = list(zip(configurations.tolist(), labels.tolist(), strict=True))
     labelled = SURFACES if robot.rig.scales_adhesion else ()
     of_table5 = {

@@ -24,8 +24,8 @@ def driven_on(columns: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray:
 
 
 def driven(columns: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray:
-    """What drives the left and the right side, forward or backward by its sign: voltage [V], on a battery a share of
-    it, or speed [rpm]; shape (2, rows).
+    """Voltage [V] of the left and the right side, on a battery a share of it, or their speed [rpm], shape (2, rows);
+    negative backward.
 
     Args:
         columns: of a table that turns.

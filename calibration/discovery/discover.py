@@ -460,7 +460,7 @@ class _Task:
     keep: Keep
 
     def screen(self, noise: Noise, near: Candidate | None, ranked: list[Ranking]) -> Screening:
-        """The base fit with this noise, from `near` if given, and its rows that stand alone; see `windows`."""
+        """The base fit with this noise, from `near` if given, and its outliers; see `windows`."""
         space = pose(self.runs, self.robot, noise.sd, self.settings, self.stated, self.library)
         known, at = self.known, functools.partial(bases_at, self.runs)
         if known is not None and space.bare.observe.long:  # whose rows count here too
@@ -524,7 +524,7 @@ def _tried(task: _Task, screened: Screening, left: Diagnosis) -> tuple[Screening
 def _searched(
     task: _Task, screened: Screening, sds: Sds, ranked: list[Ranking]
 ) -> tuple[Screening, Diagnosis, Search | None]:
-    """The search, repeated while rows stand alone beside what it found; None where the base leaves nothing."""
+    """The search, repeated while it leaves outliers; None where the base leaves nothing."""
     settings, keep, progress = task.settings, task.keep, task.progress
     for k in range(SCREENINGS):
         progress(Step("bootstrap", (settings.replicates,)))
@@ -894,7 +894,7 @@ def _keeps(traced: LoopStages, written: _Written, gain: prediction.Gain | None) 
 def _claims(
     traced: LoopStages, settings: Settings
 ) -> tuple[tuple[FoundEffect, ...], DiscrepancyLocation | None, tuple[HiddenEffect, ...]]:
-    """Effects that a verdict names, where something remains beside them, and effects that they may conceal."""
+    """Effects that a verdict names, the place where something remains, and effects that they may conceal."""
     screened, left, alike = traced.screened, traced.left, traced.alike
     space, base, best = screened.base.space, screened.base.candidate, traced.best
     if alike is None:

@@ -128,7 +128,7 @@ def calibrate(
 
 @dataclasses.dataclass(frozen=True)
 class _Plan:
-    """What a calibration does, where its arguments leave that to the kind of data and the fidelity.
+    """Settings of a calibration, completed by the kind of data and the fidelity.
 
     Attributes:
         fidelity: its name; starts: of the search; profiles: True to profile every parameter.
@@ -246,7 +246,7 @@ def _evolved(
     """Settings of the search by generations, from the arguments of `calibrate`.
 
     Raises:
-        BadConfiguration: settings of a population where there is none, or of one where none is possible.
+        BadConfiguration: settings of a population for a search without one, or for data that are not searched so.
     """
     if population is None:
         population = POPULATION if fidelities.unread("steady", names, runs.turns) else 0

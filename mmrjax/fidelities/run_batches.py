@@ -41,7 +41,7 @@ class Pending:
 
     @at_once
     def shown(self) -> dict[str, jax.Array]:
-        """What the robot's instruments show, by channel, and the codes of how the runs ended as `status`."""
+        """Readings of the robot's instruments, by channel, and the codes of how the runs ended as `status`."""
         outputs, names = self.fidelity.outputs, (*channels.names(self.robot.channels), STATUS)
         assert outputs is not None
         return _in_chunks(self.fidelity, lambda runs: outputs(self.robot, runs, names), self.conditions)
@@ -75,7 +75,7 @@ T = TypeVar("T")
 
 
 def _in_chunks(fidelity: Fidelity, function: Callable[[Conditions], T], conditions: Conditions) -> T:
-    """What a function of conditions of shape (runs,) gives, of the shape that the conditions have.
+    """Returns the values of a function of conditions of shape (runs,), in the shape of the conditions.
 
     More runs than a fidelity takes at once go in chunks of one size, which share a compilation; the last one ends
     with the last run. Few are filled up (`Facts.filled`), by NumPy, for which nothing is compiled; else nothing is

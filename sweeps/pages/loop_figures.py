@@ -289,7 +289,7 @@ def depends_on(table: dict[str, np.ndarray], change: np.ndarray) -> tuple[np.nda
 
 @dataclasses.dataclass(frozen=True)
 class Change:
-    """What an effect of the robot that is written changes in the readings of the runs.
+    """Change of the readings of the runs by an effect of the robot that is written.
 
     Attributes:
         channel: the one that it changes most; rms: by how much [% of its measured rms].

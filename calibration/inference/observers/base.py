@@ -54,7 +54,7 @@ class CurveScores(Protocol):
 
 
 class Statistics(Protocol):
-    """Strongest statistics of a fit, of which a time series reads the memory of its residuals."""
+    """Strongest statistics of a fit; `white` measures the memory of its residuals."""
 
     @property
     def white(self) -> Any: ...
