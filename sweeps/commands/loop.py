@@ -24,6 +24,7 @@ from calibration.discovery.settings import fewest_replicates
 from calibration.inference import blocks, observers, priors
 from calibration.inference.simulation_errors import OF_SIZE
 from calibration.words import loop_words as said_of
+from calibration.words.note_words import in_words
 from calibration.words.step_words import expected
 from sweeps import config as configuration
 from sweeps.console import pulse, say, tell
@@ -126,7 +127,7 @@ def _resolved(
     """The result, with its resistance resolved by the track model."""
     resolved = resolve(
         found, noise=config.noise or None, population=config.population, generations=config.generations,
-        members=members, seed=config.seed, tell=progress,
+        members=members, seed=config.seed, tell=in_words(progress),
     )  # fmt: skip
     return dataclasses.replace(found, resolved=resolved)
 
