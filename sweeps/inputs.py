@@ -7,7 +7,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from calibration.data import effect_file, robot_file, surfaces
+from calibration.data import effect_file, robot_file, surface_labels
 from calibration.data import posterior_file as posterior
 from calibration.data import runs as records
 from calibration.data.columns import IMPOSED, Layout
@@ -109,7 +109,7 @@ def check_surface(robot: Robot, names: Collection[str], surface: str | None, whe
         BadConfiguration: says `where`, and which there are.
     """
     known = surface is None or surface in SURFACES or not robot.rig.scales_adhesion
-    if not known and not all(surfaces.named(name, str(surface)) in robot.configurations for name in names):
+    if not known and not all(surface_labels.named(name, str(surface)) in robot.configurations for name in names):
         raise BadConfiguration(
             f"{where}: got {surface}, whose friction is not known; {choices(str(surface), SURFACES)}"
         )

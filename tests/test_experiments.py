@@ -16,8 +16,9 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import experiments, menu, predicted
 from calibration.discovery.candidates import Candidate, filled, fit_candidates
 from calibration.discovery.classes import Classes
+from calibration.discovery.instructions import NothingPossible
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.loop_notes import Heat, NothingPossible, Overspeed, Overvoltage
+from calibration.discovery.loop_notes import Heat, Overspeed, Overvoltage
 from calibration.discovery.reach import reach
 from calibration.discovery.stated_values import Shift
 from mmrjax.effects import BY_NAME, OF_CHANNELS

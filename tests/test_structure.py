@@ -789,6 +789,34 @@ def test_a_circle_of_imports_is_found(found, tmp_path):
     assert set(circle(tmp_path)) == ({"sweeps.a", "sweeps.b"} if found else set())
 
 
+#: Most modules that import what their annotations alone need.
+ANNOTATED = 15
+
+
+def annotated(root: Path) -> list[str]:
+    """Modules with imports for annotations alone, under `TYPE_CHECKING`."""
+    return [
+        path.relative_to(root).as_posix()
+        for layer in LAYERS
+        for path in sorted((root / layer).rglob("*.py"))
+        if any(
+            isinstance(node, ast.If)
+            and ast.unparse(node.test) == "TYPE_CHECKING"
+            and any(isinstance(x, ast.Import | ast.ImportFrom) for x in node.body)
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        )
+    ]
+
+
+def test_few_modules_import_for_annotations_alone(tmp_path):
+    """A type that two modules need of one another belongs below both."""
+    assert len(found := annotated(ROOT)) <= ANNOTATED, found
+    (tmp_path / "sweeps").mkdir()
+    (tmp_path / "sweeps" / "a.py").write_text("if TYPE_CHECKING:\n    from sweeps.b import f")
+    (tmp_path / "sweeps" / "b.py").write_text("if not TYPE_CHECKING:\n    from sweeps.a import f")
+    assert annotated(tmp_path) == ["sweeps/a.py"]
+
+
 def test_nobody_asks_what_a_load_is():
     """What a load can do it states; which it is ask its balances, and what reads, writes and describes its file."""
     found = {

@@ -6,15 +6,8 @@ import pytest
 
 from calibration.discovery import menu
 from calibration.discovery.experiments import more_runs
-from calibration.discovery.loop_notes import (
-    CarryOut,
-    Heat,
-    NothingPossible,
-    NothingTells,
-    Overspeed,
-    Overvoltage,
-    TooWeak,
-)
+from calibration.discovery.instructions import CarryOut, NothingPossible, NothingTells, TooWeak
+from calibration.discovery.loop_notes import Heat, Overspeed, Overvoltage
 from calibration.discovery.reach import Reach, Used
 from calibration.words import experiment_words as words
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from calibration.data.input_errors import BadConfiguration, BadData, number
 from calibration.data.runs import Runs
-from calibration.data.surfaces import scaled
+from calibration.data.surface_labels import scaled
 from mmrjax.model import params
 from mmrjax.model.paper_tables import BENCH
 from mmrjax.model.robot import Robot

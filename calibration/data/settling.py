@@ -463,6 +463,26 @@ def _levels(
     yield rows[begin:]
 
 
+@dataclasses.dataclass(frozen=True)
+class _End:
+    """The end of a level, before it is known whether it is settled.
+
+    Attributes:
+        rows: of it; seen: mean, sd and change of each channel over it, by name [unit of the column].
+        left_over: largest share of a channel that changes for certain within it.
+        glitches: readings of each channel that its mean leaves out.
+    """
+
+    rows: np.ndarray
+    seen: dict[str, tuple[float, float, float]]
+    left_over: float
+    glitches: dict[str, int]
+
+
+#: Why a level has no settled end: a reason of `REASONS`, the channel to blame, and how much, as a share.
+_Why = tuple[str, str, float]
+
+
 def _settled(
     runs: Runs,
     signals: tuple[Signal, ...],
@@ -477,8 +497,7 @@ def _settled(
     """The settled end of a level, or why it has none."""
     time = runs["time_s"]
     begin, end, imposed = float(time[rows[0]]), float(time[rows[-1]]), float(np.mean(drives[rows]))
-    run = str(runs.run_names[rows[0]])
-    left = Stretch(run, rows, begin, end, imposed)
+    left = Stretch(str(runs.run_names[rows[0]]), rows, begin, end, imposed)
 
     def out(why: str, channel: str = "", size: float = 0.0) -> Stretch:
         return dataclasses.replace(left, why=why, channel=channel, size=size)
@@ -492,67 +511,88 @@ def _settled(
     for signal in signals:
         if stuck[signal.channel.name][rows].mean() > 0.5:
             return out("stuck", signal.channel.name)
+    found = _end(signals, time, rows, shortest, drift)
+    unsettled, left_over = _unsettled(signals, rows, found, drift)
+    if unsettled is not None:
+        return out(*unsettled)
+    seen = {name: x for name, x in found.seen.items() if math.isfinite(x[0])}
+    if not seen:
+        return out("unread")
+    if _rests(signals, seen):
+        return out("rest")
+    acting = inertia.get(str(runs["configuration"][rows[0]]))
+    lasts = float(time[found.rows[-1]] - time[found.rows[0]])
+    if acting is not None and (accelerates := _accelerates(acting, seen, lasts, imposed, drift)) is not None:
+        return out(*accelerates)
+    every = {s.channel.name: seen.get(s.channel.name, (math.nan,) * 3) for s in signals}
+    # What changes goes on after the end, of a lag's tail about as much again, and all channels with it.
+    further = {s.channel.name: left_over * _scale(s, every[s.channel.name][0]) for s in signals}
+    return dataclasses.replace(
+        left,
+        rows=found.rows,
+        begin=float(time[found.rows[0]]),
+        mean={name: mean for name, (mean, _, _) in every.items()},
+        sd={name: math.hypot(sd, further[name]) for name, (_, sd, _) in every.items()},
+        drift={name: change for name, (_, _, change) in every.items()},
+        glitches={name: count for name, count in found.glitches.items() if count},
+    )
+
+
+def _end(signals: tuple[Signal, ...], time: np.ndarray, rows: np.ndarray, shortest: float, drift: float) -> _End:
+    """The end of a level from where on nothing changes for certain, if there is such a place, else its last parts."""
     parts = _parts(time[rows], shortest)
     first = _first_steady(signals, rows, parts, drift)
     last = max(len(parts) - 3, first)
-    # From where on nothing changes for certain, if there is such a place; else the end.
     for k in sorted({first, *np.linspace(first, last, TRIES).astype(int).tolist()}):
         taken = rows[parts[k][0] :]
         seen = {s.channel.name: _mean(s, time[taken], taken) for s in signals}
         left_over = max(_certain(s, *seen[s.channel.name]) for s in signals)
         if left_over <= SLIGHT * drift:
             break
-    means, sds, drifts = {}, {}, {}
-    off = {s.channel.name: int(s.glitches[taken].sum()) for s in signals}
+    return _End(taken, seen, left_over, {s.channel.name: int(s.glitches[taken].sum()) for s in signals})
+
+
+def _unsettled(signals: tuple[Signal, ...], rows: np.ndarray, end: _End, drift: float) -> tuple[_Why | None, float]:
+    """Why the end of a level is not settled, None where it is; and the largest share by which a channel changes
+    within it or after it."""
+    left_over = end.left_over
     for signal in signals:
         name = signal.channel.name
-        if off[name] > MOST_GLITCHES * len(taken):
-            return out("glitches", name, off[name] / len(taken))
-        mean, sd, change = seen[name]
+        share = end.glitches[name] / len(end.rows)
+        if end.glitches[name] > MOST_GLITCHES * len(end.rows):
+            return ("glitches", name, share), left_over
+        mean, sd, change = end.seen[name]
         if not math.isfinite(mean):
             continue
         tolerance = max(drift * abs(mean), FINE * signal.largest)
         if abs(change) > tolerance + SDS * OF_CHANGE * sd:
-            return out("settling", name, abs(change) / max(abs(mean), FINE * signal.largest))
+            return ("settling", name, abs(change) / max(abs(mean), FINE * signal.largest)), left_over
         if (to_come := _to_come(signal, rows, mean)) > drift:
-            return out("settling", name, to_come)
+            return ("settling", name, to_come), left_over
         left_over = max(left_over, to_come)
-        means[name], sds[name], drifts[name] = mean, sd, change
-    if not means:
-        return out("unread")
+    return None, left_over
+
+
+def _rests(signals: tuple[Signal, ...], seen: Mapping[str, tuple[float, float, float]]) -> bool:
+    """True if channels that are zero at rest were read and none of them moves."""
     moving = [
-        s for s in signals if s.channel.zero_at_rest and s.channel.name in means and s.channel.name not in OF_YAW
+        s for s in signals if s.channel.zero_at_rest and s.channel.name in seen and s.channel.name not in OF_YAW
     ]
-    least = {
-        s.channel.name: max(STILL * s.largest, SDS * sds[s.channel.name]) for s in moving if s.channel.name in sds
-    }
-    if moving and all(abs(means[s.channel.name]) < least[s.channel.name] for s in moving):
-        return out("rest")
-    acting = inertia.get(str(runs["configuration"][rows[0]]))
-    if acting is not None and acting.speed in drifts and (not acting.current or acting.current in means):
-        a_second = acting.per_rate / float(time[taken[-1]] - time[taken[0]])
-        whole = max(abs(means[acting.current] if acting.current else imposed), acting.least)
-        share, noise = (
-            abs(a_second * drifts[acting.speed]) / whole,
-            OF_CHANGE * abs(a_second * sds[acting.speed]) / whole,
-        )
-        if share > drift + SDS * noise:
-            return out("accelerates", acting.speed, share)
-    for signal in signals:
-        name = signal.channel.name
-        means.setdefault(name, math.nan)
-        # What changes goes on after the end, of a lag's tail about as much again, and all channels with it.
-        sds[name] = math.hypot(sds.get(name, math.nan), left_over * _scale(signal, means[name]))
-        drifts.setdefault(name, math.nan)
-    return dataclasses.replace(
-        left,
-        rows=taken,
-        begin=float(time[taken[0]]),
-        mean=means,
-        sd=sds,
-        drift=drifts,
-        glitches={name: count for name, count in off.items() if count},
-    )
+    ends = [(s, *seen[s.channel.name][:2]) for s in moving]
+    return bool(ends) and all(abs(mean) < max(STILL * s.largest, SDS * sd) for s, mean, sd in ends)
+
+
+def _accelerates(
+    acting: Inertia, seen: Mapping[str, tuple[float, float, float]], lasts: float, imposed: float, drift: float
+) -> _Why | None:
+    """Why acceleration takes too large a share of the current, over so many seconds; None where it does not."""
+    if acting.speed not in seen or (acting.current and acting.current not in seen):
+        return None
+    a_second = acting.per_rate / lasts
+    _, sd, change = seen[acting.speed]
+    whole = max(abs(seen[acting.current][0] if acting.current else imposed), acting.least)
+    share, noise = abs(a_second * change) / whole, OF_CHANGE * abs(a_second * sd) / whole
+    return ("accelerates", acting.speed, share) if share > drift + SDS * noise else None
 
 
 def _scale(signal: Signal, mean: float) -> float:

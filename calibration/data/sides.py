@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calibration.data.columns import DUTY, SIDES, SUPPLY, VOLTS, Layout
 from calibration.data.input_errors import BadData, number
+from calibration.data.table import Runs, driven
 from mmrjax.model import channels
 from mmrjax.model.rig import Instrument
-
-if TYPE_CHECKING:
-    from calibration.data.table import Runs
 
 #: Of rows that tell: what drives the sides apart, or one backward, as a share of the most that does so [-].
 CLEAR = 0.25
@@ -21,19 +18,6 @@ CLEAR = 0.25
 FEWEST, MOSTLY = 3, 0.75
 #: By how much a side's voltage may be above the supply's, as both are written with few digits [-].
 ROUNDED = 0.01
-
-
-def driven(columns: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray:
-    """What drives the left and the right side, forward or backward by its sign: voltage [V], on a battery a share of
-    it, or speed [rpm]; shape (2, rows).
-
-    Args:
-        columns: of a table that turns.
-    """
-    alike = np.ones(len(next(iter(columns.values()))))
-    each = np.stack([columns.get(name, columns.get("duty", alike)) for name in layout.sides])
-    supply = columns.get(SUPPLY, alike) if layout.imposed == "voltage" else alike
-    return each * np.where(np.isnan(supply), 1.0, supply)
 
 
 def shares(volts: np.ndarray, supply: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -8,19 +8,15 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, TypeVar
-
-import numpy as np
+from typing import TypeVar
 
 from calibration.data.columns import Layout
+from calibration.data.surface_labels import named
+from calibration.data.table import Runs
 from mmrjax.errors import choices
 from mmrjax.model.paper_tables import SURFACES
 from mmrjax.model.robot import Configurations, Robot
-
-if TYPE_CHECKING:
-    from calibration.data.table import Runs
 
 #: Beginning of the parameters of a configuration that are its surface's.
 GROUND = "ground."
@@ -28,11 +24,6 @@ GROUND = "ground."
 MISSPELT = 0.75
 
 V = TypeVar("V")
-
-
-def named(configuration: str, surface: str) -> str:
-    """Name of a configuration on a surface."""
-    return f"{configuration}-{re.sub(r'[^0-9A-Za-z_]+', '_', surface)}"
 
 
 def common(configurations: Sequence[str], labels: Iterable[str]) -> str | None:
@@ -54,17 +45,6 @@ def refused(label: str, layout: Layout) -> str:
         return ""
     alike = difflib.get_close_matches(label, SURFACES, 1, MISSPELT)
     return f"one of these; {choices(label, SURFACES)}" if not label or alike or not layout.configurations else ""
-
-
-def scaled(robot: Robot, configurations: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Whether a row's adhesion is the robot's times the ratio of Table 5, shape (rows,)."""
-    pairs = list(zip(configurations.tolist(), labels.tolist(), strict=True))
-    labelled = SURFACES if robot.rig.scales_adhesion else ()
-    of_table5 = {
-        (name, label): label in labelled and named(name, label) not in robot.configurations
-        for name, label in set(pairs)
-    }
-    return np.array([of_table5[pair] for pair in pairs], bool)
 
 
 def with_surface_configurations(robot: Robot, runs: Runs) -> Robot:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from calibration.data import sides, surfaces
+from calibration.data import surface_labels
 from calibration.data.columns import CIRCUITS, DRIVEN, DUTY, HEADING, IMPOSED, LEVERS, LOAD, SUPPLY, TIME, Layout
 from calibration.data.input_errors import BadData, choices
 from mmrjax.model import channels
@@ -21,6 +21,19 @@ def driven_on(columns: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray:
     """True for rows whose stated load torque turns the shafts the way in which they are driven, shape (rows,)."""
     imposed = columns[layout.imposed_column] * (columns.get("duty", 1.0) if layout.imposed == "voltage" else 1.0)
     return columns[LOAD] * imposed < 0 if LOAD in columns else np.zeros(len(imposed), bool)
+
+
+def driven(columns: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray:
+    """Voltage [V] of the left and the right side, on a battery a share of it, or their speed [rpm], shape (2, rows);
+    negative backward.
+
+    Args:
+        columns: of a table that turns.
+    """
+    alike = np.ones(len(next(iter(columns.values()))))
+    each = np.stack([columns.get(name, columns.get("duty", alike)) for name in layout.sides])
+    supply = columns.get(SUPPLY, alike) if layout.imposed == "voltage" else alike
+    return each * np.where(np.isnan(supply), 1.0, supply)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,8 +81,8 @@ class Runs:
 
     @property
     def of_sides(self) -> np.ndarray:
-        """See `sides.driven`; of a table with `turns`."""
-        return sides.driven(self.columns, self.layout)
+        """See `driven`; of a table with `turns`."""
+        return driven(self.columns, self.layout)
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -181,7 +194,7 @@ class Runs:
 
     def configurations(self, robot: Robot) -> np.ndarray:
         """Index of each row's configuration in `robot`, shape (rows,): that of its configuration on its surface
-        (`surfaces.named`) where the robot has one, else that of its configuration.
+        (`surface_labels.named`) where the robot has one, else that of its configuration.
 
         Raises:
             InputError: a configuration that the robot does not have; those that it has are listed.
@@ -205,7 +218,7 @@ class Runs:
         if not self.has("surface"):
             return stated
         pairs = list(zip(stated.tolist(), self["surface"].tolist(), strict=True))
-        on = {pair: surfaces.named(*pair) for pair in set(pairs)}
+        on = {pair: surface_labels.named(*pair) for pair in set(pairs)}
         return np.array([on[p] if on[p] in robot.configurations else p[0] for p in pairs])
 
     def conditions(self, robot: Robot, *, battery: float = 0.0, discharge: float = 0.0) -> Conditions:
@@ -228,7 +241,7 @@ class Runs:
         adhesion, lateral = np.ones(len(self)), np.ones(len(self))
         if self.has("surface"):
             on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[which]
-            scaled = surfaces.scaled(robot, self["configuration"], self["surface"])
+            scaled = surface_labels.scaled(robot, self["configuration"], self["surface"])
             adhesion[scaled] = [
                 adhesion_ratio(s, t) for s, t in zip(self["surface"][scaled], on_tracks[scaled], strict=True)
             ]

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import BadConfiguration
-
-if TYPE_CHECKING:
-    from calibration.data.table import Runs
+from calibration.data.table import Runs
 
 #: Rows at the start of a run that are read whatever follows: the beginning of a run is measured by them.
 FIRST = 5

@@ -19,6 +19,7 @@ from calibration.data import own_mass
 from calibration.data.columns import ROWS, SIDES, WHEN
 from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadData
+from calibration.data.posterior_file import Posterior
 from calibration.data.runs import Runs
 from calibration.data.thinning import thinned
 from calibration.discovery import findings, kept, menu, prediction, preference, scales
@@ -27,7 +28,7 @@ from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, filled, fit_base, fit_candidates, start
 from calibration.discovery.classes import Classes, classes, cosines
 from calibration.discovery.description import undescribed, unused
-from calibration.discovery.discrepancy import CurveBeside, locate
+from calibration.discovery.discrepancy import CurveBeside, Discrepancy, locate
 from calibration.discovery.experiments import Proposal, denser, no_menu, separating
 from calibration.discovery.hidden import hidden
 from calibration.discovery.kept import Keep
@@ -60,6 +61,7 @@ from calibration.discovery.mechanism import mechanism
 from calibration.discovery.outliers import Screening, ahead, same_rows, screen, screen_beside
 from calibration.discovery.prediction import Predicted
 from calibration.discovery.result import (
+    Alternative,
     DiscoveryResult,
     Errors,
     FoundEffect,
@@ -68,6 +70,7 @@ from calibration.discovery.result import (
     Ranking,
     ReadingsOfRows,
     Sensitivity,
+    UnnamedDiscrepancy,
 )
 from calibration.discovery.score_tests import Statistics, bootstrap
 from calibration.discovery.screening import beforehand, with_room
@@ -430,80 +433,122 @@ def trace(
     Where residuals are without structure and everywhere as many times the sds, it is the sds that are wrong: the
     stages go through again with such as the residuals show.
     """
+    task = _Task(runs, robot, noise, settings, stated, library, progress, known, later, keep)
+    ranked = list[Ranking]()
+    screened, sds = keep("base", functools.partial(_base, task, ranked))
+    screened, left, searched = _searched(task, screened, sds, ranked)
+    if searched is None:
+        missed = undescribed(screened.base.space, runs, sds.noise, left.linear)
+        word = "undescribed" if missed else "none"
+        return LoopStages(word, screened, left, sds, missed=missed, unused=unused(runs))
+    return _verdict(task, screened, left, sds, searched)
 
-    first = list[Ranking]()
 
-    def look(noise: Noise, near: Candidate | None = None) -> Screening:
-        space = pose(runs, robot, noise.sd, settings, stated, library)
-        at = functools.partial(bases_at, runs)
+@dataclasses.dataclass(frozen=True)
+class _Task:
+    """The arguments of `trace`, which its stages share."""
+
+    runs: Runs
+    robot: Robot
+    noise: Noise
+    settings: Settings
+    stated: Mapping[str, tuple[float, float]] | None
+    library: Library
+    progress: Tell
+    known: LoopStages | None
+    later: Callable[[BaseFit], None]
+    keep: Keep
+
+    def screen(self, noise: Noise, near: Candidate | None, ranked: list[Ranking]) -> Screening:
+        """The base fit with this noise, from `near` if given, and its outliers; see `windows`."""
+        space = pose(self.runs, self.robot, noise.sd, self.settings, self.stated, self.library)
+        known, at = self.known, functools.partial(bases_at, self.runs)
         if known is not None and space.bare.observe.long:  # whose rows count here too
             space = dataclasses.replace(space.without(np.array(known.screened.outliers, int)), near=known.simulated)
-            progress(Step("base"))
-            return same_rows(fit_base(space, settings, runs.source, near), at, known.screened, settings)
+            self.progress(Step("base"))
+            base = fit_base(space, self.settings, self.runs.source, near)
+            return same_rows(base, at, known.screened, self.settings)
         if near is None:
-            near = windows(space)
-        progress(Step("base"))
-        return screen(fit_base(space, settings, runs.source, near), at, runs, settings)
+            near = self.windows(space, ranked)
+        self.progress(Step("base"))
+        return screen(fit_base(space, self.settings, self.runs.source, near), at, self.runs, self.settings)
 
-    def windows(space: CandidateSpace) -> Candidate | None:
-        """Where the base fit begins by the equations of a log in weak form, which rank the library too."""
-        found = beforehand(space, settings)
+    def windows(self, space: CandidateSpace, ranked: list[Ranking]) -> Candidate | None:
+        """Where the base fit begins by the equations of a log in weak form; their ranking of the library is appended
+        to `ranked`."""
+        found = beforehand(space, self.settings)
         if found is None:
             return None
-        first.append(keep("ranking", functools.partial(findings.ranking_beforehand, space, found, settings)))
+        make = functools.partial(findings.ranking_beforehand, space, found, self.settings)
+        ranked.append(self.keep("ranking", make))
         return found.base
 
-    def begun() -> tuple[Screening, Sds]:
-        screened = look(noise, None if known is None else known.screened.base.candidate)
-        residuals = residuals_of(screened, runs)
-        factors = {} if screened.cluster is not None else common_factors(residuals)
-        sds = Sds(noise, factors, tuple(noise_remarks(residuals, noise.word)))
-        if factors:
-            progress(Step("sds"))
-            sds = dataclasses.replace(sds, noise=noise.scaled(factors))
-            screened = look(sds.noise, screened.base.candidate)
-        return screened, sds
 
-    def tested(screened: Screening) -> tuple[Screening, Diagnosis]:
-        weight = screened.base.space.weight
-        null = None if known is None or np.any(known.screened.base.space.weight != weight) else known.left.test.null
-        room = () if known is None else known.screened.base.space.room
-        base, (linear, scores, _) = screened.base, screened.diagnosed
-        space = base.space.with_room(room)
-        if not room:
-            space = with_room(base.space, base.candidate, linear, scores, settings)
-        screened = dataclasses.replace(screened, base=dataclasses.replace(base, space=space))
-        if np.max(np.abs(np.asarray(scores.single))) > LIKELY:
-            later(screened.base)
-        return screened, diagnosis_of_base(screened, settings, sds.noise.freedom, null)
+def _base(task: _Task, ranked: list[Ranking]) -> tuple[Screening, Sds]:
+    """The base fit and the noise, which is scaled where residuals without structure exceed it by one factor."""
+    known, noise = task.known, task.noise
+    screened = task.screen(noise, None if known is None else known.screened.base.candidate, ranked)
+    residuals = residuals_of(screened, task.runs)
+    factors = {} if screened.cluster is not None else common_factors(residuals)
+    sds = Sds(noise, factors, tuple(noise_remarks(residuals, noise.word)))
+    if factors:
+        task.progress(Step("sds"))
+        sds = dataclasses.replace(sds, noise=noise.scaled(factors))
+        screened = task.screen(sds.noise, screened.base.candidate, ranked)
+    return screened, sds
 
-    def tried(screened: Screening, left: Diagnosis) -> tuple[Screening, Diagnosis, Search]:
-        base = screened.base
-        found = search(base.space, base.candidate, left, screened.bases, settings, progress)
-        base = dataclasses.replace(base, space=base.space.with_room(found.room))
-        return dataclasses.replace(screened, base=base), left, found
 
-    screened, sds = keep("base", begun)
+def _tested(task: _Task, sds: Sds, screened: Screening) -> tuple[Screening, Diagnosis]:
+    """A base fit with room for the sets of effects that are simulated, and the bootstrap of what it leaves."""
+    known, weight = task.known, screened.base.space.weight
+    null = None if known is None or np.any(known.screened.base.space.weight != weight) else known.left.test.null
+    room = () if known is None else known.screened.base.space.room
+    base, (linear, scores, _) = screened.base, screened.diagnosed
+    space = base.space.with_room(room)
+    if not room:
+        space = with_room(base.space, base.candidate, linear, scores, task.settings)
+    screened = dataclasses.replace(screened, base=dataclasses.replace(base, space=space))
+    if np.max(np.abs(np.asarray(scores.single))) > LIKELY:
+        task.later(screened.base)
+    return screened, diagnosis_of_base(screened, task.settings, sds.noise.freedom, null)
+
+
+def _tried(task: _Task, screened: Screening, left: Diagnosis) -> tuple[Screening, Diagnosis, Search]:
+    """The search for effects that explain what the base leaves."""
+    base = screened.base
+    found = search(base.space, base.candidate, left, screened.bases, task.settings, task.progress)
+    base = dataclasses.replace(base, space=base.space.with_room(found.room))
+    return dataclasses.replace(screened, base=base), left, found
+
+
+def _searched(
+    task: _Task, screened: Screening, sds: Sds, ranked: list[Ranking]
+) -> tuple[Screening, Diagnosis, Search | None]:
+    """The search, repeated while it leaves outliers; None where the base leaves nothing."""
+    settings, keep, progress = task.settings, task.keep, task.progress
     for k in range(SCREENINGS):
         progress(Step("bootstrap", (settings.replicates,)))
-        screened, left = keep(f"bootstrap {k}", functools.partial(tested, screened))
-        if k == 0 and not first:
+        screened, left = keep(f"bootstrap {k}", functools.partial(_tested, task, sds, screened))
+        if k == 0 and not ranked:
             keep("ranking", functools.partial(findings.ranking, screened.base.space, left, settings))
         if not left.test.rejected and screened.cluster is None:
-            missed = undescribed(screened.base.space, runs, sds.noise, left.linear)
-            word = "undescribed" if missed else "none"
-            return LoopStages(word, screened, left, sds, missed=missed, unused=unused(runs))
+            return screened, left, None
         progress(Step("effects"))
-        screened, left, searched = keep(f"search {k}", functools.partial(tried, screened, left))
+        screened, left, searched = keep(f"search {k}", functools.partial(_tried, task, screened, left))
         after = searched.diagnosis
         if after is None or not after.test.rejected_with_margin or screened.base.space.near:
             break
-        more = screen_beside(screened, after.scores, lambda base: bases_at(runs, base), runs, settings)
+        more = screen_beside(screened, after.scores, lambda base: bases_at(task.runs, base), task.runs, settings)
         if more is None:
             break
         progress(Step("alone"))
         screened = more
+    return screened, left, searched
 
+
+def _verdict(task: _Task, screened: Screening, left: Diagnosis, sds: Sds, searched: Search) -> LoopStages:
+    """The verdict where the base leaves something: names, classes, a mechanism or a place."""
+    runs, settings, progress = task.runs, task.settings, task.progress
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
     beside, predicted = CurveBeside(space, base, left, bases), Predicted()
     where = dataclasses.replace(beside.where, by_duty=varied_by_duty(runs))
@@ -783,6 +828,85 @@ def missing(space: CandidateSpace, alike: Classes, support: NameSupport | None) 
 # --- the result -----------------------------------------------------------------------------------------
 
 
+@dataclasses.dataclass(frozen=True)
+class _Written:
+    """The fit that a result is about: with the named effects, or with the curve where no name is given.
+
+    Attributes:
+        before, after: the fits of the base and of what is proposed, None where that is the base.
+        robot: of the fit, with its coordinates z, their sds, its cost, and whether it converged.
+        ends: what it leaves; curve, beside: the curve and what remains beside it, where no name is given.
+    """
+
+    before: findings.Fitted
+    after: findings.Fitted | None
+    robot: Robot
+    z: np.ndarray
+    sd: np.ndarray
+    cost: float
+    converged: bool
+    posterior: Posterior
+    ends: Diagnosis
+    curve: Discrepancy | None = None
+    beside: Diagnosis | None = None
+
+    def or_refit(self, traced: LoopStages, kept: bool) -> _Written:
+        """The same where it is `kept`, else with the robot and the posterior of the refit."""
+        if kept:
+            return self
+        space, base = traced.screened.base.space, traced.screened.base.candidate
+        posterior = of_fit(space, base.active, base.z, traced.left.linear)
+        robot = findings.proposed_robot(space, base)
+        return dataclasses.replace(self, robot=robot, converged=base.converged, posterior=posterior)
+
+
+def _written(traced: LoopStages, progress: Tell) -> _Written:
+    """The fit that the result of a verdict is about."""
+    space, base, best, ends = traced.screened.base.space, traced.screened.base.candidate, traced.best, traced.ends
+    curve = beside = None
+    if traced.verdict in WITHOUT_NAME and traced.beside is not None:
+        progress(Step("shape"))
+        curve, beside = traced.beside.curve, traced.beside.diagnosis
+    before = findings.Fitted(*space.fit_of(base.active, base.z))
+    if best is base and curve is not None and beside is not None:
+        return _Written(
+            before, findings.Fitted(curve.problem, curve.z, None), curve.robot, curve.z,
+            np.sqrt(np.diag(curve.covariance)), curve.chi2[1] / 2, curve.converged,
+            of_curve(space, best.active, curve), beside, curve, beside,
+        )  # fmt: skip
+    after = None if best is base else findings.Fitted(*space.fit_of(best.active, best.z))
+    posterior = of_fit(space, best.active, best.z, ends.linear)
+    robot = findings.proposed_robot(space, best)
+    return _Written(before, after, robot, best.z, best.sd, best.cost, best.converged, posterior, ends, curve, beside)
+
+
+def _keeps(traced: LoopStages, written: _Written, gain: prediction.Gain | None) -> bool:
+    """True if what is found predicts well enough to be written in place of the refit.
+
+    What is written never predicts worse than the refit; a curve, which claims no cause, has to predict better.
+    """
+    refit = traced.best is traced.screened.base.candidate
+    if gain is None or (written.curve is None and refit):
+        return True
+    return gain.mean > gain.se if refit else gain.mean >= -prediction.WORSE
+
+
+def _claims(
+    traced: LoopStages, settings: Settings
+) -> tuple[tuple[FoundEffect, ...], DiscrepancyLocation | None, tuple[HiddenEffect, ...]]:
+    """Effects that a verdict names, the place where something remains, and effects that they may conceal."""
+    screened, left, alike = traced.screened, traced.left, traced.alike
+    space, base, best = screened.base.space, screened.base.candidate, traced.best
+    if alike is None:
+        return (), None, ()
+    found = findings.found_effects(space, base, best, alike, left.test, settings)
+    if traced.verdict in WITHOUT_NAME:
+        return found, None, ()
+    ask = space.bare.observe.menu and not space.bare.observe.long
+    concealed = findings.hidden_effects(space, hidden(space, best, alike, left, traced.ends, settings, ask=ask))
+    return found, traced.where, concealed
+
+
 def assemble_result(
     traced: LoopStages,
     runs: Runs,
@@ -792,81 +916,94 @@ def assemble_result(
     progress: Tell,
 ) -> DiscoveryResult:
     """The result of a verdict, with what only now is worth its time: errors held out, and the next experiment."""
-    screened, left, where, noise = traced.screened, traced.left, traced.where, traced.sds.noise
-    space, base, best, ends = screened.base.space, screened.base.candidate, traced.best, traced.ends
-    curve = beside = None
-    if traced.verdict in WITHOUT_NAME and traced.beside is not None:
-        progress(Step("shape"))
-        curve, beside = traced.beside.curve, traced.beside.diagnosis
-    observe, rows = space.bare.observe, len(runs)
-    numbers = np.arange(1, rows + 1) if numbers is None else numbers
-    included = space.included[:rows]
-    before = findings.Fitted(*space.fit_of(base.active, base.z))
-    after, robot, z, sd = None, findings.proposed_robot(space, best), best.z, best.sd
-    cost, converged = best.cost, best.converged
-    posterior = of_fit(space, best.active, best.z, ends.linear)
-    if best is not base:
-        after = findings.Fitted(*space.fit_of(best.active, best.z))
-    elif curve is not None and beside is not None:
-        after, ends = findings.Fitted(curve.problem, curve.z, None), beside
-        robot, z, sd = curve.robot, curve.z, np.sqrt(np.diag(curve.covariance))
-        posterior = of_curve(space, best.active, curve)
-        cost, converged = curve.chi2[1] / 2, curve.converged
-
+    screened, noise = traced.screened, traced.sds.noise
+    space, base, best = screened.base.space, screened.base.candidate, traced.best
+    included = space.included[: len(runs)]
+    numbers = np.arange(1, len(runs) + 1) if numbers is None else numbers
+    written = _written(traced, progress)
     progress(Step("errors"))
     known = [traced.predicted.get(prediction.key(c)) for c in (base, best)]
-    seen = findings.readings(runs, noise.sd, before, after, known[0], None if best is base else known[1])
-    error = lambda simulated: findings.errors(space.bare, simulated, seen.measured, seen.sd, included)  # noqa: E731
-    compared = traced.held_out
-    if traced.alike is not None and traced.verdict not in WITHOUT_NAME and not compared and not observe.long:
-        compared = preference.compared(space, runs, best, traced.alike)
-    gain, kept = _gain(space, runs, seen), True
-    if gain is not None and (curve is not None or best is not base):
-        # What is written never predicts worse than the refit; a curve, which claims no cause, has to predict better.
-        kept = gain.mean > gain.se if best is base else gain.mean >= -prediction.WORSE
-    if not kept:
-        robot, converged = findings.proposed_robot(space, base), base.converged
-        posterior = of_fit(space, base.active, base.z, left.linear)
-    progress(Step("next"))
-    ladder = traced.searched.ladder if traced.searched is not None else ()
-    near, too_large = findings.alternatives(
-        space, best, cost, traced.alike.ladder if traced.alike is not None else ladder, settings
+    seen = findings.readings(
+        runs, noise.sd, written.before, written.after, known[0], None if best is base else known[1]
     )
-    p = left.test.p_value
+    compared = traced.held_out
+    nameless = traced.verdict in WITHOUT_NAME
+    if traced.alike is not None and not nameless and not compared and not space.bare.observe.long:
+        compared = preference.compared(space, runs, best, traced.alike)
+    gain = _gain(space, runs, seen)
+    kept = _keeps(traced, written, gain)
+    written = written.or_refit(traced, kept)
+    progress(Step("next"))
+    remaining = _residuals(space, runs, written.ends.linear, seen.after, written.z)
+    found = _Found(traced, written, seen, compared, gain, kept, remaining)
+    result = _result(found, runs, numbers, settings, library)
+    # What happens for a while is not everywhere alike.
+    of_noise = of_sds(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
+    return dataclasses.replace(result, remarks=(*of_noise, *refit_worse(seen, noise, included), *remarks(result)))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Found:
+    """Verdict, fit and predictions of which a result is made.
+
+    Attributes:
+        seen: readings of every row; compared: alternatives by data held out; remaining: residuals of the fit.
+        gain: by how much the fit predicts better than the refit; kept: True if it is written.
+    """
+
+    traced: LoopStages
+    written: _Written
+    seen: ReadingsOfRows
+    compared: tuple[HeldOutAlternative, ...]
+    gain: prediction.Gain | None
+    kept: bool
+    remaining: Residuals
+
+
+def _alternatives(found: _Found, settings: Settings) -> tuple[tuple[Alternative, ...], tuple[Alternative, ...]]:
+    """Sets of effects that explain nearly as much, and those of implausible size."""
+    traced = found.traced
+    ladder = traced.searched.ladder if traced.searched is not None else ()
+    ladder = traced.alike.ladder if traced.alike is not None else ladder
+    return findings.alternatives(traced.screened.base.space, traced.best, found.written.cost, ladder, settings)
+
+
+def _unnamed(found: _Found, rows: int) -> UnnamedDiscrepancy | None:
+    """The discrepancy that a curve describes, where no name is given."""
+    written, where = found.written, found.traced.where
+    if written.curve is None or where is None or written.beside is None:
+        return None
+    return findings.unnamed(written.curve, where, found.traced.left.test.p_value, written.beside.linear, rows)
+
+
+def _result(about: _Found, runs: Runs, numbers: np.ndarray, settings: Settings, library: Library) -> DiscoveryResult:
+    """The result without its remarks."""
+    traced, written, seen = about.traced, about.written, about.seen
+    screened, left, ends = traced.screened, traced.left, written.ends
+    space, base = screened.base.space, screened.base.candidate
+    observe, included = space.bare.observe, space.included[: len(runs)]
+    error = lambda simulated: findings.errors(space.bare, simulated, seen.measured, seen.sd, included)  # noqa: E731
+    near, too_large = _alternatives(about, settings)
+    found, remains, concealed = _claims(traced, settings)
     listed = findings.effect_scores(space, left.scores, settings)
     shown = space.library.indices([s.name for s in listed])
-    found: tuple[FoundEffect, ...] = ()
-    remains = None
-    if traced.alike is not None:
-        found = findings.found_effects(space, base, best, traced.alike, left.test, settings)
-        remains = None if where is None or traced.verdict in WITHOUT_NAME else where
-    concealed: tuple[HiddenEffect, ...] = ()
-    if traced.alike is not None and traced.verdict not in WITHOUT_NAME:
-        ask = observe.menu and not observe.long
-        concealed = findings.hidden_effects(
-            space, hidden(space, best, traced.alike, left, traced.ends, settings, ask=ask)
-        )
-    unnamed = None
-    if curve is not None and where is not None and beside is not None:
-        unnamed = findings.unnamed(curve, where, p, beside.linear, rows)
-    remaining = _residuals(space, runs, ends.linear, seen.after, z)
     said = summary(traced, numbers)
-    result = DiscoveryResult(
+    return DiscoveryResult(
         verdict=traced.verdict,
         summary=said,
-        robot=robot,
+        robot=written.robot,
         refit=findings.proposed_robot(space, base),
-        gain=gain,
-        written=kept,
-        converged=converged,
-        posterior=posterior,
+        gain=about.gain,
+        written=about.kept,
+        converged=written.converged,
+        posterior=written.posterior,
         runs=runs,
         numbers=numbers,
         included=included,
         outliers=tuple(int(numbers[k]) for k in screened.outliers),
         unusable=tuple(int(numbers[k]) for k in screened.base.unusable),
         effects=found,
-        unnamed=unnamed,
+        unnamed=_unnamed(about, len(runs)),
         remains=remains,
         next_experiment=findings.next_experiment(_proposal(space, traced, settings)),
         cannot_see=findings.invisible(space, left.scores, settings),
@@ -877,12 +1014,12 @@ def assemble_result(
         hidden=concealed,
         support=said.support,
         cluster=screened.cluster,
-        residual_clusters=residual_clusters(remaining, settings.seed),
+        residual_clusters=residual_clusters(about.remaining, settings.seed),
         before=findings.evidence(left.test, adequate=not left.test.rejected),
         after=findings.evidence(ends.test, adequate=not ends.test.rejected_with_margin),
-        chi2=(2 * base.cost, 2 * cost),
+        chi2=(2 * base.cost, 2 * written.cost),
         readings=int(np.sum(space.weight > 0)),
-        base_shift=findings.base_shift(space, base.z, z, sd),
+        base_shift=findings.base_shift(space, base.z, written.z, written.sd),
         scores=listed,
         cosine=cosines(space, left.scores)[np.ix_(shown, shown)],
         detail=observe.detail(screened.bases, included, left, ends),
@@ -892,14 +1029,11 @@ def assemble_result(
         errors_held_out={k: on_same_rows(*both, error) for k, both in seen.held_out.items()},
         held_out_unpredictable=blocks_room.unpredictable(runs, space.bare),
         held_out_worse=preference.worse(seen.held_out, error),
-        alternatives_held_out=compared,
-        noise=_noise(runs, noise, type(observe)),
+        alternatives_held_out=about.compared,
+        noise=_noise(runs, traced.sds.noise, type(observe)),
         settings=settings,
         replicates=len(left.test.null.single),
     )
-    # What happens for a while is not everywhere alike.
-    of_noise = of_sds(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
-    return dataclasses.replace(result, remarks=(*of_noise, *refit_worse(seen, noise, included), *remarks(result)))
 
 
 def refit_worse(seen: ReadingsOfRows, noise: Noise, included: np.ndarray) -> list[RefitWorse]:

@@ -28,8 +28,7 @@ from calibration.discovery import menu, predicted
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import Classes
-from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.loop_notes import (
+from calibration.discovery.instructions import (
     CarryOut,
     Instruction,
     MoreRuns,
@@ -38,6 +37,7 @@ from calibration.discovery.loop_notes import (
     NothingTells,
     TooWeak,
 )
+from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.reach import Reach, reach_of
 from calibration.discovery.settings import Settings
 from calibration.inference import bases, priors

@@ -20,10 +20,9 @@ from calibration.discovery.result import PLAUSIBLE, DiscoveryResult, Estimate, R
 from calibration.inference import noise as noise_room
 from calibration.inference import observers
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import Step
+from calibration.inference.fit_notes import Note, Step
 from calibration.inference.population import saved_members
 from calibration.inference.result import CalibrationResult
-from calibration.words.note_words import in_words
 from mmrjax.effects import UNNAMED
 from mmrjax.model import channels
 from mmrjax.model.robot import Robot
@@ -78,13 +77,14 @@ def resolve(
     generations: int | None = None,
     members: Path | None = None,
     seed: int = 0,
-    tell: Callable[[str], None] = lambda sentence: None,
+    tell: Callable[[Note | str], None] = lambda note: None,
 ) -> Resolved | None:
     """Ask the track model about a verdict.
 
     Args:
         found: by the loop, from settled rows; noise: as the loop was given it.
         population, generations, members, seed: of the search, see `calibrate`.
+        tell: receives a note, or a sentence of `calibrate`, as the work goes on.
 
     Returns:
         None where nothing is to be asked: nothing remains in slip, track or ground, or no row is on tracks.
@@ -115,9 +115,9 @@ def resolve(
             seed=seed, profiles=False, blocks=False, tell=tell,
         )  # fmt: skip
 
-    in_words(tell)(Step("gear stated"))
+    tell(Step("gear stated"))
     stated = fit(friction)
-    in_words(tell)(Step("gear free"))
+    tell(Step("gear free"))
     free = fit((*friction, *gear), members)
     fall = 2 * (stated.objective - free.objective)
     return Resolved(

@@ -16,8 +16,9 @@ from calibration.data.runs import WHEN, Runs
 from calibration.data.writing import write_json, write_table
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.headline import headline
+from calibration.discovery.instructions import Instruction
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.loop_notes import Asked, Headline, Instruction, Mechanism, NameSupport, RuledOut, Summary
+from calibration.discovery.loop_notes import Asked, Headline, Mechanism, NameSupport, RuledOut, Summary
 from calibration.discovery.prediction import Gain
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail

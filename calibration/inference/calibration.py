@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -107,56 +108,146 @@ def calibrate(
     if not is_double():
         raise BadConfiguration(f"calibrate: {SINGLE}")
     solver = solvers.solver(solver) if isinstance(solver, str) else solver
-    runs = thinned(runs.of(robot), rows)
+    runs, told = thinned(runs.of(robot), rows), in_words(tell)
+    plan = _planned(runs, model, starts, profiles, blocks)
+    choose = functools.partial(_free_names, runs, plan, free, fix, tell)
+    ready = prepare(runs, robot, noise, stated, assume=False, choose=choose)
+    for note in (*ready.former, *ready.foreign, *ready.doubted):
+        told(note)
+    base, of_product = _guided(runs, ready, plan)
+    setting = _Setting(runs, plan, ready, base, of_product)
+    posed = setting.problem()
+    evolved = _evolved(posed, ready.names, runs, population, generations, members)
+    found, beside = _searched(runs, base, posed, ready.noise, plan.starts, evolved, seed, told, solver)
+    optimum = _optimum(setting, found)
+    if found.problem.observe.long:
+        doing = ["the linear analysis", *["profiles"] * plan.profiles, *["blocks held out"] * bool(plan.kinds)]
+        told(Step("optimum", (", ".join(doing),)))
+    return _result(setting, found, optimum, _analysed(setting, found, optimum), beside, seed)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Plan:
+    """Settings of a calibration, completed by the kind of data and the fidelity.
+
+    Attributes:
+        fidelity: its name; starts: of the search; profiles: True to profile every parameter.
+        kinds: of the blocks that are held out.
+    """
+
+    observe: type[observers.Observer]
+    fidelity: str
+    starts: int
+    profiles: bool
+    kinds: tuple[str, ...]
+
+
+def _planned(
+    runs: Runs, model: str | None, starts: int | None, profiles: bool | None, blocks: Sequence[str] | bool | None
+) -> _Plan:
+    """Plan of a calibration from the arguments of `calibrate`; the kind of data and the fidelity fill in for None."""
     observe = observers.kind(runs)
     fidelity = model or (OF_HISTORIES if observe.axis else fidelities.NAMES[0])
-    facts = observers.facts(fidelity)
-    effort = facts.effort
+    effort = observers.facts(fidelity).effort
     starts = (observe.searches or effort.starts) if starts is None else starts
     profiles = effort.profiles and observe.profiled if profiles is None else profiles
     blocks = effort.blocks if blocks is None else blocks
     kinds = (observe.blocks if blocks else ()) if isinstance(blocks, bool) else tuple(blocks)
+    return _Plan(observe, fidelity, starts, profiles, kinds)
 
-    told = in_words(tell)
+
+def _free_names(
+    runs: Runs,
+    plan: _Plan,
+    free: Sequence[str],
+    fix: Sequence[str],
+    tell: Callable[[str], None],
+    prepared: Prepared,
+) -> tuple[str, ...]:
+    """Names of the free parameters.
+
+    Raises:
+        BadConfiguration: an unknown name, or one that the fidelity does not read.
+    """
+    robot, fidelity, computes = prepared.robot, plan.fidelity, observers.facts(plan.fidelity).computes
     former: list[str] = []
+    words = [surfaces.names_of_surfaces(names, robot, runs) for names in (free, fix)]
+    words = [robot_file.current_names(names, robot, former) for names in words]
+    for sentence in former:  # before a name is refused that nobody has typed
+        tell(sentence)
+    present = _present(runs, robot)
+    default = priors.default_names(present, robot, computed=computes, turns=runs.turns)
+    owned = priors.stated_names(robot, present, () if plan.observe.axis else priors.OVER_TIME)
+    held = {*default, *fidelities.unread(fidelity, owned, runs.turns)}
+    default = (*default, *(n for n in owned if n not in held and not n.endswith(computes)))
+    default = (*default, *priors.delays(robot, plan.observe.free()[0]))
+    names = priors.choose(robot, default, *words)
+    if unread := fidelities.unread(fidelity, names, runs.turns):
+        if fidelities.OF_TURNS in unread[0]:
+            raise BadConfiguration(f"--free {unread[0]}: these runs are straight, which do not show it")
+        reads = ", ".join(other for other in fidelities.NAMES if not fidelities.unread(other, unread, runs.turns))
+        raise BadConfiguration(f"--free {unread[0]}: --model {fidelity} does not read it; allowed: --model {reads}")
+    return names
 
-    def chosen(prepared: Prepared) -> tuple[str, ...]:
-        robot = prepared.robot
-        words = [surfaces.names_of_surfaces(names, robot, runs) for names in (free, fix)]
-        words = [robot_file.current_names(names, robot, former) for names in words]
-        for sentence in former:  # before a name is refused that nobody has typed
-            tell(sentence)
-        present = {robot.configurations.names[k] for k in runs.configurations(robot)}
-        default = priors.default_names(present, robot, computed=facts.computes, turns=runs.turns)
-        owned = priors.stated_names(robot, present, () if observe.axis else priors.OVER_TIME)
-        held = {*default, *fidelities.unread(fidelity, owned, runs.turns)}
-        default = (*default, *(n for n in owned if n not in held and not n.endswith(facts.computes)))
-        default = (*default, *priors.delays(robot, observe.free()[0]))
-        names = priors.choose(robot, default, *words)
-        if unread := fidelities.unread(fidelity, names, runs.turns):
-            if fidelities.OF_TURNS in unread[0]:
-                raise BadConfiguration(f"--free {unread[0]}: these runs are straight, which do not show it")
-            reads = ", ".join(other for other in fidelities.NAMES if not fidelities.unread(other, unread, runs.turns))
-            raise BadConfiguration(
-                f"--free {unread[0]}: --model {fidelity} does not read it; allowed: --model {reads}"
-            )
-        return names
 
-    ready = prepare(runs, robot, noise, stated, assume=False, choose=chosen)
-    robot, known, stated, names = ready.robot, ready.noise, ready.stated, ready.names
-    for note in (*ready.former, *ready.foreign, *ready.doubted):
-        told(note)
-    base = robot
-    of_product: dict[str, tuple[float, float]] = {}
-    if priors.GUIDE_SHARE in facts.computes:
-        present = {robot.configurations.names[k] for k in runs.configurations(robot)}
-        base, of_product = _guided(robot, present, names, stated)
-    coordinates = priors.coordinates(base, names, {**of_product, **stated})
-    notes: list[Note | str] = [*ready.foreign, *ready.doubted, *ready.checked, *ready.weighed]
-    notes += [PriorOfProduct(name, mean, sd, priors.GUIDED) for name, (mean, sd) in of_product.items()]
-    notes += ready.begins
-    posed = observers.pose(runs, base, coordinates, known.sd, fidelity)
+def _present(runs: Runs, robot: Robot) -> set[str]:
+    """Names of the configurations that the runs have."""
+    return {robot.configurations.names[k] for k in runs.configurations(robot)}
 
+
+@dataclasses.dataclass(frozen=True)
+class _Setting:
+    """A table and a robot, ready for a search.
+
+    Attributes:
+        base: the robot at the prior means; of_product: priors of its guide frictions, see `_guided`.
+    """
+
+    runs: Runs
+    plan: _Plan
+    ready: Prepared
+    base: Robot
+    of_product: dict[str, tuple[float, float]]
+
+    def problem(self) -> Problem:
+        """The problem to be solved, with the noise as it is known before a search."""
+        coordinates = priors.coordinates(self.base, self.ready.names, {**self.of_product, **self.ready.stated})
+        return observers.pose(self.runs, self.base, coordinates, self.ready.noise.sd, self.plan.fidelity)
+
+    def remarks(self) -> list[Note | str]:
+        """Remarks on the table and the priors."""
+        ready = self.ready
+        products = [PriorOfProduct(name, mean, sd, priors.GUIDED) for name, (mean, sd) in self.of_product.items()]
+        return [*ready.foreign, *ready.doubted, *ready.checked, *ready.weighed, *products, *ready.begins]
+
+
+def _guided(runs: Runs, ready: Prepared, plan: _Plan) -> tuple[Robot, dict[str, tuple[float, float]]]:
+    """The robot with the guides' share that the fidelity computes, and the priors of the guide frictions that are
+    free and not stated."""
+    robot, known = ready.robot, dict[str, tuple[float, float]]()
+    if priors.GUIDE_SHARE not in observers.facts(plan.fidelity).computes:
+        return robot, known
+    present = _present(runs, robot)
+    for name, chassis in ready.robot.configurations.items():
+        if name in present and float(chassis.on_tracks) > 0.5:
+            robot, more = priors.guided(robot, name)
+            known |= more
+    return robot, {name: prior for name, prior in known.items() if name in ready.names and name not in ready.stated}
+
+
+def _evolved(
+    posed: Problem,
+    names: Sequence[str],
+    runs: Runs,
+    population: int | None,
+    generations: int | None,
+    members: Path | None,
+) -> _Evolved:
+    """Settings of the search by generations, from the arguments of `calibrate`.
+
+    Raises:
+        BadConfiguration: settings of a population for a search without one, or for data that are not searched so.
+    """
     if population is None:
         population = POPULATION if fidelities.unread("steady", names, runs.turns) else 0
     if (members is not None or generations is not None) and not population:
@@ -167,91 +258,7 @@ def calibrate(
         )
     if 0 < population < LEAST:
         raise BadConfiguration(f"--population: got {population}; expected 0 or at least {LEAST} members")
-    evolved = _Evolved(population, generations or GENERATIONS, members)
-    found, beside = _searched(runs, base, posed, known, starts, evolved, seed, told, solver)
-    posed, z = found.problem, np.asarray(found.best.z)
-    fitted = posed.robot(jnp.asarray(z))
-    after, before = fit.observation(posed, jnp.asarray(z)), fit.read(posed, posed.base)
-    status, status_before = np.asarray(after.status), np.asarray(before.status)
-    lost = multistart.unreachable(posed, status)
-    if lost.any():
-        raise checks.infeasible(runs, fitted, status, lost, names)
-
-    if posed.observe.long:
-        doing = ["the linear analysis", *["profiles"] * profiles, *["blocks held out"] * bool(kinds)]
-        told(Step("optimum", (", ".join(doing),)))
-    notes += posed.observe.cautions(fitted)
-    searched = found.searched
-    about = identifiability.analyse(posed, jnp.asarray(z), slope=None if searched is None else searched.slope)
-    notes += searched.remarks() if searched is not None else []
-    seen_over = scans.profiles(posed, z)
-    about = scans.with_scanned_sds(about, seen_over)
-    notes += scans.remarks(posed, seen_over)
-    elsewhere = scans.apart(seen_over, found.starts.z, found.starts.converged)
-    if elsewhere:
-        over = tuple(posed.coordinates.names[k] for k in seen_over)
-        notes.append(Elsewhere(elsewhere, len(found.starts.cost), over))
-    if not np.isfinite(about.covariance).all():
-        notes.append(Fact("no covariance"))
-    if jumps := numbers(np.asarray(after.flags) >> FLAGS.index("jumps") & 1):
-        notes.append(OfRows(jumps, "jumps"))
-    profile = identifiability.profile(posed, jnp.asarray(z), float(found.best.cost), about) if profiles else None
-    masks = {kind: holdout.blocks(runs, kind) for kind in kinds}
-    held = holdout.held_out(posed, np.asarray(z), masks)
-
-    measured, sd = runs.measured(), np.asarray(posed.data.sd)
-    seen, seen_before = _reached(posed, status, after.reading), _reached(posed, status_before, before.reading)
-    finite = np.isfinite(measured) & np.isfinite(seen)
-    whitened = np.where(finite, (seen - measured) / sd, 0.0)
-    left = lack_of_fit.Residuals(observe, runs, seen, whitened, finite, about.jacobian, z)
-    if not known.estimated.any():
-        notes += noise_remarks(left)
-    sources = {name: "product" for name in of_product} | {name: "stated" for name in stated}
-    result = CalibrationResult(
-        robot=fitted,
-        source=runs.source,
-        channels=runs.channels,
-        model=fidelity,
-        seed=seed,
-        parameters=estimates.parameters(posed, base, z, about, profile, beside, sources, seen_over),
-        tied=estimates.tied(posed),
-        noise=estimates.noise(posed, known, found.shares, measured),
-        axis=observe.axis,
-        errors_before=estimates.errors(runs.channels, seen_before, measured, sd),
-        errors_after=estimates.errors(runs.channels, seen, measured, sd),
-        held_out={kind: estimates.held_out(posed, h, measured, sd) for kind, h in held.items()},
-        conditions=estimates.conditions(observe, runs),
-        readings=estimates.readings(runs.channels, measured, sd, seen_before, seen),
-        status_before=np.array(STATUSES)[status_before],
-        status=np.array(STATUSES)[status],
-        adhesion_used=np.asarray(after.adhesion_used),
-        objective=float(found.best.cost),
-        converged=bool(found.best.converged) and not elsewhere,
-        starts=found.starts,
-        searched=searched,
-        chi_square=estimates.chi_square(seen, measured, sd, about, known),
-        adequacy=lack_of_fit.judged(
-            left, seen_before, sd, estimated=known.estimated, converged=bool(found.best.converged)
-        ),
-        residual_clusters=residual_clusters(left, seed),
-        identifiability=about,
-        posterior=of_coordinates(posed.coordinates, z, about.covariance),
-        remarks=(*notes, *checks.unmeasured(names, about.sensitivity)),
-    )
-    return dataclasses.replace(result, remarks=(*result.remarks, *remarks(result)))
-
-
-def _guided(
-    robot: Robot, present: set[str], names: Sequence[str], stated: Mapping[str, tuple[float, float]]
-) -> tuple[Robot, dict[str, tuple[float, float]]]:
-    """The robot with the guides' share that the model puts out, and the priors of the guide frictions that are free
-    and not stated."""
-    known: dict[str, tuple[float, float]] = {}
-    for name, chassis in robot.configurations.items():
-        if name in present and float(chassis.on_tracks) > 0.5:
-            robot, more = priors.guided(robot, name)
-            known |= more
-    return robot, {name: prior for name, prior in known.items() if name in names and name not in stated}
+    return _Evolved(population, generations or GENERATIONS, members)
 
 
 def _searched(
@@ -326,6 +333,131 @@ def _first_generation(easy: Problem, z: np.ndarray) -> np.ndarray:
     covariance[friction] = covariance[:, friction] = 0.0
     covariance[friction, friction] = 1.0
     return covariance
+
+
+@dataclasses.dataclass(frozen=True)
+class _Optimum:
+    """The model at the optimum and before the fit.
+
+    Attributes:
+        z: coordinates; robot: that they make; after: what is observed of it.
+        status, status_before: codes, shape (rows,).
+        seen, seen_before: readings [SI], shape (rows, channels), NaN in rows that the model does not reach.
+    """
+
+    z: np.ndarray
+    robot: Robot
+    after: fit.Observation
+    status: np.ndarray
+    status_before: np.ndarray
+    seen: np.ndarray
+    seen_before: np.ndarray
+
+
+def _optimum(setting: _Setting, found: Found) -> _Optimum:
+    """The model at the optimum that was found and before the fit.
+
+    Raises:
+        BadConfiguration: the model reaches no operating point in some row at the optimum.
+    """
+    posed, z = found.problem, np.asarray(found.best.z)
+    fitted = posed.robot(jnp.asarray(z))
+    after, before = fit.observation(posed, jnp.asarray(z)), fit.read(posed, posed.base)
+    status, status_before = np.asarray(after.status), np.asarray(before.status)
+    lost = multistart.unreachable(posed, status)
+    if lost.any():
+        raise checks.infeasible(setting.runs, fitted, status, lost, setting.ready.names)
+    seen, seen_before = _reached(posed, status, after.reading), _reached(posed, status_before, before.reading)
+    return _Optimum(z, fitted, after, status, status_before, seen, seen_before)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Analysis:
+    """What is known of an optimum.
+
+    Attributes:
+        about: the linear analysis; scanned: scans along parameters, by the number of the coordinate.
+        elsewhere: searches that ended where the scans have nothing, see `scans.apart`.
+        profile: of every parameter, None without profiles; held: blocks held out, by kind.
+        notes: remarks on these.
+    """
+
+    about: identifiability.Identifiability
+    scanned: dict[int, scans.Scan]
+    elsewhere: int
+    profile: identifiability.Profile | None
+    held: dict[str, holdout.HeldOut]
+    notes: list[Note | str]
+
+
+def _analysed(setting: _Setting, found: Found, optimum: _Optimum) -> _Analysis:
+    """Linear analysis, scans, profiles and held-out blocks at the optimum."""
+    posed, z, plan, searched = found.problem, optimum.z, setting.plan, found.searched
+    notes: list[Note | str] = [*posed.observe.cautions(optimum.robot)]
+    about = identifiability.analyse(posed, jnp.asarray(z), slope=None if searched is None else searched.slope)
+    notes += searched.remarks() if searched is not None else []
+    scanned = scans.profiles(posed, z)
+    about = scans.with_scanned_sds(about, scanned)
+    notes += scans.remarks(posed, scanned)
+    elsewhere = scans.apart(scanned, found.starts.z, found.starts.converged)
+    if elsewhere:
+        over = tuple(posed.coordinates.names[k] for k in scanned)
+        notes.append(Elsewhere(elsewhere, len(found.starts.cost), over))
+    if not np.isfinite(about.covariance).all():
+        notes.append(Fact("no covariance"))
+    if jumps := numbers(np.asarray(optimum.after.flags) >> FLAGS.index("jumps") & 1):
+        notes.append(OfRows(jumps, "jumps"))
+    profile = None
+    if plan.profiles:
+        profile = identifiability.profile(posed, jnp.asarray(z), float(found.best.cost), about)
+    held = holdout.held_out(posed, z, {kind: holdout.blocks(setting.runs, kind) for kind in plan.kinds})
+    return _Analysis(about, scanned, elsewhere, profile, held, notes)
+
+
+def _result(
+    setting: _Setting, found: Found, optimum: _Optimum, analysis: _Analysis, beside: np.ndarray | None, seed: int
+) -> CalibrationResult:
+    """The result of a calibration; `beside` is the optimum of `steady` that the search began from, if any."""
+    runs, known, posed, about = setting.runs, setting.ready.noise, found.problem, analysis.about
+    z, seen, seen_before, observe = optimum.z, optimum.seen, optimum.seen_before, setting.plan.observe
+    measured, sd, converged = runs.measured(), np.asarray(posed.data.sd), bool(found.best.converged)
+    finite = np.isfinite(measured) & np.isfinite(seen)
+    whitened = np.where(finite, (seen - measured) / sd, 0.0)
+    left = lack_of_fit.Residuals(observe, runs, seen, whitened, finite, about.jacobian, z)
+    notes = [*setting.remarks(), *analysis.notes, *([] if known.estimated.any() else noise_remarks(left))]
+    sources = {name: "product" for name in setting.of_product} | {name: "stated" for name in setting.ready.stated}
+    result = CalibrationResult(
+        robot=optimum.robot,
+        source=runs.source,
+        channels=runs.channels,
+        model=setting.plan.fidelity,
+        seed=seed,
+        parameters=estimates.parameters(
+            posed, setting.base, z, about, analysis.profile, beside, sources, analysis.scanned
+        ),
+        tied=estimates.tied(posed),
+        noise=estimates.noise(posed, known, found.shares, measured),
+        axis=observe.axis,
+        errors_before=estimates.errors(runs.channels, seen_before, measured, sd),
+        errors_after=estimates.errors(runs.channels, seen, measured, sd),
+        held_out={kind: estimates.held_out(posed, h, measured, sd) for kind, h in analysis.held.items()},
+        conditions=estimates.conditions(observe, runs),
+        readings=estimates.readings(runs.channels, measured, sd, seen_before, seen),
+        status_before=np.array(STATUSES)[optimum.status_before],
+        status=np.array(STATUSES)[optimum.status],
+        adhesion_used=np.asarray(optimum.after.adhesion_used),
+        objective=float(found.best.cost),
+        converged=converged and not analysis.elsewhere,
+        starts=found.starts,
+        searched=found.searched,
+        chi_square=estimates.chi_square(seen, measured, sd, about, known),
+        adequacy=lack_of_fit.judged(left, seen_before, sd, estimated=known.estimated, converged=converged),
+        residual_clusters=residual_clusters(left, seed),
+        identifiability=about,
+        posterior=of_coordinates(posed.coordinates, z, about.covariance),
+        remarks=(*notes, *checks.unmeasured(setting.ready.names, about.sensitivity)),
+    )
+    return dataclasses.replace(result, remarks=(*result.remarks, *remarks(result)))
 
 
 def _reached(posed: Problem, status: np.ndarray, reading: jax.Array) -> np.ndarray:

@@ -10,18 +10,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.inference.fit_notes import Step
+from calibration.inference.fit_notes import Note, Step
 from calibration.sensitivity.model import Answer, Model, OutputRow, counted
 from calibration.sensitivity.result import Points
 from calibration.sensitivity.uncertain_inputs import Inputs
-from calibration.words.note_words import in_words
 from mmrjax import fidelities
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
 
-Tell = Callable[[str], None]
+Tell = Callable[[Note | str], None]
 #: After so long a time it says how far it is [s].
 SILENCE = 10.0
 
@@ -47,10 +46,10 @@ class Study:
         model: str = "steady",
         options: Mapping[str, float] | None = None,
         supply: Supply | None = None,
-        tell: Tell = lambda text: None,
+        tell: Tell = lambda note: None,
     ) -> None:
         supply = Supply() if supply is None else supply
-        self.robot, self.inputs, self.points, self.tell = robot, inputs, points, in_words(tell)
+        self.robot, self.inputs, self.points, self.tell = robot, inputs, points, tell
         options = fidelities.facts(model).resolved() if options is None else options
         self.model = Model(robot, inputs.columns, model, options, outputs)
         names = robot.configurations.names

@@ -6,18 +6,16 @@ import math
 from collections.abc import Sequence
 
 from calibration.discovery import menu, setups
-from calibration.discovery.loop_notes import (
+from calibration.discovery.instructions import (
     CarryOut,
     Instruction,
     MoreRuns,
     NoMenu,
     NothingPossible,
     NothingTells,
-    Overspeed,
-    Overvoltage,
     TooWeak,
-    Watch,
 )
+from calibration.discovery.loop_notes import Overspeed, Overvoltage, Watch
 from calibration.inference import bases
 from mmrjax.model import channels
 from mmrjax.model.quantities import RPM

@@ -15,6 +15,7 @@ from mmrjax.compile.programs import has_tracer
 from mmrjax.errors import UsageError, choices, counted
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import History
+from mmrjax.fidelities.run_batches import Pending
 from mmrjax.missions import mission_batch
 from mmrjax.missions.mission import Mission
 from mmrjax.model.channels import Channel, usual
@@ -22,9 +23,6 @@ from mmrjax.model.channels import names as channel_names
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.signals import CODES, STATUSES, Result
-
-if TYPE_CHECKING:
-    from mmrjax.fidelities.simulation import Pending
 
 #: Columns of a printed table beside conditions and channels.
 _SHOWN = ("slip", "adhesion_used", "power_supply_W", "winding_settled_C")

@@ -5,33 +5,29 @@ from __future__ import annotations
 import dataclasses
 import math
 import warnings
-from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from collections.abc import Mapping
+from typing import Any
 
 import equinox.internal as eqxi
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from mmrjax import fidelities
-from mmrjax.compile.compiling import compiled
-from mmrjax.compile.precision import ambient, at_once, in_double, in_trace
+from mmrjax.compile.precision import ambient, in_double, in_trace
 from mmrjax.compile.programs import has_tracer
 from mmrjax.errors import UsageError, choices
-from mmrjax.fidelities.base import Fidelity, History, Run
+from mmrjax.fidelities.base import History
 from mmrjax.fidelities.results import Results
+from mmrjax.fidelities.run_batches import Pending, flat, run_batch, shaped, total_mass
 from mmrjax.missions import mission_batch
 from mmrjax.missions.mission import Start
 from mmrjax.missions.profile import Profile
-from mmrjax.model import channels, params, power
+from mmrjax.model import params, power
 from mmrjax.model.conditions import OF_TURNS, Conditions, Named, sides_contradict
-from mmrjax.model.params import Scalar
 from mmrjax.model.quantities import CONDITIONS
 from mmrjax.model.robot import NO_BRAKE, Robot, cannot_turn
-from mmrjax.model.signals import CODES, Result
+from mmrjax.model.signals import CODES
 
-#: Runs of which `simulate` keeps histories at once.
-HISTORIES = 1000
 #: What is said of runs that say nothing of either side, of a robot whose sides differ.
 STRAIGHT = "the robot's sides differ, and runs that say nothing of either side travel straight, as if steered"
 #: What is said of reverse mode through a fidelity that has none.
@@ -112,13 +108,13 @@ def simulate(
     fidelity, traced = fidelities.get(model), has_tracer((robot, conditions))
     if not traced:
         try:
-            fidelity.check(robot, _flat(conditions), stated)
+            fidelity.check(robot, flat(conditions), stated)
         except ValueError as error:
             raise UsageError(f"model {model}, {error}") from error
     names = robot.configurations.names
     if fidelity.outputs is not None and not traced:
         return Results.pending(Pending(robot, conditions, fidelity), names, model)
-    run = _run(fidelity, robot, conditions, stated, history and fidelities.facts(model).histories)
+    run = run_batch(fidelity, robot, conditions, stated, history and fidelities.facts(model).histories)
     results = Results(
         conditions, total_mass(robot, conditions), run.result, run.columns, run.history, names, model,
         channels=robot.channels,
@@ -183,22 +179,22 @@ def _check_profile(model: str, profile: Any, options: Mapping[str, float | None]
 
 def _missions(robot: Robot, conditions: Conditions, profile: Profile, start: Start | None, history: bool) -> Results:
     """Every run of a batch over the same profile."""
-    flat = _flat(conditions)
-    if not has_tracer((robot, flat, profile, start)):
-        cell = mission_batch.begins_below(robot, flat, profile, start)
+    runs = flat(conditions)
+    if not has_tracer((robot, runs, profile, start)):
+        cell = mission_batch.begins_below(robot, runs, profile, start)
         if np.isfinite(cell).any():
             k = int(np.argmax(np.isfinite(cell)))
             at = f"[{k}]" if len(cell) > 1 else ""
             raise UsageError(
-                f"discharge{at}: got {float(np.asarray(flat.discharge)[k]):g} C; a cell is then at {cell[k]:.4g} V, "
+                f"discharge{at}: got {float(np.asarray(runs.discharge)[k]):g} C; a cell is then at {cell[k]:.4g} V, "
                 f"below its cut-off of {robot.battery.voltage_cutoff:g} V, before the mission begins"
             )
-    found = mission_batch.batch(robot, flat, profile, start, history=history)
-    further = mission_batch.columns(mission_batch.numbers(robot, flat, found))
+    found = mission_batch.batch(robot, runs, profile, start, history=history)
+    further = mission_batch.columns(mission_batch.numbers(robot, runs, found))
     course = None
     if found.course is not None:
         course = History.of(robot, found.course.time, found.course.distance, found.course.signals)
-    found, further, course = _shaped((found, further, course), conditions.shape)
+    found, further, course = shaped((found, further, course), conditions.shape)
     names, mass = robot.configurations.names, total_mass(robot, conditions)
     return Results(
         conditions,
@@ -212,108 +208,6 @@ def _missions(robot: Robot, conditions: Conditions, profile: Profile, start: Sta
         profile.stated,
         robot.channels,
     )
-
-
-@dataclasses.dataclass(frozen=True)
-class Pending:
-    """A batch that has been checked, and of which nothing has been computed.
-
-    Attributes:
-        robot: concrete; conditions: of any shape, configurations resolved; fidelity: one that has `outputs`.
-    """
-
-    robot: Robot
-    conditions: Conditions
-    fidelity: Fidelity
-
-    @at_once
-    def shown(self) -> dict[str, jax.Array]:
-        """What the robot's instruments show, by channel, and the codes of how the runs ended as `status`."""
-        outputs, names = self.fidelity.outputs, (*channels.names(self.robot.channels), STATUS)
-        assert outputs is not None
-        return _in_chunks(self.fidelity, lambda flat: outputs(self.robot, flat, names), self.conditions)
-
-    @at_once
-    def result(self) -> Result:
-        """Everything."""
-        return _run(self.fidelity, self.robot, self.conditions, {}, history=False).result
-
-    @at_once
-    def total_mass(self) -> jax.Array:
-        """Mass of robot and payload, stated or the robot's own [kg]."""
-        return total_mass(self.robot, self.conditions)
-
-
-def _run(
-    fidelity: Fidelity, robot: Robot, conditions: Conditions, options: Mapping[str, float], history: bool
-) -> Run:
-    """A batch of any shape."""
-    runs = math.prod(conditions.shape)
-    if history and runs > HISTORIES:
-        raise UsageError(f"history: got {runs} runs; at most {HISTORIES} are kept over time; expected history=False")
-    simulate = fidelity.histories if history else fidelity.run
-    assert simulate is not None
-    if has_tracer((robot, conditions)):
-        return _shaped(simulate(robot, _flat(conditions), options), conditions.shape)
-    return _in_chunks(fidelity, lambda flat: simulate(robot, flat, options), conditions)
-
-
-T = TypeVar("T")
-
-
-def _in_chunks(fidelity: Fidelity, function: Callable[[Conditions], T], conditions: Conditions) -> T:
-    """What a function of conditions of shape (runs,) gives, of the shape that the conditions have.
-
-    More runs than a fidelity takes at once go in chunks of one size, which share a compilation; the last one ends
-    with the last run. Few are filled up (`Facts.filled`), by NumPy, for which nothing is compiled; else nothing is
-    dispatched leaf by leaf: at 262 144 runs that took twenty times as long as the equations.
-    """
-    size = fidelity.facts.at_once(jax.default_backend() != "cpu")
-    runs = math.prod(conditions.shape)
-    filled = min(fidelity.facts.filled(runs), size)
-    if 0 < runs < filled:
-        rows = np.minimum(np.arange(filled), runs - 1)  # the last ones stand for the last run again
-        found = function(jax.device_put(jax.tree.map(lambda x: np.ravel(x)[rows], conditions)))
-        return jax.device_put(
-            jax.tree.map(lambda x: np.asarray(x)[:runs].reshape((*conditions.shape, *x.shape[1:])), found)
-        )
-    flat = _flat(conditions)
-    if runs <= size:
-        return _shaped(function(flat), conditions.shape)
-    parts = [function(_rows(flat, np.asarray(first), size)) for first in range(0, runs, size)]
-    return _shaped(_joined(parts, runs), conditions.shape)
-
-
-def _flat(conditions: Conditions) -> Conditions:
-    """Conditions of shape (runs,)."""
-    return conditions if len(conditions.shape) == 1 else _raveled(conditions)
-
-
-@compiled
-def _raveled(conditions: Conditions) -> Conditions:
-    return jax.tree.map(jnp.ravel, conditions)
-
-
-def _shaped(tree: T, shape: tuple[int, ...]) -> T:
-    """A tree whose leaves have a leading axis of runs, with that axis in a batch's own shape."""
-    return tree if len(shape) == 1 else _reshaped(tree, shape)
-
-
-@compiled
-def _reshaped(tree: T, shape: tuple[int, ...]) -> T:
-    return jax.tree.map(lambda x: jnp.reshape(x, shape + x.shape[1:]), tree)
-
-
-@compiled
-def _rows(conditions: Conditions, first: np.ndarray, size: int) -> Conditions:
-    """So many runs from the first on, or the last ones where there are not as many left."""
-    return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, size), conditions)
-
-
-@compiled
-def _joined(parts: list[T], runs: int) -> T:
-    """Chunks of one size one after another, the last one's beginning left out where it repeats the one before."""
-    return jax.tree.map(lambda *x: jnp.concatenate([*x[:-1], x[-1][(len(x) * len(x[-1]) - runs) :]]), *parts)
 
 
 def _check_robot(robot: Robot) -> None:
@@ -344,19 +238,6 @@ def _resolved(robot: Robot, conditions: Conditions) -> Conditions:
         known = ", ".join(f"{k} ({name})" for k, name in enumerate(names))
         raise UsageError(f"configuration{wrong[0]}: got {wrong[1]:g}; expected one of {known}")
     return conditions
-
-
-def total_mass(robot: Robot, conditions: Conditions) -> jax.Array:
-    """Mass of robot and payload, stated or the robot's own [kg]."""
-    if conditions.total_mass is not None:
-        return conditions.total_mass
-    own = tuple(chassis.mass for chassis in robot.configurations.members)
-    return _own_mass(own, conditions.configuration, conditions.payload)
-
-
-@compiled
-def _own_mass(own: tuple[Scalar, ...], configuration: jax.Array | np.ndarray, payload: jax.Array) -> jax.Array:
-    return jnp.stack([jnp.asarray(mass) for mass in own])[configuration] + payload
 
 
 def _check_conditions(conditions: Conditions) -> None:

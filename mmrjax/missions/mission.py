@@ -8,7 +8,7 @@ events that the steps land on, and derivatives pass through the moments at which
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -219,56 +219,87 @@ def mission(
         of the profile, through stops and reversals; at a limit that begins to act they are those of one side.
     """
     begin, law = Start() if start is None else start, law_of(conditions, profile)
-    names, highest = list(law.TOTALS), len(law.PEAKS)
-    dtype = jnp.result_type(conditions.voltage, profile.time)
-    y0 = initial_unknowns(law, robot, conditions, begin).astype(dtype) / law.units(robot).astype(dtype)
-    q0 = jnp.zeros(len(names), dtype)
-    whole, false = jnp.asarray(0), jnp.asarray(False)
+    nothing = jnp.full(len(law.PEAKS), -jnp.inf, jnp.result_type(conditions.voltage, profile.time))
+
+    def one(carry: Carry, k: Array) -> tuple[Carry, _Segment]:
+        segment = profile.row(k)
+        fresh = carry._replace(peaks=nothing, flags=jnp.asarray(0))
+        beginning = law.instant(robot, conditions, segment, carry.y.at[law.CLOCK].set(0.0), carry.stands)[0]
+        c = follow(law, robot, conditions, segment, fresh, tolerance, most_steps)
+        ended = _segment_end(law, robot, conditions, segment, carry, c, beginning)
+        carry = c._replace(peaks=jnp.maximum(carry.peaks, c.peaks), flags=carry.flags | ended.flags)
+        return carry, ended
+
+    order = jnp.tile(jnp.arange(profile.segments), profile.cycles)
+    c, each = jax.lax.scan(one, _at_start(law, robot, conditions, begin, nothing, keep), order)
+    return _mission(law, robot, conditions, profile, c, each)
+
+
+class _Segment(NamedTuple):
+    """A segment at its end, as of `Totals` and `Mission`; found: its last instant; kept: steps kept so far."""
+
+    time: Array
+    q: Array
+    rise: Array
+    given: Array
+    peaks: Array
+    status: Array
+    flags: Array
+    found: Any
+    kept: Array
+
+
+def _charge(law: Law, y: Array) -> Array:
+    """Charge taken [C]."""
+    return y[law.DISCHARGE] * law.UNITS[law.DISCHARGE]
+
+
+def _at_start(law: Law, robot: Robot, conditions: Conditions, start: Start, peaks: Array, keep: int) -> Carry:
+    """The state at the beginning of a mission, with room for `keep` steps of its course."""
+    dtype, whole, false = peaks.dtype, jnp.asarray(0), jnp.asarray(False)
+    y0 = initial_unknowns(law, robot, conditions, start).astype(dtype) / law.units(robot).astype(dtype)
+    q0 = jnp.zeros(len(law.TOTALS), dtype)
     buffer = None
     if keep:
         blank = jnp.full((keep, 1), jnp.nan, dtype)
         buffer = (blank * y0, blank * q0, jnp.zeros(keep, bool), jnp.full(keep, -1))
-    carry = Carry(
-        y=y0, q=q0, step=jnp.asarray(FIRST, dtype), stands=jnp.asarray(begin.speed == 0.0), ended=false,
-        below=false, low=jnp.zeros((), dtype), cut_off=false, peaks=jnp.full(highest, -jnp.inf, dtype),
+    return Carry(
+        y=y0, q=q0, step=jnp.asarray(FIRST, dtype), stands=jnp.asarray(start.speed == 0.0), ended=false,
+        below=false, low=jnp.zeros((), dtype), cut_off=false, peaks=peaks,
         flags=whole, events=jnp.full(len(EVENTS), -1.0, dtype), accepted=whole, rejected=whole, failed=false,
         kept=whole, buffer=buffer, slope=jnp.zeros_like(y0),
     )  # fmt: skip
 
-    def charge(y: Array) -> Array:
-        return y[law.DISCHARGE] * law.UNITS[law.DISCHARGE]
 
-    def one(carry: Carry, k: Array) -> tuple[Carry, tuple]:
-        segment = profile.row(k)
-        fresh = carry._replace(peaks=jnp.full(highest, -jnp.inf, dtype), flags=whole)
-        beginning = law.instant(robot, conditions, segment, carry.y.at[law.CLOCK].set(0.0), carry.stands)[0]
-        c = follow(law, robot, conditions, segment, fresh, tolerance, most_steps)
-        found, _, _, asked = law.instant(robot, conditions, segment, c.y, c.stands)
-        status, missed = _ends(law, robot, conditions, segment, found, asked, c.stands)
-        status = jnp.where(c.ended, _ending(c), status)
-        slips = law.over(robot, found)["slips"] & ~c.stands
-        flags = c.flags | mask({"demand_missed": missed & ~c.ended, "slips": slips})
-        rise = law.stored(robot, found) - law.stored(robot, beginning)
-        drawn, returned = (c.q[names.index(name)] for name in ("drawn", "returned"))
-        before, after = (robot.battery.energy(charge(x.y)) for x in (carry, c))
-        given = jnp.where(conditions.battery > 0.5, after - before, drawn - returned)
-        ran = ~carry.ended
-        time, rise, given = (jnp.where(ran, x, 0.0) for x in (c.y[law.CLOCK], rise, given))
-        out = (time, jnp.where(ran, c.q, 0.0), rise, given, c.peaks, status, flags, found, c.kept)
-        carry = c._replace(peaks=jnp.maximum(carry.peaks, c.peaks), flags=carry.flags | flags)
-        return carry, out
+def _segment_end(
+    law: Law, robot: Robot, conditions: Conditions, segment: Profile, before: Carry, c: Carry, beginning: Any
+) -> _Segment:
+    """A segment at its end `c`, of the state `before` it and its first instant."""
+    found, _, _, asked = law.instant(robot, conditions, segment, c.y, c.stands)
+    status, missed = _ends(law, robot, conditions, segment, found, asked, c.stands)
+    status = jnp.where(c.ended, _ending(c), status)
+    slips = law.over(robot, found)["slips"] & ~c.stands
+    flags = c.flags | mask({"demand_missed": missed & ~c.ended, "slips": slips})
+    rise = law.stored(robot, found) - law.stored(robot, beginning)
+    drawn, returned = (c.q[list(law.TOTALS).index(name)] for name in ("drawn", "returned"))
+    first, last = (robot.battery.energy(_charge(law, x.y)) for x in (before, c))
+    given = jnp.where(conditions.battery > 0.5, last - first, drawn - returned)
+    ran = ~before.ended
+    time, rise, given = (jnp.where(ran, x, 0.0) for x in (c.y[law.CLOCK], rise, given))
+    return _Segment(time, jnp.where(ran, c.q, 0.0), rise, given, c.peaks, status, flags, found, c.kept)
 
-    order = jnp.tile(jnp.arange(profile.segments), profile.cycles)
-    c, (time, q, rise, given, peaks, status, flags, found, kept) = jax.lax.scan(one, carry, order)
+
+def _mission(law: Law, robot: Robot, conditions: Conditions, profile: Profile, c: Carry, ends: _Segment) -> Mission:
+    """The mission of its last state `c` and the ends of its segments, (cycles · segments, ...)."""
     shape = (profile.cycles, profile.segments)
-    totals = {n: q[:, i].reshape(shape) for i, n in enumerate(names)}
-    each = Totals(time.reshape(shape), totals, rise.reshape(shape), given.reshape(shape))
-    total = jax.tree.map(jnp.sum, each)
+    totals = {n: ends.q[:, i].reshape(shape) for i, n in enumerate(law.TOTALS)}
+    each = Totals(ends.time.reshape(shape), totals, ends.rise.reshape(shape), ends.given.reshape(shape))
+    total, status = jax.tree.map(jnp.sum, each), ends.status
     bad = (status == STALLED) | (status == SLIDES) | (status == ROLLS_BACK) | (status == TIPS)
     first = jnp.argmax(bad)
     outcome = jnp.where(jnp.any(bad), status[first], CONVERGED)
     outcome = jnp.where(c.ended, _ending(c), outcome)
-    end = jax.tree.map(lambda x: x[-1], found)
+    end = jax.tree.map(lambda x: x[-1], ends.found)
     answer = withhold(law.RESULT(robot, end, outcome), outcome != FAILED, outcome != FAILED)
     answer = dataclasses.replace(answer, flags=c.flags)
 
@@ -277,13 +308,13 @@ def mission(
         return {name: signs.get(name, 1.0) * x[..., i] for i, name in enumerate(law.PEAKS)}
 
     course = None
-    if buffer is not None:
-        course = _course(law, robot, conditions, profile, c, each, kept)
+    if c.buffer is not None:
+        course = _course(law, robot, conditions, profile, c, each, ends.kept)
     winding, housing = _temperatures(law, c.y)
     return Mission(
-        total=total, segments=each, peaks=named(c.peaks), segment_peaks=named(peaks.reshape(*shape, -1)),
-        status=status.reshape(shape), flags=flags.reshape(shape), result=answer,
-        temperature_winding=jnp.max(winding), temperature_housing=jnp.max(housing), discharge=charge(c.y),
+        total=total, segments=each, peaks=named(c.peaks), segment_peaks=named(ends.peaks.reshape(*shape, -1)),
+        status=status.reshape(shape), flags=ends.flags.reshape(shape), result=answer,
+        temperature_winding=jnp.max(winding), temperature_housing=jnp.max(housing), discharge=_charge(law, c.y),
         steps=c.accepted + c.rejected, rejected=c.rejected,
         course=course,
     )  # fmt: skip

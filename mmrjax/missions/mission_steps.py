@@ -273,36 +273,116 @@ def follow(
     most: int,
 ) -> Carry:
     """One segment: steps until its end, or until the mission has."""
-    clock = law.CLOCK
     length = (segment.time[1] - segment.time[0]).astype(carry.y.dtype)
-    first, nearly = carry.accepted + carry.rejected, length * (1 - 1e-12 if carry.y.dtype == float else 1 - 1e-6)
     limit = step_longest(robot, otherwise)
-    longest = jnp.inf if limit is None else limit
-
-    def rates(y: Array, stands: Array) -> tuple[Array, Array]:
-        _, dy, dq, _ = law.instant(robot, otherwise, segment, y, stands)
-        return dy, dq
-
-    def left_below(c: Carry) -> Array:
-        """How much longer the cells may stay below their cut-off [s]."""
-        return jnp.where(c.below, robot.battery.delay_cutoff - c.low, jnp.inf)
+    leg = _Leg(law, robot, otherwise, segment, tolerance, length, jnp.inf if limit is None else limit)
+    first, nearly = carry.accepted + carry.rejected, length * (1 - 1e-12 if carry.y.dtype == float else 1 - 1e-6)
 
     def going(c: Carry) -> Array:
-        return (c.y[clock] < nearly) & ~c.ended & (c.accepted + c.rejected - first < most)
+        return (c.y[law.CLOCK] < nearly) & ~c.ended & (c.accepted + c.rejected - first < most)
 
     def turn(c: Carry) -> Carry:
-        to_end, to_trip = length - c.y[clock], left_below(c)
+        tried = leg.tried(c)
+        return leg.after(c, tried.h, tried.good, leg.landed(c, tried))
+
+    c = jax.lax.while_loop(going, turn, leg.begin(carry))
+    failed = c.failed | ((c.y[law.CLOCK] < nearly) & ~c.ended)
+    return c._replace(failed=failed, ended=c.ended | failed)
+
+
+class _Tried(NamedTuple):
+    """A step before it is known whether it counts.
+
+    Attributes:
+        y, q: unknowns and integrals at its end; h: its length [s]; last: True if it ends the segment or trips.
+        good: its error is small enough; grown: the length that its error allows next [s].
+    """
+
+    y: Array
+    q: Array
+    h: Array
+    last: Array
+    good: Array
+    grown: Array
+
+
+class _Landed(NamedTuple):
+    """A step with the event that it lands on.
+
+    Attributes:
+        y, q, stands, below, low: as of `Carry`, at its end; which: the event, -1 for none.
+        cut_off: the cells stayed below their cut-off; after: functions of events at the end of the step tried.
+        taken: the step counts; event: it lands on an event; step: length of the next one [s].
+    """
+
+    y: Array
+    q: Array
+    stands: Array
+    below: Array
+    low: Array
+    which: Array
+    cut_off: Array
+    after: Array
+    taken: Array
+    event: Array
+    step: Array
+
+
+class _Leg(NamedTuple):
+    """One segment of a mission, with its length and the longest step [s]."""
+
+    law: Law
+    robot: Robot
+    otherwise: Conditions
+    segment: Profile
+    tolerance: Scalar
+    length: Array
+    longest: Array | float
+
+    def begin(self, carry: Carry) -> Carry:
+        """The state at the beginning of the segment."""
+        law, robot, otherwise, segment, *_ = self
+        # The segment's beginning may have taken away what held the robot.
+        y = carry.y.at[law.CLOCK].set(0.0)
+        asked = law.asked_at(robot, otherwise, segment, y, carry.stands)
+        stands = carry.stands & (_firm(law, asked, y, carry.stands) >= 0)
+        # And it may have lifted the cells above their cut-off, or pressed them below.
+        below = jnp.asarray(_cell_above(law, asked, y, stands) < 0)
+        low = jnp.where(below & carry.below, carry.low, 0.0)
+        step = jnp.minimum(jnp.asarray(FIRST, y.dtype), self.longest)
+        events = events_of(law, robot, otherwise, segment, y, stands, below)
+        cut_off = carry.cut_off | _stayed_below(robot, below, low)
+        begin = carry._replace(
+            y=y, q=jnp.zeros_like(carry.q), step=step, stands=stands, below=below, low=low, cut_off=cut_off,
+            ended=carry.ended | cut_off, events=events,
+        )  # fmt: skip
+        return begin._replace(slope=law.instant(robot, otherwise, segment, y, stands)[1])
+
+    def tried(self, c: Carry) -> _Tried:
+        """A step of the length that is planned, at most to the segment's end or to the cut-off of the cells."""
+        law, robot, otherwise, segment, *_ = self
+
+        def rates(y: Array) -> tuple[Array, Array]:
+            _, dy, dq, _ = law.instant(robot, otherwise, segment, y, c.stands)
+            return dy, dq
+
+        to_end = self.length - c.y[law.CLOCK]
+        to_trip = jnp.where(c.below, robot.battery.delay_cutoff - c.low, jnp.inf)
         left, trips = jnp.minimum(to_end, to_trip), to_trip < to_end
         last = c.step >= left * (1 - 1e-9)
         h = jnp.where(last, left, jax.lax.stop_gradient(c.step))
-        y, q, u, _ = stages(functools.partial(rates, stands=c.stands), c.y, c.q, h, looped=law.LONG)
-        y = y.at[clock].set(jnp.where(last & ~trips, length, y[clock]))
-        scale = tolerance * (1 + jnp.maximum(jnp.abs(c.y), jnp.abs(y)))
+        y, q, u, _ = stages(rates, c.y, c.q, h, looped=law.LONG)
+        y = y.at[law.CLOCK].set(jnp.where(last & ~trips, self.length, y[law.CLOCK]))
+        scale = self.tolerance * (1 + jnp.maximum(jnp.abs(c.y), jnp.abs(y)))
         size = law.norm(u[-1] / scale)
         size = jax.lax.stop_gradient(jnp.where(jnp.isfinite(size), size, 1e6))
-        good = size <= 1
         grown = h * jnp.clip(0.9 * jnp.maximum(size, 1e-12) ** -0.25, 0.1, 6.0)
-        # Events: steps land on the first of them.
+        return _Tried(y, q, h, last, size <= 1, grown)
+
+    def landed(self, c: Carry, tried: _Tried) -> _Landed:
+        """The step, on the first event in it if there is one."""
+        law, robot, otherwise, segment, *_ = self
+        y, q, h, last, good, grown = tried
         after = events_of(law, robot, otherwise, segment, y, c.stands, c.below)
         happened = after > 0
         between = happened & (c.events < 0)
@@ -322,7 +402,13 @@ def follow(
         step = jnp.where(taken, jnp.where(last, jnp.maximum(grown, c.step), grown), grown)
         step = jnp.where(good & far, h * jnp.clip(jnp.min(share), 0.02, 0.99), step)
         step = jnp.where(event, FIRST, step)
-        step = jnp.clip(jax.lax.stop_gradient(step), SHORTEST, longest)
+        step = jnp.clip(jax.lax.stop_gradient(step), SHORTEST, self.longest)
+        return _Landed(y, q, stands, below, low, which, cut_off, after, taken, event, step)
+
+    def after(self, c: Carry, h: Array, good: Array, landed: _Landed) -> Carry:
+        """The state after a step of length h [s], with what it adds to peaks, flags and the course."""
+        law, robot, otherwise, segment, *_ = self
+        y, stands, below, taken, cut_off = landed.y, landed.stands, landed.below, landed.taken, landed.cut_off
         found, dy, _, _ = law.instant(robot, otherwise, segment, y, stands)
         # Current and heat may be largest within the step. Not so speeds: at the end of a long step their slopes are
         # those of what is stiff in them, and a cubic would swing.
@@ -333,39 +419,21 @@ def follow(
         hot = taken & (within["temperature"] > robot.motor.temperature_limit)
         flags = _flags(law, robot, found, cut_off) | mask({"too_hot": hot})
         failed = c.failed | (~good & (h <= SHORTEST))
-        ended = c.ended | cut_off | (which == EMPTY) | failed
+        ended = c.ended | cut_off | (landed.which == EMPTY) | failed
         now = (robot, otherwise, segment, y, stands, below)
-        events_now = rarely(event, functools.partial(events_of, law), now, jnp.where(taken, after, c.events))
+        unchanged = jnp.where(taken, landed.after, c.events)
+        events_now = rarely(landed.event, functools.partial(events_of, law), now, unchanged)
         kept, buffer = c.kept, c.buffer
         if buffer is not None:
             at = jnp.where(taken, kept, buffer[0].shape[0])  # beyond the end: dropped
-            row = (y, q, stands, jnp.where(cut_off, MARKS.index("cut_off"), which))
+            row = (y, landed.q, stands, jnp.where(cut_off, MARKS.index("cut_off"), landed.which))
             buffer = tuple(b.at[at].set(r, mode="drop") for b, r in zip(buffer, row, strict=True))
         return Carry(
-            y=y, q=q, step=step, stands=stands, ended=ended, below=below, low=low, cut_off=cut_off, peaks=peaks,
-            flags=c.flags | flags,
+            y=y, q=landed.q, step=landed.step, stands=stands, ended=ended, below=below, low=landed.low,
+            cut_off=cut_off, peaks=peaks, flags=c.flags | flags,
             events=events_now, accepted=c.accepted + taken, rejected=c.rejected + ~taken, failed=failed,
             kept=kept + taken, buffer=buffer, slope=dy,
         )  # fmt: skip
-
-    # The segment's beginning may have taken away what held the robot.
-    y = carry.y.at[clock].set(0.0)
-    asked = law.asked_at(robot, otherwise, segment, y, carry.stands)
-    stands = carry.stands & (_firm(law, asked, y, carry.stands) >= 0)
-    # And it may have lifted the cells above their cut-off, or pressed them below.
-    below = jnp.asarray(_cell_above(law, asked, y, stands) < 0)
-    low = jnp.where(below & carry.below, carry.low, 0.0)
-    step = jnp.minimum(jnp.asarray(FIRST, y.dtype), longest)
-    events = events_of(law, robot, otherwise, segment, y, stands, below)
-    cut_off = carry.cut_off | _stayed_below(robot, below, low)
-    begin = carry._replace(
-        y=y, q=jnp.zeros_like(carry.q), step=step, stands=stands, below=below, low=low, cut_off=cut_off,
-        ended=carry.ended | cut_off, events=events,
-    )  # fmt: skip
-    begin = begin._replace(slope=law.instant(robot, otherwise, segment, y, stands)[1])
-    c = jax.lax.while_loop(going, turn, begin)
-    failed = c.failed | ((c.y[clock] < nearly) & ~c.ended)
-    return c._replace(failed=failed, ended=c.ended | failed)
 
 
 def _stayed_below(robot: Robot, below: Array, low: Array) -> Array:

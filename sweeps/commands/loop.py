@@ -24,6 +24,7 @@ from calibration.discovery.settings import fewest_replicates
 from calibration.inference import blocks, observers, priors
 from calibration.inference.simulation_errors import OF_SIZE
 from calibration.words import loop_words as said_of
+from calibration.words.note_words import in_words
 from calibration.words.step_words import expected
 from sweeps import config as configuration
 from sweeps.console import pulse, say, tell
@@ -104,16 +105,11 @@ def _loop(
                 )  # fmt: skip
         except KeyboardInterrupt as ended:
             if isinstance(ended, OutOfTime):
-                more = max(5, math.ceil((within or 0.0) / 30))  # twice as much
-                first = "" if stages else f", nor a fit of the base model; give it more, as --within {more}min"
-                tell(f"no verdict within {within:g} s{first}")
+                _say_out_of_time(within or 0.0, begun=bool(stages))
             _say_kept(stages, folder, config.robot)
             raise
         if config.resolve:
-            found = dataclasses.replace(found, resolved=resolve(
-                found, noise=config.noise or None, population=config.population, generations=config.generations,
-                members=members, seed=config.seed, tell=progress,
-            ))  # fmt: skip
+            found = _resolved(found, config, members, progress)
         print_discovery(found)
         if config.resolve and found.resolved is None:
             say("The track model was not asked: nothing remains in slip, track or ground that it has a say in.")
@@ -123,6 +119,24 @@ def _loop(
         manifest = {"seed": config.seed, "verdict": found.verdict}
         shown = page("loop", found, robot_name=config.robot)
         return leave(folder, config, manifest, solved=found.converged, page=shown, runs=found.runs)
+
+
+def _resolved(
+    found: DiscoveryResult, config: configuration.Loop, members: Path | None, progress: Callable[[str], None]
+) -> DiscoveryResult:
+    """The result, with its resistance resolved by the track model."""
+    resolved = resolve(
+        found, noise=config.noise or None, population=config.population, generations=config.generations,
+        members=members, seed=config.seed, tell=in_words(progress),
+    )  # fmt: skip
+    return dataclasses.replace(found, resolved=resolved)
+
+
+def _say_out_of_time(within: float, begun: bool) -> None:
+    """Say that time was out before a verdict [s]; `begun`: a stage has ended."""
+    more = max(5, math.ceil(within / 30))  # twice as much
+    first = "" if begun else f", nor a fit of the base model; give it more, as --within {more}min"
+    tell(f"no verdict within {within:g} s{first}")
 
 
 @contextlib.contextmanager
@@ -188,6 +202,39 @@ def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> Non
     tell(f"the best that is known so far is the refit, {folder.partial / REFIT_FILE}")
 
 
+def _effects(found: DiscoveryResult) -> Table:
+    """Table of the effects that were found."""
+    shown = Table(box=None, pad_edge=False)
+    numbers = ("amplitude", "lowers misfit by", "own p")
+    for heading in ("effect", "what is missing", *numbers, "indistinguishable from"):
+        number = heading in numbers
+        shown.add_column(heading, justify="right" if number else "left", no_wrap=number or heading == "effect")
+    for e in found.effects:
+        shown.add_row(
+            said_of.called(found, e), ", or ".join(e.families), said_of.size(e),
+            f"{said_of.misfit(e.score)} ({100 * e.share:.0f} %)", f"{e.p_value:.2g}",
+            said_of.alike(found, e) or "-",
+        )  # fmt: skip
+    return shown
+
+
+def _errors(found: DiscoveryResult) -> Table:
+    """Table of the errors of the robot as stated, of its fits, and of rows held out."""
+    errors = Table(title=f"rms error [% of the {OF_SIZE}]", title_justify="left")
+    for heading in ("", "rows", *(c.label for c in found.channels)):
+        errors.add_column(heading, justify="right" if heading else "left")
+    whens = (0,) if found.refit_alone else (0, 1)
+    when = ("before", "after")
+    lines = {"as stated, nothing fitted": found.errors_as_stated}
+    lines |= {f"{when[k]}, fitted": found.errors[k] for k in whens}
+    for kind, both in found.errors_held_out.items():
+        lines |= {f"{when[k]}, held out by {blocks.in_words(kind)}": both[k] for k in whens}
+    for text, by in lines.items():
+        cells = ("-" if e["rows"] == 0 else f"{e['rms_percent']:.1f}" for e in by.values())
+        errors.add_row(text, f"{max(e['rows'] for e in by.values())}/{len(found.runs)}", *cells)
+    return errors
+
+
 def print_discovery(found: DiscoveryResult) -> None:
     """Verdict, effects, errors and remarks, for a person; the answer and the next step last."""
     first = found.headline
@@ -203,18 +250,7 @@ def print_discovery(found: DiscoveryResult) -> None:
     if rise:
         say(rise)
     if found.effects:
-        shown = Table(box=None, pad_edge=False)
-        numbers = ("amplitude", "lowers misfit by", "own p")
-        for heading in ("effect", "what is missing", *numbers, "indistinguishable from"):
-            number = heading in numbers
-            shown.add_column(heading, justify="right" if number else "left", no_wrap=number or heading == "effect")
-        for e in found.effects:
-            shown.add_row(
-                said_of.called(found, e), ", or ".join(e.families), said_of.size(e),
-                f"{said_of.misfit(e.score)} ({100 * e.share:.0f} %)", f"{e.p_value:.2g}",
-                said_of.alike(found, e) or "-",
-            )  # fmt: skip
-        say(shown)
+        say(_effects(found))
         say(
             "lowers misfit by: rise of χ² without it, all else refitted (share of the excess misfit); own p: among "
             "the strongest of the library"
@@ -227,19 +263,7 @@ def print_discovery(found: DiscoveryResult) -> None:
         say(found.resolved.statement)
         for note in found.resolved.notes:
             say(f"- track model: {note}")
-    errors = Table(title=f"rms error [% of the {OF_SIZE}]", title_justify="left")
-    for heading in ("", "rows", *(c.label for c in found.channels)):
-        errors.add_column(heading, justify="right" if heading else "left")
-    whens = (0,) if found.refit_alone else (0, 1)
-    when = ("before", "after")
-    lines = {"as stated, nothing fitted": found.errors_as_stated}
-    lines |= {f"{when[k]}, fitted": found.errors[k] for k in whens}
-    for kind, both in found.errors_held_out.items():
-        lines |= {f"{when[k]}, held out by {blocks.in_words(kind)}": both[k] for k in whens}
-    for text, by in lines.items():
-        cells = ("-" if e["rows"] == 0 else f"{e['rms_percent']:.1f}" for e in by.values())
-        errors.add_row(text, f"{max(e['rows'] for e in by.values())}/{len(found.runs)}", *cells)
-    say(errors)
+    say(_errors(found))
     if Layout.of(found.robot).crosses_zero:
         shown_fits = {when: by for when, by in found.rms.items() if not (found.refit_alone and "after" in when)}
         say(words.describe_rms(shown_fits))

@@ -23,6 +23,7 @@ from calibration.sensitivity.result import METHODS, NEGLIGIBLE, Points, Sensitiv
 from calibration.sensitivity.study import Study, Supply
 from calibration.sensitivity.uncertain_inputs import Inputs
 from calibration.words import sensitivity_words as words
+from calibration.words.note_words import in_words
 from mmrjax.model.conditions import OF_TURNS
 from mmrjax.model.paper_tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
 from mmrjax.model.power import COULOMB_PER_MAH
@@ -77,7 +78,7 @@ def sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool
     turned: dict[str, Any] = {name: np.full(len(runs), np.mean(ranges[name])) for name in freed}
     refuse(robot, dataclasses.replace(conditions, **turned), config)
     supply = Supply(float(config.battery), config.discharge_mAh * COULOMB_PER_MAH, np.asarray(conditions.adhesion))
-    study = Study(robot, inputs, Points.of(runs), outputs, config.model, config.options, supply, tell)
+    study = Study(robot, inputs, Points.of(runs), outputs, config.model, config.options, supply, in_words(tell))
     with open_folder("sensitivity", config, robot, out, force, runs) as folder:
         found = analyse(study, config.method, config.evaluations, config.seed, candidates)
         folder.write_json("result.json", found.to_json())

@@ -8,7 +8,7 @@ import json
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -22,9 +22,6 @@ from matplotlib.text import Text
 from matplotlib.ticker import LogFormatter, NullFormatter, ScalarFormatter
 
 from mmrjax.model.channels import Channel
-
-if TYPE_CHECKING:
-    from matplotlib.typing import RcKeyType
 
 WIDTH = 10.0  # inches, the width of the page's text
 INK, FAINT = "#222222", "#8a8a8a"
@@ -43,7 +40,7 @@ def axis_label(channel: Channel) -> str:
     return f"{channel.label} [{channel.unit}]"
 
 
-_RC: dict[RcKeyType, Any] = {
+_RC: dict[Any, Any] = {
     "font.family": "DejaVu Sans",  # comes with matplotlib; browsers without it have Verdana, of the same widths
     "font.size": 9.5,
     "axes.titlesize": 10,

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -29,9 +29,6 @@ from sweeps.pages.figure_style import (
 )
 from sweeps.pages.sweep_figures import UNITS, imposed
 from sweeps.pages.words import short_name
-
-if TYPE_CHECKING:
-    from sweeps.pages.loop_page import Change
 
 #: Effects on the ladder and on the map of look-alikes.
 RUNGS, ALIKE = 20, 14
@@ -288,6 +285,21 @@ def depends_on(table: dict[str, np.ndarray], change: np.ndarray) -> tuple[np.nda
     whole = {k: v for k, v in every.items() if np.isfinite(v[use]).all()}
     label = min(whole, key=lambda k: roughness(whole[k][use], change[use]))
     return whole[label], label
+
+
+@dataclasses.dataclass(frozen=True)
+class Change:
+    """Change of the readings of the runs by an effect of the robot that is written.
+
+    Attributes:
+        channel: the one that it changes most; rms: by how much [% of its measured rms].
+        without, with_it: simulated without and with it, all else alike [SI], shape (rows,).
+    """
+
+    channel: Channel
+    rms: float
+    without: np.ndarray
+    with_it: np.ndarray
 
 
 def laws(found: DiscoveryResult, table: dict[str, np.ndarray], changes: Mapping[str, Change]) -> Figure:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from calibration.words import loop_words as words
 from calibration.words.note_words import sentence
 from mmrjax.effects import BY_NAME
 from mmrjax.model import params
-from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 from sweeps.pages import cluster_figures, loop_figures
 from sweeps.pages.page import Album, columns, conditions, curves, first_rows, render, words_shown
@@ -72,7 +70,7 @@ def alike(found: DiscoveryResult) -> list[str]:
     return [*(words.alike(found, e) for e in found.effects), *without_name]
 
 
-def findings(found: DiscoveryResult, changed: Mapping[str, Change]) -> list[dict[str, str]]:
+def findings(found: DiscoveryResult, changed: Mapping[str, loop_figures.Change]) -> list[dict[str, str]]:
     """Each effect of the model for the first screen: what it is, how large, how sure, what else it could be."""
     listed = []
     for e in found.effects:
@@ -84,22 +82,7 @@ def findings(found: DiscoveryResult, changed: Mapping[str, Change]) -> list[dict
     return listed
 
 
-@dataclasses.dataclass(frozen=True)
-class Change:
-    """What an effect of the robot that is written changes in the readings of the runs.
-
-    Attributes:
-        channel: the one that it changes most; rms: by how much [% of its measured rms].
-        without, with_it: simulated without and with it, all else alike [SI], shape (rows,).
-    """
-
-    channel: Channel
-    rms: float
-    without: np.ndarray
-    with_it: np.ndarray
-
-
-def changes(found: DiscoveryResult) -> dict[str, Change]:
+def changes(found: DiscoveryResult) -> dict[str, loop_figures.Change]:
     """What each effect changes in settled runs; nothing of histories, and of effects that the written robot lacks."""
     added = [e.name for e in found.effects if e.name in {x.name for x in found.robot.effects}]
     if not isinstance(found.detail, EquationDefects) or not added:
@@ -118,7 +101,7 @@ def changes(found: DiscoveryResult) -> dict[str, Change]:
             a, b = without[c.name], with_it[c.name]
             size = root_mean_square(measured[found.included, k])
             if np.isfinite(size) and size > 0:
-                moved.append(Change(c, 100 * root_mean_square((b - a)[found.included]) / size, a, b))
+                moved.append(loop_figures.Change(c, 100 * root_mean_square((b - a)[found.included]) / size, a, b))
         if moved:
             most[name] = max(moved, key=lambda change: change.rms)
     return most

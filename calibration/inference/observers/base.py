@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,9 +25,6 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
 
-if TYPE_CHECKING:
-    from calibration.discovery.adequacy import Diagnosis
-
 
 @dataclasses.dataclass(frozen=True)
 class SearchPolicy:
@@ -44,6 +41,47 @@ class SearchPolicy:
     steps: int = 60
     searches: int = 16
     one_by_one: bool = True
+
+
+class CurveScores(Protocol):
+    """Scores of the curves that a fit leaves: as normal deviates, and what each explains [σ²]; shape (families,)."""
+
+    @property
+    def curve(self) -> Array: ...
+
+    @property
+    def explained(self) -> Array: ...
+
+
+class Statistics(Protocol):
+    """Strongest statistics of a fit; `white` measures the memory of its residuals."""
+
+    @property
+    def white(self) -> Any: ...
+
+
+class AdequacyTest(Protocol):
+    """Test of whether a fit leaves something, by kind of statistic."""
+
+    @property
+    def found(self) -> Statistics: ...
+
+    def p(self, kind: str) -> float: ...
+
+    def threshold(self, kind: str) -> float: ...
+
+
+class Diagnosis(Protocol):
+    """What an observer reads of a fit and of what it leaves, see `discovery.adequacy.Diagnosis`."""
+
+    @property
+    def linear(self) -> Linearization: ...
+
+    @property
+    def scores(self) -> CurveScores: ...
+
+    @property
+    def test(self) -> AdequacyTest: ...
 
 
 class Observer(eqx.Module):

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -23,7 +23,7 @@ from calibration.inference.details import EquationDefects
 from calibration.inference.fit_notes import Note, Repeats
 from calibration.inference.linearization import Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
-from calibration.inference.observers.base import Observer, SearchPolicy
+from calibration.inference.observers.base import Diagnosis, Observer, SearchPolicy
 from calibration.inference.optimizers import Member, Numbers, Optimum, counted, penalties, searches_refilled
 from calibration.inference.problem import Data, Observation, Problem
 from calibration.inference.repeats import same_conditions
@@ -41,9 +41,6 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import FAILED, SLIDES, TIPS, Result, Signals
-
-if TYPE_CHECKING:
-    from calibration.discovery.adequacy import Diagnosis
 
 #: Column that a brake or a weight may set, so that a reading is a condition.
 LOAD = "output_torque_Nm"

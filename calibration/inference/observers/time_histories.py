@@ -13,7 +13,7 @@ import re
 import threading
 import warnings
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -42,7 +42,7 @@ from calibration.inference.linearization import (
 )
 from calibration.inference.noise import Noise
 from calibration.inference.observers import settled_ends
-from calibration.inference.observers.base import Observer, SearchPolicy
+from calibration.inference.observers.base import Diagnosis, Observer, SearchPolicy
 from calibration.inference.optimizers import (
     CORES,
     Evaluate,
@@ -88,9 +88,6 @@ from mmrjax.model.rig import Begin, Begins, Rig
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, FAILED, Signals, State
 from mmrjax.numerics.linear_equations import solved
-
-if TYPE_CHECKING:
-    from calibration.discovery.adequacy import Diagnosis
 
 #: Most knots of a run's defect in time, and most of knots times steps of all runs: 2 GB while they are computed.
 KNOTS, KNOT_STEPS = 256, 1e7
@@ -405,84 +402,14 @@ class Histories(Observer):
         the values of its term. What an effect remembers follows from the run too. Between two instants its change of
         a reading is on a straight line.
         """
-        others = dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor")
-        entered = tuple(probe(b) for b in others if b not in {p.balance for p in probes})
-        every, size = (*probes, *entered), len(probes)
-        effects = tuple(shaped_as_in(robot, e) for e in effects)
-        counts, places = np.array([len(e.at) for e in effects], int), [p.balance for p in every]
-        entering = np.array([places.index(b) if (b := e.effect.balance) in places else 0 for e in effects], int)
-        entering = np.repeat(entering, counts)
-        enters = np.repeat([1.0 * (e.effect.balance in places) for e in effects], counts)
-        shown = channels.names(robot.channels)
-        at_sensor = np.array([[e.effect.channel == c for e in effects] for c in shown], float)
-        at_sensor = np.repeat(at_sensor, counts, 1) if effects else np.zeros((len(shown), 0))
+        every = _Probed.of(robot, probes, effects)
         clock = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.knots]]
-
-        def probed(amplitude: Array) -> Robot:
-            put = tuple(eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(every, amplitude, strict=True))
-            return dataclasses.replace(robot, effects=(*robot.effects, *put))
-
-        none = jnp.zeros(len(every))
-
-        def one(
-            conditions: Conditions, clock: Array, instants: Array, along: Followed, times: Array, time: Array
-        ) -> tuple[Array, Array]:
-            # A run that ended early repeats its last knot; only the first of them is one.
-            real = jnp.concatenate([jnp.ones(1), (jnp.diff(clock) > 0).astype(clock.dtype)])
-            before = jnp.concatenate([clock[:1], clock[:-1]])
-            after = jnp.concatenate([clock[1:], clock[-1:] + 1.0])
-            remembered = _remembered(robot, conditions, along, effects)
-
-            def hat(t: Array) -> Array:
-                rising = ((t - before) / jnp.maximum(clock - before, 1e-12)).at[0].set(1.0)
-                falling = jnp.where(after > clock, (after - t) / jnp.where(after > clock, after - clock, 1.0), 1.0)
-                return real * jnp.clip(jnp.minimum(rising, falling), 0.0, 1.0)
-
-            def terms(t: Array, y: Array, held: Conditions, way: Array | None = None) -> Array:
-                signals = moving(robot, held, state_of(robot, y), way)
-                return terms_of(robot, signals, effects, remembered(t))
-
-            def both(by_probes: Array, t: Array, term: Array) -> Array:
-                """Changes by defects of all knots and by every instance, by the change by each probe."""
-                knots = (by_probes[:, :size, None] * hat(t)).reshape(len(by_probes), -1)
-                return jnp.concatenate([knots, by_probes[:, entering] * (enters * term)], 1)
-
-            def source(t: Array, y: Array, held: Conditions, way: Array) -> Array:
-                by_probes = jax.jacfwd(lambda a: rates(probed(a), held, y, way))(none)
-                return both(by_probes, t, terms(t, y, held, way))
-
-            def seen(t: Array, y: Array, dy: Array, held: Conditions) -> Array:
-                """By the state, and at once: the current follows from torque where the speed is imposed."""
-
-                def reading(y: Array, amplitude: Array) -> Array:
-                    return _reading(robot, moving(probed(amplitude), held, state_of(robot, y)))
-
-                by_state, at_once = jax.jacfwd(reading, (0, 1))(y, none)
-                term = terms(t, y, held)
-                shows = jnp.concatenate([jnp.zeros((len(by_state), size * len(clock))), at_sensor * term], 1)
-                return by_state @ dy + both(at_once, t, term) + shows
-
-            first, begins = at_first(robot, conditions)
-            by_probes = jax.jacfwd(lambda a: at_first(probed(a), conditions)[1])(none)
-            begun = by_probes[:, entering] * (enters * terms(clock[0], begins, first))
-            unmoved = jnp.concatenate([jnp.zeros((len(begins), size * len(clock))), begun], 1)
-            changed = respond(conditions, along, source, seen, unmoved)
-            whole = jnp.concatenate([seen(clock[0], begins, unmoved, first)[None], changed])
-            knots = whole[instants, :, : size * len(clock)].reshape(len(instants), -1, size, len(clock))
-            mine = whole[:, :, size * len(clock) :]
-            if self.delayed:
-                step, share = robot.rig.before(times, time)
-                by_effects = mine[step] + share[:, None, None] * (mine[step + 1] - mine[step])
-            else:
-                by_effects = mine[instants]
-            return knots.transpose(2, 3, 0, 1), by_effects
-
         rows = jnp.where(self.rows_of < 0, 0, self.rows_of)
         known = self.following(robot).known
         assert known is not None
         # One run after another: each is wide by its knots, and large.
         given = self.conditions, clock, self.instant[rows], known, self.times, self.time[rows]
-        knots, by_effects = jax.lax.map(lambda of_run: one(*of_run), given)
+        knots, by_effects = jax.lax.map(lambda of_run: every.changes(*of_run, delayed=self.delayed), given)
         return jnp.moveaxis(knots, 0, 1), by_effects
 
     def following(self, robot: Robot) -> Histories:
@@ -1175,6 +1102,120 @@ def _responses(
     runs = observe.whole(robot)
     by_reading = signatures.reshape(scale.size, -1)
     return finite(by_reading), finite(defects), observe.at_rows(runs), observe.angle(runs)
+
+
+class _Probed(NamedTuple):
+    """A robot with probes of balances, and the effects that change its readings by them.
+
+    Attributes:
+        every: probes, those of which the defects are wanted first; size: how many these are.
+        effects: with the robot's shapes; entering: number of each instance's probe, shape (instances,).
+        enters: 1 where that balance has a probe, else 0, shape (instances,).
+        at_sensor: 1 where an instance is of a channel's instrument, else 0, shape (channels, instances).
+    """
+
+    robot: Robot
+    every: tuple[Effect, ...]
+    size: int
+    effects: tuple[ScoredEffect, ...]
+    entering: np.ndarray
+    enters: np.ndarray
+    at_sensor: np.ndarray
+
+    @classmethod
+    def of(cls, robot: Robot, probes: tuple[Effect, ...], effects: tuple[ScoredEffect, ...]) -> _Probed:
+        """With further probes for the balances that the effects enter."""
+        others = dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor")
+        entered = tuple(probe(b) for b in others if b not in {p.balance for p in probes})
+        every, size = (*probes, *entered), len(probes)
+        effects = tuple(shaped_as_in(robot, e) for e in effects)
+        counts, places = np.array([len(e.at) for e in effects], int), [p.balance for p in every]
+        entering = np.array([places.index(b) if (b := e.effect.balance) in places else 0 for e in effects], int)
+        entering = np.repeat(entering, counts)
+        enters = np.repeat([1.0 * (e.effect.balance in places) for e in effects], counts)
+        shown = channels.names(robot.channels)
+        at_sensor = np.array([[e.effect.channel == c for e in effects] for c in shown], float)
+        at_sensor = np.repeat(at_sensor, counts, 1) if effects else np.zeros((len(shown), 0))
+        return cls(robot, every, size, effects, entering, enters, at_sensor)
+
+    def at(self, amplitude: Array) -> Robot:
+        """The robot with the probes at amplitudes [units of their balances], shape (probes,)."""
+        put = tuple(eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(self.every, amplitude, strict=True))
+        return dataclasses.replace(self.robot, effects=(*self.robot.effects, *put))
+
+    def changes(
+        self,
+        conditions: Conditions,
+        clock: Array,
+        instants: Array,
+        along: Followed,
+        times: Array,
+        time: Array,
+        *,
+        delayed: bool,
+    ) -> tuple[Array, Array]:
+        """Changes of a run's readings by a defect at each knot, and by each effect.
+
+        Args:
+            clock: times of the knots [s]; instants: numbers of the samples' instants; times: of instants [s].
+            along: the run; time: of samples [s]; delayed: True if readings are late.
+        """
+        robot, size, none = self.robot, self.size, jnp.zeros(len(self.every))
+        remembered, hat = _remembered(robot, conditions, along, self.effects), _hats(clock)
+
+        def terms(t: Array, y: Array, held: Conditions, way: Array | None = None) -> Array:
+            signals = moving(robot, held, state_of(robot, y), way)
+            return terms_of(robot, signals, self.effects, remembered(t))
+
+        def both(by_probes: Array, t: Array, term: Array) -> Array:
+            """Changes by defects of all knots and by every instance, by the change by each probe."""
+            knots = (by_probes[:, :size, None] * hat(t)).reshape(len(by_probes), -1)
+            return jnp.concatenate([knots, by_probes[:, self.entering] * (self.enters * term)], 1)
+
+        def source(t: Array, y: Array, held: Conditions, way: Array) -> Array:
+            by_probes = jax.jacfwd(lambda a: rates(self.at(a), held, y, way))(none)
+            return both(by_probes, t, terms(t, y, held, way))
+
+        def seen(t: Array, y: Array, dy: Array, held: Conditions) -> Array:
+            """By the state, and at once: the current follows from torque where the speed is imposed."""
+
+            def reading(y: Array, amplitude: Array) -> Array:
+                return _reading(robot, moving(self.at(amplitude), held, state_of(robot, y)))
+
+            by_state, at_once = jax.jacfwd(reading, (0, 1))(y, none)
+            term = terms(t, y, held)
+            shows = jnp.concatenate([jnp.zeros((len(by_state), size * len(clock))), self.at_sensor * term], 1)
+            return by_state @ dy + both(at_once, t, term) + shows
+
+        first, begins = at_first(robot, conditions)
+        by_probes = jax.jacfwd(lambda a: at_first(self.at(a), conditions)[1])(none)
+        begun = by_probes[:, self.entering] * (self.enters * terms(clock[0], begins, first))
+        unmoved = jnp.concatenate([jnp.zeros((len(begins), size * len(clock))), begun], 1)
+        changed = respond(conditions, along, source, seen, unmoved)
+        whole = jnp.concatenate([seen(clock[0], begins, unmoved, first)[None], changed])
+        knots = whole[instants, :, : size * len(clock)].reshape(len(instants), -1, size, len(clock))
+        mine = whole[:, :, size * len(clock) :]
+        if delayed:
+            step, share = robot.rig.before(times, time)
+            by_effects = mine[step] + share[:, None, None] * (mine[step + 1] - mine[step])
+        else:
+            by_effects = mine[instants]
+        return knots.transpose(2, 3, 0, 1), by_effects
+
+
+def _hats(clock: Array) -> Callable[[Array], Array]:
+    """For each knot a function of time that is 1 there and falls linearly to 0 at the next ones, shape (knots,)."""
+    # A run that ended early repeats its last knot; only the first of them is one.
+    real = jnp.concatenate([jnp.ones(1), (jnp.diff(clock) > 0).astype(clock.dtype)])
+    before = jnp.concatenate([clock[:1], clock[:-1]])
+    after = jnp.concatenate([clock[1:], clock[-1:] + 1.0])
+
+    def hat(t: Array) -> Array:
+        rising = ((t - before) / jnp.maximum(clock - before, 1e-12)).at[0].set(1.0)
+        falling = jnp.where(after > clock, (after - t) / jnp.where(after > clock, after - clock, 1.0), 1.0)
+        return real * jnp.clip(jnp.minimum(rising, falling), 0.0, 1.0)
+
+    return hat
 
 
 def _remembered(
