@@ -95,8 +95,7 @@ def simulate(
     except ValueError as error:
         raise UsageError(f"model {model}, {error}") from error
     _check_robot(robot)
-    conditions = _resolved(robot, conditions)
-    _check_conditions(conditions)
+    conditions = checked(robot, conditions)
     _check_battery(robot, conditions)
     _check_turning(robot, conditions, profile)
     _check_brake(robot, conditions, profile)
@@ -357,6 +356,17 @@ def total_mass(robot: Robot, conditions: Conditions) -> jax.Array:
 @compiled
 def _own_mass(own: tuple[Scalar, ...], configuration: jax.Array | np.ndarray, payload: jax.Array) -> jax.Array:
     return jnp.stack([jnp.asarray(mass) for mass in own])[configuration] + payload
+
+
+def checked(robot: Robot, conditions: Conditions) -> Conditions:
+    """Conditions with indices of the robot's configurations for names; values are checked unless they are tracers.
+
+    Raises:
+        UsageError: a configuration that the robot lacks, a value out of range or NaN, or values that contradict.
+    """
+    conditions = _resolved(robot, conditions)
+    _check_conditions(conditions)
+    return conditions
 
 
 def _check_conditions(conditions: Conditions) -> None:
