@@ -44,7 +44,7 @@ FLOOR = 0.01
 #: Steps of Newton's method to the current that a voltage drives.
 CURRENT_STEPS = 3
 #: Most steps of the regression, and the relative change of its sum of squares below which it ends; change of a
-#: coordinate for the derivative of the noise, and the change after which that derivative is computed again [prior sd].
+#: coordinate for the derivative of the noise, and the change after which that is computed again [prior sd].
 STEPS, SMALL, STEP, FAR = 10, 1e-3, 1e-4, 0.5
 
 

@@ -70,7 +70,7 @@ def in_double(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def at_once(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorator like `in_double` for functions of concrete numbers, which are computed at once even inside a trace."""
+    """Decorator like `in_double` for functions of concrete numbers, computed at once even inside a trace."""
     double = in_double(function)
 
     @functools.wraps(function)
