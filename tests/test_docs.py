@@ -44,7 +44,12 @@ def test_the_page_of_public_names_says_what_every_function_returns():
     for name in (n for n in mm.__all__ if n.islower() and not n.startswith("_")):
         (section,) = re.findall(rf"^## `mm\.{name}\([^`]* → ([^`]+)`\n\n```text\n(.*?)```", text, re.M | re.S)
         assert section[0] not in ("None", "Any", "<class 'inspect._empty'>") and "Returns" in section[1], name
-    assert [kind.__name__ for kind in site().returned_types()] == ["CalibrationResult", "DiscoveryResult", "Profile", "Runs"]
+    assert [kind.__name__ for kind in site().returned_types()] == [
+        "CalibrationResult",
+        "DiscoveryResult",
+        "Profile",
+        "Runs",
+    ]
     assert "None\n```" not in text  # every member has a docstring
 
 
