@@ -1,4 +1,4 @@
-"""What is said of a fit, of the loop as of a calibration."""
+"""Sentences about a fit, for the loop and for calibrations."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def ended_at_edge(note: fit_notes.EndedAtEdge) -> str:
 
 
 def shown_by(test: fit_notes.Shown) -> str:
-    """What the most telling test shows."""
+    """Result of the most significant test of residuals."""
     whose = f"the residuals of {channels.find(test.channel).label}" if test.channel else ""
     return {
         "": "",
@@ -218,7 +218,7 @@ def _percent(share: float) -> str:
 
 
 def adequacy(found: Adequacy) -> str:
-    """Whether a fit is adequate; opens a calibration's output."""
+    """Verdict on the adequacy of a fit; first line of a calibration's output."""
     if found.obstacle:
         large = "it misses " + _misses([m for m in found.misses if m.large])
         return OBSTACLES[found.obstacle].format(large=large, every=_misses(found.misses))

@@ -266,7 +266,7 @@ def ranking(found: Ranking, most: int = 5) -> list[str]:
 
 
 def so_far(effects: Sequence[str], families: Sequence[str]) -> str:
-    """What a search has found whose verdict is not known yet."""
+    """Findings of a search before its verdict is known."""
     return (
         f"so far, confirmed by simulation: {' and '.join(a(f) for f in dict.fromkeys(families))} "
         f"({' and '.join(effects)}); which claim stands is not tested yet"

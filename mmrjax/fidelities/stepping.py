@@ -89,10 +89,9 @@ def step(robot: Robot, state: State, command: Command, dt: Scalar, conditions: C
         conditions: of one run, scalar fields; None: `Conditions()`.
 
     Raises:
-        UsageError: conditions of several runs, conditions that impose the motors' speed or drive the sides
-            independently, a value out of range or NaN, a configuration that the robot lacks, a command that is no
-            number or names no condition, a state of another robot, or a `dt` that is not above 0. Values are checked
-            unless they are tracers.
+        UsageError: conditions of several runs; conditions that impose the motors' speed or drive the sides
+            independently; a value out of range or NaN; a configuration that the robot lacks; a command that is no
+            number or names no condition; a state of another robot; a `dt` that is not above 0. Tracers pass.
     """
     robot, conditions = _cast((robot, _commanded(robot, command, conditions)))
     y = _vector(robot, state)
