@@ -656,10 +656,6 @@ def _no_number(error: Any) -> str:
     return f"{option.opts[0]}: got no number; expected one without its unit. {told}"
 
 
-#: Longest message, beyond which its middle is left out: an input is quoted in it, and may be of any length.
-LONGEST = 390
-
-
 def _fail(message: str, code: int) -> int:
-    print(f"mmrjax: {shortened(' '.join(message.splitlines()), LONGEST)}", file=sys.stderr)
+    print(f"mmrjax: {shortened(' '.join(message.splitlines()))}", file=sys.stderr)
     return code

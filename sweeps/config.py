@@ -569,8 +569,8 @@ class Calibrate(RobotPart, InferencePart, OutputPart):
     )
     solver: Annotated[str, AfterValidator(_solver)] | None = about(
         None,
-        f"Of the searches, from optimistix ({', '.join(solvers.OF_OPTIMISTIX)}) or optax "
-        f"({', '.join(solvers.OF_OPTAX)}), by exact derivatives",
+        f"Solver of the searches, of optimistix ({', '.join(solvers.OF_OPTIMISTIX)}) or optax "
+        f"({', '.join(solvers.OF_OPTAX)})",
         usual="our Levenberg-Marquardt",
         solver=True,
     )

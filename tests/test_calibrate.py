@@ -570,12 +570,14 @@ def test_a_calibration_is_the_same_where_jax_is_single(measured):
     assert json.dumps(single.to_json()) == json.dumps(double.to_json())
 
 
-def test_a_calibration_is_refused_inside_a_trace_in_single_precision(measured):
+@pytest.mark.parametrize("name", ["calibrate", "discover"])
+def test_a_fit_is_refused_inside_a_trace_in_single_precision(name, measured, robot):
+    fit = getattr(calibration, name)
     with (
         jax.enable_x64(False),
-        pytest.raises(BadConfiguration, match="calibrate: called inside a JAX transformation"),
+        pytest.raises(BadConfiguration, match=f"{name}: called inside a JAX transformation"),
     ):
-        jax.jit(lambda x: quick(measured).objective * x)(1.0)
+        jax.jit(lambda x: fit(measured, robot) and x)(1.0)
 
 
 @pytest.mark.slow

@@ -743,6 +743,13 @@ def test_memory_exhausted_is_one_sentence_and_leaves_nothing(mmrjax, tmp_path, m
     assert "Traceback" not in err and not any(tmp_path.iterdir())
 
 
+def test_a_message_with_long_paths_is_whole(capsys):
+    message = (
+        f"{'/data' * 30}/log.csv: got none; run mmrjax loop {'/data' * 30}/log.csv --robot {'/rigs' * 30}/r.toml, or"
+    )
+    assert cli._fail(message, 4) == 4 and capsys.readouterr().err == f"mmrjax: {message}\n"
+
+
 def test_too_little_memory_is_refused_at_once(mmrjax, tmp_path, monkeypatch):
     import resource
 

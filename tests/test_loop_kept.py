@@ -107,7 +107,7 @@ def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypat
     code, _, err = mmrjax(*rig, "--within", "5min")
     assert at_once == [ends]
     assert ("no verdict within 300 s\n" in err) == (end is OutOfTime)
-    assert code == ends and "kept: verdict; the same command with --out found goes on" in err
+    assert code == ends and "kept: verdict; to continue, run the same command with --out found" in err
     assert "s  verdict: class, iron_loss or windage; next, errors held out and other noises\n" in err  # at once
     assert "verdict: class, iron_loss or windage; errors held out and other noises are outstanding" in err
     assert not (tmp_path / "found").exists()

@@ -198,8 +198,8 @@ BAD = {
     ),
     "never holds": (
         lambda c: c | {"supply_voltage_V": np.round(12 + 6 * np.sin(8 * c["time_s"]), 5)},
-        r"no settled stretch: what is imposed holds for 0\.\d+ s at most \(rows \d+ to \d+\), and 0\.3 s are asked for; "
-        "give the log to the loop as it is, mmrjax loop LOG --robot RIG, or hold each level longer or state --shortest",
+        r"no settled stretch: the longest level has 0\.\d+ s \(rows \d+ to \d+\); expected at least 0\.3 s; "
+        r"use the log itself \(mmrjax loop LOG --robot RIG\), or hold each level longer or state --shortest",
     ),
     "no sign of the duty, levels repeated": (
         lambda c: (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from mmrjax.fidelities.drive import rates as rates_of_unknowns
 from mmrjax.model import paper_robots
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
+from mmrjax.model.signals import State
 
 DT = 0.01
 RUNS = {
@@ -143,6 +145,7 @@ def test_a_robot_rolls_at_first_as_steady_travels(robot):
 
 
 WRONG = {
+    "robot: got str; expected a Robot": dict(robot="nominal"),
     "conditions: got runs of shape (2,); expected one, and jax.vmap over several": dict(
         conditions=mm.Conditions(voltage=[15.0, 24.0])
     ),
@@ -152,16 +155,28 @@ WRONG = {
     "conditions: the motors' speed is imposed; a step needs a voltage or a current": dict(
         command={"motor_speed": 300.0}
     ),
-    "command: got volts; did you mean voltage?": dict(command={"volts": 12.0}),
     "conditions: got dict; expected mmrjax.Conditions(...)": dict(conditions={"voltage": 12.0}),
+    "configuration: got 6T3A; did you mean 6T2A?": dict(conditions=mm.Conditions("6T3A")),
+    "slope_deg: got 95; expected -45 to 45 deg": dict(conditions=mm.Conditions(slope_deg=95.0)),
+    "duty: got nan; expected -1 to 1": dict(command=math.nan),
+    "voltage: got nan; expected -100 to 100 V": dict(command={"voltage": math.nan}),
+    "command: got volts; did you mean voltage?": dict(command={"volts": 12.0}),
+    "command, duty: got 'full'; expected a number": dict(command="full"),
+    "command, duty: got shape (2,); expected one number": dict(command=[0.5, 1.0]),
+    "state: got float; expected one from mmrjax.initial_state": dict(state=0.4),
+    "state: got one of another robot": dict(state=State(0.0, 0.0, 0.0, 0.0, {"thermal_drift": 0.0})),
+    "state: got numbers of shape (2,); expected one state": dict(state=State(0.0, 0.0, np.zeros(2), 0.0)),
+    "dt: got 0.0; expected a number of seconds above 0": dict(dt=0.0),
+    "dt: got nan; expected a number of seconds above 0": dict(dt=math.nan),
+    "dt: got NoneType; expected a number of seconds above 0": dict(dt=None),
 }
 
 
 @pytest.mark.parametrize("message", WRONG)
-def test_wrong_use_is_said(message, robot):
-    given = {"command": 1.0, "conditions": mm.Conditions(), **WRONG[message]}
+def test_wrong_use_of_a_step_is_one_sentence(message, robot):
+    given = {"robot": robot, "state": mm.initial_state(robot), "command": 1.0, "dt": DT, **WRONG[message]}
     with pytest.raises(mm.UsageError) as error:
-        mm.step(robot, mm.initial_state(robot), given["command"], DT, given["conditions"])
+        mm.step(**given)
     assert str(error.value).startswith(message)
 
 

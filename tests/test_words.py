@@ -206,7 +206,7 @@ SAMPLES = [
     ),
     (
         of_fit.EstimatedNoise((("motor_speed", 1.23), ("speed", 4.0))),
-        "no noise was stated for motor speed 1.2 %, speed 4.0 %: estimated from the misfit, so it holds model error too "
+        "no noise was stated for motor speed 1.2 %, speed 4.0 %: estimated from the misfit, so it includes model error "
         "and cannot test whether the model is adequate",
     ),
     (
@@ -731,12 +731,12 @@ def test_what_the_track_model_is_asked_about(about, said):
         (
             Adequacy(False, 812.3, 600.0, 1e-9, Shown(what="stated"), True),
             "Not adequate: the residuals exceed the stated noise (χ² 812.3 on 600 degrees of freedom, p < 1e-6), so "
-            "something is missing and the parameters may absorb it; mmrjax loop finds what",
+            "something is missing and the parameters may absorb it; run mmrjax loop to find it",
         ),
         (
             Adequacy(False, 60.0, 60.0, 0.0021, Shown("motor_speed", "follow", "slope_deg"), False),
             "Not adequate: the residuals of motor speed follow slope_deg (p = 0.0021, the noise estimated from them), "
-            "so something is missing and the parameters may absorb it; mmrjax loop finds what",
+            "so something is missing and the parameters may absorb it; run mmrjax loop to find it",
         ),
         (
             Adequacy(True, 61.0, 60.0, 0.4, Shown(what="repeats"), True),

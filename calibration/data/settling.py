@@ -844,24 +844,24 @@ def _read(runs: Runs, channel: str) -> bool:
 
 def _nothing(found: Settled, loop: str) -> str:
     """Says that a log has no settled stretch, why mostly, and what to do; `loop` is the command that takes it."""
-    direct = "" if found.runs.turns else f"give the log to the loop as it is, {loop}, or "
+    direct = "" if found.runs.turns else f"use the log itself ({loop}), or "
     source, longest = found.runs.source, max(found.stretches, key=lambda s: s.lasts)
     whys = [s.why for s in found.stretches]
     why = max(dict.fromkeys(whys), key=lambda w: sum(s.lasts for s in found.stretches if s.why == w))
     rows = f"rows {longest.rows[0] + 1} to {longest.rows[-1] + 1}"
     if why in ("changes", "short"):
         step = longest.lasts / max(len(longest.rows) - 1, 1)
-        held, asked = f"for {longest.lasts:.3g} s", f"{found.shortest:.3g} s are asked for"
+        held, asked = f"{longest.lasts:.3g} s", f"{found.shortest:.3g} s"
         cure = "hold each level longer or state --shortest"
         if len(longest.rows) < FEWEST or found.shortest > longest.lasts >= LEAST:  # it is the samples that are few
             needed = max(FEWEST, round(found.shortest / step) if step > 0 else FEWEST)
-            held, asked = f"for {counted(len(longest.rows), 'sample')}", f"{needed} are needed"
+            held, asked = counted(len(longest.rows), "sample"), f"{needed}"
             cure = (
                 "log faster, hold each level longer (--shortest states the time, of at least "
                 f"{FEWEST} samples), or remove time_s if each row is a settled run already"
             )
         return (
-            f"{source}: no settled stretch: what is imposed holds {held} at most ({rows}), and {asked}; "
+            f"{source}: no settled stretch: the longest level has {held} ({rows}); expected at least {asked}; "
             f"{direct}{cure}"
         )
     if why in ("settling", "accelerates"):

@@ -18,7 +18,7 @@ import numpy as np
 from calibration.data import own_mass
 from calibration.data.columns import ROWS, SIDES, WHEN
 from calibration.data.effect_file import Library
-from calibration.data.input_errors import BadData
+from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.posterior_file import Posterior
 from calibration.data.runs import Runs
 from calibration.data.thinning import thinned
@@ -101,7 +101,7 @@ from calibration.inference.noise_factor import common_factors, noise_remarks
 from calibration.inference.residual_clusters import residual_clusters
 from calibration.words.note_words import in_words, sentence
 from mmrjax import effects
-from mmrjax.compile.precision import Threads, in_double
+from mmrjax.compile.precision import SINGLE, Threads, in_double, is_double
 from mmrjax.effects import Effect
 from mmrjax.errors import counted
 from mmrjax.model import channels
@@ -165,8 +165,10 @@ def discover(
 
     Raises:
         BadData, BadConfiguration: data that contradict themselves or are too few, priors that cannot be, experiments
-            that are not known.
+            that are not known; or a call inside `jax.jit` where JAX is single.
     """
+    if not is_double():
+        raise BadConfiguration(f"discover: {SINGLE}")
     tell = in_words(progress)
     ready = prepared(
         runs, robot, noise=noise, stated=stated, library=library, replicates=replicates, seed=seed, prefer=prefer,

@@ -1,10 +1,10 @@
-"""Least squares with residuals that count only where they are positive, as a solver of optimistix.
+"""Least-squares solver of optimistix for residuals some of which count only if they are positive.
 
 The objective is ½ Σ r² over the two-sided residuals and the positive one-sided ones. The solver is
-Levenberg-Marquardt, built from optimistix's parts: a descent that finds which one-sided residuals are positive at the
-end of its step, a trust region that predicts with them, and Anderson's mixing between the two. optimistix's own
-Levenberg-Marquardt takes the same residuals cut off at 0. From just inside of an edge its linearisation predicts a
-gain that does not exist, and it then follows the edge in steps of 1e-4.
+Levenberg-Marquardt, built from optimistix's parts: a descent that determines which one-sided residuals are positive
+at the end of its step, a trust region that predicts with them, and Anderson's mixing between the two. The
+Levenberg-Marquardt method of optimistix needs the same residuals clipped at 0. Near the edge of a clipped residual
+its linearisation predicts a gain that does not exist, and it then follows the edge in steps of 1e-4.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from mmrjax.numerics.linear_equations import solved
 
 #: Rejected steps in a row after which a search ends.
 PATIENCE = 12
-#: Shares of the predicted fall of the objective below which a step is rejected and above which the next may be
-#: longer, and by what the length of the next is then multiplied.
+#: Shares of the predicted decrease of the objective: below the first a step is rejected, above the second the next
+#: may be longer. Factors of the length of the next step in these cases.
 LITTLE, NEARLY_ALL = 0.01, 0.75
 SHORTER, LONGER = 0.25, 3.5
-#: Turns in which the one-sided residuals that are positive at the end of a step are found, at most.
+#: Most iterations in which the one-sided residuals that are positive at the end of a step are determined.
 TURNS = 8
-#: Largest step, in prior deviations, that is mixed with the last one, and most of the last one that is mixed in.
+#: Largest step that is mixed with the last one [prior sds], and the largest factor of that mixing.
 NEAR, MIXED_MOST = 0.3, 10.0
 
 Z = Float[Array, " parameters"]
-#: A residual function of optimistix: of y and its arguments, to the residuals and what else the evaluation gives.
+#: Residual function of optimistix: from y and its arguments to residuals and auxiliary output.
 Function = Callable[[Z, Any], tuple[Float[Array, " residuals"], Any]]
 
 
 @jax.custom_jvp
 def with_slope(y: Array, value: Array, slope: Array) -> Array:
-    """Returns `value`, whose derivative by y is `slope`, whatever it was computed from.
+    """Returns `value` with `slope` as its derivative by y.
 
     Args:
         y: shape (n,); value: shape (m,); slope: shape (m, n).
@@ -52,18 +52,18 @@ def _slope(primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Ar
 
 
 def at_known(value: Array, slope: Array, aux: Any = None) -> Function:
-    """A residual function that was evaluated elsewhere, at the one place where it will be called."""
+    """Returns a residual function with a known value and slope at the single point where it will be called."""
     return lambda y, args: (with_slope(y, value, slope), aux)
 
 
 def counted(r: Array, jacobian: Array, one_sided: slice) -> tuple[Array, Array]:
-    """Residuals and Jacobian as they count: the one-sided only where they are positive."""
+    """Returns residuals and Jacobian with zeros for the one-sided residuals that are not positive."""
     counts = jnp.ones(r.shape, bool).at[one_sided].set(r[one_sided] > 0)
     return jnp.where(counts, r, 0.0), jnp.where(counts[:, None], jacobian, 0.0)
 
 
 def half_squares(r: Array, one_sided: slice) -> Float[Array, ""]:
-    """The objective, half the sum of the squared residuals that count."""
+    """Returns the objective, half the sum of the squared residuals that count."""
     return 0.5 * jnp.sum(r.at[one_sided].set(jnp.maximum(r[one_sided], 0.0)) ** 2)
 
 
@@ -71,11 +71,11 @@ def stride_of(r: Array, jacobian: Array, one_sided: slice, damping: Array | floa
     """Step to the optimum of a linearisation whose one-sided residuals count where they are positive.
 
     min_d ½ Σ (r + J d)² + ½ damping |d|², over the two-sided residuals and the one-sided ones that are positive at
-    its end; these are found by turns (a semismooth Newton method). A step that takes those that are positive at its
-    beginning crosses the edge from just inside of it, and predicts a gain that does not exist.
+    its end; these are found iteratively (a semismooth Newton method). A step that assumed the residuals positive at
+    its start would cross a nearby edge, and predict a gain that does not exist.
 
     Args:
-        r, jacobian: residuals and slopes, of one-sided residuals too where they are negative.
+        r, jacobian: residuals and slopes, including those of negative one-sided residuals.
     """
     free = jacobian.at[one_sided].set(0.0)
     normal = free.T @ free + damping * jnp.eye(jacobian.shape[1])
@@ -116,7 +116,7 @@ class Linearisation(optx.FunctionInfo):
 
     @property
     def one_sided(self) -> slice:
-        """Which residuals are one-sided."""
+        """Slice of the one-sided residuals."""
         return slice(self.first, self.last)
 
     @property
@@ -126,7 +126,7 @@ class Linearisation(optx.FunctionInfo):
 
     @property
     def counting(self) -> Float[Array, " residuals"]:
-        """The residuals as they count."""
+        """Residuals with zeros for the one-sided ones that do not count."""
         return self.residual.at[self.one_sided].set(jnp.where(self.positive, self.residual[self.one_sided], 0.0))
 
     def as_min(self) -> Float[Array, ""]:
@@ -134,7 +134,7 @@ class Linearisation(optx.FunctionInfo):
 
 
 class OneSidedDescent(optx.AbstractDescent[Z, Linearisation, Linearisation]):
-    """Damped Newton steps of the linearisation, with the one-sided residuals that are positive where they lead."""
+    """Damped Newton steps of the linearisation, with those one-sided residuals that are positive after the step."""
 
     def init(self, y: Z, f_info_struct: Linearisation) -> Linearisation:
         return f_info_struct
@@ -149,7 +149,7 @@ class OneSidedDescent(optx.AbstractDescent[Z, Linearisation, Linearisation]):
 
 
 class OneSidedTrustRegion(optx.ClassicalTrustRegion):
-    """The classical trust region (Conn, Gould, Toint 2000, alg. 6.1.1), of residuals some of which are one-sided."""
+    """Classical trust region (Conn, Gould, Toint 2000, alg. 6.1.1) for residuals some of which are one-sided."""
 
     high_cutoff: float = NEARLY_ALL
     low_cutoff: float = LITTLE
@@ -157,16 +157,16 @@ class OneSidedTrustRegion(optx.ClassicalTrustRegion):
     low_constant: float = SHORTER
 
     def predict_reduction(self, y_diff: Z, f_info: Linearisation) -> Array:
-        """Fall of the objective that the linearisation predicts for a step, as a negative number; 0 for a rise, which
-        a step that is mixed may have."""
+        """Returns the predicted change of the objective for a step, negative or 0. A mixed step may have a predicted
+        rise, for which this is 0."""
         ahead = half_squares(f_info.residual + f_info.jacobian @ y_diff, f_info.one_sided)
         return jnp.minimum(ahead - f_info.as_min(), 0.0)
 
 
 def mixed_step(stride: Z, moved: Z, changed: Z) -> Z:
-    """A step that takes into account how the last one changed the step of the linearisation.
+    """Returns a step corrected by the change of the linearised step since the last point.
 
-    Gauss-Newton steps shrink by a constant factor for ever if residuals are large compared with their curvature.
+    Gauss-Newton steps converge only linearly if residuals are large compared with their curvature.
     Anderson's mixing (D. G. Anderson, J. ACM 12 (1965)) of depth one is a secant in that direction:
     d - θ (Δy + Δd), θ = d·Δd / |Δd|².
 
@@ -179,11 +179,11 @@ def mixed_step(stride: Z, moved: Z, changed: Z) -> Z:
 
 
 class Searching(eqx.Module):
-    """State of a search between two steps; y, the best point so far, is the solver's caller's.
+    """State of a search between two steps; y, the best point so far, is kept by the caller of the solver.
 
     Attributes:
-        found: at y; aux: what else the evaluation there gave; stride: the step of the linearisation there.
-        ahead: where the function is to be evaluated next; mixed: True if `mixed_step` leads there.
+        found: linearisation at y; aux: auxiliary output of its evaluation; stride: step of the linearisation there.
+        ahead: point of the next evaluation; mixed: True if `mixed_step` leads there.
         region: state of the trust region.
         steps: evaluations so far; rejected: those since y was found; over: True if the search has ended.
     """
@@ -243,7 +243,7 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
     def step(
         self, fn: Function, y: Z, args: Any, options: dict[str, Any], state: Searching, tags: frozenset
     ) -> tuple[Z, Searching, Any]:
-        """Evaluates the function where the last step led, judges that step and finds the next."""
+        """Evaluates the function at the end of the last step, accepts or rejects that step, and finds the next."""
         found, aux = self._linearised(fn, state.ahead, args)
         moved, first, before = state.ahead - y, state.steps == 0, state.found
         _, accepted, _, region = self.search.step(first, y, state.ahead, before, found, state.region)
@@ -285,7 +285,7 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
         tags: frozenset,
         result: optx.RESULTS,
     ) -> tuple[Z, Any, dict[str, Any]]:
-        """Returns the best point, what else its evaluation gave, and no statistics."""
+        """Returns the best point, the auxiliary output of its evaluation, and no statistics."""
         return y, aux, {}
 
 

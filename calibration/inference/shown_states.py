@@ -1,7 +1,7 @@
-"""What a log shows of a robot's states, row by row, and the windows of its runs in which their equations hold.
+"""States of a robot that a log shows, row by row, and windows of its runs in which the equations hold.
 
-No window holds a jump of what is imposed, a gap, or rest: a current rises after a jump within a share of the time
-between rows, and friction at rest is no function of speed.
+No window contains a jump of an imposed quantity, a gap between rows, or rest. After a jump the current rises within a
+fraction of the time between rows, and friction at rest is not a function of speed.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ LONGEST = 1.0
 
 
 class Plan(eqx.Module):
-    """What a log shows of a robot's states, by positions of its channels.
+    """States that a log shows, as indices of its channels.
 
     Attributes:
         current: the channel that shows the current, -1: it follows from what is imposed.
@@ -56,17 +56,17 @@ class Plan(eqx.Module):
 
     @property
     def electrical(self) -> bool:
-        """Whether the voltage balance is an equation of the log."""
+        """True if the voltage balance is an equation of the log."""
         return self.imposed == "voltage" and self.current >= 0
 
     @property
     def mechanical(self) -> bool:
-        """Whether the balance of torques is an equation of the log."""
+        """True if the balance of torques is an equation of the log."""
         return self.imposed != "motor_speed"
 
 
 def plan_of(problem: Problem) -> Plan | None:
-    """The plan of a log; None where it does not show the states."""
+    """Returns the plan of a log; None if the log does not show the states."""
     robot, counts = problem.base, np.asarray(problem.data.weight).sum(0) > 0
     shown = {k: c for k, c in enumerate(problem.channels) if counts[k]}
     if robot.loose or robot.rig.turns or {c.name for c in shown.values()} & robot.rig.magnitudes:
@@ -95,12 +95,12 @@ def _voltages(shown: dict[int, Channel]) -> list[int]:
 
 
 def _travels(channel: Channel) -> bool:
-    """Whether a channel shows what the load does, and not a shaft."""
+    """True if a channel shows the motion of the load, not of a shaft."""
     return channel.unit_si in ("m", "m/s")
 
 
 class Rows(eqx.Module):
-    """What is known of each row, shape (rows, ...).
+    """Conditions, readings and states of each row, shape (rows, ...).
 
     Attributes:
         conditions: as they are from the row on; shown: readings [SI].
@@ -137,7 +137,7 @@ def window(share: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np
 
 
 def windows_in(time: np.ndarray, usable: np.ndarray, broken: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Windows of one run, each as (indices of its rows, their shares of its length).
+    """Returns the windows of one run, each as (indices of its rows, their positions as shares of its length).
 
     Args:
         time: of the rows [s], increasing; usable: whether a row may be in a window.
@@ -165,7 +165,7 @@ def windows_in(time: np.ndarray, usable: np.ndarray, broken: np.ndarray) -> list
 
 
 def windows_of(problem: Problem, plan: Plan, rate: np.ndarray) -> list[Windows]:
-    """The windows of every run."""
+    """Returns the windows of every run."""
     observe: Any = problem.observe
     time, weight = np.asarray(observe.time), np.asarray(problem.data.weight)
     measured, sd = np.asarray(problem.data.measured), np.asarray(problem.data.sd)
@@ -198,7 +198,7 @@ def windows_of(problem: Problem, plan: Plan, rate: np.ndarray) -> list[Windows]:
 
 
 def _late(problem: Problem) -> float:
-    """Time after a jump within which it may not act yet [s]."""
+    """Longest delay between a jump and its effect [s]."""
     names, delay = problem.coordinates.names, abs(float(np.max(np.asarray(problem.base.rig.delay))))
     if DELAY not in names:
         return delay
@@ -206,7 +206,7 @@ def _late(problem: Problem) -> float:
 
 
 def _jumps(observe: Any, run: int) -> np.ndarray:
-    """Instants at which what is imposed on a run jumps [s]."""
+    """Times at which an imposed quantity of a run jumps [s]."""
     conditions, times = observe.conditions, np.asarray(observe.times[run])
     jumps = np.zeros(len(times) - 1, bool)
     imposed = "voltage", "motor_current", "duty", "open", "load_torque", "slope_deg", "payload", "total_mass"
@@ -219,7 +219,7 @@ def _jumps(observe: Any, run: int) -> np.ndarray:
 
 
 def ways_of(problem: Problem, plan: Plan, measured: np.ndarray, sd: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """The way of travel of every row, 0 where it may rest."""
+    """Direction of travel at every row, 0 where the robot may be at rest."""
     if plan.imposed == "motor_speed":
         speed = np.asarray(problem.observe.of_rows.motor_speed)  # type: ignore[attr-defined]
         return np.where(np.abs(speed) > REST * np.abs(speed).max(initial=0.0), np.sign(speed), 0.0)
@@ -248,7 +248,7 @@ def rates_of(problem: Problem, plan: Plan) -> np.ndarray:
 
 
 def rows_of(problem: Problem, plan: Plan, rate: np.ndarray) -> Rows:
-    """What is known of each row."""
+    """Returns conditions, readings and states of each row."""
     observe: Any = problem.observe
     time, measured = np.asarray(observe.time), np.asarray(problem.data.measured)
     sd = np.asarray(problem.data.sd)

@@ -22,17 +22,17 @@ OF_OPTIMISTIX = {
 #: Functions of optax that take a learning rate, by their names there.
 OF_OPTAX = ("adam", "adamw", "nadam", "radam", "adabelief", "adagrad", "rmsprop", "lion", "sgd")
 NAMES = (*OF_OPTIMISTIX, *OF_OPTAX)
-#: Relative and absolute change of z and of the objective at which they end.
+#: Relative and absolute tolerance on z and on the objective.
 TOLERANCE = 1e-6
-#: Learning rate of optax's [prior sds].
+#: Learning rate of optax's functions [prior sds].
 RATE = 0.02
 
 
 def solver(name: str) -> optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser:
-    """The solver of a name, one of `NAMES`.
+    """Returns the solver of a name, one of `NAMES`.
 
     Raises:
-        BadConfiguration: there is none of that name.
+        BadConfiguration: an unknown name.
     """
     if name not in NAMES:
         raise BadConfiguration(f"--solver: got {name}; {choices(name, NAMES)}")

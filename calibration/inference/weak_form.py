@@ -1,12 +1,13 @@
-"""The equations of logs in weak form: a regression of base parameters and effects without a simulation.
+"""Regression of base parameters and effects on the equations of a log in weak form, without a simulation.
 
-The balances give the rate of each state at the readings of a log that shows the states. The equation y' = f(y) is
+If a log shows the states, the balances give their rates at its readings. The equation y' = f(y) is
 multiplied by smooth windows w(t) and integrated by parts: ∫ w f(y) dt + ∫ w' y dt = 0. No derivative of a noisy
 reading is taken. References: modulating functions, Preisig and Rippin, Comput. Chem. Eng. 17 (1993) 1; inverse
 dynamic identification, Gautier and Khalil, IEEE Trans. Robot. Autom. 6 (1990) 368; weak SINDy, Messenger and Bortz,
-Multiscale Model. Simul. 19 (2021) 1474. Both terms hold readings, and windows that overlap share their noise. Its
-covariance follows from the sds of the readings, their instruments' steps included, and weighs the windows (Bortz,
-Messenger and Dukic, Bull. Math. Biol. 85 (2023) 110). No window holds a jump of what is imposed, a gap, or rest.
+Multiscale Model. Simul. 19 (2021) 1474. Both terms contain readings, and overlapping windows share their noise. The
+covariance of this noise follows from the sds of the readings and the steps of their instruments, and weights the
+windows (Bortz, Messenger and Dukic, Bull. Math. Biol. 85 (2023) 110). No window contains a jump of an imposed
+quantity, a gap, or rest.
 """
 
 from __future__ import annotations
@@ -35,23 +36,23 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals, State
 
-#: Windows a base parameter, from which on a regression is trusted.
+#: Fewest windows for each base parameter of a regression that is used.
 ENOUGH = 4
-#: Variance of what a window leaves beside the noise of its readings, as a share of that: windows that overlap would
-#: else tell differences of each other without noise.
+#: Variance added to the noise of a window, as a share of it: without it, differences between overlapping windows
+#: would have no noise.
 FLOOR = 0.01
 #: Steps of Newton's method to the current that a voltage drives.
 CURRENT_STEPS = 3
-#: Steps of the regression, and the relative change of what is left from which on it goes on; by how much a coordinate
-#: is moved to see how noise depends on it, and by how much until that is looked at again [prior sd].
+#: Most steps of the regression, and the relative change of its sum of squares below which it ends; change of a
+#: coordinate for the derivative of the noise, and the change after which that is computed again [prior sd].
 STEPS, SMALL, STEP, FAR = 10, 1e-3, 1e-4, 0.5
 
 
 class Terms(eqx.Module):
-    """Terms of the equations at each row, of which Σ w f Δt + Σ w' y Δt is zero; shape (rows, equations, ...).
+    """Terms f and y of the equations Σ w f Δt + Σ w' y Δt = 0 at each row, shape (rows, equations, ...).
 
     Attributes:
-        f, y: of the readings; by_z, by_reading, by_effects: their derivatives, those of y after those of f.
+        f, y: at the readings; by_z, by_reading, by_effects: their derivatives, those of f first.
     """
 
     f: Array
@@ -62,7 +63,7 @@ class Terms(eqx.Module):
 
 
 def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar) -> Scalar:
-    """Current at which the voltage balances; its derivatives are those of the last step alone."""
+    """Current of the voltage balance by Newton's method; derivatives are those of the last step."""
 
     def left(robot: Robot, state: State, current: Scalar) -> Scalar:
         at = dataclasses.replace(state, current=current)
@@ -78,7 +79,7 @@ def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar) ->
 
 
 def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str]) -> tuple[Array, Array, Signals]:
-    """Terms f and y of a row's equations, and its signals; `probes`: effects that read nothing."""
+    """Returns terms f and y of a row's equations, and its signals; `probes`: effects that read no signal."""
     conditions, names = row.conditions, channels.names(robot.channels)
     chassis = robot.chassis(conditions.configuration)
     none, one = jnp.zeros(()), jnp.ones(())
@@ -120,7 +121,7 @@ def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str
     signals, own = signals_at(turning)
     f, y = [], []
     if plan.electrical:
-        # By its inductance the rate of the current would be mostly noise, and larger ones would leave less.
+        # Divided by the inductance, the rate of the current would be mostly noise, and a large inductance fit best.
         f.append(signals.voltage_left)
         y.append(signals.inductance * own)
     if plan.mechanical:  # in what the instrument shows: in what depends on a parameter, that would shrink it
@@ -140,7 +141,7 @@ def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str
 
 @functools.partial(compiled, options=SELDOM)
 def _terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[ScoredEffect, ...]) -> Terms:
-    """Terms of every row at coordinates z, and what base parameters, readings and effects change of them."""
+    """Returns the terms of every row at coordinates z, with derivatives by base parameters, readings and effects."""
     entering = tuple(dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor"))
     probes = tuple(probe(b) for b in entering)
     size, names = z.size, channels.names(problem.channels)
@@ -160,8 +161,8 @@ def _terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[Sc
     base = problem.coordinates.robot(problem.base, z)
     memory = _remembered(base, rows, signals, effects)
     entered = jax.vmap(lambda s, m: terms_of(base, s, effects, m))(signals, memory)
-    # An effect changes an equation as a defect of its balance does; one of an instrument as minus a reading of it
-    # does, or where that follows from the states as a defect of that equation.
+    # An effect changes an equation like a defect of its balance. An effect of an instrument changes it like a
+    # negative reading, or like a defect of that equation if the reading follows from the states.
     counts = np.array([len(e.at) for e in effects], int)
     enters = [entering.index(b) if (b := e.effect.balance) in entering else -1 for e in effects]
     which = np.repeat(np.array([size + k if k >= 0 else -1 for k in enters], int), counts)
@@ -190,7 +191,7 @@ def _terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[Sc
 
 
 def _remembered(robot: Robot, rows: Rows, signals: Signals, effects: tuple[ScoredEffect, ...]) -> list[Array]:
-    """What effects remember at every row, each at every point of its grid; shape (rows, grid)."""
+    """Returns the memory of each effect at every row and point of its grid, shape (rows, grid)."""
     count = rows.since.shape[0]
     nothing = [jnp.zeros((count, len(e.at))) for e in effects]
 
@@ -221,13 +222,13 @@ def _remembered(robot: Robot, rows: Rows, signals: Signals, effects: tuple[Score
 
 @dataclasses.dataclass(frozen=True)
 class WeakForm:
-    """The windows of a log at base coordinates z, whitened: what each leaves, and what changes it.
+    """Whitened residuals of the windows of a log at base coordinates z, with their derivatives.
 
     Attributes:
-        z: coordinates of the base where the windows and the priors leave least.
+        z: coordinates of the base that minimise the squared residuals of windows and priors.
         residual: of windows, then z - centre, shape (windows + coordinates,).
-        jacobian: by the coordinates; signatures: of the windows, by each instance's amplitude in prior sds.
-        windows: how many equations there are, one or more a window.
+        jacobian: by the coordinates; signatures: derivatives of the windows by each instance's amplitude [prior sd].
+        windows: number of equations, one or more for each window.
     """
 
     z: np.ndarray
@@ -238,11 +239,11 @@ class WeakForm:
 
 
 def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakForm | None:
-    """Regression of the base parameters of a log on its equations in weak form; None where it does not show the
-    states, or has too few windows.
+    """Returns the regression of a log's base parameters on its equations in weak form; None if the log does not show
+    the states, or has too few windows.
 
     Args:
-        problem: of histories, without effects in its coordinates; effects: of which signatures are wanted.
+        problem: of histories, without effects in its coordinates; effects: instances whose signatures are computed.
     """
     plan = plan_of(problem)
     if plan is None:
@@ -264,8 +265,8 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
     grown: list[tuple[np.ndarray, list[np.ndarray]]] = []
 
     def growth(z: np.ndarray, here: list[_Joined]) -> list[np.ndarray]:
-        """Relative growth of the sds by each coordinate, as it was not far away. Were it left out, a larger inertia
-        would leave less of anything."""
+        """Returns the relative derivative of the sds by each coordinate, computed near z. Without it a larger inertia
+        would always fit better."""
         if not grown or np.max(np.abs(grown[0][0] - z)) > FAR:
             moved = [terms_at(z + STEP * one) for one in np.eye(len(z))]
             sds = [[_sd(_noise(problem, plan, w, t)) for t in moved] for w in cut]
@@ -300,19 +301,19 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
 
 @dataclasses.dataclass(frozen=True)
 class _Joined:
-    """Equations of the windows of a run: what each leaves, its derivatives and signatures, shape (windows, 1 +
-    coordinates + instances), and what a sd of each reading changes, shape (windows, readings)."""
+    """Equations of the windows of a run: residual, derivatives and signatures, shape (windows, 1 + coordinates +
+    instances), and their change by one sd of each reading, shape (windows, readings)."""
 
     whole: np.ndarray
     noise: np.ndarray
 
     @property
     def sd(self) -> np.ndarray:
-        """Of each window."""
+        """Noise of each window."""
         return _sd(self.noise)
 
     def whitened(self, growth: np.ndarray) -> np.ndarray:
-        """`whole` by its noise, of which `growth` is the relative growth by each coordinate."""
+        """Returns `whole` divided by its noise; `growth`: relative derivative of the noise by each coordinate."""
         covariance = self.noise @ self.noise.T + np.diag(FLOOR * self.sd**2)
         whole, count = self.whole.copy(), growth.shape[1]
         whole[:, 1 : count + 1] -= whole[:, :1] * growth
@@ -324,7 +325,7 @@ def _sd(noise: np.ndarray) -> np.ndarray:
 
 
 def _slopes(plan: Plan, w: Windows, equations: int) -> list[np.ndarray]:
-    """By what y of each equation is weighed in windows."""
+    """Weight of y of each equation in the windows."""
     slopes = [w.slope] * equations
     if plan.angle and plan.mechanical:
         slopes[plan.electrical] = -w.bend
@@ -332,7 +333,7 @@ def _slopes(plan: Plan, w: Windows, equations: int) -> list[np.ndarray]:
 
 
 def _noise(problem: Problem, plan: Plan, w: Windows, terms: Terms) -> np.ndarray:
-    """Change of the windows of a run by a sd of each of its readings, shape (windows, readings)."""
+    """Change of the windows of a run by one sd of each reading, shape (windows, readings)."""
     sd = np.asarray(problem.data.sd)[w.rows]
     by, also = (np.asarray(x)[w.rows] for x in terms.by_reading)
     slopes = _slopes(plan, w, terms.f.shape[1])

@@ -1,4 +1,4 @@
-"""What an effect says of itself, and how it is told from others on a bench."""
+"""Description of an effect, and tests that distinguish it from others on a bench."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said of a fit, of the loop as of a calibration."""
+"""Sentences about a fit, for the loop and for calibrations."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FAR = {
 #: Facts without a name or a number.
 FACTS = {
     "not converged": "the search did not converge; values and intervals are not to be trusted",
-    "not profiled": "no profiles were made: the intervals are linear, and too symmetric where the model is curved",
+    "not profiled": "no profiles were made: intervals are linear, and too symmetric where the model is curved",
     "no covariance": "the posterior has no finite covariance: values stand, intervals do not",
     "no grip": "no run grips: static friction, and slip below it, are known by their priors alone",
 }
@@ -56,8 +56,8 @@ def estimated_noise(note: fit_notes.EstimatedNoise) -> str:
     """Channels whose noise was estimated."""
     each = ", ".join(f"{channel.replace('_', ' ')} {percent:.1f} %" for channel, percent in note.percent)
     return (
-        f"no noise was stated for {each}: estimated from the misfit, so it holds model error too and cannot test "
-        "whether the model is adequate"
+        f"no noise was stated for {each}: estimated from the misfit, so it includes model error and cannot "
+        "test whether the model is adequate"
     )
 
 
@@ -183,14 +183,14 @@ def ended_at_edge(note: fit_notes.EndedAtEdge) -> str:
 
 
 def shown_by(test: fit_notes.Shown) -> str:
-    """What the most telling test shows."""
+    """Result of the most significant test of residuals."""
     whose = f"the residuals of {channels.find(test.channel).label}" if test.channel else ""
     return {
         "": "",
         "stated": "the residuals exceed the stated noise",
         "repeats": "the residuals exceed the scatter of repeated runs",
         "follow": f"{whose} follow {test.variable}",
-        "remember": f"{whose} remember the sample before",
+        "remember": f"{whose} show autocorrelation",
     }[test.what]
 
 
@@ -218,7 +218,7 @@ def _percent(share: float) -> str:
 
 
 def adequacy(found: Adequacy) -> str:
-    """Whether a fit is adequate; opens a calibration's output."""
+    """Verdict on the adequacy of a fit; first line of a calibration's output."""
     if found.obstacle:
         large = "it misses " + _misses([m for m in found.misses if m.large])
         return OBSTACLES[found.obstacle].format(large=large, every=_misses(found.misses))
@@ -233,7 +233,7 @@ def adequacy(found: Adequacy) -> str:
         why = f"{chi2}, {p}" if found.noise_known else f"{p}, the noise estimated from them"
         return (
             f"Not adequate: {shown_by(found.shown_by)} ({why}), so something is missing and the parameters may "
-            "absorb it; mmrjax loop finds what"
+            "absorb it; run mmrjax loop to find it"
         )
     if found.noise_known:
         return f"Adequate: the residuals are what the stated noise leaves ({chi2}, {p})"

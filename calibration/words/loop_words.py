@@ -109,10 +109,15 @@ def headline(found: loop_notes.Headline) -> str:
     return f"{at} {held[found.level]}"
 
 
+def a(noun: str) -> str:
+    """A noun with its indefinite article."""
+    return f"{'an' if noun[:1] in 'aeiou' else 'a'} {noun}"
+
+
 def _claim(sure: Sequence[str], others: Sequence[str]) -> str:
     """Members of a claim, and what some noises do not tell from them."""
-    apart = f" (not told at each noise from a {' or a '.join(others)})" if others else ""
-    return f"a {' or a '.join(sure)}{apart}"
+    apart = f" (not told at each noise from {' or '.join(map(a, others))})" if others else ""
+    return f"{' or '.join(map(a, sure))}{apart}"
 
 
 def _undescribed(said: loop_notes.Summary) -> str:
@@ -133,7 +138,7 @@ def _undescribed(said: loop_notes.Summary) -> str:
 
 def _mechanism(found: loop_notes.Mechanism, within: str) -> str:
     """A mechanism with its evidence."""
-    return f"a {' or a '.join(found.families)}{within}, established as a mechanism: it {evidence(found)}"
+    return f"{' or '.join(map(a, found.families))}{within}, established as a mechanism: it {evidence(found)}"
 
 
 def evidence(found: loop_notes.Mechanism) -> str:
@@ -239,12 +244,12 @@ def _tentative(those: Sequence[loop_notes.Missing], support: loop_notes.NameSupp
 
 def verdict(stages: LoopStages) -> str:
     """The verdict as soon as it is known: `verdict: class, series_resistance or supply_sag`."""
-    sure = [" or ".join(members) for members in stages.members] or [f"a {family}" for family in stages.families]
+    sure = [" or ".join(members) for members in stages.members] or [a(family) for family in stages.families]
     return f"verdict: {', '.join((stages.verdict, *sure))}"
 
 
 def ranking(found: Ranking, most: int = 5) -> list[str]:
-    """What regression says of the library, a line each: whether anything is missing, and the strongest effects."""
+    """Lines of the ranking by regression: whether an effect is missing, and the strongest effects."""
     by = f"by regression on {found.windows} windows of the log" if found.windows else "by regression"
     if not found.missing:
         return [f"{by}: nothing is missing (family-wise p = {found.p_value:.2g})"]
@@ -253,17 +258,17 @@ def ranking(found: Ranking, most: int = 5) -> list[str]:
     if not beyond:
         return [f"{first}; no effect explains more than chance"]
     lines = [
-        f"  {k}. {e.name}, a {e.family}: lowers the misfit by {rounded(e.score)} σ², "
+        f"  {k}. {e.name}, {a(e.family)}: lowers the misfit by {rounded(e.score)} σ², "
         f"amplitude {e.amplitude:.3g} ± {e.sd:.2g} {e.unit}".rstrip(" -")
         for k, e in enumerate(beyond, 1)
     ]
-    return [f"{first}; effects by what each alone would explain:", *lines]
+    return [f"{first}; strongest effects, each added alone:", *lines]
 
 
 def so_far(effects: Sequence[str], families: Sequence[str]) -> str:
-    """What a search has found whose verdict is not known yet."""
+    """Findings of a search before its verdict is known."""
     return (
-        f"so far, confirmed by simulation: {' and '.join(f'a {f}' for f in dict.fromkeys(families))} "
+        f"so far, confirmed by simulation: {' and '.join(a(f) for f in dict.fromkeys(families))} "
         f"({' and '.join(effects)}); which claim stands is not tested yet"
     )
 
@@ -351,7 +356,7 @@ def answer(found: DiscoveryResult) -> str:
 
 def _kind_of(effect: FoundEffect) -> str:
     """`a voltage drop that changes with current`."""
-    return f"a {' or '.join(effect.families)}"
+    return a(" or ".join(effect.families))
 
 
 def is_established(found: DiscoveryResult, effect: FoundEffect) -> bool:

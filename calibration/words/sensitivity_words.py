@@ -1,4 +1,4 @@
-"""What is said of a sensitivity study."""
+"""Sentences about a sensitivity study."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said of a table, before anything is fitted to it."""
+"""Sentences about a table before any fit."""
 
 from __future__ import annotations
 

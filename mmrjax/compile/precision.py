@@ -1,8 +1,8 @@
-"""Precision of the public functions: double outside a trace, and that of JAX's setting within one.
+"""Precision of the public functions: double outside a trace, JAX's own inside one.
 
-JAX computes in single precision unless its user asks for double, and importing this package does not change that. A
-public function that is called outside a trace switches to double precision for its own thread until it returns.
-Robots, conditions and results hold NumPy's arrays where JAX is single, since its operations would cut its own arrays.
+JAX computes in single precision by default, and importing this package does not change that. A public function
+switches to double precision in its own thread until it returns, if it is called outside a trace. Where JAX is single,
+robots, conditions and results contain NumPy arrays, since JAX would round its own arrays to single precision.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ import numpy as np
 
 from mmrjax.compile.programs import has_tracer
 
-#: Why a fit is refused inside a trace in single precision, and what to do.
+#: Reason for refusing a fit inside a trace in single precision, with the remedy.
 SINGLE = (
-    "called inside a JAX transformation in single precision, which a fit cannot be computed in; call it outside of "
+    "called inside a JAX transformation in single precision, which is too coarse for a fit; call it outside of "
     'jax.jit, or set jax.config.update("jax_enable_x64", True)'
 )
 
@@ -43,7 +43,7 @@ def in_trace(*arguments: Any) -> bool:
 
 @contextlib.contextmanager
 def double_precision() -> Iterator[None]:
-    """Double precision of JAX in this thread meanwhile."""
+    """Context in which JAX computes in double precision in this thread."""
     if is_double():
         yield
         return
@@ -52,9 +52,9 @@ def double_precision() -> Iterator[None]:
 
 
 def in_double(function: Callable[P, T]) -> Callable[P, T]:
-    """A function that computes in double precision where it is called outside a trace.
+    """Decorator: the function computes in double precision when it is called outside a trace.
 
-    Arrays among its results are NumPy's where JAX was single before.
+    If JAX was single before the call, arrays among its results are NumPy arrays.
     """
 
     @functools.wraps(function)
@@ -70,7 +70,7 @@ def in_double(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def at_once(function: Callable[P, T]) -> Callable[P, T]:
-    """The same of a function of concrete numbers, which is computed where it is called, within a trace too."""
+    """Decorator like `in_double` for functions of concrete numbers, computed at once even inside a trace."""
     double = in_double(function)
 
     @functools.wraps(function)
@@ -84,7 +84,7 @@ def at_once(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def _widened(argument: Any) -> Any:
-    """The same module with its floating-point numbers as JAX's arrays in double precision; anything else as it is."""
+    """Returns a module with its floating-point numbers as JAX arrays in double precision; other objects unchanged."""
 
     def wide(leaf: Any) -> Any:
         return jnp.asarray(leaf, float) if eqx.is_array(leaf) and np.issubdtype(leaf.dtype, np.floating) else leaf
@@ -93,15 +93,15 @@ def _widened(argument: Any) -> Any:
 
 
 def ambient(tree: T) -> T:
-    """A tree whose NumPy arrays are JAX's, in its precision here, and constants of what is traced."""
+    """Returns a tree with JAX arrays for NumPy arrays, in JAX's current precision and as constants of a trace."""
     with jax.ensure_compile_time_eval():
         return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray | np.generic) else x, tree)
 
 
 def on_host(tree: T) -> T:
-    """The same with NumPy's arrays in the place of JAX's.
+    """Returns a tree with NumPy arrays in place of JAX arrays.
 
-    An object with a method `on_host` converts itself; a result that is no pytree has its modules converted.
+    An object with a method `on_host` converts itself. In a dataclass that is not a pytree, modules are converted.
     """
     if hasattr(tree, "on_host"):
         return tree.on_host()
@@ -113,17 +113,17 @@ def on_host(tree: T) -> T:
 
 
 def as_array(value: Any, kind: type = float) -> Any:
-    """Numbers that a user states as an array: JAX's where it is double, else NumPy's; JAX's own stay JAX's."""
+    """Returns a user's numbers as an array: of JAX if JAX is double or if they are one already, else of NumPy."""
     if isinstance(value, jax.Array):
         return jnp.asarray(value, kind)
     return jnp.asarray(value, kind) if is_double() else np.asarray(value, kind)
 
 
 class Threads(concurrent.futures.ThreadPoolExecutor):
-    """Threads that compute in the precision of whoever hands them work."""
+    """Pool of threads; each call is computed in the precision of the thread that submits it."""
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **named: Any) -> concurrent.futures.Future[T]:
-        """Hand over a call."""
+        """Submits a call, to be computed in the precision of this thread."""
         return super().submit(_within, is_double(), fn, *args, **named)
 
 

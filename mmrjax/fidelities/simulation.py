@@ -91,8 +91,7 @@ def simulate(
     except ValueError as error:
         raise UsageError(f"model {model}, {error}") from error
     _check_robot(robot)
-    conditions = _resolved(robot, conditions)
-    _check_conditions(conditions)
+    conditions = checked(robot, conditions)
     _check_battery(robot, conditions)
     _check_turning(robot, conditions, profile)
     _check_brake(robot, conditions, profile)
@@ -237,6 +236,17 @@ def _resolved(robot: Robot, conditions: Conditions) -> Conditions:
         assert wrong is not None
         known = ", ".join(f"{k} ({name})" for k, name in enumerate(names))
         raise UsageError(f"configuration{wrong[0]}: got {wrong[1]:g}; expected one of {known}")
+    return conditions
+
+
+def checked(robot: Robot, conditions: Conditions) -> Conditions:
+    """Conditions with indices of the robot's configurations for names; values are checked unless they are tracers.
+
+    Raises:
+        UsageError: a configuration that the robot lacks, a value out of range or NaN, or values that contradict.
+    """
+    conditions = _resolved(robot, conditions)
+    _check_conditions(conditions)
     return conditions
 
 

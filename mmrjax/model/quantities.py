@@ -1,9 +1,8 @@
-"""The table of quantities: what is set of a run, one row each, and how units are spelled. Importable without jax.
+"""Table of the conditions of a run, one row each, and the spelling of units. Importable without jax.
 
-A quantity has a name, units, a range and a rule for its sign. `CONDITIONS` are those that are set;
-`channels.EVERY` are those that an instrument shows. Columns of tables and profiles, fields of `Conditions`, options,
-pages and `explain` take names, units, ranges and words from these rows, so a new condition is a row here and a field
-of `Conditions`.
+A quantity has a name, units, a range and a rule for its sign. `CONDITIONS` are set before a run; `channels.EVERY` are
+shown by instruments. Columns of tables and profiles, fields of `Conditions`, options, pages and `explain` read names,
+units, ranges and words from these rows, so a new condition needs a row here and a field of `Conditions`.
 """
 
 from __future__ import annotations
@@ -17,9 +16,9 @@ DEG = math.pi / 180  # rad
 RPM = math.pi / 30  # rad/s
 MM = 1e-3  # m
 
-#: Per cent of a slope: those of the tangent of its angle.
+#: Unit of a slope in per cent, the tangent of its angle.
 PERCENT = "percent"
-#: Units as people write them beside numbers, where a column's name has another spelling.
+#: Units as people write them, where a column's name has another spelling.
 WRITTEN = {
     "°": "deg", "v": "V", "volt": "V", "volts": "V", "a": "A", "amp": "A", "amps": "A", "ma": "mA", "mv": "mV",
     "gram": "g", "grams": "g", "°c": "C", "1/min": "rpm", "u/min": "rpm",
@@ -28,13 +27,14 @@ WRITTEN = {
 
 
 def spelled(unit: str) -> str:
-    """A unit as the end of a column's name: `km/h` is `km_h`."""
+    """Returns a unit as a column's name ends with it: `km_h` for `km/h`."""
     unit = WRITTEN.get(unit.lower(), unit)
     return unit.replace("/", "_").replace("%", PERCENT).replace("·", "")
 
 
 def at_the_end(text: str, known: Iterable[str]) -> str | None:
-    """The one of `known` units that a column's name ends with, `torque_kNm` or `Torque [kN·m]`; None of none."""
+    """Returns the unit among `known` that a column's name ends with, such as kNm of `torque_kNm` and `Torque [kN·m]`;
+    None if there is none."""
     end = re.split(r"[\[(\s]", text.rstrip("])"))[-1]
     found = [unit for unit in known if unit and re.search(rf"(?:^|[^A-Za-z]){unit}$", spelled(end))]
     return max(found, key=len, default=None)
@@ -49,10 +49,10 @@ class Quantity:
         unit: of its column; factor: the SI value of one such unit.
         label: words of reports.
         range: least and greatest value [unit].
-        unit_si: of the value inside, where people write it otherwise than `unit`; empty for the same.
-        other_units: what it is also written in, and the SI value of each.
-        percent: whether per cent of a slope are understood too.
-        stem: of its columns, where that is not its name.
+        unit_si: spelling of the SI unit, if it differs from `unit`; else empty.
+        other_units: further units that are accepted, with the SI value of each.
+        percent: True if a slope in per cent is accepted too.
+        stem: start of the names of its columns, if it differs from `name`.
     """
 
     name: str
@@ -67,7 +67,7 @@ class Quantity:
 
     @property
     def column(self) -> str:
-        """Its column in tables, with the unit in the name."""
+        """Name of its column in tables, with the unit."""
         return self._column(spelled(self.unit))
 
     @property
@@ -91,13 +91,13 @@ class Quantity:
         return f"{stem}_{unit}" if unit else stem
 
     def value(self, written: float, unit: str) -> float:
-        """What is written in `unit`, in the unit of its column."""
+        """Returns a value written in `unit`, in the unit of the column."""
         if self.percent and unit == PERCENT:
             return math.degrees(math.atan(written / 100))
         return written * self.units[unit]
 
     def limits(self, unit: str) -> tuple[float, float]:
-        """Least and greatest value allowed, in `unit`."""
+        """Returns the least and greatest allowed value in `unit`."""
         low, high = self.range
         if self.percent and unit == PERCENT:
             return 100 * math.tan(math.radians(low)), 100 * math.tan(math.radians(high))
@@ -109,8 +109,8 @@ class Condition(Quantity):
     """A quantity that is set from outside before a run starts.
 
     Attributes:
-        field: of `Conditions`; empty where that has none.
-        heading: of its column on pages, empty where no page shows it; shown: format of a number there.
+        field: field of `Conditions`; empty if there is none.
+        heading: of its column on pages, empty if no page shows it; shown: format of a number there.
     """
 
     field: str = ""
@@ -126,7 +126,7 @@ _SHARES = ((PERCENT, 1e-2),)
 _VOLTS, _SHARE, _SWITCH = (-100.0, 100.0), (-1.0, 1.0), (-1.0, 1.0)
 _RATIO, _RADIANS_PER_SECOND = (1e-3, 100.0), (-1e4, 1e4)
 
-#: Everything that can be set of a run and is a number.
+#: All numbers that can be set for a run.
 SET: tuple[Condition, ...] = (
     Condition(
         "supply_voltage", "V", 1.0, "supply voltage", _VOLTS, "voltage", other_units=_MILLIVOLT, heading="U [V]"
@@ -209,12 +209,12 @@ SET: tuple[Condition, ...] = (
 
 #: Conditions of a run that are numbers, by their fields of `Conditions`.
 CONDITIONS: dict[str, Condition] = {c.field: c for c in SET if c.field}
-#: The same and what else is set, by column.
+#: All of `SET`, by column.
 BY_COLUMN: dict[str, Condition] = {c.column: c for c in SET}
 
 
 def named(name: str) -> Condition:
-    """What is set by a name without unit: `slope`, `supply_voltage`.
+    """Returns the condition of a name without its unit: `slope`, `supply_voltage`.
 
     Raises:
         KeyError: no such quantity.

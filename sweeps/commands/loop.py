@@ -182,7 +182,7 @@ def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> Non
     if not kept:
         tell(f"nothing could be kept of {', '.join(stages)}; the same command begins anew")
         return
-    tell(f"kept: {', '.join(kept)}; the same command with --out {folder.path} goes on")
+    tell(f"kept: {', '.join(kept)}; to continue, run the same command with --out {folder.path}")
     if "verdict" in stages:
         traced = stages["verdict"]
         tell(f"{said_of.verdict(traced)}; errors held out and other noises are outstanding")
