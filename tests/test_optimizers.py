@@ -189,7 +189,7 @@ def test_solvers_of_other_libraries_find_the_truth(bent, name):
 
 
 def test_a_solver_that_there_is_not_is_refused_with_the_nearest():
-    with pytest.raises(BadConfiguration, match=r"--solver: got dogleq; did you mean dogleg[?] allowed: lm, dogleg,"):
+    with pytest.raises(BadConfiguration, match=r"^solver: got dogleq; did you mean dogleg[?] allowed: lm, dogleg,"):
         solvers.solver("dogleq")
 
 

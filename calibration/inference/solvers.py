@@ -35,7 +35,7 @@ def solver(name: str) -> optx.AbstractLeastSquaresSolver | optx.AbstractMinimise
         BadConfiguration: an unknown name.
     """
     if name not in NAMES:
-        raise BadConfiguration(f"--solver: got {name}; {choices(name, NAMES)}")
+        raise BadConfiguration(f"solver: got {name}; {choices(name, NAMES)}")
     import optax
     import optimistix as optx
 
