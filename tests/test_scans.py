@@ -1,3 +1,8 @@
+import functools
+from types import SimpleNamespace
+
+from calibration.inference.observers import time_histories
+
 """Parameters whose misfit is a staircase are scanned: a delay of coarse samples is found, and its interval is honest."""
 
 import dataclasses
@@ -120,3 +125,25 @@ def test_searches_that_converged_elsewhere_are_counted():
     converged = np.array([True, True, True, False])
     assert scans.apart(seen, ends, converged) == 1
     assert scans.apart({}, ends, converged) == scans.apart(seen, None, converged) == 0
+
+
+def test_a_fit_that_may_be_proposed_goes_on_until_it_is_an_optimum(monkeypatch):
+    """A fit that has used up its steps and lies within a class's margin of the lowest one goes on from its end."""
+    calls: list[np.ndarray] = []
+
+    def ended(evaluate, starts, *_, **__):
+        calls.append(np.asarray(starts))
+        cost = np.array([100.0, 102.0, 110.0]) - len(calls)
+        return SimpleNamespace(
+            z=np.asarray(starts) + 1, cost=cost, converged=np.array([True, len(calls) > 1, False])
+        ), None
+
+    monkeypatch.setattr(time_histories, "searches_long", ended)
+    monkeypatch.setattr(time_histories, "_evaluator", lambda *_: None)
+    observer = SimpleNamespace(policy=SimpleNamespace(steps=30, batch=8))
+    search = functools.partial(time_histories.Histories.search, observer, SimpleNamespace(data=None))
+    found, _ = search(np.zeros((3, 2)), np.ones(3))
+    assert len(calls) == 2 and calls[1].tolist() == [[1.0, 1.0]] * 3 and found.converged[1]
+    calls.clear()
+    search(np.zeros((3, 2)), np.ones(3), most=6)  # as many steps as are stated
+    assert len(calls) == 1
