@@ -1,11 +1,8 @@
-import functools
-from types import SimpleNamespace
-
-from calibration.inference.observers import time_histories
-
 """Parameters whose misfit is a staircase are scanned: a delay of coarse samples is found, and its interval is honest."""
 
 import dataclasses
+import functools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +11,7 @@ from test_rig_histories import BENCH, DRIVE, history
 from calibration.data import robot_file
 from calibration.inference import multistart, noise, observers, priors, scans
 from calibration.inference.calibration import calibrate
+from calibration.inference.observers import time_histories
 from calibration.inference.optimizers import evaluated
 from calibration.inference.scans import Scan
 from mmrjax.model import params

@@ -137,6 +137,7 @@ def _by_row(
     place = jnp.where(rows_of < 0, rows, rows_of)
     return jnp.zeros((rows, *of_runs.shape[2:]), of_runs.dtype).at[place].set(of_runs, mode="drop")
 
+
 #: How far above the lowest of several fits one that has not converged goes on [half σ²], the margin of a class.
 NEAR = 3.0
 
@@ -662,7 +663,9 @@ class Histories(Observer):
 
         found = searched(starts)
         near = np.asarray(found[0].cost) < np.nanmin(found[0].cost) + NEAR
-        if most is None and np.any(near & ~np.asarray(found[0].converged)):  # what may be proposed has to be an optimum
+        if most is None and np.any(
+            near & ~np.asarray(found[0].converged)
+        ):  # what may be proposed has to be an optimum
             found = searched(np.asarray(found[0].z))
         if not rivals or not scans.scanned(problem):
             return found
