@@ -254,22 +254,31 @@ def _vacant(problem: Problem, members: Member) -> Progress:
     return jax.vmap(one)(members)
 
 
+def _with_fresh(problem: Problem, members: Member, fresh: Numbers, at: Progress) -> Progress:
+    """Searches side by side; `fresh` ones begin at their starts."""
+
+    def begin(member: Member, fresh: Array, at: Progress) -> Progress:
+        begun = _begun(problem, member.start, member.problem(problem).data)
+        return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), begun, at)
+
+    return jax.vmap(begin)(members, fresh, at)
+
+
+_admitted = compiled(_with_fresh, options=SELDOM)
+
+
 def _go_on(
     problem: Problem, members: Member, fresh: Numbers, at: Progress, enough: Numbers, max_steps: Numbers
 ) -> tuple[Progress, Optimum]:
     """Searches side by side until `enough` of them have ended, those that are `fresh` from their starts."""
     pin = no_pin(members.start.shape[-1])
 
-    def begin(member: Member, fresh: Array, at: Progress) -> Progress:
-        begun = _begun(problem, member.start, member.problem(problem).data)
-        return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), begun, at)
-
     def advance(member: Member, at: Progress) -> Progress:
         here = member.problem(problem)
         new = _advance(here, at, here.data, max_steps)
         return jax.tree.map(lambda new, old: jnp.where(at[1].over, old, new), new, at)
 
-    at = jax.vmap(begin)(members, fresh, at)
+    at = _with_fresh(problem, members, fresh, at)
     at = jax.lax.while_loop(lambda at: jnp.sum(at[1].over) < enough, lambda at: jax.vmap(advance)(members, at), at)
     return at, jax.vmap(lambda member, at: _ended(at, member.problem(problem).data, pin))(members, at)
 
@@ -285,17 +294,6 @@ def _roots(problem: Problem, z: Numbers, active: Numbers | None) -> tuple[Array,
     found = jax.vmap(one)(z, active)
     assert found is not None  # of an observer that is `apart`
     return found
-
-
-@functools.partial(compiled, options=SELDOM)
-def _admitted(problem: Problem, members: Member, fresh: Numbers, at: Progress) -> Progress:
-    """Searches side by side; `fresh` ones begin at their starts."""
-
-    def begin(member: Member, fresh: Array, at: Progress) -> Progress:
-        begun = _begun(problem, member.start, member.problem(problem).data)
-        return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), begun, at)
-
-    return jax.vmap(begin)(members, fresh, at)
 
 
 @functools.partial(compiled, options=OVER_TIME)

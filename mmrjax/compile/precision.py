@@ -83,13 +83,18 @@ def at_once(function: Callable[P, T]) -> Callable[P, T]:
     return call
 
 
+def as_floats(tree: T) -> T:
+    """Returns a tree with its floating-point arrays as JAX arrays, in JAX's current precision."""
+
+    def cast(leaf: Any) -> Any:
+        return jnp.asarray(leaf, float) if eqx.is_array(leaf) and jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+
+    return jax.tree.map(cast, tree)
+
+
 def _widened(argument: Any) -> Any:
-    """Returns a module with its floating-point numbers as JAX arrays in double precision; other objects unchanged."""
-
-    def wide(leaf: Any) -> Any:
-        return jnp.asarray(leaf, float) if eqx.is_array(leaf) and np.issubdtype(leaf.dtype, np.floating) else leaf
-
-    return jax.tree.map(wide, argument) if isinstance(argument, eqx.Module) else argument
+    """Returns a module with its floating-point numbers as JAX arrays in double precision; others unchanged."""
+    return as_floats(argument) if isinstance(argument, eqx.Module) else argument
 
 
 def ambient(tree: T) -> T:

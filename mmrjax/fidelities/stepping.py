@@ -9,15 +9,15 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax.compile.compiling import compiled
+from mmrjax.compile.precision import as_floats
 from mmrjax.compile.programs import has_tracer
 from mmrjax.errors import UsageError, choices
 from mmrjax.fidelities import drive
@@ -28,8 +28,6 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import State
 from mmrjax.numerics.rosenbrock import stages
-
-T = TypeVar("T")
 
 #: Duty of the driver, or values of conditions by name.
 Command = Scalar | Mapping[str, Scalar] | None
@@ -52,7 +50,7 @@ def initial_state(robot: Robot, conditions: Conditions | None = None, *, rolling
     Raises:
         UsageError: an argument that `step` refuses too.
     """
-    robot, conditions = _cast((robot, _commanded(robot, None, conditions)))
+    robot, conditions = as_floats((robot, _commanded(robot, None, conditions)))
     return drive.state_of(robot, _begun(robot, conditions, rolling))
 
 
@@ -67,7 +65,7 @@ def rates(robot: Robot, state: State, command: Command, conditions: Conditions |
     Raises:
         UsageError: an argument that `step` refuses too.
     """
-    robot, conditions = _cast((robot, _commanded(robot, command, conditions)))
+    robot, conditions = as_floats((robot, _commanded(robot, command, conditions)))
     return drive.state_of(robot, drive.rates(robot, conditions, _vector(robot, state)))
 
 
@@ -93,7 +91,7 @@ def step(robot: Robot, state: State, command: Command, dt: Scalar, conditions: C
             independently; a value out of range or NaN; a configuration that the robot lacks; a command that is no
             number or names no condition; a state of another robot; a `dt` that is not above 0. Tracers pass.
     """
-    robot, conditions = _cast((robot, _commanded(robot, command, conditions)))
+    robot, conditions = as_floats((robot, _commanded(robot, command, conditions)))
     y = _vector(robot, state)
     return drive.state_of(robot, _stepped(robot, conditions, y, _seconds(dt)))
 
@@ -175,15 +173,6 @@ def _seconds(dt: Scalar) -> Scalar:
     if _shape(dt) != () or not (has_tracer(dt) or 0 < float(dt) < math.inf):
         raise UsageError(f"dt: got {_named(dt)}; expected a number of seconds above 0")
     return jnp.asarray(dt, float)
-
-
-def _cast(tree: T) -> T:
-    """A tree with its floating-point numbers as JAX arrays, in JAX's current precision."""
-
-    def cast(x: Any) -> Any:
-        return jnp.asarray(x, float) if eqx.is_array(x) and jnp.issubdtype(x.dtype, jnp.floating) else x
-
-    return jax.tree.map(cast, tree)
 
 
 def _vector(robot: Robot, state: State) -> Float[Array, " unknowns"]:
