@@ -108,6 +108,8 @@ def swing(
     What carries the levers gives ω = free + yields T after the step. Between the voltages `least` and `most` the
     one is taken at which ω is what is asked; of a lever that is to stand, the least that holds it. Each drive's law
     is of straight pieces (`_PIECES`); of all pairs of them the one is taken whose solution is on both, or least off.
+    This is exact and has no iterations. A root finder cannot replace it: where a lever stands, its law allows a range
+    of torques and is no function.
 
     Args:
         step: [s]; rate: before it [rad/s]; free: after it, of levers without torque [rad/s]; yields: [rad/(N·m·s)].
