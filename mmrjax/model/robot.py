@@ -208,7 +208,7 @@ class Robot(eqx.Module):
 
 
 #: Reason why a vehicle has no brake torque on its output.
-NO_BRAKE = "the robot is a vehicle, and a brake's torque acts on a shaft; its load is the ground"
+NO_BRAKE = "the robot is a vehicle; the torque of a brake acts only on a shaft"
 
 
 def cannot_turn(robot: Robot, names: Iterable[str]) -> str | None:
