@@ -127,7 +127,7 @@ class Rig(eqx.Module):
         meaning="dead time between a value in the imposed quantity's column and its action",
         bounds=(-10.0, 10.0),
         sd=0.02,
-        source="stated by whoever owns the rig",
+        source="stated by the owner of the rig",
         scanned=0.0,
     )
     begins: Begins | None = None
