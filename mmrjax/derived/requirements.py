@@ -263,7 +263,7 @@ def _payload(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
 
 
 def _edge(left, robot: Robot, low: Array, high: Array) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
-    """Point between low and high at which `left` becomes negative, and whether `left` is positive at low.
+    """Point between low and high where `left` becomes negative, and whether `left` is positive at low.
 
     `high` if it does not become negative. Derivatives are implicit, forward and reverse.
     """
@@ -347,7 +347,7 @@ def _turn(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
 
 
 def _across(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
-    """Side slope [deg] at which a robot that travels across it slides or tips.
+    """Steepest side slope [deg] that a robot travels across without sliding or tipping.
 
     Rolling resistance takes a share f/φ_x of the friction ellipse: tan α = φ_y √(1 - (f/φ_x)²). It tips at
     tan α = B / (2 h). For a rigid robot whose load does not shift.

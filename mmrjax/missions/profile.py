@@ -140,8 +140,8 @@ def profile(
         demand, linear, cycles: see `Profile`; values: its other fields, by name.
 
     Raises:
-        UsageError: fewer than two rows, a time that does not increase, an unknown mode or field, a length that
-            differs from that of `time`, a value that is not finite, a duty beyond -1..1, cycles below 1.
+        UsageError: fewer than two rows; a time that does not increase; an unknown mode or field; a length that
+            differs from that of `time`; a value that is not finite; a duty beyond -1..1; cycles below 1.
     """
     rows = np.asarray(time, float)
     if rows.ndim != 1 or len(rows) < 2:
