@@ -130,7 +130,7 @@ def test_package_states_its_names_version_and_types():
 
 def test_type_checkers_see_every_public_name():
     text = (ROOT / "mmrjax" / "__init__.py").read_text(encoding="utf-8")
-    block = text[text.index("if TYPE_CHECKING:") : text.index("#: Where")]
+    block = text[text.index("if TYPE_CHECKING:") : text.index("#: Module of")]
     assert set(re.findall(r"import (\w+) as \1", block)) == set(mm.__all__) - {"__version__"}
 
 

@@ -273,7 +273,7 @@ def test_a_robot_that_cannot_turn_is_refused_wherever_it_is_asked_to(tmp_path, m
     told = ("sweep", "plan.toml"), ("sensitivity", "--configurations", "6T2A", "--vary", "duty_left=0.5:1")
     for words in told:
         code, _, err = mmrjax(*words, *narrow)
-        assert code == 2 and "duty_left: 6T2A.turning.width [m] missing" in err
+        assert code == 2 and "duty_left: the robot's file lacks 6T2A.turning.width [m]" in err
 
 
 def test_results_of_turns_show_both_sides():
