@@ -3,7 +3,7 @@
 
 python benchmarks/free_chain.py            the chain alone
 python benchmarks/free_chain.py --track    beside the track model, over the guide's recess
-python benchmarks/free_chain.py --shaking --track    at the running gear that shakes (set S of docs/vibration.md)
+python benchmarks/free_chain.py --shaking --track    at set S of docs/explanation/vibration.md
 
 One side of 6T2A on the flat without payload. The masses of the belt are free in the plane; stiff springs
 join them; two 48-tooth pulleys hold them from inside by one-sided springs and carry them along by tooth

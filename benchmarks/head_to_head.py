@@ -371,7 +371,9 @@ def _seconds(r: Compared) -> str:
 def options() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--public", type=Path, metavar="FOLDER", help="records of others, as in docs/benchmarks.md")
+    parser.add_argument(
+        "--public", type=Path, metavar="FOLDER", help="records of others, as in docs/lab/head-to-head.md"
+    )
     parser.add_argument("--cases", type=Path, metavar="FOLDER", help="cases with a robot's file and a table each")
     parser.add_argument(
         "--packages", type=Path, metavar="FOLDER", help="where pysindy and scikit-learn are installed"

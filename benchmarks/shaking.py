@@ -1,4 +1,4 @@
-"""A running gear that shakes (set S of docs/vibration.md): the paper's findings at it, and C MuJoCo beside it.
+"""The paper's findings at a running gear that shakes (set S of docs/explanation/vibration.md), and C MuJoCo.
 
     python benchmarks/shaking.py            # findings: twenty rows at two steps, a minute on two cores
     python benchmarks/shaking.py --native   # C MuJoCo stepped with the same forces, two points; two minutes

@@ -30,7 +30,7 @@ TURNS = 0.05
 
 
 def surfaces() -> None:
-    """Print the table of docs/turning.md."""
+    """Print the table of docs/explanation/turning.md."""
     robot = mm.nominal()
     names = [(c, s, p) for c in robot.configurations for s in SURFACES for p in (0.0, 8.0)]
     rows = [(c, s, p, float(u)) for c, s, p in names for u in VOLTAGES]
@@ -85,7 +85,7 @@ def speed(points: int) -> None:
 
 
 def tracks() -> None:
-    """Print the table of docs/turning.md, Beside the track model."""
+    """Print the table "Against the track model" of docs/explanation/turning.md."""
     robot = mm.nominal()
     rows = [(24, 24, 10), (15, 15, -15), (33, 33, 14.85), (15, 10.5, 15), (24, -24, 24), (24, 24, 12)]
     names = ["6T2A"] * 4 + ["4W2T"] * 2

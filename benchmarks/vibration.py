@@ -5,7 +5,8 @@
 
 A track that runs over its grousers shakes: reaction and sliding speed of each contact swing about their means.
 Friction does not average, so a robot may slip far more than Fig. 7 says of its mean demand (Section 3.2.4, ref. [46];
-Blekhman, Vibrational Mechanics, 2000: dry friction turns into an apparent viscous one). docs/vibration.md derives it.
+Blekhman, Vibrational Mechanics, 2000: dry friction turns into an apparent viscous one).
+docs/explanation/vibration.md derives it.
 Of each run the ripple of its contacts is measured and the slip that follows from it compared with the run's own,
 beside that of Fig. 7 without ripple. Prints a line of JSON.
 """
@@ -58,7 +59,7 @@ LOG = ("6T2A.ground.friction.speed_static", "running_gear.contact_stiffness", "r
 #: Upper ends of the classes of slip [%].
 CLASSES = (3.0, 6.0, 10.0, 100.0)
 #: Second harmonic of the sliding speed over the first: two events a pitch, a grouser landing in front and one lifting
-#: at the rear. Bursts of sliding are short and steep with it, as in the track model (docs/vibration.md).
+#: at the rear. Bursts of sliding are short and steep with it, as in the track model (docs/explanation/vibration.md).
 SECOND = 0.5
 #: Phases over which is averaged.
 PHASES = 128

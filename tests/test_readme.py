@@ -24,7 +24,7 @@ def commands(text):
 def unknown(words):
     """What of a command line the program does not know."""
     command = get_command(cli.app)
-    while hasattr(command, "commands"):
+    while hasattr(command, "commands") and not words[0].startswith("--"):
         if words[0] not in command.commands:
             return words[0]
         command, words = command.commands[words[0]], words[1:]
@@ -40,7 +40,8 @@ def test_every_command_of_a_page_and_its_options_exist(page):
 
 def test_a_command_that_does_not_exist_is_found():
     assert unknown(["simulat"]) == "simulat" and unknown(["simulate", "--slop", "3"]) == "--slop"
-    assert unknown(["rig", "check", "a.toml"]) is None
+    assert unknown(["rig", "check", "a.toml"]) is None and unknown(["--version"]) is None
+    assert unknown(["--versio"]) == "--versio"
 
 
 def anchor(heading):

@@ -172,9 +172,9 @@ class VibrationSlip(SlipEffect):
 
     Source: Section 3.2.4 and its ref. [46]; Blekhman, Vibrational Mechanics (2000). The law of Fig. 7 averaged over
     contacts that swing by s (`mmrjax.vibration`), where V_s is small beside s: slip in proportion to s and, with the
-    load's lead, to u; s itself grows as 1 / (1 - u), as the track model shows (docs/vibration.md). That is rounded
-    off within 0.05 of the limit, beyond which the robot slides anyway, and the power of the speed at rest. Under a
-    demand that pulls forward the robot runs ahead of its tracks.
+    load's lead, to u; s itself grows as 1 / (1 - u), as the track model shows
+    (docs/explanation/vibration.md). That is rounded off within 0.05 of the limit, beyond which the robot slides
+    anyway, and the power of the speed at rest. Under a demand that pulls forward the robot runs ahead of its tracks.
     """
 
     driver = "demand"
@@ -187,7 +187,7 @@ class VibrationSlip(SlipEffect):
         meaning="speed lost at V_1 and half of the adhesion",
         bounds=(-0.05, 0.5),
         sd=0.02,
-        source="contacts of the track model swing by 1 to 4 % of the speed: running gears of docs/vibration.md",
+        source="contacts of the track model swing by 1 to 4 % of the speed (docs/explanation/vibration.md)",
     )
     exponent: Scalar = parameter(
         2.0,

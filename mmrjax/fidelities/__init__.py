@@ -67,7 +67,7 @@ class Facts:
         resolves: beginnings of names of parameters that it reads and fidelities without them do not.
         reverse: whether derivatives by reverse mode (`jax.grad`) go through, next to forward ones.
         slow: whether a batch takes long enough for a bar that shows its progress.
-        one_thread: whether XLA has to run on one thread: on two, runs have hung for good (docs/benchmarks.md).
+        one_thread: whether XLA has to run on one thread: on two, runs have hung for good (docs/lab/figures.md).
     """
 
     module: str
