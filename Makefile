@@ -63,6 +63,7 @@ docs: $(READY)
 	$(PYTHON) -m venv runs/docs-venv
 	runs/docs-venv/bin/pip install --quiet --disable-pip-version-check "mkdocs-material>=9.5,<10"
 	NO_MKDOCS_2_WARNING=1 runs/docs-venv/bin/mkdocs build --strict --quiet
+	rm -f site/404.html  # of a server's root, which a site on disk has not
 	@echo "open site/index.html"
 
 clean:
