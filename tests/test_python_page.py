@@ -55,7 +55,9 @@ def test_a_recipe_runs(heading):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", TUTORIALS)
+@pytest.mark.parametrize(
+    "page", [pytest.param(p, marks=pytest.mark.nightly) if p == "start/python" else p for p in TUTORIALS]
+)
 @pytest.mark.filterwarnings("default")
 def test_a_tutorial_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

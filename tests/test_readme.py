@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
+from calibration.data import profiles, requirements_file, robot_file
 from sweeps import cli
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -74,3 +75,17 @@ def test_python_of_the_readme_runs():
     names = {}
     exec(code, names)
     assert names["found"].converged
+
+
+def block(page, kind):
+    """The first block of code of a kind in a page of the docs."""
+    return re.search(rf"```{kind}\n(.*?)```", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.S)[1]
+
+
+def test_files_of_the_how_to_pages_are_read(tmp_path):
+    assert requirements_file.read(block("howto/requirements.md", "toml"), "x.toml")
+    for page in ("howto/describe-a-rig.md", "howto/turn.md"):
+        (tmp_path / "robot.toml").write_text(block(page, "toml"), encoding="utf-8")
+        assert robot_file.read(tmp_path / "robot.toml").sides == 2
+    (tmp_path / "mission.csv").write_text(block("howto/mission.md", "csv"), encoding="utf-8")
+    assert profiles.read(tmp_path / "mission.csv").cycles == 40
