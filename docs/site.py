@@ -109,11 +109,11 @@ def statuses() -> str:
     from sweeps.results.climb_results import VERDICTS
 
     parts = {
-        "Statuses": {name: f"{status.meaning}." for name, status in words.STATUSES.items()},
-        "Flags": {name: f"{meaning}." for name, meaning in words.FLAGS.items()},
-        "Verdicts of the loop": {name: f"{meaning}." for name, meaning in words.LOOP_VERDICTS.items()},
-        "Verdicts of a climb": {name: f"{verdict[1]}." for name, verdict in VERDICTS.items()},
-        "Files of a run folder": {name: f"{meaning}." for name, meaning in words.FILES.items()},
+        "Statuses": {name: _sentence(status.meaning) for name, status in words.STATUSES.items()},
+        "Flags": {name: _sentence(meaning) for name, meaning in words.FLAGS.items()},
+        "Verdicts of the loop": {name: _sentence(meaning) for name, meaning in words.LOOP_VERDICTS.items()},
+        "Verdicts of a climb": {name: _sentence(verdict[1]) for name, verdict in VERDICTS.items()},
+        "Files of a run folder": {name: _sentence(meaning) for name, meaning in words.FILES.items()},
     }
     opening = (
         "Every run has one status and any number of flags; `runs.csv` has a column for each. A run that stalls or "
@@ -274,6 +274,10 @@ def modules() -> str:
                 folders.setdefault(folder, []).append((f"`{path.name}`", first))
         parts += [f"## `{folder}`\n\n" + _table(("module", "contents"), rows) for folder, rows in folders.items()]
     return "\n\n".join(parts) + "\n"
+
+
+def _sentence(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}."
 
 
 def _named(rows: dict[str, str]) -> list[tuple[str, str]]:
