@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-import mmrjax
+import mmrjax as mm
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
@@ -25,11 +25,11 @@ def test_citation_is_complete_and_of_this_version():
     assert (known["version"], known["license"]) == (PROJECT["version"], PROJECT["license"])
 
 
-def test_the_release_has_one_version_one_date_and_a_tag():
+def test_the_release_has_one_version_one_date_and_a_tag(mmrjax):
     """In the package, the citation, the changelog and the command of CONTRIBUTING."""
     changes = (ROOT / "CHANGELOG.md").read_text("utf-8")
     (date,) = re.findall(r"^date-released: (.*)$", (ROOT / "CITATION.cff").read_text("utf-8"), re.M)
-    assert mmrjax.__version__ == PROJECT["version"]
+    assert mm.__version__ == PROJECT["version"] and mmrjax("--version")[:2] == (0, f"mmrjax {mm.__version__}\n")
     assert re.findall(r"^## (.*)$", changes, re.M)[0] in (f"{PROJECT['version']} ({date})", "Unreleased")
     assert f"## {PROJECT['version']} ({date})" in changes
     assert f"git tag -a v{PROJECT['version']} " in (ROOT / "CONTRIBUTING.md").read_text("utf-8")
