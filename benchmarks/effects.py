@@ -27,14 +27,14 @@ from mmrjax.model.robot import Robot
 jax.config.update("jax_enable_x64", True)
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "reference" / "effects.md"
-#: Adhesion at which all of Table 8 climbs, from standstill too; Table 5's does not hold 20 degrees.
+#: Adhesion that lets all of Table 8 climb, also from standstill; Table 5's does not hold 20 degrees.
 ADHESION = {
     f"{c}.ground.friction.{k}": v for c in (TRACKED, WHEELED) for k, v in (("static", 0.6), ("dynamic", 0.48))
 }
-#: In the units of the channels' columns; only the ratios of what a display resolves matter for look-alikes.
+#: In the units of the channels' columns; only the ratios of display resolutions matter for look-alikes.
 SHOWN = 1 / np.array(channels.factors(channels.usual()))
 NOISE = np.array([0.02, 5.0, 3.0])
-#: Base parameters that every fit frees, projected out.
+#: Base parameters that every fit frees; they are projected out.
 FREED = (
     *(f"{TRACKED}.{n}" for n in ("track.loss_coulomb", "track.loss_viscous", "track.guide_share")),
     *(f"{WHEELED}.{n}" for n in ("track.loss_coulomb", "track.loss_viscous")),
@@ -45,7 +45,7 @@ FREED = (
     ),
 )
 ALIKE = 0.95
-#: Share of a signature below which nothing of it is left.
+#: Share of a signature below which it counts as 0.
 ABSORBED = 1e-9
 STARTS = np.concatenate([[0.0], np.geomspace(1e-4, 0.05, 40), np.linspace(0.06, 2.0, 98)])  # [s]
 
@@ -79,8 +79,11 @@ def table8() -> Conditions:
 
 
 def sensitivities() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Change of the shown readings by one prior sd of each settled effect at `examples`, shape (2, 3, effects);
-    whitened over Table 8, shape (540, effects); and that of the freed parameters, shape (540, parameters)."""
+    """Three arrays of changes of the shown readings.
+
+    By one prior sd of each settled effect at `examples`, shape (2, 3, effects); the same whitened over Table 8, shape
+    (540, effects); and whitened changes by the freed parameters, shape (540, parameters).
+    """
     full = robot(SETTLED)
     names = [f"effects.{e.name}.amplitude" for e in SETTLED] + list(FREED)
     values = {p.name: p.value for p in params.walk(full)}
@@ -100,8 +103,10 @@ def sensitivities() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def look_alikes(effects: np.ndarray, base: np.ndarray) -> tuple[list[list[str]], np.ndarray]:
-    """For each settled effect the others with |cos| above ALIKE once the base is projected out, and what
-    share of its signature is left by the base."""
+    """For each settled effect the others with |cos| above ALIKE after projecting out the base.
+
+    Also returns the share of its signature that the projection leaves.
+    """
     q, _ = np.linalg.qr(base / np.linalg.norm(base, axis=0))
     left = effects - q @ (q.T @ effects)
     whole, beside = np.linalg.norm(effects, axis=0), np.linalg.norm(left, axis=0)
@@ -116,8 +121,10 @@ def look_alikes(effects: np.ndarray, base: np.ndarray) -> tuple[list[list[str]],
 
 
 def passing() -> np.ndarray:
-    """Largest change of each reading through 2 s from standstill by one prior sd of each effect that only a
-    history shows, at `examples`, on the battery where it needs one; shape (effects, 2, 3)."""
+    """Largest change of each reading in 2 s from standstill by one prior sd of each effect that only histories show.
+
+    At `examples`, on the battery if an effect needs one; shape (effects, 2, 3).
+    """
     full = robot(PASSING)
     names = [f"effects.{e.name}.amplitude" for e in PASSING]
 
@@ -146,7 +153,7 @@ def _number(value: float) -> str:
 
 
 def _about(effect: type[Effect]) -> tuple[str, ...]:
-    """Equation, what it stands for, and source, as cells of a table."""
+    """Equation, description and source, as cells of a table."""
     return tuple(text.replace("|", "∣") for text in words.about(effect))
 
 
@@ -230,7 +237,7 @@ def page() -> str:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="compare with the page, and write nothing")
+    parser.add_argument("--check", action="store_true", help="compare with the page without writing")
     check = parser.parse_args().check
     text = page()
     if check:
