@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.data.columns import Meaning
+from calibration.data.columns import Column
 from calibration.data.input_errors import number
 from calibration.data.named_arrays import Raw, numbers
 
@@ -19,7 +19,7 @@ _SOME_DAY, _DAY = "1970-01-01T", 86400.0
 _WITH_POINTS = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})(?=[ T])")
 
 
-def from_the_first(name: str, meaning: Meaning, raw: Raw, runs: Sequence[str] | None) -> tuple[Raw, str]:
+def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | None) -> tuple[Raw, str]:
     """Returns a column of time as the time since the first row of each run, and a note where that changes it.
 
     A run begins at its first row, whatever its clock shows there: the time since a controller started, or a time of

@@ -7,7 +7,7 @@ import difflib
 import re
 from collections.abc import Sequence
 
-from calibration.data.columns import HEADING, SIDES, SPEED, SUPPLY, TIME, VOLTS, Layout, Meaning
+from calibration.data.columns import HEADING, SIDES, SPEED, SUPPLY, TIME, VOLTS, WORDS, Column, Layout
 from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays
 from mmrjax.model import channels, quantities
@@ -65,7 +65,7 @@ def _with_channels(name: str, header: list[str], layout: Layout, more: Sequence[
 
 
 def check_header(
-    name: str, header: list[str], meanings: list[Meaning | None], measured: bool, battery: bool, layout: Layout
+    name: str, header: list[str], meanings: list[Column | None], measured: bool, battery: bool, layout: Layout
 ) -> None:
     stated = {m.column for m in meanings if m is not None}
     strange = [c for c, m in zip(header, meanings, strict=True) if m is None]
@@ -107,7 +107,7 @@ def check_header(
             raise BadData(f"{name}: unknown column {column}; did you mean {close[0]}? rename or remove it")
 
 
-def check_time(name: str, header: list[str], meanings: list[Meaning | None], layout: Layout) -> None:
+def check_time(name: str, header: list[str], meanings: list[Column | None], layout: Layout) -> None:
     """Refuse readings of a log without its time."""
     stated = {m.column: m.shown for m in meanings if m is not None}
     over_time = [stated[c.column] for c in layout.channels if c.column in stated and not c.settled]
@@ -155,11 +155,11 @@ def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layou
             )
 
 
-def check_units(arrays: NamedArrays, meanings: Sequence[Meaning | None]) -> None:
+def check_units(arrays: NamedArrays, meanings: Sequence[Column | None]) -> None:
     """Refuses a column whose name, or whose source, states another unit than it is read in."""
     below = [""] * len(meanings)
     for j, (unit, meaning) in enumerate(zip(arrays.units, meanings, strict=bool(arrays.units))):
-        if meaning is None or meaning.quantity is None:
+        if meaning is None or meaning.column in WORDS:
             continue
         known = meaning.quantity.columns().values()
         if unit and unit not in known:
@@ -170,7 +170,7 @@ def check_units(arrays: NamedArrays, meanings: Sequence[Meaning | None]) -> None
             )
         below[j] = unit
     for stated_below, meaning in zip(below, meanings, strict=True):
-        if meaning is None or meaning.quantity is None or abs(meaning.factor) != 1.0:
+        if meaning is None or abs(meaning.factor) != 1.0:
             continue
         named = {unit: column for column, unit in meaning.quantity.columns().items()}
         for stated, where in (

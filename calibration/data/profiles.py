@@ -21,7 +21,18 @@ from calibration.data.columns import LOAD, SUPPLY
 from calibration.data.input_errors import BadConfiguration, BadData, choices, is_number, number
 from mmrjax.errors import counted
 from mmrjax.missions.mission import Start
-from mmrjax.missions.profile import APART, MODES, MOTOR_SPEED, PAIRS, SPEED, VOLTAGE, Profile, profile, sides_refused
+from mmrjax.missions.profile import (
+    APART,
+    MODES,
+    MOTOR_SPEED,
+    PAIRS,
+    SPEED,
+    VOLTAGE,
+    YAW_RATE,
+    Profile,
+    profile,
+    sides_refused,
+)
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
@@ -36,26 +47,17 @@ CONTROLLED = tuple(mode for mode in MODES if mode in channels.USUAL)
 BETWEEN = ("held", "linear")
 #: Most rows in all, cycles included.
 LONGEST = 1_000_000
-#: What columns can hold, by the field of `mmrjax.missions.profile.Profile` that it becomes; demands become `demand`.
+#: Quantities of columns, by field of `mmrjax.missions.profile.Profile`; demands become `demand`.
 QUANTITIES: dict[str, Quantity] = {
-    "time": quantities.named("time"),
-    "voltage": quantities.CONDITIONS["voltage"],
-    "duty": quantities.CONDITIONS["duty"],
-    **{name: channels.find(name) for name in CONTROLLED},
-    **{name: quantities.named(name) for name in (*PAIRS[0], *PAIRS[1])},
-    "yaw_rate": channels.find("yaw_rate"),
-    "slope_deg": quantities.CONDITIONS["slope_deg"],
-    "payload": quantities.CONDITIONS["payload"],
-    "load_torque": quantities.CONDITIONS["load_torque"],
-    "current_other": quantities.named("current_other"),
+    quantity.key: quantity
+    for quantity in (quantities.named("time"), *quantities.SET, *channels.EVERY)
+    if quantity.in_profiles
 }
 #: Columns of which a row has at most one, and the mode that each means.
 DEMANDS = {
     **dict.fromkeys(("duty", *PAIRS[0], *PAIRS[1]), MODES[VOLTAGE]),
     **{mode: mode for mode in CONTROLLED},
 }
-#: Demanded beside a speed.
-YAW_RATE = "yaw_rate"
 #: What a row may not leave empty where the file has the column.
 HELD = ("voltage", "slope_deg", "payload", "load_torque", "current_other")
 MODE, SURFACE = "mode", "surface"

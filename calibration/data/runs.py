@@ -25,7 +25,7 @@ from calibration.data import (
     row_checks,
     sides,
 )
-from calibration.data.columns import CONDITIONS, DUTY, SUPPLY, TIME, WHEN, Layout, Meaning
+from calibration.data.columns import CONDITIONS, DUTY, SUPPLY, TIME, WHEN, Column, Layout
 from calibration.data.input_errors import BadConfiguration, BadData, number
 from calibration.data.named_arrays import NamedArrays, Raw, missing, numbers, texts
 from calibration.data.table import Runs
@@ -133,7 +133,7 @@ def of_arrays(
 
 
 def _columns(
-    arrays: NamedArrays, meanings: Sequence[Meaning | None], layout: Layout, battery: bool
+    arrays: NamedArrays, meanings: Sequence[Column | None], layout: Layout, battery: bool
 ) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
     """Values of the columns that mean something, and notes on cells that are read as something else."""
     columns: dict[str, np.ndarray] = {}
@@ -215,7 +215,7 @@ def _extra(raw: Raw) -> np.ndarray:
     return found if missing(raw, lost).all() else np.array(raw)
 
 
-def _refuse_idle(arrays: NamedArrays, meaning: Meaning, raw: Raw, layout: Layout) -> None:
+def _refuse_idle(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Layout) -> None:
     """Refuses a condition that does not act on the robot's load, unless it is 0 or not stated."""
     why = (
         f"{NO_BRAKE}; state slope_deg or payload_kg, or describe the load as a shaft"
@@ -254,13 +254,15 @@ def single(cells: dict[str, Any], layout: Layout | None = None) -> Runs:
         BadConfiguration: an option that is out of range, not finite or an unknown word.
     """
     layout = Layout() if layout is None else layout
+    rows = layout.quantities()
     columns: dict[str, np.ndarray] = {}
     for column, value in cells.items():
-        meaning = Meaning(column, column)
+        quantity = rows[column]
+        meaning = Column(quantity, column, next(iter(quantity.units)))
         text = number(value) if isinstance(value, float) else str(value)
         columns[column], refused = cell_values.values(meaning, [text], layout)
         if refused.any():
-            raise BadConfiguration(cell_values.refusal("option", meaning, text, layout))
+            raise BadConfiguration(cell_values.refusal("option", meaning, text, layout, hints=False))
     if layout.imposed == "voltage":
         columns.setdefault(SUPPLY, np.array([math.nan]))
     if "total_mass_kg" in cells and cells["total_mass_kg"] <= cells["payload_kg"]:

@@ -47,7 +47,7 @@ FAR = 6.0
 #: Share of glitches in a stretch up to which the other readings have a mean; samples beside which a reading is held.
 MOST_GLITCHES, BESIDE = 0.25, (21, 101)
 #: Channels that a robot that travels straight reads as zero.
-OF_YAW = ("yaw_rate", "lateral_speed")
+OF_YAW = tuple(c.name for c in channels.OF_TURNS if c.directed and c.side is None)
 #: Conditions whose every change ends a stretch.
 EXACT = ("configuration", "surface", "mode", "slope_deg", "payload_kg", "total_mass_kg")
 #: Why samples are left out.

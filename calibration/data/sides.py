@@ -10,6 +10,7 @@ from calibration.data.columns import DUTY, SIDES, SUPPLY, VOLTS, Layout
 from calibration.data.input_errors import BadData, number
 from calibration.data.table import Runs, driven
 from mmrjax.model import channels
+from mmrjax.model.quantities import TURN
 from mmrjax.model.rig import Instrument
 
 #: Of rows that tell: what drives the sides apart, or one backward, as a share of the most that does so [-].
@@ -87,8 +88,7 @@ def check(runs: Runs) -> None:
             runs, columns, (one, other), other - one, drive,
             "the larger one on the side that is driven faster: the sides of one pair of columns are exchanged",
         )  # fmt: skip
-    yaw = channels.find("yaw_rate").column
-    if runs.has(yaw):
+    for yaw in (c.column for c in channels.EVERY if c.sign == TURN and runs.has(c.column)):
         _refuse_against(
             runs, yaw, (runs[yaw],), runs[yaw], right - left,
             "a positive one where the right side is the faster: turn its sign, in the robot's file by [columns] "

@@ -8,9 +8,22 @@ from collections.abc import Mapping
 import numpy as np
 
 from calibration.data import surface_labels
-from calibration.data.columns import CIRCUITS, DRIVEN, DUTY, HEADING, IMPOSED, LEVERS, LOAD, SUPPLY, TIME, Layout
+from calibration.data.columns import (
+    CIRCUITS,
+    CONDITIONS,
+    DRIVEN,
+    DUTY,
+    HEADING,
+    IMPOSED,
+    LEVERS,
+    LOAD,
+    SUPPLY,
+    TIME,
+    WHEN,
+    Layout,
+)
 from calibration.data.input_errors import BadData, choices
-from mmrjax.model import channels
+from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import adhesion_ratio, lateral_ratio
@@ -118,8 +131,10 @@ class Runs:
     def axes(self) -> tuple[str, ...]:
         """Columns of the conditions that its runs have, what is imposed first."""
         duty = () if self.sampled else DUTY
-        further = (*duty, *self.layout.sides, *HEADING, *LEVERS, LOAD)
-        return tuple(c for c in (*self.layout.axes, *further) if self.has(c))
+        usual = (*CONDITIONS, *DUTY, *WHEN)
+        others = (c.column for c in quantities.SET if c.in_tables and c.field and c.column not in usual)
+        every = (*self.layout.axes, *duty, *self.layout.sides, *HEADING, *LEVERS, *others)
+        return tuple(dict.fromkeys(c for c in every if self.has(c)))
 
     @property
     def pulled(self) -> bool:
@@ -250,28 +265,22 @@ class Runs:
             ]
         column, factor = IMPOSED[robot.rig.imposed]
         imposed = robot.rig.imposed != "voltage"
-        apart = {name: self[name] for name in HEADING if self.has(name)}
-        for side, name in zip(channels.SIDES, self.layout.sides, strict=False):
-            if self.has(name):
-                apart[f"{robot.rig.imposed if imposed else 'duty'}_{side}"] = factor * self[name]
         if imposed and not self.has(column):
             raise BadData(f"{self.source}: no {column}, which the robot's file says is imposed; give it in a table")
+        stated = {c.field: self[c.column] for c in quantities.SET if c.in_tables and c.field and self.has(c.column)}
+        stated["duty"] = np.where(held, 0.0, stated.get("duty", 1.0))
+        stated["voltage"] = np.zeros(len(self)) if battery or imposed else self[SUPPLY]
+        if imposed:
+            stated[robot.rig.imposed] = self[column] * factor
+            for side, name in zip(channels.SIDES, self.layout.sides, strict=False):
+                if self.has(name):
+                    stated[f"{robot.rig.imposed}_{side}"] = self[name] * factor
         return Conditions(
             which,
-            np.zeros(len(self)) if battery or imposed else self[SUPPLY],
-            self.columns.get("slope_deg", 0.0),
-            self.columns.get("payload_kg", 0.0),
             battery=battery,
             discharge=discharge,
             adhesion=adhesion,
-            adhesion_lateral=lateral if apart else None,
-            **apart,
-            **{name: self[name] for name in LEVERS if self.has(name)},
-            load_torque=self[LOAD] if self.has(LOAD) else None,
-            total_mass=self["total_mass_kg"] if self.has("total_mass_kg") else None,
-            order=self["order"] if self.has("order") else 0.0,
-            duty=np.where(held, 0.0, self["duty"] if self.has("duty") else 1.0),
+            adhesion_lateral=lateral if self.turns else None,
             open=[CIRCUITS[mode] for mode in self["mode"]] if self.has("mode") else 0.0,
-            motor_speed=self[column] * factor if robot.rig.imposed == "motor_speed" else None,
-            motor_current=self[column] * factor if robot.rig.imposed == "motor_current" else None,
+            **stated,
         )

@@ -10,7 +10,8 @@ import numpy as np
 from calibration.data.columns import SUPPLY
 from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
-from mmrjax.effects.base import EQUATION, THE_SIDE
+from mmrjax.effects.base import EQUATION
+from mmrjax.effects.curve import EVERY_VARIABLE
 
 #: Balances in which the current stands for the load that the motors carry.
 OF_LOAD = ("motor", "gearbox", "track", "ground", "slip", "yaw")
@@ -71,10 +72,10 @@ class DiscrepancyLocation:
         happens = bases_room.window(self.variable)
         variable = self.variable if happens is None else happens.axis
         what = bases_room.in_words(self.place) if self.channel else EQUATION[self.balance]
-        drivers = {"speed_motor": "speed", "current": "load" if self.balance in OF_LOAD else "current"}
+        drivers = {name: v.driver for name, v in EVERY_VARIABLE.items() if v.driver}
+        drivers |= {"current": "load" if self.balance in OF_LOAD else "current"}
         drivers |= {"payload": "load", "slope": "demand" if self.balance == "slip" else "slope"}
         drivers |= {"voltage": "duty"} if self.by_duty else {}
-        drivers |= {"yaw_rate": "speed", "side": THE_SIDE}
         return f"{what} that changes with {drivers.get(variable, variable)}"
 
     def to_json(self) -> dict[str, Any]:

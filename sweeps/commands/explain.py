@@ -79,7 +79,7 @@ def names(library: dict[str, type[Effect]]) -> dict[str, list[str]]:
         "verdicts of a climb": list(VERDICTS),
         "flags": list(words.FLAGS),
         "channels": [c.name for c in channels.EVERY],
-        "conditions": [c.field for c in quantities.SET if c.field],
+        "conditions": [*(c.name for c in quantities.LABELS), *(c.field for c in quantities.SET if c.field)],
         "outputs": list(dict.fromkeys(o.name for o in EVERY_OUTPUT)),
         "parameters": [p.name for p in params.walk(paper_robots.nominal())],
     }
@@ -193,6 +193,9 @@ def _channel(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
 
 
 def _condition(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+    if label := next((label for label in quantities.LABELS if label.name == name), None):
+        yield "is", label.label
+        yield "column", label.column
     c = next((c for c in quantities.SET if name in (c.name, c.field, c.column)), None)
     if c is None:
         return
