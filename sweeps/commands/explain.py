@@ -12,7 +12,7 @@ import numpy as np
 
 from calibration.data import effect_file
 from calibration.data.input_errors import BadConfiguration, number
-from calibration.words import effect_words as words_of
+from calibration.words import effect_words
 from mmrjax import derived, effects
 from mmrjax.effects import Effect
 from mmrjax.errors import near
@@ -89,7 +89,7 @@ def _effect(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     effect = library.get(name)
     if effect is None:
         return
-    equation, meaning, source = words_of.about(effect)
+    equation, meaning, source = effect_words.about(effect)
     yield "equation", equation
     yield "stands for", meaning
     yield "enters", f"the {effect.balance} balance{f', channel {effect.channel}' if effect.channel else ''}"
@@ -100,12 +100,12 @@ def _effect(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
             yield "bounds", _bounds(p.spec)
         else:
             yield f"  {p.name}", f"{float(p.value):g} {p.spec.unit}: {p.spec.meaning}"
-    if said := ", ".join(words_of.declared(effect)):
+    if said := ", ".join(effect_words.declared(effect)):
         yield "declares", said
     yield "in data", f"{effect.family()}{_histories(effect)}"
     for line in _changes(made):
         yield "", line
-    for k, test in enumerate(words_of.tests(effect)):
+    for k, test in enumerate(effect_words.tests(effect)):
         yield "" if k else "on a bench", test
     if source:
         yield "source", source
@@ -188,7 +188,7 @@ def _channel(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     wrong = [e for e in library.values() if e.channel == c.name and e.name not in effects.UNNAMED]
     if wrong:
         yield "its errors", ", ".join(e.name for e in wrong)
-        for k, test in enumerate(words_of.tests(wrong[0])):
+        for k, test in enumerate(effect_words.tests(wrong[0])):
             yield "" if k else "on a bench", test
 
 
