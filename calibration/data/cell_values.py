@@ -13,12 +13,12 @@ from calibration.data.input_errors import choices, number, parsed
 from calibration.data.named_arrays import Raw, missing, numbers, texts
 from mmrjax.model import quantities
 
-#: From how many times the largest value that is allowed another unit is supposed.
+#: Ratio to the largest allowed value from which another unit is probable.
 FAR = 2.0
-#: How far a value may be beyond a limit because it is written with few digits, and because a factor from its unit is,
-#: as shares of the limit.
+#: Rounding of a value with few digits, and of one with a factor of few digits, that may carry it beyond a limit, as
+#: shares of the limit.
 ROUNDED, ROUNDED_FACTOR = 1e-6, 5e-4
-#: What people write there.
+#: Entries of people for a missing reading.
 NOTHING = ("n.a.", "-", "--", "?", "x", "inf", "-inf")
 _WITH_UNIT = re.compile(r"([+-]?\d*\.?\d+(?:[eE][+-]?\d+)?)\s*([^\d\s.,].*)")
 
@@ -57,7 +57,7 @@ def _may_be_empty(column: str, layout: Layout) -> bool:
 
 
 def _allowed_words(column: str, word: str, layout: Layout) -> str:
-    """Words that a message offers in the place of one that is refused; empty for one that is allowed."""
+    """Allowed words for the message about a word; empty if the word is allowed itself."""
     if column == "surface":
         return surfaces.refused(word, layout)
     if column == "mode" and word not in DRIVEN:
@@ -89,7 +89,7 @@ def refusal(where: str, meaning: Column, cell: str, layout: Layout, *, hints: bo
 
 
 def _hint(meaning: Column, cell: str, units: bool, readings: tuple[str, ...]) -> str:
-    """What a cell that is refused probably means, with a semicolon behind it; empty where nothing is known."""
+    """Guess at the meaning of a refused cell, with a semicolon at its end; empty where there is none."""
     if cell.lower() in NOTHING:
         return "leave the cell empty where there is no reading; " if meaning.column in readings else ""
     quantity, mine = meaning.quantity, meaning.unit
@@ -112,7 +112,7 @@ def _hint(meaning: Column, cell: str, units: bool, readings: tuple[str, ...]) ->
 
 
 def _unit_hint(value: str, written: str, mine: str, named: Mapping[str, str]) -> str:
-    """What to do with a unit beside a number; `mine`: the column's own, `named`: columns by their units."""
+    """Advice on a unit next to a number; `mine`: the column's own unit, `named`: columns by their units."""
     unit = quantities.spelled(written)
     if unit == mine:
         return f"write {value}, the unit stands in the column's name; "

@@ -13,7 +13,7 @@ from calibration.data.columns import Column
 from calibration.data.input_errors import number
 from calibration.data.named_arrays import Raw, numbers
 
-#: What follows a day where a cell holds a time alone, and how long a day lasts [s].
+#: Day of a cell that holds a time alone, and length of a day [s].
 _SOME_DAY, _DAY = "1970-01-01T", 86400.0
 #: A date as 25.11.2026.
 _WITH_POINTS = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})(?=[ T])")
@@ -69,12 +69,12 @@ def _past_midnight(clock: np.ndarray, cells: Sequence[str], run: np.ndarray) -> 
 
 
 def _alone(cell: str) -> bool:
-    """Whether a cell has a time without a date."""
+    """True if a cell has a time without a date."""
     return cell[2:3] == ":"
 
 
 def _seconds(cell: str) -> float:
-    """Since some day of a date and time, NaN of what is none."""
+    """Seconds of a date and time since a fixed day, NaN for other cells."""
     if ":" not in cell:
         return math.nan
     dated = _WITH_POINTS.sub(r"\3-\2-\1", cell)

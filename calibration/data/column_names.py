@@ -15,7 +15,7 @@ from mmrjax.model.channels import Channel
 
 #: Most columns of a table that a message names.
 NAMED = 8
-#: How people call the sides.
+#: Other words for the sides.
 _SIDE = {"l": "left", "lh": "left", "lft": "left", "port": "left", "r": "right", "rh": "right", "starboard": "right"}
 
 
@@ -57,7 +57,7 @@ def _in_case(name: str, header: Sequence[str], layout: Layout, inferred: bool) -
 
 
 def _with_channels(name: str, header: list[str], layout: Layout, more: Sequence[Channel]) -> Layout:
-    """`layout` with those of some more channels of which a file has a column."""
+    """`layout` with each of `more` for which the file has a column."""
     meanings = dataclasses.replace(layout, channels=channels.EVERY).meanings(name, header)
     stated = {m.column for m in meanings if m is not None}
     found = tuple(c for c in channels.EVERY if c in layout.channels or (c in more and c.column in stated))
@@ -108,7 +108,7 @@ def check_header(
 
 
 def check_time(name: str, header: list[str], meanings: list[Column | None], layout: Layout) -> None:
-    """Refuse readings of a log without its time."""
+    """Refuses readings of a log without a column of time."""
     stated = {m.column: m.shown for m in meanings if m is not None}
     over_time = [stated[c.column] for c in layout.channels if c.column in stated and not c.settled]
     if over_time and stated.keys().isdisjoint(TIME):
@@ -120,7 +120,7 @@ def check_time(name: str, header: list[str], meanings: list[Column | None], layo
 
 
 def _other_names(strange: list[str], column: str) -> str:
-    """How columns that have names of their own are told apart, for a message; empty where there are none."""
+    """Advice on columns with unknown names, for a message; empty if there are none."""
     if not strange:
         return ""
     unit = column.rpartition("_")[2]
@@ -133,7 +133,7 @@ def _other_names(strange: list[str], column: str) -> str:
 
 
 def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layout: Layout) -> None:
-    """Refuse columns that name a side in other words, or elsewhere in the column's name."""
+    """Refuses columns that name a side in other words, or elsewhere in the column's name."""
 
     def words(column: str) -> list[str]:
         return sorted(_SIDE.get(word.casefold(), word.casefold()) for word in column.split("_"))

@@ -56,7 +56,7 @@ LOAD = "load_torque_Nm"
 WHEN = ("time_s", "order")
 WORDS = tuple(label.column for label in quantities.LABELS)
 
-#: How alike the names of two columns are at least for one to be meant by the other.
+#: Least similarity of two names of columns for one to be meant by the other.
 ALIKE = 0.6
 
 
@@ -99,15 +99,15 @@ class Column:
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Facts of a robot on which the columns of its tables depend.
+    """Facts of a robot that decide about the columns of its tables.
 
     Attributes:
         imposed: on its motors, one of `rig.IMPOSED`.
-        has_ground: whether a ground carries it, see `Robot.has_ground`.
-        weight: whether a weight or a constant torque acts on it, which may drive its motors either way.
-        inherits: whether what its file leaves open is a packaged robot's.
-        configurations: its names.
-        instruments: of channels, where more is known than that they are there.
+        has_ground: True if a ground carries it, see `Robot.has_ground`.
+        weight: True if a weight or a constant torque acts on it, which may drive its motors either way.
+        inherits: True if values that its file does not state are those of a packaged robot.
+        configurations: their names.
+        instruments: properties of instruments that are known.
         mapped: (column as this program calls it, column of the file, factor from its unit).
         channels: that its readings are of, in the order of arrays.
     """
@@ -141,7 +141,7 @@ class Layout:
 
     @property
     def complete(self) -> bool:
-        """True if tables have to state every condition; else those that they leave out have their usual value."""
+        """True if tables have to state every condition; otherwise a missing condition has its usual value."""
         return self.table8
 
     @property
@@ -161,7 +161,7 @@ class Layout:
 
     @property
     def sides(self) -> tuple[str, ...]:
-        """Columns that say what drives the left and the right side of a robot that turns; none of one that cannot."""
+        """Columns of the drive of the left and the right side; none for a robot that cannot turn."""
         imposed = {"voltage": tuple(SIDES), "motor_speed": SPEEDS}.get(self.imposed, ())
         return imposed if self.has_ground else ()
 
@@ -185,7 +185,7 @@ class Layout:
         return any(i.channel == channel and i.signed is False for i in self.instruments)
 
     def variance(self, channel: str) -> float:
-        """Of the error by the step of a channel's instrument [SI²]."""
+        """Returns the variance of the error by the step of a channel's instrument [SI²]."""
         return sum(i.variance for i in self.instruments if i.channel == channel)
 
     def known(self) -> tuple[str, ...]:
@@ -205,14 +205,14 @@ class Layout:
         return (("configuration",) if len(self.configurations) != 1 else ()) + imposed
 
     def quantities(self) -> dict[str, Quantity]:
-        """Quantities that columns of its tables hold, by column, with those that do not act on its load."""
+        """Quantities of the columns of its tables, by column, including conditions that do not act on its load."""
         shown = [c for c in channels.EVERY if c in self.channels or c.column in (self.imposed_column, *self.sides)]
         rows = (*quantities.LABELS, *quantities.SET, *(q for c in shown for q in _of_channel(c)))
         known = {*self.known(), *ON_GROUND, *ON_SHAFT}
         return {q.column: q for q in rows if q.column in known}
 
     def meanings(self, source: str, header: list[str]) -> list[Column | None]:
-        """Returns the quantity that each column of a file holds, None where it is none; names may state another unit.
+        """Returns the quantity of each column of a file, None for an unknown column; names may state another unit.
 
         Raises:
             BadData: two columns of one quantity.

@@ -58,7 +58,7 @@ DEMANDS = {
     **dict.fromkeys(("duty", *PAIRS[0], *PAIRS[1]), MODES[VOLTAGE]),
     **{mode: mode for mode in CONTROLLED},
 }
-#: What a row may not leave empty where the file has the column.
+#: Columns of a file that no row may leave empty.
 HELD = ("voltage", "slope_deg", "payload", "load_torque", "current_other")
 MODE, SURFACE = "mode", "surface"
 #: What a comment line may set of the state that a mission begins in: field of `Start`, least, greatest, and the SI
@@ -112,12 +112,12 @@ class ProfileTable:
 
     @property
     def duration(self) -> float:
-        """Of the whole mission [s]."""
+        """Duration of the whole mission [s]."""
         return self.cycles * float(self.time[-1] - self.time[0])
 
     @property
     def turns(self) -> bool:
-        """Whether it drives the sides apart."""
+        """True if it drives the sides apart."""
         return any(name in self.values for name in APART)
 
     @property
@@ -247,7 +247,7 @@ def _parsed(content: bytes, name: str) -> ProfileTable:
 
 
 def _settings(name: str, comments: list[str]) -> dict[str, Any]:
-    """What the comment lines at the top set: `cycles = 40`, `between_rows = "linear"`; other lines are remarks."""
+    """Settings in the comment lines at the top: `cycles = 40`, `between_rows = "linear"`; other lines are remarks."""
     stated: dict[str, Any] = {}
     for line in comments:
         text = line.lstrip("#").strip()
@@ -423,7 +423,7 @@ def _driven(cells: _Cells) -> tuple[tuple[str, ...], dict[str, np.ndarray]]:
 
 
 def _demands_yaw(cells: _Cells, row: int, before: str, mode: str) -> bool:
-    """Whether a row states a yaw rate, which a demanded speed has beside it and nothing else."""
+    """True if a row states a yaw rate, which only a row with a demanded speed may."""
     speed, stated = MODES[SPEED], bool(cells.text(YAW_RATE, row))
     if stated and mode != speed and not (cells.linear and before == speed):
         cells.refuse(

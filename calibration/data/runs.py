@@ -83,16 +83,15 @@ def of_arrays(
     Args:
         arrays: columns of the source.
         measured: True if at least one channel is required; without any, `total_mass_kg` may be missing too.
-        battery: True if the runs are on the on-board battery, whose voltage no table states: its column is left out,
-            or empty.
-        robot: that the table is of; it says which columns are needed, and which channels it has. None: the packaged
-            one; the table then has every other channel too of which it has a column.
-        of_turns: True if a table of turns has every channel of either side, and of the yaw, of which it has a column.
+        battery: True if the runs are on the on-board battery; the column of the voltage is missing then, or empty.
+        robot: defines the columns that are needed, and the channels. None: the packaged robot, with a channel for
+            each further column of one.
+        of_turns: True to give a table of turns a channel for each of its columns of one side or of the yaw.
 
     Raises:
-        BadData: no columns or rows, no channel, a missing, misspelt or repeated column, another unit than a column's,
-            values that contradict each other or the robot, or a value that is no number, not finite or out of range.
-            The sentence has source, row, column, value and what is allowed.
+        BadData: no columns or rows, no channel, a missing, misspelt or repeated column, or a wrong unit; values that
+            contradict each other or the robot; a value that is no number, not finite or out of range. The sentence
+            has source, row, column, value and the allowed values.
     """
     inferred = robot is None
     name, layout = arrays.name, Layout.of(robot)
@@ -168,7 +167,7 @@ def _columns(
 
 
 def _listed(name: str, said: Sequence[str], count: int) -> str:
-    """What is wrong with a file's cells, the first row's first; what to do about it once.
+    """One message on all refused cells, the first row first; each advice stands once.
 
     Args:
         said: sentences, among them the first `LISTED`; count: number of cells.

@@ -84,12 +84,12 @@ class Runs:
         return self.columns[column]
 
     def has(self, column: str) -> bool:
-        """Whether the table has this column."""
+        """True if the table has this column."""
         return column in self.columns
 
     @property
     def turns(self) -> bool:
-        """Whether its robot is free to turn: its sides are driven apart, or it heads elsewhere than uphill."""
+        """True if its robot is free to turn: its sides are driven apart, or it does not head uphill."""
         return any(self.has(name) for name in (*self.layout.sides, *HEADING))
 
     @property
@@ -99,7 +99,7 @@ class Runs:
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """That its readings are of, in the order of arrays."""
+        """Channels of its readings, in the order of arrays."""
         return self.layout.channels
 
     def of(self, robot: Robot) -> Runs:
@@ -138,14 +138,17 @@ class Runs:
 
     @property
     def pulled(self) -> bool:
-        """Whether gravity, a constant torque or a motor as the load may drive the motors."""
+        """True if gravity, a constant torque or a motor as the load may drive the motors."""
         sloped = self.has("slope_deg") and bool(self["slope_deg"].any())
         return self.layout.weight or sloped or bool(driven_on(self.columns, self.layout).any())
 
     def turns_round(self, channel: Channel) -> bool:
-        """Whether a channel's readings have the sign of what drives the motors: a speed's do, and a current's where
-        nothing else drives them; a bridge that turns the voltage turns the supply's current back. In a turn each side
-        has its own sign, and the yaw rate that of their difference (`sides.check`)."""
+        """True if a channel's readings have the sign of what drives the motors.
+
+        A speed has it, and so has a current if nothing else drives the motors. A bridge that reverses the voltage
+        reverses the supply's current. In a turn each side has its own sign, and the yaw rate has the sign of their
+        difference (`sides.check`).
+        """
         if (
             self.turns
             or not channel.directed
@@ -158,7 +161,7 @@ class Runs:
 
     @property
     def sampled(self) -> bool:
-        """Whether a row is a sample of a run."""
+        """True if a row is a sample of a run."""
         return all(self.has(column) for column in TIME)
 
     @property
@@ -186,7 +189,7 @@ class Runs:
         return self._stacked(tuple(c.column for c in self.channels))
 
     def deviations(self) -> np.ndarray:
-        """Stated sds of the readings [SI], NaN where none is stated, shape (rows, channels)."""
+        """Stated sds of the readings [SI], NaN for others, shape (rows, channels)."""
         return self._stacked(tuple(c.sd_column for c in self.channels))
 
     def _stacked(self, columns: tuple[str, ...]) -> np.ndarray:
@@ -195,7 +198,7 @@ class Runs:
         return np.stack(found, 1) * np.asarray(channels.factors(self.channels))
 
     def missing(self) -> list[str]:
-        """A sentence for each channel of which readings are missing."""
+        """Returns a note on each channel with missing readings."""
         said = []
         for k, channel in enumerate(self.channels):
             lost = np.flatnonzero(np.isnan(self.measured()[:, k]))
@@ -228,7 +231,7 @@ class Runs:
         return which
 
     def configurations_named(self, robot: Robot) -> np.ndarray:
-        """As `configurations`, by name; of those that the robot does not have as the table does."""
+        """Names of `configurations`; a configuration that the robot does not have keeps the table's name."""
         stated = self["configuration"]
         if not self.has("surface"):
             return stated

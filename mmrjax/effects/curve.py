@@ -44,16 +44,16 @@ PLACES = {**BALANCES, **ROUND, **READINGS}
 
 @dataclasses.dataclass(frozen=True)
 class Variable:
-    """A signal over which curves are, one that every balance above knows; or time, order or side of a run.
+    """Abscissa of a curve: a signal of every balance above, or the time, the order or the side of a run.
 
     Attributes:
         unit: SI; low, high: its ordinary range [unit].
         column: of tables, or of points that stand for one; label: words of figures.
         unit_shown: in figures; shown: SI value of it.
-        symbol: in formulas, empty where it stands in none.
-        driver: word for what an effect changes with; empty: its name.
+        symbol: in formulas; empty: no formula has it.
+        driver: word for it as the driver of an effect; empty: its name.
         sign: what turns its sign, see `quantities.Quantity`.
-        levels: True if a person sets it, so that one of its levels may differ from the others.
+        levels: True if a person sets it, so that one of its levels may differ from the rest.
     """
 
     unit: str
