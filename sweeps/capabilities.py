@@ -89,8 +89,8 @@ def without_idle(robot: Robot, table: dict[str, np.ndarray]) -> dict[str, np.nda
     return {column: values for column, values in table.items() if column not in gone}
 
 
-def parameters(file: RobotFile) -> list[dict[str, str]]:
-    """Parameters of a rig: those that its file states, and all else that is not as nothing is; with the source."""
+def parameters(file: RobotFile) -> list[tuple[str, float, str, str, str]]:
+    """Parameters that a rig's file states, and others with an effect: name, value, unit, meaning, source."""
     robot = file.robot
     nothing, found = _nothing(robot), []
     for p in params.walk(robot):
@@ -104,8 +104,5 @@ def parameters(file: RobotFile) -> list[dict[str, str]]:
             continue
         of_file = own or head in file.linear
         source = f"stated in {file.name}" if of_file else "default" if not moved or load else "changed"
-        found.append(
-            {"name": p.name, "meaning": p.spec.meaning, "unit": p.spec.unit, "value": f"{float(p.value):.6g}"}
-            | {"source": source}
-        )
+        found.append((p.name, float(p.value), p.spec.unit, p.spec.meaning, source))
     return found

@@ -7,10 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from sweeps import config as configuration
 from sweeps.config import RobotPart
 from sweeps.console import say
+from sweeps.report import terminal_renderer
+from sweeps.report.document import Document
 from sweeps.store import DONE, SOLVER_FAILED, Folder
 
 Page = Callable[[Path], Any]
@@ -22,6 +25,12 @@ def page(name: str, *found: Any, **known: Any) -> Page:
     It is imported when it is written: figures cost half a second, which --no-report saves.
     """
     return lambda folder: importlib.import_module(f"sweeps.pages.{name}_page").write(folder, *found, **known)
+
+
+def report(document: Document, file: RobotFile | None = None) -> Page:
+    """Print a document and return its page, which ends with the robot's parameters if its file is given."""
+    terminal_renderer.show(document)
+    return lambda folder: importlib.import_module("sweeps.report.page_renderer").write(folder, document, file)
 
 
 def leave(

@@ -27,6 +27,13 @@ STEPS = {
     "points": "derivatives at every operating point",
     "sobol": "Sobol indices of the same points, to compare the bounds with",
     "evaluations": "{:,} model evaluations so far, {:,.0f} a second",
+    # requirements and sizing
+    "requirement": "requirement {} of {}: {}",
+    "changes": "changes that would meet missed requirement {} of {}: {}",
+    "designs": "1 of 4, random designs of every choice of parts",
+    "descents": "2 of 4, {} searches by gradients",
+    "whole": "3 of 4, ratios of the sheets and whole cells",
+    "refined": "4 of 4, the best {} with any ratio and fractions of a cell",
     # a calibration
     "optimum": "optimum found; now {}",
     "steady": "the same with steady first, to begin from its optimum",

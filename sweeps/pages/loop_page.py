@@ -22,8 +22,8 @@ from mmrjax.effects import BY_NAME
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from sweeps.pages import cluster_figures, loop_figures
-from sweeps.pages.page import Album, columns, conditions, curves, first_rows, render, words_shown
-from sweeps.pages.words import GLOSSARY
+from sweeps.pages.page import Album, columns, conditions, curves, first_rows, render
+from sweeps.pages.words import GLOSSARY, words_shown
 
 #: Change of an rms error that is marked [%].
 NOTABLE = 0.05

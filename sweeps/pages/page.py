@@ -23,9 +23,9 @@ from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
 from sweeps.pages.figure_style import style, svg
-
-ROWS = 200  # of a table on a page
-_PAPERS_NAMES = {"nominal": "nominal (PM)", "sm1": "SM-1", "sm2": "SM-2"}
+from sweeps.report.document import PAGE_ROWS as ROWS
+from sweeps.report.document import Column, Note, Section, Table, tone
+from sweeps.report.markup import download, marked
 
 
 class Album:
@@ -56,21 +56,38 @@ def _inline(svg: str, name: str) -> str:
 
 
 def named(file: RobotFile) -> dict[str, Any]:
-    """What a page says of the robot: the `robot`'s name, and the parameters `changed` from the nominal one's.
+    """The `robot`'s name and its section of a page (`about_robot`), with its remarks and unnamed curves.
 
-    Of a rig that starts from nothing its `own`, with where each comes from. A changed packaged robot is said to be
-    one.
+    A packaged robot with other parameters is called changed.
     """
     from mmrjax.model.paper_robots import ROBOTS
 
     robot, name = file.robot, file.name
-    known: dict[str, Any] = {"robot": name, "changed": [], "own": [], "curves": curves(robot)}
-    known["remarks"] = file.remarks
-    if not robot.rig.inherits:
-        return known | {"own": capabilities.parameters(file)}
-    if name in ROBOTS and changed_parameters(robot, ROBOTS[name]()):
-        name = f"{name}, changed"
-    return known | {"robot": words_shown(name), "changed": changed_parameters(robot, ROBOTS["nominal"]())}
+    if robot.rig.inherits:
+        if name in ROBOTS and changed_parameters(robot, ROBOTS[name]()):
+            name = f"{name}, changed"
+        name = words.words_shown(name)
+    about = {"robot": name, "curves": curves(robot), "remarks": file.remarks}
+    return about | {"about_robot": _section(file, ROBOTS["nominal"]())}
+
+
+def _section(file: RobotFile, nominal: Robot) -> Section:
+    """Parameters of a rig, or those in which a robot differs from the nominal one."""
+    end = (Column("unit"), Column("meaning"))
+    first, value = Column("parameter"), "{:.6g}"
+    if not file.robot.rig.inherits:
+        columns = (first, Column("value", form=value), *end, Column("source"))
+        text = "Its parameters (SI units). A loss or limit that its file does not state is absent."
+        rows, table = capabilities.parameters(file), "own"
+    else:
+        columns = (first, Column("this robot", form=value), Column("nominal", form=value), *end)
+        text = "Parameters that differ from the nominal robot's (SI units):"
+        rows, table = changed_parameters(file.robot, nominal), "changed"
+    if not rows:
+        text = "Every parameter is the nominal robot's (Tables 1-7 of the paper and the makers' sheets)."
+    return Section(
+        "The robot", (Note(text), Table(table, columns, [(f"`{name}`", *rest) for name, *rest in rows])), "robot"
+    )
 
 
 def curves(robot: Robot) -> list[str]:
@@ -78,24 +95,14 @@ def curves(robot: Robot) -> list[str]:
     return [e.name for e in robot.effects if e.name in effects.UNNAMED]
 
 
-def words_shown(name: str) -> str:
-    """A robot's name as a page shows it."""
-    return _PAPERS_NAMES.get(name, name)
-
-
-def changed_parameters(robot: Robot, nominal: Robot) -> list[dict[str, str]]:
-    """Every parameter of `robot` that is not the nominal robot's, with both values."""
+def changed_parameters(robot: Robot, nominal: Robot) -> list[tuple[Any, ...]]:
+    """Parameters of `robot` that differ from the nominal robot's: name, both values, unit, meaning."""
     base = {p.name: float(p.value) for p in params.walk(nominal)}
-    answer = []
-    for p in params.walk(robot):
-        value = float(p.value)
-        if p.name not in base or not np.isclose(value, base[p.name], rtol=1e-9, atol=0.0):
-            before = f"{base[p.name]:.6g}" if p.name in base else "not in the paper's model"
-            answer.append(
-                {"name": p.name, "meaning": p.spec.meaning, "unit": p.spec.unit, "value": f"{value:.6g}"}
-                | {"nominal": before}
-            )
-    return answer
+    return [
+        (p.name, float(p.value), base.get(p.name, "not in the paper's model"), p.spec.unit, p.spec.meaning)
+        for p in params.walk(robot)
+        if p.name not in base or not np.isclose(float(p.value), base[p.name], rtol=1e-9, atol=0.0)
+    ]
 
 
 def _column(condition: Condition) -> str:
@@ -221,7 +228,9 @@ def render(
         lstrip_blocks=True,
     )
     environment.filters |= {"number": number, "reading": reading, "grade": _grade, "error": error, "winding": winding}
+    environment.filters |= {"marked": marked, "download": download, "tone": tone}
     environment.globals |= {
+        "page_rows": ROWS,
         "channels": {c.name: (c.label, c.unit) for c in of_channels},
         "status_words": {name: status.short for name, status in words.STATUSES.items()},
         "settled_words": words.SETTLED,
