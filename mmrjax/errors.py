@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 import re
 from collections.abc import Iterable
 
@@ -42,7 +43,16 @@ def choices(word: str, allowed: Iterable[str], most: int = 1, shown: Iterable[st
     allowed = list(allowed)
     found = near(word, allowed, most)
     hint = f"did you mean {', '.join(found)}? " if found else ""
-    return f"{hint}allowed: {', '.join(allowed if shown is None else shown)}"
+    return f"{hint}allowed: {some(allowed if shown is None else shown)}"
+
+
+def some(names: Iterable[str], width: int = 240) -> str:
+    """A list of names, cut after `width` characters with the number of the others: "a, b and 3 more"."""
+    names = list(names)
+    ends = list(itertools.accumulate(len(name) + 2 for name in names))
+    shown = max(1, sum(end <= width for end in ends))
+    rest = len(names) - shown
+    return ", ".join(names) if rest <= 1 else f"{', '.join(names[:shown])} and {rest} more"
 
 
 def near(word: str, allowed: Iterable[str], most: int = 1) -> list[str]:
