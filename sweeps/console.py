@@ -91,7 +91,7 @@ def pulse(
     """
     import jax
 
-    from calibration.words.step_words import still
+    from sweeps.report.words.step_words import still
 
     compiled, said = 0, [(doing, time.monotonic(), 0)]
     spoke, over = threading.Event(), threading.Event()

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from calibration.described import in_words
 from calibration.discovery import loop_notes as of_loop
 from calibration.discovery.loop_notes import (
     CurveOver,
@@ -27,11 +28,11 @@ from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.residual_clusters import LevelMean, ResidualCluster
 from calibration.inference.series_noise import SeriesNoise
 from calibration.sensitivity import sensitivity_notes as of_study
-from calibration.words import fit_words, loop_words, step_words, table_words
-from calibration.words.note_words import SAID, in_words, sentence
 from mmrjax.model import channels
 from sweeps import console
 from sweeps.pages.words import FILES
+from sweeps.report.words import fit_words, loop_words, step_words, table_words
+from sweeps.report.words.note_words import NOTES, describe
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Notes, and what is said of them.
@@ -417,7 +418,7 @@ SAMPLES = [
 
 @pytest.mark.parametrize(("note", "said"), SAMPLES, ids=lambda x: type(x).__name__ if isinstance(x, Note) else "")
 def test_a_note_is_said(note, said):
-    assert sentence(note) == said
+    assert describe(note) == said
     told = []
     in_words(told.append)(note)
     assert told == [said]
@@ -434,14 +435,16 @@ def kinds():
 
 
 def test_every_kind_of_note_has_a_sentence_and_a_sample():
-    assert kinds() == set(SAID) == {type(note) for note, _ in SAMPLES}
+    assert kinds() == set(NOTES) == {type(note) for note, _ in SAMPLES}
     assert all(dataclasses.is_dataclass(kind) for kind in kinds())
 
 
 def test_a_sentence_is_its_own_words_and_what_is_no_note_says_so():
-    assert sentence("as it is") == "as it is"
-    with pytest.raises(NotImplementedError):
-        sentence(Note())
+    assert describe("as it is") == "as it is"
+    with pytest.raises(TypeError, match="got Note; expected a note or a result"):
+        describe(Note())
+    with pytest.raises(TypeError, match="got HeldByPrior, header; expected"):
+        describe(of_fit.HeldByPrior(("a",)), "header")
 
 
 @pytest.mark.parametrize(
@@ -451,7 +454,7 @@ def test_a_sentence_is_its_own_words_and_what_is_no_note_says_so():
 def test_names_of_rows_are_those_of_the_code(kind, rows):
     """A name without a row would fail only where it is said, and a row without a name is never said."""
     used = set()
-    for room in ("inference", "discovery", "sensitivity"):
+    for room in ("inference", "discovery", "sensitivity", "sizing"):
         for file in (ROOT / "calibration" / room).rglob("*.py"):
             for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.Call) and ast.unparse(node.func) == kind and node.args:
@@ -537,7 +540,7 @@ def test_verdict_of_a_complete_model():
     off = of_fit.NoiseOff("", 2.0, "stated")
     said = "Nothing is missing: what the fitted model leaves is what noise leaves (family-wise p = 0.4)."
     assert loop_words.statement(Summary("none", 0.4, None)) == said
-    assert loop_words.statement(Summary("none", 0.4, None, noise=(off,))) == f"{said} But {sentence(off)}"
+    assert loop_words.statement(Summary("none", 0.4, None, noise=(off,))) == f"{said} But {describe(off)}"
     aside = loop_words.statement(Summary("none", 0.4, None, aside=10, of=100))
     assert aside == f"10 of 100 rows (10 %) lie off alone and are set aside. {said}"
 
@@ -792,7 +795,7 @@ def clustered(levels, **other):
     ],
 )
 def test_what_residuals_cluster_by_is_said(found, said):
-    assert found.statement == said == sentence(found) == found.to_json()["statement"]
+    assert found.statement == said == describe(found) == found.to_json()["statement"]
 
 
 def test_six_levels_that_are_furthest_off_are_listed():

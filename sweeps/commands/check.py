@@ -9,8 +9,8 @@ import numpy as np
 
 from calibration.data import requirements_file, robot_file
 from calibration.data.input_errors import BadConfiguration
+from calibration.described import in_words
 from calibration.sizing import sheet
-from calibration.words.note_words import in_words
 from mmrjax.derived.requirements import CHARGE, OF_HEAT
 from mmrjax.model.channels import HEAT
 from mmrjax.model.robot import Robot

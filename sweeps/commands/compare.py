@@ -14,10 +14,10 @@ from calibration.data import instruments
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
+from calibration.described import sentences
 from calibration.inference import preparation
 from calibration.inference import simulation_errors as residual
 from calibration.inference.ranges import check_ranges
-from calibration.words.note_words import sentences
 from mmrjax import fidelities
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot

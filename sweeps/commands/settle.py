@@ -12,10 +12,9 @@ from rich.table import Table
 
 from calibration.data import robot_file, settling
 from calibration.data.settling import Inertia, Settled
+from calibration.described import sentences
 from calibration.inference import ranges
 from calibration.inference.observers import SettledRuns
-from calibration.words import settle_words as words
-from calibration.words.note_words import sentences
 from mmrjax.model import balances
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
@@ -24,6 +23,7 @@ from mmrjax.model.signals import State
 from sweeps import config as configuration
 from sweeps.console import say
 from sweeps.inputs import load_robot, read_runs
+from sweeps.report.words import settle_words as words
 from sweeps.skeleton import leave, page
 from sweeps.store import open_folder
 

@@ -9,11 +9,11 @@ from pathlib import Path
 from calibration.data import requirements_file, robot_file
 from calibration.data.input_errors import BadConfiguration, choices
 from calibration.data.parts import motors
+from calibration.described import in_words
 from calibration.sizing import sheet
 from calibration.sizing.chart import Chart, chart, extent
 from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.design_search import size as search
-from calibration.words.note_words import in_words
 from sweeps import config as configuration
 from sweeps.console import pulse, tell
 from sweeps.inputs import load_robot

@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 
 from calibration.data.courses import applied
 from calibration.data.settling import Settled
-from calibration.words import settle_words as words
 from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, figure
 from sweeps.pages.page import ROWS, Album, render
+from sweeps.report.words import settle_words as words
 
 #: What is imposed, and the unit of `applied`.
 IMPOSED = {

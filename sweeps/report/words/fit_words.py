@@ -68,15 +68,11 @@ def combination(two: fit_notes.Pair) -> str:
     return f"{two.one} {'-' if two.weight < 0 else '+'} {abs(two.weight):.2g} · {two.other}"
 
 
-def pair(two: fit_notes.Pair) -> dict[str, Any]:
-    """As in result.json."""
-    return {"a": two.one, "b": two.other, "correlation": two.correlation, "determined": combination(two)}
-
-
-def determined(name: str, held: bool, pairs: Sequence[fit_notes.Pair]) -> str:
+def determined(found: fit_notes.Determination) -> str:
     """Answer whether data determine a parameter: `yes`, `no`, or `only with motor.resistance` for both of a pair."""
-    others = [p.other if p.one == name else p.one for p in pairs if name in (p.one, p.other)]
-    return f"only with {', '.join(others)}" if others else "no" if held else "yes"
+    if found.others:
+        return f"only with {', '.join(found.others)}"
+    return "no" if found.held else "yes"
 
 
 def only_together(note: fit_notes.OnlyTogether) -> str:

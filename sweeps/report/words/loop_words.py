@@ -16,10 +16,10 @@ from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME
 from calibration.inference import bases
 from calibration.inference import blocks as blocks_room
 from calibration.inference.series_noise import SeriesNoise
-from calibration.words import fit_words
 from mmrjax import effects
 from mmrjax.errors import counted
 from mmrjax.model import channels
+from sweeps.report.words import fit_words
 
 if TYPE_CHECKING:
     from calibration.discovery.discover import LoopStages
