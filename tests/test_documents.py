@@ -8,23 +8,30 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
+import json
 import re
 import urllib.parse
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pages import Tables, drawn, outside
 
 from calibration.data import requirements_file
+from calibration.data import runs as records
 from calibration.data.parts import cells
+from calibration.data.robot_file import RobotFile
 from calibration.sizing import sheet
 from calibration.sizing.design_search import Found, Sizing
 from calibration.sizing.part_options import drives
 from mmrjax.model.paper_robots import nominal
-from sweeps.report import check_report, page_renderer, size_report, terminal_renderer
+from sweeps import store
+from sweeps.inputs import fit_of
+from sweeps.report import check_report, comparison_report, page_renderer, size_report, terminal_renderer
 from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table
 from sweeps.results.check_results import CheckResult
+from sweeps.results.comparison_results import Comparison, compared
 from sweeps.results.size_results import SizeResult
 
 RECORD = Path(__file__).parent / "record" / "pages"
@@ -83,7 +90,30 @@ def size() -> Document:
     return size_report.document(SizeResult(asked, robot, sizing, ("mass",), outcomes()), "nominal (PM)")
 
 
-DOCUMENTS: dict[str, Callable[[], Document]] = {"check": check, "size": size}
+def comparison(log: bool = False) -> Document:
+    """The bench's rows with a simulation 4 % above them, the first row without one; of a log as its first 2.8 s."""
+    measured = records.read("measured")
+    error = np.where(np.arange(len(measured)) == 0, np.nan, 1.04 + 0.001 * measured["slope_deg"])
+    simulated = {c: measured[c] for c in ("configuration", *measured.axes)}
+    simulated |= {c.column: error * measured[c.column] for c in measured.channels}
+    simulated["status"] = np.where(np.isnan(error), "slides", "converged")
+    table, summary = compared(measured, simulated, sized=log)
+    time = {"time_s": 0.1 * np.arange(len(measured))} if log else {}
+    return comparison_report.document(
+        Comparison(
+            table | time, summary, measured.channels, "measured", "steady", "nominal (PM)", log, "" if log else "these",
+            {"time_s": "time [s]"} if log else None, ("a note",),
+        )
+    )  # fmt: skip
+
+
+def comparison_log() -> Document:
+    return comparison(log=True)
+
+
+DOCUMENTS: dict[str, Callable[[], Document]] = {
+    "check": check, "size": size, "comparison": comparison, "comparison_log": comparison_log
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)
@@ -104,6 +134,24 @@ SMALL = Document(
         )),
     ),
 )  # fmt: skip
+
+
+def test_a_robot_is_fitted_to_the_rows_that_its_folder_records(tmp_path):
+    robot, runs = tmp_path / "robot.toml", records.read("measured")
+    robot.write_text("# a robot\n")
+    file = RobotFile(nominal(), str(robot))
+    assert fit_of(file, runs) == "" == fit_of(RobotFile(nominal(), "nominal"), runs)
+    manifest = {
+        "arguments": ["loop", "x.csv"],
+        "hashes": {"robot": store.digest(robot.read_bytes()), "x.csv": runs.digest},
+    }
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    assert fit_of(file, runs) == "these"
+    assert fit_of(file, records.Runs("other", runs.columns)) == "others"
+    robot.write_text("# changed by hand\n")
+    assert fit_of(file, runs) == ""
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest | {"arguments": ["compare", "x.csv"]}))
+    assert fit_of(file, runs) == ""
 
 
 def test_page_terminal_and_csv_show_the_same_cells(tmp_path, capsys):

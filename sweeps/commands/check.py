@@ -44,7 +44,7 @@ def check(config: configuration.Check, out: Path | None, force: bool) -> int:
             outcomes = sheet.check(robot, asked, changes=config.changes, tell=in_words(heard))
             found = CheckResult(asked, robot, outcomes, posture_results.of_requirements(robot, outcomes))
         _write(folder, config, found)
-        shown = report(check_report.document(found, words.words_shown(file.name), config.changes), file)
+        shown = report(check_report.document(found, capabilities.shown_name(file), config.changes), file)
         manifest = {"seed": None, **sheet.counts(found.outcomes)}
         solved = words.solved(Counter(o.status for o in found.outcomes))
         return leave(folder, config, manifest, solved=solved, page=shown)

@@ -14,6 +14,7 @@ from calibration.sizing import sheet
 from calibration.sizing.chart import Chart, chart, extent
 from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.design_search import size as search
+from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import pulse, tell
 from sweeps.inputs import load_robot
@@ -62,7 +63,7 @@ def size(config: configuration.Size, out: Path | None, force: bool) -> int:
         found = SizeResult(asked, robot, sizing, objectives, outcomes, charts)
         _write(folder, config, found)
         shown = report(
-            size_report.document(found, words.words_shown(file.name)), dataclasses.replace(file, robot=best)
+            size_report.document(found, capabilities.shown_name(file)), dataclasses.replace(file, robot=best)
         )
         manifest = {"seed": config.seed, "feasible": sizing.best is not None}
         solved = words.solved(Counter(o.status for o in outcomes))

@@ -20,8 +20,9 @@ from mmrjax.effects import BY_NAME
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from sweeps.pages import cluster_figures, loop_figures
-from sweeps.pages.page import Album, columns, conditions, curves, first_rows, render
+from sweeps.pages.page import Album, columns, curves, first_rows, render
 from sweeps.pages.words import GLOSSARY, words_shown
+from sweeps.report.condition_columns import conditions
 from sweeps.report.words import loop_words as words
 from sweeps.report.words.note_words import describe
 

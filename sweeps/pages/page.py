@@ -16,9 +16,8 @@ from markupsafe import Markup, escape
 from calibration.data.robot_file import RobotFile
 from calibration.data.writing import write_text
 from mmrjax import __version__, effects
-from mmrjax.model import channels, params
+from mmrjax.model import channels
 from mmrjax.model.channels import Channel
-from mmrjax.model.quantities import SET, Condition
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
@@ -62,12 +61,7 @@ def named(file: RobotFile) -> dict[str, Any]:
     """
     from mmrjax.model.paper_robots import ROBOTS
 
-    robot, name = file.robot, file.name
-    if robot.rig.inherits:
-        if name in ROBOTS and changed_parameters(robot, ROBOTS[name]()):
-            name = f"{name}, changed"
-        name = words.words_shown(name)
-    about = {"robot": name, "curves": curves(robot), "remarks": file.remarks}
+    about = {"robot": capabilities.shown_name(file), "curves": curves(file.robot), "remarks": file.remarks}
     return about | {"about_robot": _section(file, ROBOTS["nominal"]())}
 
 
@@ -82,7 +76,7 @@ def _section(file: RobotFile, nominal: Robot) -> Section:
     else:
         columns = (first, Column("this robot", form=value), Column("nominal", form=value), *end)
         text = "Parameters that differ from the nominal robot's (SI units):"
-        rows, table = changed_parameters(file.robot, nominal), "changed"
+        rows, table = capabilities.changed_parameters(file.robot, nominal), "changed"
     if not rows:
         text = "Every parameter is the nominal robot's (Tables 1-7 of the paper and the makers' sheets)."
     return Section(
@@ -93,36 +87,6 @@ def _section(file: RobotFile, nominal: Robot) -> Section:
 def curves(robot: Robot) -> list[str]:
     """Curves of a robot for what is missing without a name."""
     return [e.name for e in robot.effects if e.name in effects.UNNAMED]
-
-
-def changed_parameters(robot: Robot, nominal: Robot) -> list[tuple[Any, ...]]:
-    """Parameters of `robot` that differ from the nominal robot's: name, both values, unit, meaning."""
-    base = {p.name: float(p.value) for p in params.walk(nominal)}
-    return [
-        (p.name, float(p.value), base.get(p.name, "not in the paper's model"), p.spec.unit, p.spec.meaning)
-        for p in params.walk(robot)
-        if p.name not in base or not np.isclose(float(p.value), base[p.name], rtol=1e-9, atol=0.0)
-    ]
-
-
-def _column(condition: Condition) -> str:
-    """The column of a condition; an imposed speed or current stands in that of its channel."""
-    return next((c.column for c in channels.EVERY if c.name == condition.name), condition.column)
-
-
-#: Conditions of a run by their columns: heading, and format of a number.
-CONDITIONS = {_column(c): (c.heading, c.shown) for c in SET if c.heading}
-
-
-def conditions(table: dict[str, np.ndarray], *, mass: bool = False) -> dict[str, tuple[str, str]]:
-    """Heading and format of each condition that a table has, by column; readings of channels are none.
-
-    Args:
-        mass: whether the total mass is among them.
-    """
-    readings = {c for c in table if f"simulated_{c}" in table or f"after_{c}" in table}
-    shown = {c: about for c, about in CONDITIONS.items() if c in table and c not in readings}
-    return {c: about for c, about in shown.items() if mass or c != "total_mass_kg"}
 
 
 def label(table: dict[str, np.ndarray], row: int) -> str:
