@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from pages import Tables, drawn, outside
 
-from calibration.data import requirements_file
+from calibration.data import requirements_file, settling
 from calibration.data import runs as records
 from calibration.data.parts import cells
 from calibration.data.robot_file import RobotFile
@@ -28,7 +28,14 @@ from calibration.sizing.part_options import drives
 from mmrjax.model.paper_robots import nominal
 from sweeps import store
 from sweeps.inputs import fit_of
-from sweeps.report import check_report, comparison_report, page_renderer, size_report, terminal_renderer
+from sweeps.report import (
+    check_report,
+    comparison_report,
+    page_renderer,
+    settle_report,
+    size_report,
+    terminal_renderer,
+)
 from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table
 from sweeps.results.check_results import CheckResult
 from sweeps.results.comparison_results import Comparison, compared
@@ -111,8 +118,26 @@ def comparison_log() -> Document:
     return comparison(log=True)
 
 
+def settle() -> Document:
+    """A log of two levels, the first of which still changes at its beginning, and of a third that is too short."""
+    rng = np.random.default_rng(3)
+    volts = np.repeat([6.0, 12.0, 18.0], (200, 200, 12))
+    lag = np.where(np.arange(len(volts)) < 200, np.exp(-np.arange(len(volts)) / 40), 0.0)
+    runs = records.Runs(
+        "log.csv",
+        {
+            "configuration": np.repeat("6T2A", len(volts)), "time_s": 0.01 * np.arange(len(volts)),
+            "supply_voltage_V": volts, "payload_kg": 0.0 * volts, "slope_deg": 0.0 * volts,
+            "total_current_A": 1.2 + volts / 20 + 0.01 * rng.standard_normal(len(volts)),
+            "motor_speed_rpm": 350 * volts * (1 - 0.5 * lag) + 3 * rng.standard_normal(len(volts)),
+        },
+    )  # fmt: skip
+    return settle_report.document(settling.settle(runs), "Too few for the loop.", ("a further note",))
+
+
 DOCUMENTS: dict[str, Callable[[], Document]] = {
-    "check": check, "size": size, "comparison": comparison, "comparison_log": comparison_log
+    "check": check, "size": size, "comparison": comparison, "comparison_log": comparison_log,
+    "settle": settle,
 }  # fmt: skip
 
 

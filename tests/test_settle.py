@@ -523,7 +523,7 @@ def test_the_command_leaves_a_table_that_is_read_as_settled_runs(tmp_path, mmrja
     page = (tmp_path / "found" / "report.html").read_text(encoding="utf-8")
     assert (
         "The log." in page
-        and "<th>voltage [V]</th>" in page
+        and '<th rowspan="2">voltage [V]</th>' in page
         and (tmp_path / "found" / "figures" / "log.svg").is_file()
     )
 

@@ -1,4 +1,4 @@
-"""The command `settle`: from a log over time to a table of settled runs, and a page that shows them over the log."""
+"""The command `settle`: find the settled runs of a log over time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from rich.table import Table
 
 from calibration.data import robot_file, settling
 from calibration.data.settling import Inertia, Settled
@@ -21,15 +20,15 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import State
 from sweeps import config as configuration
-from sweeps.console import say
 from sweeps.inputs import load_robot, read_runs
+from sweeps.report import settle_report
 from sweeps.report.words import settle_words as words
-from sweeps.skeleton import leave, page
+from sweeps.skeleton import leave, report
 from sweeps.store import open_folder
 
 
 def settle(config: configuration.Settle, source: str, out: Path | None, force: bool) -> int:
-    """Find what of a log has settled, and leave a run folder with the table; returns the exit code, 0."""
+    """Find the settled runs of a log and write a run folder with their table; returns the exit code, 0."""
     robot = load_robot(config).robot
     runs = read_runs(source, robot, measured=True, series=True)
     loop = shlex.join(["mmrjax", "loop", source, "--robot", config.robot])
@@ -47,10 +46,8 @@ def settle(config: configuration.Settle, source: str, out: Path | None, force: b
         folder.write_table("settled.csv", found.table())
         folder.write_table("stretches.csv", stretches(found))
         folder.write_json("result.json", to_json(found, few))
-        print_settled(found, few)
-        for sentence in sentences(ranges.turned_signs(found.settled_runs(), robot)):
-            say(f"- {sentence}")
-        shown = page("settle", found, few=few)
+        turned = sentences(ranges.turned_signs(found.settled_runs(), robot))
+        shown = report(settle_report.document(found, few, turned))
         return leave(folder, config, {"seed": None, "settled": len(found.kept)}, page=shown, runs=runs)
 
 
@@ -138,20 +135,3 @@ def to_json(found: Settled, few: str = "") -> dict[str, Any]:
         "left_out": [dict(zip(("why", "stretches", "samples", "rows", "do"), row, strict=True)) for row in left],
         "notes": [*filter(None, [few]), *words.remarks(found)],
     }
-
-
-def print_settled(found: Settled, few: str = "") -> None:
-    """Print what was found, the log's own command where that is too few, and what was left out."""
-    say(words.statement(found))
-    if few:
-        say(few)
-    left = words.left_out(found.stretches, bool(few))
-    if left:
-        shown = Table(title="left out", title_justify="left", box=None, pad_edge=False)
-        for heading in ("why", "stretches", "samples", "rows, as", "what to do"):
-            shown.add_column(heading, justify="right" if heading in ("stretches", "samples") else "left")
-        for row in left:
-            shown.add_row(*map(str, row))
-        say(shown)
-    for sentence in words.remarks(found):
-        say(f"- {sentence}")
