@@ -124,6 +124,19 @@ def pulse(
         thread.join()
 
 
+@contextmanager
+def stage(number: int, total: int, doing: str, silent: bool = False) -> Iterator[None]:
+    """Report a stage of a command and, while it lasts, its time; `silent`: without the time, next to a bar."""
+    text = f"{number} of {total}, {doing}"
+    if silent:
+        tell(text)
+        yield
+        return
+    with pulse(tell, doing) as heard:
+        heard(text)
+        yield
+
+
 class RateColumn(ProgressColumn):
     """How many a second."""
 
