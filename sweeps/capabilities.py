@@ -1,4 +1,4 @@
-"""What of the numbers of a run a robot has: a shaft has no ground, and a rig only what its file states."""
+"""Numbers that a robot has: a shaft has no ground, and a rig only what its file states."""
 
 from __future__ import annotations
 

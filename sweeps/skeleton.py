@@ -1,4 +1,4 @@
-"""How every command ends that leaves a run folder, once it has loaded, computed, written and printed."""
+"""The common end of commands that write a run folder."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def leave(
     page: Page | None = None,
     runs: Runs | None = None,
 ) -> int:
-    """Write the configuration and, unless it is not wanted, the page; move the folder into place and say where it is.
+    """Write the configuration and the page (if wanted), move the folder into place and print its path.
 
     Args:
         folder: with the command's own files, `robot.toml` among them.
-        manifest: what it says beside program, versions and hashes; runs: the table whose file's hash it has, if any.
-        solved: whether every solver gave an answer.
+        manifest: entries besides program, versions and hashes; runs: the table whose hash is recorded, if any.
+        solved: True if every solver gave an answer.
 
     Returns:
         The exit code: 0, or 3 where a solver failed.

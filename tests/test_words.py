@@ -254,7 +254,7 @@ OVER = CurveOver("slip", ("slope",))
                     NameTest("c", 5.0, 3.41, (), 9.0, again=0.75, larger=("d", "e"), remains=True),
                 ),
             ),
-            "a explains 1.2 σ beside smooth curves (slip balance over slope), and chance reaches 3.4; b is a worse "
+            "a explains 1.2 σ next to smooth curves (slip balance over slope), and chance reaches 3.4; b is a worse "
             "explanation than a smooth curve in its place and rests on row 10; c is chosen again in 75 % of the data "
             "with a block left out, has a rival of an implausible size (d and e) and leaves something in its own "
             "equation",
@@ -269,7 +269,7 @@ OVER = CurveOver("slip", ("slope",))
                 "beside",
                 tests=(NameTest("a", 6.91, 3.27, (OVER,), 1.0, 11, 5.8), NameTest("b", 5.0, 3.27, (), 0.0)),
             ),
-            "each by itself, at the fit of the others, explains more than chance would: a 6.9 σ (chance 3.3, without row 11 "
+            "each one, added to the fit of the others, explains more than chance would: a 6.9 σ (chance 3.3, without row 11 "
             "5.8), b 5.0 σ (chance 3.3)",
         ),
     ],
@@ -280,7 +280,7 @@ def test_why_names_stand_or_not(support, said):
 
 def test_verdict_of_a_complete_model():
     off = of_fit.NoiseOff("", 2.0, "stated")
-    said = "Nothing is missing: what the fitted model leaves is what noise leaves (family-wise p = 0.4)."
+    said = "Nothing is missing: the residuals are consistent with noise (family-wise p = 0.4)."
     assert loop_words.statement(Summary("none", 0.4, None)) == said
     assert loop_words.statement(Summary("none", 0.4, None, noise=(off,))) == f"{said} But {describe(off)}"
     aside = loop_words.statement(Summary("none", 0.4, None, aside=10, of=100))
@@ -485,7 +485,7 @@ def test_what_the_track_model_is_asked_about(about, said):
         ),
         (
             Adequacy(True, 61.0, 60.0, 0.4, Shown(what="repeats"), True),
-            "Adequate: the residuals are what the stated noise leaves (χ² 61 on 60 degrees of freedom, p = 0.4)",
+            "Adequate: the residuals are consistent with the stated noise (χ² 61 on 60 degrees of freedom, p = 0.4)",
         ),
         (
             Adequacy(True, 50.0, 50.0, 0.4, Shown(), False),

@@ -192,7 +192,7 @@ class Alternative:
 
     @property
     def why(self) -> str:
-        """Why they are not plausible, in words."""
+        """Reasons for not being plausible, as a sentence."""
         return described(self)
 
     def to_json(self) -> dict[str, Any]:
@@ -543,12 +543,12 @@ class DiscoveryResult:
 
     @property
     def statement(self) -> str:
-        """The verdict in one sentence."""
+        """The verdict as a sentence."""
         return described(self.summary)
 
     @property
     def headline(self) -> Headline:
-        """What holds at every noise that was tried."""
+        """Claim that holds at every noise factor tried."""
         return headline(self.summary, [(s.factor, s.summary) for s in self.sensitivity])
 
     @property
@@ -558,12 +558,12 @@ class DiscoveryResult:
 
     @property
     def standing(self) -> str:
-        """Why names do not stand, or beside what they do, in words; "" where there is nothing to say."""
+        """Reasons for or against the names, as a sentence; "" for none."""
         return described(self, "standing")
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences worth saying."""
+        """Remarks as sentences."""
         return sentences(self.remarks)
 
     @property
@@ -744,7 +744,7 @@ class Sensitivity:
 
     @property
     def statement(self) -> str:
-        """The verdict in one sentence."""
+        """The verdict as a sentence."""
         return described(self.summary)
 
     def to_json(self) -> dict[str, Any]:

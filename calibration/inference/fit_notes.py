@@ -11,7 +11,7 @@ from calibration.described import described
 
 @dataclass_transform(frozen_default=True)
 class Note:
-    """A note, of which `mmrjax.describe` makes a sentence.
+    """A note; `mmrjax.describe` makes its sentence.
 
     Each subclass with its fields becomes a frozen dataclass.
     """
@@ -73,7 +73,7 @@ class Determination(NamedTuple):
 
     @classmethod
     def of(cls, name: str, held: bool, pairs: Iterable[Pair]) -> Determination:
-        """From the pairs of which data determine a combination alone."""
+        """From the pairs that data determine only in combination."""
         return cls(held, tuple(p.other if p.one == name else p.one for p in pairs if name in (p.one, p.other)))
 
 

@@ -317,7 +317,7 @@ class CalibrationResult:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences worth saying."""
+        """Remarks as sentences."""
         return sentences(self.remarks)
 
     @property
@@ -332,7 +332,7 @@ class CalibrationResult:
 
     @property
     def together(self) -> tuple[Pair, ...]:
-        """Pairs of parameters of which these data determine a combination alone."""
+        """Pairs of parameters that these data determine only in combination."""
         return determined_together(self.posterior, self.held_by_prior)
 
     @property

@@ -278,7 +278,7 @@ class _Held:
 
 
 def _computed(requirement: Requirement) -> str:
-    """Of several names of one quantity the one that it is computed by: one program for both."""
+    """Name by which a quantity is computed; the same for several names of one quantity, to share a program."""
     return "speed_m_s" if requirement.name == "speed_end_of_charge_m_s" else requirement.name
 
 

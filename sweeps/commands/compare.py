@@ -1,4 +1,4 @@
-"""The command `compare`: a simulation set against a table of measured runs, equation (35) and R² of (A1)."""
+"""The command `compare`: compare a simulation with measured runs, equation (35) and R² of (A1)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ HISTORIES, OVER = "drive", {"time_s": "time [s]"}
 
 
 def compare(config: configuration.Compare, source: str, own_mass: bool, out: Path | None, force: bool) -> int:
-    """Simulate the runs of a table, set them beside its readings, leave a run folder; returns the exit code."""
+    """Simulate the runs of a table, compare them with its readings, write a run folder; returns the exit code."""
     file = load_robot(config)
     stated = runs = read_runs(source, file.robot, measured=True, series=True, of_turns=True)
     if runs.turns:
@@ -71,7 +71,7 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
 def _over_time(
     config: configuration.Compare, file: RobotFile, runs: records.Runs, own_mass: bool, out: Path | None, force: bool
 ) -> int:
-    """The same for time histories, which the robot follows as its fits do, from each run's own beginning."""
+    """The same for time histories, each simulated from its beginning as in fits."""
     options = {"--own-mass": own_mass, "--posterior": config.posterior, "--duration": config.duration_s}
     for option in (name for name, stated in options.items() if stated):
         raise BadConfiguration(
@@ -98,7 +98,7 @@ def _over_time(
 
 
 def missing(table: dict[str, np.ndarray], channels: Sequence[Channel]) -> list[str]:
-    """A sentence for each channel of which the table lacks readings."""
+    """Sentences on channels with missing readings."""
     lost = {c.column: int(np.isnan(table[c.column]).sum()) for c in channels}
     rows = len(table["status"])
     return [

@@ -52,8 +52,10 @@ def settle(config: configuration.Settle, source: str, out: Path | None, force: b
 
 
 def rolling(robot: Robot) -> dict[str, dict[str, float]]:
-    """Of each configuration what speeds show while the motors turn by 1 rad/s and the load rolls with them, by
-    channel [unit of the column]; of a vehicle, which slips, those of the shafts."""
+    """Readings of speeds in each configuration at 1 rad/s of the motors, the load rolling [unit of the column].
+
+    By channel; only speeds of shafts for a vehicle, which slips.
+    """
     found = {}
     for k, (name, load) in enumerate(robot.configurations.items()):
         none, turns = jnp.zeros(()), float(load.radius) / float(robot.gearbox.ratio)
@@ -64,7 +66,7 @@ def rolling(robot: Robot) -> dict[str, dict[str, float]]:
 
 
 def inertia(robot: Robot) -> dict[str, Inertia]:
-    """What acceleration takes of the motors' current in each configuration, where that is known."""
+    """Current that acceleration takes in each configuration, where it is known."""
     constant, ratio = float(robot.motor.torque_constant), float(robot.gearbox.ratio)
     found = {}
     for k, (name, load) in enumerate(robot.configurations.items()):
@@ -85,7 +87,7 @@ def inertia(robot: Robot) -> dict[str, Inertia]:
 
 
 def _shown(robot: Robot, configuration: int, channel: Channel, state: State) -> float:
-    """What a channel shows of a state [unit of its column] that follows from it alone, 0 of others."""
+    """Reading of a channel that follows from a state alone [unit of its column]; 0 for others."""
     signals = balances.begin(robot, Conditions(configuration), state)
     try:
         return float(channel.read(robot, signals)) / channel.factor

@@ -47,7 +47,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         BadConfiguration: runs of a file, a robot that cannot turn, a turn without a steady state.
     """
     if isinstance(given, str):
-        raise BadConfiguration("--runs: got a file beside --left, --right or --heading; state columns duty_left and "
+        raise BadConfiguration("--runs: got a file and --left, --right or --heading; state columns duty_left and "
                                "duty_right in it, or one run by options")  # fmt: skip
     file = load_robot(config)
     robot = file.robot

@@ -147,7 +147,7 @@ def supply(value: Any) -> str:
 
 
 def reading(value: Any, channel: str) -> str:
-    """A reading with the digits that matter beside others of its kind, one less than its resolution."""
+    """A reading with one digit less than its channel's resolution."""
     digits = max(channels.find(channel).resolution - 1, 0)
     return number(value, f"{{:.{digits}f}}")
 
@@ -173,15 +173,15 @@ def render(
     of_channels: Iterable[Channel] = (),
     **known: Any,
 ) -> Path:
-    """Write `report.html` from a template, the album's pictures and what the template asks for.
+    """Write `report.html` from a template, the album's pictures and the template's values.
 
-    What every page has comes here: contents after the answer, what lies beside the page (`files`: meanings that are
-    not the usual ones), tables that scroll in themselves.
+    Adds the parts of every page: contents after the answer, files of the folder (`files`: unusual meanings), tables
+    that scroll.
 
     Args:
-        curves: of the robot that the page is about, which nobody has named (see `curves`): it warns of them.
-        remarks: sentences on the robot, of which it warns too.
-        of_channels: that the page is about.
+        curves: unnamed curves of the robot, for a warning (see `curves`).
+        remarks: further warnings about the robot.
+        of_channels: channels of the page.
     """
     templates = resources.files("sweeps.pages") / "templates"
     environment = jinja2.Environment(

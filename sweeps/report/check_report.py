@@ -24,8 +24,8 @@ _MARGINS = (
     "the line it is met, **left** it is missed."
 )
 _POSTURES = (
-    "The robot in the posture of each geometric requirement: its centre of mass (dot) above the edge of the highest "
-    "step that any posture of its levers allows, its levers flush with its belt over a gap, folded for its size."
+    "The robot in the posture of each geometric requirement. Highest step: centre of mass (dot) above its edge. Gap: "
+    "levers flush with the belt. Size: folded."
 )
 _CHANGES = (
     "Each line changes one parameter, with everything else (masses too) as it is, and meets the requirement at "

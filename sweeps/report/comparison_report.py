@@ -104,10 +104,10 @@ def _tone(percent: float) -> str:
 
 
 def _summary(found: Comparison) -> Table:
-    of = " of its size" if found.sized else ""
+    share = "% of its size" if found.sized else "%"
     columns = (
         Column("rows of"), Column("channel"), Column("rows", form="{}"), Column("rms error", form="{}"),
-        Column("rms error", f"%{of}", "{:.1f}"), Column("worst", f"%{of}", "{:.1f}"), Column("R²", form="{:.3f}"),
+        Column("rms error", share, "{:.1f}"), Column("worst", share, "{:.1f}"), Column("R²", form="{:.3f}"),
     )  # fmt: skip
     rows = []
     for group, by_channel in found.summary.items():
@@ -162,6 +162,6 @@ def _trend(found: Comparison) -> str:
             both = np.isfinite(error) & np.isfinite(found.table[column])
             x, y = found.table[column][both], error[both]
             if both.sum() > 2 and np.ptp(x) > 0 and np.ptp(y) > 0 and abs(r := np.corrcoef(x, y)[0, 1]) > size:
-                best = f"The error of {c.label} changes most with {heading} (correlation {r:+.2f}, {len(x)} rows)"
+                best = f"The error of {c.label} changes most with {heading} (correlation {r:+.2f}, n = {len(x)})"
                 size = abs(r)
     return best

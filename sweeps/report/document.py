@@ -1,4 +1,4 @@
-"""A report as data, from which `page_renderer` makes the page and `terminal_renderer` the text of the terminal.
+"""A report as data: `page_renderer` makes a page of it, `terminal_renderer` the text of the terminal.
 
 Texts may hold `**bold**` words and names in backticks. A command builds its document once, in `x_report.py`.
 """

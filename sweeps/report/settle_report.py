@@ -17,8 +17,8 @@ IMPOSED = {
 }
 _LOG = "**The log.** Shaded: settled stretches; thick: their means, the rows of `settled.csv`."
 _SDS = (
-    "±: standard deviation of the mean, from the scatter and autocorrelation within the stretch, the step of the "
-    "instrument, the remaining change, and the difference between levels that were held several times."
+    "±: standard deviation of the mean. It includes scatter and autocorrelation within the stretch, the step of the "
+    "instrument, the remaining change, and differences between repeated levels."
 )
 
 
@@ -57,10 +57,10 @@ def _settled(found: Settled) -> Table:
         columns += [Column("mean", c.unit, "{:.5g}", c.label), Column("±", c.unit, "{:.2g}", c.label)]
     rows = [
         (
-            f"{s.run or 'log'}, {s.begin:.4g} to {s.end:.4g} s", len(s.rows), of, s.imposed,
+            f"{s.run or 'log'}, {s.begin:.4g} to {s.end:.4g} s", len(s.rows), available, s.imposed,
             *(x for k in found.signals for x in (s.mean[k.channel.name], s.sd[k.channel.name])),
         )
-        for s, of in _levels(found)
+        for s, available in _levels(found)
     ]  # fmt: skip
     return Table("settled", tuple(columns), rows, file="settled.csv", wide=True, terminal=False)
 

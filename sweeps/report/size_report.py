@@ -28,8 +28,8 @@ COLUMNS = (
 SHOWN = 5
 _DESIGNS = "The best, and the best with other parts, with ratios of the makers' sheets and whole cells."
 _MOTORS = (
-    "The best design of each motor, with any ratio of its gearboxes and fractions of a cell. Where no design meets "
-    "the requirements, the misses of the nearest."
+    "The best design of each motor, with any ratio of its gearboxes and fractions of a cell. If no design "
+    "meets the requirements, the limits that the nearest one misses."
 )
 _LIMITS = (
     "The **colour** shows the nearest limit at each payload and slope, at the worse end of the charge. Beyond the "

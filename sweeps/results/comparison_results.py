@@ -27,7 +27,7 @@ class Comparison:
         channels: of the readings; source: name of the table; model: fidelity; robot_name: of the simulated robot.
         sized: True if percent are of a channel's size, as for histories and readings that cross zero.
         fit: `these` if the robot was fitted to these rows, `others` if to other rows, "" if no fit is recorded.
-        over: further columns of histories over which errors are shown, with their headings.
+        over: further columns of histories for the axes of the errors, with their headings.
         notes: sentences on the table.
     """
 

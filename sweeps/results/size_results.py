@@ -21,7 +21,7 @@ class SizeResult:
 
     Attributes:
         asked: the requirements; robot: where the search started; sizing: its result; objectives: minimised numbers.
-        outcomes: of `check` for the best design, empty if there is none.
+        outcomes: results of `check` for the best design; empty without one.
         charts: limits over payload and slope of the best design, if any, and of `robot`; empty without a page.
     """
 

@@ -59,12 +59,11 @@ def statement(found: Settled) -> str:
 
 
 def levels(found: Settled) -> str:
-    """How samples are divided into levels, and which samples of a level are used."""
+    """Division of samples into levels, and the samples of a level that are used."""
     return (
         f"Neighbouring samples belong to one level if the imposed quantity differs by less than "
-        f"{50 * found.drift:g} % or by less than its noise. A level is used from the sample on from which every "
-        f"channel stays within {100 * found.drift:g} % of its end, or within its noise; a level that is still "
-        "changing at its beginning keeps few of its samples."
+        f"{50 * found.drift:g} % or by less than its noise. The first samples of a level are left out until every "
+        f"channel stays within {100 * found.drift:g} % of its value at the end, or within its noise."
     )
 
 

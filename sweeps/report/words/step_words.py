@@ -1,4 +1,4 @@
-"""What a long computation does next, in words: a row each."""
+"""Steps of long computations, one row each."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from mmrjax.errors import counted
 STEPS = {
     # the loop
     "base": "fitting the base model",
-    "sds": "the sds are not as stated: the same with those that the residuals show",
+    "sds": "the stated sds do not fit: the same with sds from the residuals",
     "bootstrap": "bootstrap of {} tables: what would a complete model leave?",
     "effects": "something is missing: fitting every effect that could explain it",
-    "more effects": "{} leaves something: fitting further effects beside it",
-    "alone": "rows stand alone beside what was found: the same without them",
+    "more effects": "{} does not explain everything: fitting further effects",
+    "alone": "outlying rows found: the same without them",
     "mechanism": "which mechanism explains most of it?",
     "alike": "what else explains as much as {}?",
     "held out": "which of those predicts best what a fit has not seen?",
-    "factors": "the verdict with {} times the {} noise, beside:",
+    "factors": "the verdict with {} times the {} noise, next to:",
     "shape": "the shape of what is missing",
     "errors": "errors on data held out",
     "next": "the next experiment",
@@ -68,7 +68,7 @@ def expected(text: str, seconds: float) -> float | None:
     """Time that a loop is expected to take yet, by what the stages before took [s]; None where that is not known.
 
     Args:
-        text: what is said of a stage that begins; seconds: since the loop began.
+        text: line of a stage that begins; seconds: since the loop began.
     """
     stage, _, rest = text.partition(f" of {OF}, ")
     over = OVER.get(int(stage)) if rest and stage.isdigit() else None
