@@ -284,7 +284,7 @@ def test_verdict_of_a_complete_model():
     assert loop_words.statement(Summary("none", 0.4, None)) == said
     assert loop_words.statement(Summary("none", 0.4, None, noise=(off,))) == f"{said} But {describe(off)}"
     aside = loop_words.statement(Summary("none", 0.4, None, aside=10, of=100))
-    assert aside == f"10 of 100 rows (10 %) lie off alone and are set aside. {said}"
+    assert aside == f"10 of 100 rows (10 %) are outliers and are set aside. {said}"
 
 
 def test_verdict_tells_what_is_tentative():

@@ -379,22 +379,20 @@ def how_sure(found: DiscoveryResult, effect: FoundEffect) -> str:
 def use_it(found: DiscoveryResult) -> list[str]:
     """Errors of the written robot on fitted and on held-out rows, by kind of block."""
     when = 1 if found.written else 0
-    lines = (
-        [f"Like these runs: errors up to {_worst(found.errors[when], len(found.runs))}."]
-        if found.errors[when]
-        else []
-    )
+    lines = [f"Within these conditions: {_rms(found.errors[when], len(found.runs))}."] * bool(found.errors[when])
     for kind, both in found.errors_held_out.items():
-        lines.append(f"Another {blocks_room.in_words(kind)}: {_worst(both[when], len(found.runs))}.")
+        lines.append(f"Another {blocks_room.in_words(kind)}: {_rms(both[when], len(found.runs))}.")
     return lines
 
 
-def _worst(errors: Errors, total: int) -> str:
-    """The largest rms error of any channel, and of how many rows where not all are reached: `16.7 % (14/20)`."""
-    rows = max(int(e["rows"]) for e in errors.values())
-    worst = max((float(e["rms_percent"]) for e in errors.values() if e["rows"]), default=math.nan)
-    few = f" ({rows}/{total} reached)" if rows < total else ""
-    return f"{worst:.1f} %{few}" if rows else "not reached"
+def _rms(errors: Errors, total: int) -> str:
+    """Largest rms error of any channel, the worst reading, and the rows reached if not all are."""
+    known = [e for e in errors.values() if e["rows"]]
+    if not known:
+        return "no row is reached"
+    rms, worst, rows = (max(float(e[name]) for e in known) for name in ("rms_percent", "max_percent", "rows"))
+    few = f" ({rows:.0f}/{total} reached)" if rows < total else ""
+    return f"rms up to {rms:.1f} %, worst reading {worst:.1f} %{few}"
 
 
 def largest_share(found: DiscoveryResult) -> str:
