@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from calibration.words import loop_words
 from synthetic import SETTLED, table
 from test_implausible import unnamed
 from worlds import settled, tables
@@ -24,7 +25,6 @@ from calibration.inference import bases
 from calibration.inference.held_out import held_out
 from calibration.inference.linearization import PROBED
 from calibration.inference.observers.settled import SettledLinearization
-from calibration.words import loop_words
 from mmrjax.effects.curve import PLACES
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, params
