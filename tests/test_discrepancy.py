@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from calibration.words import loop_words
 from synthetic import SETTLED, table
 from test_implausible import unnamed
 from worlds import settled, tables
@@ -28,6 +27,7 @@ from calibration.inference.observers.settled import SettledLinearization
 from mmrjax.effects.curve import PLACES
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, params
+from sweeps.report.words import loop_words
 
 #: An effect that no library holds → balance and variable that it acts through.
 CASES = {"commutation_step": ("electrical", "voltage"), "guide_binding": ("track", "payload")}
