@@ -8,7 +8,9 @@ from calibration.data.columns import Layout
 from calibration.inference.identifiability import HELD
 from calibration.inference.result import CalibrationResult
 from sweeps.pages import calibration_figures, cluster_figures, comparison_figures
-from sweeps.pages.page import Album, columns, conditions, curves, first_rows, render, words_shown
+from sweeps.pages.page import Album, columns, curves, first_rows, render
+from sweeps.pages.words import words_shown
+from sweeps.report.condition_columns import conditions
 
 
 def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:

@@ -17,8 +17,9 @@ from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import posture_words, power_figures, words
 from sweeps.pages.history_figures import Start
-from sweeps.pages.page import Album, columns, conditions, first_rows, label, named, render, statuses
+from sweeps.pages.page import Album, columns, first_rows, label, named, render, statuses
 from sweeps.points.imposed import UNLIMITED
+from sweeps.report.condition_columns import conditions
 from sweeps.results.posture_results import Postures
 
 #: What the table of runs shows beside conditions and channels: heading, factor, format.
