@@ -23,6 +23,7 @@ from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from sweeps.pages import cluster_figures, loop_figures
 from sweeps.pages.page import Album, columns, conditions, curves, first_rows, render, words_shown
+from sweeps.pages.time_overlay import time_overlay
 from sweeps.pages.words import GLOSSARY
 
 #: Change of an rms error that is marked [%].
@@ -53,6 +54,10 @@ def _run_by_run(album: Album, found: DiscoveryResult) -> None:
 def _over_time(album: Album, found: DiscoveryResult) -> None:
     assert isinstance(found.detail, TimeStatistics)
     detail = found.detail
+    simulated = {"after_": "with what was found", "before_": "before"}
+    if _drawn(found) == "none":
+        simulated = {"after_": "simulated"}
+    album.add_overlay("overlay", time_overlay(rows_of(found), found.channels, simulated))
     album.add(
         "before_after", lambda: loop_figures.over_time(found.runs, rows_of(found), found.channels, _drawn(found))
     )
