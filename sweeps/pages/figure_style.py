@@ -108,7 +108,7 @@ def figure(rows: int, columns: int, height: float, **keywords: Any) -> tuple[Fig
         grid = fig.subplots(rows * columns, 1, squeeze=False).reshape(rows, columns)
         for axis in ("x", "y"):
             shared = keywords.get(f"share{axis}", False)
-            groups = {"row": grid, "col": grid.T, True: [grid.ravel()], "all": [grid.ravel()]}.get(shared, [])
+            groups: Any = {"row": grid, "col": grid.T, True: [grid.ravel()], "all": [grid.ravel()]}.get(shared, [])
             for group in groups:
                 for other in group[1:]:
                     getattr(other, f"share{axis}")(group[0])
@@ -123,7 +123,7 @@ def can_stack(fig: Figure) -> bool:
 
 def with_labels(fig: Figure) -> Figure:
     """A stacked figure in which each panel has the labels that its row or column shared."""
-    grid = fig.panels
+    grid: np.ndarray = vars(fig)["panels"]
     for i, j in np.ndindex(grid.shape):
         axes = grid[i, j]
         if not axes.axison:

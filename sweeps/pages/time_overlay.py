@@ -83,7 +83,8 @@ class TimeOverlay:
     def to_json(self) -> str:
         """Data of the interactive figure: for each run its times and, by channel, measured and simulated readings."""
         most = max(200, POINTS // (len(self.rows) * len(self.channels) * (1 + len(self.simulated))))
-        runs, spent = {}, 0
+        runs: dict[str, Any] = {}
+        spent = 0
         for name in sorted(self.rows, key=lambda name: name != self.worst):
             rows = self._thinned(self.rows[name], most)
             spent += len(rows) * len(self.channels) * (1 + len(self.simulated))
