@@ -123,7 +123,7 @@ def can_stack(fig: Figure) -> bool:
 
 def with_labels(fig: Figure) -> Figure:
     """A stacked figure in which each panel has the labels that its row or column shared."""
-    grid: np.ndarray = vars(fig)["panels"]
+    grid: Any = vars(fig)["panels"]
     for i, j in np.ndindex(grid.shape):
         axes = grid[i, j]
         if not axes.axison:
