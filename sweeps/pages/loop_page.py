@@ -21,6 +21,7 @@ from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from sweeps.pages import cluster_figures, loop_figures
 from sweeps.pages.page import Album, columns, curves, first_rows, render
+from sweeps.pages.time_overlay import time_overlay
 from sweeps.pages.words import GLOSSARY, words_shown
 from sweeps.report.condition_columns import conditions
 from sweeps.report.words import loop_words
@@ -54,6 +55,10 @@ def _run_by_run(album: Album, found: DiscoveryResult) -> None:
 def _over_time(album: Album, found: DiscoveryResult) -> None:
     assert isinstance(found.detail, TimeStatistics)
     detail = found.detail
+    simulated = {"after_": "with what was found", "before_": "before"}
+    if _drawn(found) == "none":
+        simulated = {"after_": "simulated"}
+    album.add_overlay("overlay", time_overlay(rows_of(found), found.channels, simulated))
     album.add(
         "before_after", lambda: loop_figures.over_time(found.runs, rows_of(found), found.channels, _drawn(found))
     )

@@ -21,7 +21,8 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
-from sweeps.pages.figure_style import style, svg
+from sweeps.pages.figure_style import can_stack, has_colour_scale, stacked_panels, style, svg, with_labels
+from sweeps.pages.time_overlay import TimeOverlay
 from sweeps.report.document import PAGE_ROWS as ROWS
 from sweeps.report.document import Column, Note, Section, Table, tone
 from sweeps.report.markup import download, marked
@@ -34,21 +35,43 @@ class Album:
         self.folder = Path(folder) / "figures"
         self.folder.mkdir(parents=True, exist_ok=True)
         self.pictures: dict[str, Markup] = {}
+        self.overlays = False
 
     def add(self, name: str, draw: Callable[[], Any]) -> Any:
-        """Draw one figure; `draw` returns it, alone or followed by numbers, which are returned."""
+        """Draw one figure, and a narrow one for phones if its panels stand side by side.
+
+        Args:
+            draw: returns the figure, alone or followed by numbers, which are returned.
+        """
         with style():
             drawn = draw()
             figure, *numbers = drawn if isinstance(drawn, tuple) else (drawn,)
-            text = svg(figure)
+            text, narrow = svg(figure), ""
+            if can_stack(figure):
+                with stacked_panels():
+                    drawn = draw()
+                    narrow = svg(with_labels(drawn[0] if isinstance(drawn, tuple) else drawn))
         write_text(self.folder / f"{name}.svg", text)
-        self.pictures[name] = Markup(_inline(text, name))
+        looks = "scale " * has_colour_scale(figure)
+        picture = _inline(text, name, looks + ("wide" if narrow else "only"))
+        self.pictures[name] = Markup(
+            picture + (_inline(narrow, f"{name}-narrow", looks + "narrow") if narrow else "")
+        )
         return numbers[0] if numbers else None
 
+    def add_overlay(self, name: str, overlay: TimeOverlay) -> None:
+        """Draw readings over time, as a figure for print and with the data of an interactive one."""
+        self.add(name, overlay.draw)
+        self.overlays = True
+        self.pictures[name] += Markup(
+            f'<script type="application/json" data-overlay="{name}">{overlay.to_json()}</script>'
+        )
 
-def _inline(svg: str, name: str) -> str:
-    """An SVG document as an element of a page: only what is referred to has an id, which is of this figure alone."""
+
+def _inline(svg: str, name: str, looks: str) -> str:
+    """An SVG document as an element of a page, with the classes `looks`; ids that are referred to are its own."""
     element = re.sub(r' xmlns(?::\w+)?="[^"]*"', "", svg[svg.index("<svg") :])
+    element = element.replace("<svg ", f'<svg class="{looks}" ', 1)
     wanted = set(re.findall(r'(?:href="|url\()#([^")]+)', element))
     element = re.sub(r' id="([^"]+)"', lambda m: f' id="{name}-{m[1]}"' if m[1] in wanted else "", element)
     return re.sub(r'((?:href="|url\()#)(?=[^")]+)', rf"\g<1>{name}-", element)
@@ -201,7 +224,7 @@ def render(
         "version": __version__,
     }
     known["files"] = _beside(Path(folder), words.FILES | known.get("files", {}))
-    page = environment.get_template(template).render(pictures=album.pictures, **known)
+    page = environment.get_template(template).render(pictures=album.pictures, overlays=album.overlays, **known)
     page = page.replace("<table", '<div class="scroll" tabindex="0"><table').replace("</table>", "</table></div>")
     warnings = {"curve-warning": words.of_curves(curves), "robot-warning": escape(". ".join(remarks))}
     page = _with_contents(page, warnings)
