@@ -41,10 +41,12 @@ class Album:
         """Draw one figure, and a narrow one for phones if its panels stand side by side.
 
         Args:
-            draw: returns the figure, alone or followed by numbers, which are returned.
+            draw: returns the figure, alone or followed by numbers, which are returned; or an overlay over time.
         """
         with style():
             drawn = draw()
+            if isinstance(drawn, TimeOverlay):
+                return self.add_overlay(name, drawn)
             figure, *numbers = drawn if isinstance(drawn, tuple) else (drawn,)
             text, narrow = svg(figure), ""
             if can_stack(figure):
