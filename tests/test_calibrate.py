@@ -195,7 +195,7 @@ def test_stated_noise_comes_before_columns_and_columns_before_estimates(measured
     [
         (
             "current=2%,total_current=3%",
-            "--noise total_current=3%: total_current stands twice; expected each channel once",
+            "--noise total_current=3%: total_current is given twice; expected each channel once",
         ),
         ("amps=2%", "--noise amps=2%: no such channel; .*allowed: current, motor_speed, speed"),
         ("current=2", "--noise current=2: expected a positive number with % or A or mA, e.g. current=2%"),

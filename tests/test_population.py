@@ -175,7 +175,7 @@ def test_members_of_another_calibration_are_refused(posed, known, tmp_path):
     file = tmp_path / "members.npz"
     evolve(posed, known, 1, file)
     other = dataclasses.replace(posed, data=dataclasses.replace(posed.data, measured=posed.data.measured * 1.01))
-    with pytest.raises(BadConfiguration, match="its members are of another calibration"):
+    with pytest.raises(BadConfiguration, match="its members belong to another calibration"):
         Members(other, file)
     noisier = dataclasses.replace(posed, data=dataclasses.replace(posed.data, sd=2 * posed.data.sd))
     assert len(Members(noisier, file)._kept) == SIZE  # the noise is none of what was run
@@ -186,7 +186,7 @@ def test_members_of_another_calibration_are_refused(posed, known, tmp_path):
 def test_file_that_holds_no_members_is_refused(posed, tmp_path, content):
     file = tmp_path / "members.npz"
     file.write_bytes(content)
-    with pytest.raises(BadConfiguration, match="not a file of members that can be read"):
+    with pytest.raises(BadConfiguration, match="not a readable file of members"):
         Members(posed, file)
 
 
@@ -197,7 +197,7 @@ def never(*_, **__):
 def test_damaged_members_are_refused_before_the_first_search(tmp_path, monkeypatch, mmrjax):
     (tmp_path / "kept.npz").write_bytes(b"cut")
     monkeypatch.setattr(multistart, "search", never)
-    with pytest.raises(BadConfiguration, match="not a file of members that can be read"):
+    with pytest.raises(BadConfiguration, match="not a readable file of members"):
         calibrate(
             records.read("measured"),
             paper_robots.nominal(),
@@ -207,7 +207,7 @@ def test_damaged_members_are_refused_before_the_first_search(tmp_path, monkeypat
         )
     monkeypatch.setattr("sweeps.commands.loop.discover", never)
     code, _, err = mmrjax("loop", "measured", "--resolve", "--members", "kept.npz", "--out", "x")
-    assert code == 2 and "--members kept.npz: not a file of members that can be read" in err
+    assert code == 2 and "--members kept.npz: not a readable file of members" in err
     assert [p.name for p in tmp_path.iterdir()] == ["kept.npz"]
 
 

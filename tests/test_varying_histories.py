@@ -402,7 +402,7 @@ def test_what_cannot_change_within_a_run_is_refused(runs):
     with pytest.raises(BadData, match=r"configuration: run coasting has several values; a run has one configuration"):
         Histories.check(changed(runs, configuration=other), nothing)
     mass = 11.5 + runs["payload_kg"] + 0.5 * (runs["time_s"] > 1)
-    with pytest.raises(BadData, match=r"total_mass_kg: run coasting changes by 0.5 kg beside its payload"):
+    with pytest.raises(BadData, match=r"total_mass_kg: run coasting changes by 0.5 kg apart from its payload"):
         Histories.check(changed(runs, total_mass_kg=mass), nothing)
     payload = runs["payload_kg"] + 3.0 * (runs["time_s"] > 1)
     Histories.check(changed(runs, payload_kg=payload, total_mass_kg=11.5 + payload), nothing)

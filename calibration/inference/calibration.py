@@ -1,4 +1,4 @@
-"""A calibration from table to result: noise, starts, optimum, what is known of it, errors seen and unseen."""
+"""A calibration from table to result: noise, starts, optimum, its analysis, errors on fitted and held-out rows."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ from mmrjax.compile.precision import SINGLE, in_double, is_double
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import FLAGS, STATUSES
 
-#: Members of a generation where parameters are free that `steady` does not read.
+#: Members of a generation if parameters are free that `steady` does not read.
 POPULATION = 256
-#: Fidelity of time histories where none is stated.
+#: Default fidelity for time histories.
 OF_HISTORIES = "drive"
-#: Parameters that the resolved running gear gives another meaning: beginnings after their configuration.
+#: Parameters with another meaning in the resolved running gear: prefixes after the configuration's name.
 FRICTION = "ground.friction."
 
 
@@ -80,30 +80,30 @@ def calibrate(
 
     Args:
         runs: rows of settled runs, or of time histories.
-        robot: its values are the prior means; a mass that the table states takes the place of its own.
+        robot: its values are the prior means; a mass in the table replaces its own.
         free, fix: parameter names, see `priors.choose`; stated: priors in place of the fields', (mean, sd) [SI].
         noise: as `noise.parse`; None takes the file's sd columns, or estimates.
         model: name of a fidelity; None takes `drive` for time histories and `steady` for settled runs.
-        starts: the prior mean and `starts - 1` draws from the prior; for settled rows with a rollout the optimum of
-            `steady` and draws from its posterior.
-        population: members of each generation of a search without gradients, with which that of a rollout begins;
-            None takes `POPULATION` where parameters are free that `steady` does not read, else none.
-        generations: at most, None `population.GENERATIONS`; members: file in which those that were run are kept, and
-            from which the same calibration goes on.
-        seed: of the starts and of all that is drawn; profiles: whether to profile every parameter.
-        blocks: kinds of blocks to hold out; True: all that tell something of such data.
-            These three by default as the kind of data and the fidelity say.
-        rows: of a log over time from which on readings are used of fewer, evenly in time, which its notes say.
-        solver: of optimistix, or the name of one (`solvers.NAMES`), for the searches from the starts; None takes
-            ours, which also serves all fits that begin at the optimum (profiles, blocks). Penalties on adhesion are
-            cut off at 0 for any other than ours.
-        tell: is given a sentence now and then while a long calibration goes on.
+        starts: number of searches, from the prior mean and `starts - 1` draws from the prior. For settled rows with
+            a rollout, they begin at the optimum of `steady` and at draws from its posterior.
+        population: members of each generation of a search without gradients, which precedes a rollout's search;
+            None takes `POPULATION` if parameters are free that `steady` does not read, else 0.
+        generations: largest number of generations, None `population.GENERATIONS`; members: file that stores the
+            members run so far, from which the same calibration can resume.
+        seed: random seed of the starts and of all other draws; profiles: True to profile each parameter.
+        blocks: kinds of blocks to hold out; True: all that are informative for such data.
+            Defaults of these two depend on the kind of data and the fidelity.
+        rows: number of rows of a log over time above which readings are thinned evenly in time; a note reports it.
+        solver: an optimistix solver, or the name of one (`solvers.NAMES`), for the searches from the starts; None
+            takes ours, which also serves all fits that begin at the optimum (profiles, blocks). For any other
+            solver, penalties on adhesion are cut off at 0.
+        tell: callback for progress messages of a long calibration.
 
     Raises:
         BadData: data that cannot be fitted, see `checks.check`.
-        BadConfiguration: an unknown fidelity or parameter, a prior or noise that is none, or of a mass that the
-            table states, rows that no robot near the priors reaches; an unknown solver; or a call inside `jax.jit`
-            where JAX is single.
+        BadConfiguration: an unknown fidelity, parameter or solver; an invalid prior or noise, or a prior of a mass
+            that the table states; rows that no robot near the priors reaches; or a call inside `jax.jit` while JAX
+            uses single precision.
     """
     if not is_double():
         raise BadConfiguration(f"calibrate: {SINGLE}")
@@ -145,7 +145,7 @@ class _Plan:
 def _planned(
     runs: Runs, model: str | None, starts: int | None, profiles: bool | None, blocks: Sequence[str] | bool | None
 ) -> _Plan:
-    """Plan of a calibration from the arguments of `calibrate`; the kind of data and the fidelity fill in for None."""
+    """Plan of a calibration from the arguments of `calibrate`; None is replaced by a default for the data."""
     observe = observers.kind(runs)
     fidelity = model or (OF_HISTORIES if observe.axis else fidelities.NAMES[0])
     effort = observers.facts(fidelity).effort
@@ -173,7 +173,7 @@ def _free_names(
     former: list[str] = []
     words = [surfaces.names_of_surfaces(names, robot, runs) for names in (free, fix)]
     words = [robot_file.current_names(names, robot, former) for names in words]
-    for sentence in former:  # before a name is refused that nobody has typed
+    for sentence in former:  # before an error quotes a current name that the user did not type
         tell(sentence)
     present = _present(runs, robot)
     default = priors.default_names(present, robot, computed=computes, turns=runs.turns)
@@ -191,7 +191,7 @@ def _free_names(
 
 
 def _present(runs: Runs, robot: Robot) -> set[str]:
-    """Names of the configurations that the runs have."""
+    """Names of the configurations present in the runs."""
     return {robot.configurations.names[k] for k in runs.configurations(robot)}
 
 
@@ -210,7 +210,7 @@ class _Setting:
     of_product: dict[str, tuple[float, float]]
 
     def problem(self) -> Problem:
-        """The problem to be solved, with the noise as it is known before a search."""
+        """The problem to be solved, with the noise known before the search."""
         coordinates = priors.coordinates(self.base, self.ready.names, {**self.of_product, **self.ready.stated})
         return observers.pose(self.runs, self.base, coordinates, self.ready.noise.sd, self.plan.fidelity)
 
@@ -222,8 +222,8 @@ class _Setting:
 
 
 def _guided(runs: Runs, ready: Prepared, plan: _Plan) -> tuple[Robot, dict[str, tuple[float, float]]]:
-    """The robot with the guides' share that the fidelity computes, and the priors of the guide frictions that are
-    free and not stated."""
+    """Robot with the guides' share that the fidelity computes, and priors of the free guide frictions without a
+    stated prior."""
     robot, known = ready.robot, dict[str, tuple[float, float]]()
     if priors.GUIDE_SHARE not in observers.facts(plan.fidelity).computes:
         return robot, known
@@ -246,7 +246,7 @@ def _evolved(
     """Settings of the search by generations, from the arguments of `calibrate`.
 
     Raises:
-        BadConfiguration: settings of a population for a search without one, or for data that are not searched so.
+        BadConfiguration: options of a population without one, or for data that no population search supports.
     """
     if population is None:
         population = POPULATION if fidelities.unread("steady", names, runs.turns) else 0
@@ -254,7 +254,7 @@ def _evolved(
         raise BadConfiguration("--generations, --members: there is no population; state --population")
     if population and not posed.observe.eased:
         raise BadConfiguration(
-            f"--population: got {population}; settled rows with --model drive or track alone are searched so"
+            f"--population: got {population}; a population search needs settled rows and --model drive or track"
         )
     if 0 < population < LEAST:
         raise BadConfiguration(f"--population: got {population}; expected 0 or at least {LEAST} members")
@@ -272,7 +272,7 @@ def _searched(
     tell: Callable[[Step], None],
     solver: fit.Solver | None,
 ) -> tuple[Found, np.ndarray | None]:
-    """The searches of a problem, and where they began at the optimum of `steady`, that optimum."""
+    """Searches of a problem, and the optimum of `steady` that they began from (None if they did not)."""
     rng, size = np.random.default_rng(seed), len(posed.coordinates)
     points = posed.observe.starts(posed, rng, starts)
     if not posed.observe.long:
@@ -282,7 +282,7 @@ def _searched(
         return multistart.search_one_by_one(posed, known, points, shares, tell, solver), None
     tell(Step("steady"))
     if evolved.size:
-        population.Members(posed, evolved.file)  # refuses a file of others before the search of steady
+        population.Members(posed, evolved.file)  # refuses another calibration's file before the search of steady
     draws = rng.standard_normal((fidelities.facts("steady").effort.starts, size))
     draws[0] = 0.0
     easy = multistart.search(observers.pose(runs, base, posed.coordinates, known.sd), known, draws, solver)
@@ -302,8 +302,8 @@ def _searched(
         ended = population.Searched(everyone, at, (), None, np.nan).outcomes()
         said = ", ".join(f"{count} {word.replace('_', ' ')}" for word, count in ended.items())
         raise BadConfiguration(
-            f"--population: none of {len(everyone.z)} members can be run in every row (members with a row that ends "
-            f"so: {said or 'none'}); begin from another robot, or free less"
+            f"--population: none of {len(everyone.z)} members can be run in every row (members with a row that ended "
+            f"in: {said or 'none'}); begin from another robot, or free fewer parameters"
         )
     posed, shares = multistart.reestimate_noise_at(posed, known, everyone, at)
     tell(Step("derivatives"))
@@ -318,7 +318,7 @@ def _searched(
 
 @dataclasses.dataclass(frozen=True)
 class _Evolved:
-    """A search by generations: members of each, 0 for none; how many at most; the file in which members are kept."""
+    """Options of a search by generations: members of each (0 for no search), largest number, file of members."""
 
     size: int
     generations: int
@@ -326,8 +326,10 @@ class _Evolved:
 
 
 def _first_generation(easy: Problem, z: np.ndarray) -> np.ndarray:
-    """Covariance of the first generation: what `steady` knows, but the friction of contacts is as the prior says, as
-    it meant another thing to `steady`."""
+    """Covariance of the first generation: the posterior of `steady`, but the prior for friction of contacts.
+
+    That friction has another meaning in `steady`.
+    """
     covariance = identifiability.analyse(easy, jnp.asarray(z)).covariance.copy()
     friction = np.array([FRICTION in name for name in easy.coordinates.names])
     covariance[friction] = covariance[:, friction] = 0.0
@@ -340,7 +342,7 @@ class _Optimum:
     """The model at the optimum and before the fit.
 
     Attributes:
-        z: coordinates; robot: that they make; after: what is observed of it.
+        z: coordinates; robot: the robot at z; after: its observation.
         status, status_before: codes, shape (rows,).
         seen, seen_before: readings [SI], shape (rows, channels), NaN in rows that the model does not reach.
     """
@@ -355,7 +357,7 @@ class _Optimum:
 
 
 def _optimum(setting: _Setting, found: Found) -> _Optimum:
-    """The model at the optimum that was found and before the fit.
+    """Model at the optimum of the search and before the fit.
 
     Raises:
         BadConfiguration: the model reaches no operating point in some row at the optimum.
@@ -373,12 +375,12 @@ def _optimum(setting: _Setting, found: Found) -> _Optimum:
 
 @dataclasses.dataclass(frozen=True)
 class _Analysis:
-    """What is known of an optimum.
+    """Analysis of an optimum.
 
     Attributes:
         about: the linear analysis; scanned: scans along parameters, by the number of the coordinate.
-        elsewhere: searches that ended where the scans have nothing, see `scans.apart`.
-        profile: of every parameter, None without profiles; held: blocks held out, by kind.
+        elsewhere: number of searches that ended in a minimum that the scans do not show, see `scans.apart`.
+        profile: of each parameter, None without profiles; held: blocks held out, by kind.
         notes: remarks on these.
     """
 

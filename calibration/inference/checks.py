@@ -1,4 +1,4 @@
-"""What makes data unfit for a calibration, each said in one sentence, and what is worth saying of the rest."""
+"""Checks that data can be fitted, with one sentence for each failure, and notes on data that can."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mmrjax.model.signals import SLIDES, STATUSES
 
 
 def check(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[Note | str]:
-    """Refuse data that cannot be fitted; return what should be said of data that can.
+    """Refuse data that cannot be fitted; return notes on data that can.
 
     Raises:
         BadData: too few readings, a stuck channel, contradictory replicates, samples of one run under
@@ -38,12 +38,12 @@ def check(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[
     return [*said, *check_ranges(runs, robot), *_uninformative(runs, robot, noise), *conduct(runs, robot)]
 
 
-#: Scatter of a speed over that of its changes from row to row, up to which it is noise alone.
+#: Scatter of a speed over the scatter of its changes from row to row, up to which the speed is only noise.
 WHITE = 1.5
 
 
 def _nothing_moves(runs: Runs, noise: Noise) -> None:
-    """Refuse a log whose speeds are noise alone, except a locked shaft: it is driven, and its noise is stated."""
+    """Refuse a log with speeds that are only noise, except a locked shaft that is driven and has stated noise."""
     speeds = [(k, c) for k, c in enumerate(runs.channels) if c.zero_at_rest and runs.has(c.column)]
     if not runs.sampled or runs.turns or not speeds:
         return
@@ -69,7 +69,7 @@ def _nothing_moves(runs: Runs, noise: Noise) -> None:
 
 
 def _uninformative(runs: Runs, robot: Robot, noise: Noise) -> list[Note]:
-    """Notes on settled runs of one condition, and on channels that are computed from others."""
+    """Notes on settled runs of one condition, and on channels computed from others."""
     if runs.sampled or runs.turns:
         return []
     same = nothing_varies(runs, robot, noise)
@@ -105,7 +105,7 @@ def _enough(runs: Runs, names: Sequence[str], noise: Noise) -> None:
 
 
 def _stuck(runs: Runs) -> list[StiffSupply]:
-    """Refuses a channel that shows one number under several conditions; notes a voltage that does."""
+    """Refuses a channel with one value under several conditions; returns notes for a motor voltage with one value."""
     labels = () if runs.layout.complete else ("configuration", "surface")
     columns = [c for c in (*observers.kind(runs).axes_of(runs), *labels) if runs.has(c)]
     varied = [np.unique(runs[c], return_inverse=True)[1] for c in columns]
@@ -131,7 +131,7 @@ def _constant_conditions(runs: Runs) -> list[Constant]:
     imposed = runs.layout.imposed_column
     alike = {
         "slope_deg": "guides" if runs.layout.complete else "slope",
-        imposed: "voltage" if imposed == SUPPLY else "speed",  # and friction by speed is told by levels of current
+        imposed: "voltage" if imposed == SUPPLY else "speed",  # and levels of current identify friction by speed
     }
     return [
         Constant(column, runs[column][0], losses)
@@ -141,18 +141,18 @@ def _constant_conditions(runs: Runs) -> list[Constant]:
 
 
 def unmeasured(names: Sequence[str], sensitivity: np.ndarray) -> list[Unmeasured]:
-    """Free parameters that move no reading."""
+    """Notes on free parameters that change no reading."""
     return [Unmeasured(name) for name, s in zip(names, sensitivity, strict=True) if s < 1e-6]
 
 
 def infeasible(
     runs: Runs, robot: Robot, status: np.ndarray, lost: np.ndarray, names: Sequence[str]
 ) -> BadConfiguration:
-    """The error for rows that the model does not reach at the best point found, from every start.
+    """Error for rows that the model does not reach at the best point of all searches.
 
     Args:
         robot: of that point; status: of each row there, shape (rows,).
-        lost: whether a row is not reached, shape (rows,); names: of the free parameters.
+        lost: True for rows not reached, shape (rows,); names: of the free parameters.
     """
 
     def rows(which: np.ndarray) -> str:

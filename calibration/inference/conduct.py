@@ -1,4 +1,4 @@
-"""What histories did, as far as it limits what they can tell: whether a run got under way, and whether it gripped."""
+"""Conduct of histories as far as it limits their information: runs that end early, and runs that never grip."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from calibration.inference.ranges import UNDER_WAY
 from mmrjax.model import channels
 from mmrjax.model.robot import Robot
 
-#: Share of the speed of steady travel below which a short run is not under way, and of that of its movers below which
-#: a long one does not grip [-].
+#: Share of the speed of steady travel below which a short run has ended early, and share of the movers' speed below
+#: which a long run does not grip [-].
 SLOW, SLIDING = 0.7, 0.7
 
 
 def conduct(runs: Runs, robot: Robot) -> list[Note]:
-    """Say which runs end before they are under way, and which never grip."""
+    """Notes on runs that end before they reach steady travel, and on runs that never grip."""
     runs = runs.of(robot)
     kind = observers.kind(runs)
     ends, shown, lasts = kind.settled(runs)
@@ -40,7 +40,7 @@ def conduct(runs: Runs, robot: Robot) -> list[Note]:
     slow = known & np.isfinite(steady) & (speed < SLOW * steady)
     early = (lasts < UNDER_WAY) & (slow | ~known)
     slides = (lasts >= UNDER_WAY) & known & np.isfinite(movers) & (movers > 0) & (speed < SLIDING * movers)
-    slides &= ~np.isin(names, runs.run_names[varies(runs)])  # what is shown of those is a part of them
+    slides &= ~np.isin(names, runs.run_names[varies(runs)])  # their settled ends are only parts of them
     said: list[Note] = []
     if early.any():
         seen = slow & early

@@ -1,4 +1,4 @@
-"""What a finished search says of parameters, noise and errors: the parts of a calibration's result."""
+"""Parts of a calibration's result: parameters, noise and errors after a finished search."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 
-#: How many data sds one prior sd has to move the readings to be measured by them at all.
+#: Least change of the readings by one prior sd of a parameter, in data sds, for the data to determine it at all.
 SENSITIVE = 1e-6
 
 _SIDE = {-1: "lower", 0: None, 1: "upper"}
@@ -50,14 +50,14 @@ def parameters(
     sources: dict[str, str],
     scans: Mapping[int, Scan],
 ) -> dict[str, Estimate]:
-    """Every free parameter by its name.
+    """Estimate of each free parameter, by name.
 
     Args:
         posed, base: the problem, and the robot whose values are the prior means.
-        z: the optimum; beside: that of the same problem with `steady`, or None.
+        z: the optimum; beside: the optimum of the same problem with `steady`, or None.
         about, profile: the linear analysis there, and the profiles, if any.
-        sources: of the priors that are not the fields'; scans: of the coordinates that are scanned, whose intervals
-            are those of their profiles.
+        sources: of priors other than the fields' own; scans: of the scanned coordinates, whose intervals are those
+            of their profiles.
     """
     coordinates = posed.coordinates
     at, sd = np.asarray(z), np.asarray(about.sd)
@@ -111,13 +111,13 @@ def _pair(ends: np.ndarray) -> tuple[float, float]:
 
 
 def tied(posed: Problem) -> dict[str, Tie]:
-    """Parameters that follow a free one, by name."""
+    """Parameters tied to a free one, by name."""
     names = posed.coordinates.names
     return {follower: Tie(names[k], ratio) for follower, k, ratio in posed.coordinates.tied}
 
 
 def noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np.ndarray) -> dict[str, ChannelNoise]:
-    """Where each channel's sd comes from, and its size."""
+    """Source and size of each channel's sd, by channel."""
     share = np.where(np.isfinite(measured), np.asarray(posed.data.sd) / np.maximum(np.abs(measured), 1e-12), np.nan)
     return {
         name: ChannelNoise(
@@ -147,7 +147,7 @@ def _errors(
 
 
 def held_out(posed: Problem, held: holdout.HeldOut, measured: np.ndarray, sd: np.ndarray) -> HeldOut:
-    """Errors on blocks that the fit had not seen, in all and block by block."""
+    """Hold-out errors, overall and for each block."""
     percent, lost = sized_error(held.reading, measured), posed.observe.unreachable(held.status)
     blocks = {}
     for k, label in enumerate(held.labels):
@@ -163,7 +163,7 @@ def held_out(posed: Problem, held: holdout.HeldOut, measured: np.ndarray, sd: np
 
 
 def _counted(rows: np.ndarray) -> tuple[int, ...]:
-    """Rows of a mask, counted from 1."""
+    """Row numbers of a mask, from 1."""
     return tuple((np.flatnonzero(rows) + 1).tolist())
 
 
@@ -174,7 +174,7 @@ def readings(
     before: np.ndarray,
     after: np.ndarray,
 ) -> dict[str, ChannelReadings]:
-    """Readings by channel; arrays of shape (rows, channels), NaN where there is none."""
+    """Readings by channel; arrays of shape (rows, channels), NaN for missing ones."""
     percent, sigma = sized_error(after, measured), (after - measured) / sd
     return {
         name: ChannelReadings(*(x[:, k] for x in (measured, sd, before, after, percent, sigma)))
@@ -185,7 +185,7 @@ def readings(
 def chi_square(
     after: np.ndarray, measured: np.ndarray, sd: np.ndarray, about: Identifiability, known: Noise
 ) -> ChiSquare:
-    """Misfit of the readings that are there, and the degrees of freedom that the fit leaves them."""
+    """χ² of the finite readings, and the degrees of freedom left by the fit."""
     finite = np.isfinite(measured)
     misfit = np.where(finite, (after - measured) / sd, 0.0)
     freedom = float(finite.sum() - about.leverage.sum())
@@ -193,7 +193,7 @@ def chi_square(
 
 
 def conditions(observe: type[Observer], runs: Runs) -> dict[str, np.ndarray]:
-    """Columns of the runs that say which row is which."""
+    """Columns that identify the rows."""
     others = (axis for axis in observe.axes_of(runs) if axis not in runs.axes)
     columns = ("run_id", *others, "configuration", *runs.axes, *DRIVING, "surface")
     return {column: runs[column] for column in columns if runs.has(column)}

@@ -1,4 +1,4 @@
-"""Priors that come from another robot: a file changes a part of the nominal robot, but not that part's friction."""
+"""Priors inherited from another robot: a file changes a part of the nominal robot, but not that part's friction."""
 
 from __future__ import annotations
 
@@ -9,22 +9,20 @@ from calibration.inference.priors import FRICTION, GUIDE_FRICTION, GUIDE_SHARE, 
 from mmrjax.model import paper_robots
 from mmrjax.model.robot import Robot
 
-#: What makers and scales state of a part, and what of its friction was measured on the nominal robot.
+#: Values of a part that makers and scales state, and values of its friction measured on the nominal robot.
 DRIVE = {
     "motor": (("resistance", "torque_constant"), ("friction_coulomb", "friction_viscous")),
     "gearbox": (("ratio",), ("efficiency_load", "friction_coulomb", "friction_viscous")),
 }
 CHASSIS, GUIDES = (("mass", "radius"), FRICTION), (GUIDE_SHARE, GUIDE_FRICTION)
-#: Share by which a stated value has to differ to be that of another part [-].
+#: Relative difference above which a stated value belongs to another part [-].
 DIFFERS = 0.2
 
 
 def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[InheritedPriors]:
-    """Each part that is not the nominal robot's while friction of it still is.
+    """Parts that differ from the nominal robot's but have the same friction; none for a rig without inheritance.
 
-    None of a rig that starts from nothing.
-
-    A configuration is compared with that of the nominal robot whose friction it has.
+    A configuration is compared with the one of the nominal robot that has the same friction.
 
     Args:
         stated: names of parameters whose priors the user states.

@@ -1,4 +1,4 @@
-"""What a table can determine of a rig before anything is fitted: posterior over prior sd, at the prior mean."""
+"""Parameters that a table can determine, before any fit: posterior over prior sd, at the prior mean."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from mmrjax import fidelities
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
 
-#: What is to be looked at in a table before it is used.
+#: Notes that call for a look at the table before it is used.
 DOUBTS = (
     Copied, LargerNoise, NoLoadGives, NothingVaries, OffBy, Repeats, SlopesIn, StiffSupply, Turned, Unused,
 )  # fmt: skip
@@ -41,11 +41,11 @@ DOUBTS = (
 
 @dataclasses.dataclass(frozen=True)
 class Determined:
-    """What a table says of a free parameter.
+    """Information that a table has on a free parameter.
 
     Attributes:
         name: of the parameter; value: prior mean [unit]; prior_sd: of it [unit].
-        share: posterior over prior sd [-]; held: whether its prior holds it.
+        share: posterior over prior sd [-]; held: True if its prior holds it.
     """
 
     name: str
@@ -58,16 +58,16 @@ class Determined:
 
 @dataclasses.dataclass(frozen=True)
 class Foresight:
-    """What a table can determine.
+    """Information that a table has on a robot.
 
     Attributes:
         parameters: that `loop` would free.
-        status: of each row with the numbers of the file.
-        noise: of each channel: where its sd comes from.
-        alike: pairs of parameters that these data hardly tell apart, with the correlation of their posterior.
-        together: pairs of which they determine a combination alone.
-        robot: with what the table shows of it, see `preparation.prepare`.
-        doubts: what should be looked at in the table before a fit.
+        status: of each row, for the values in the file.
+        noise: source of each channel's sd.
+        alike: strongly correlated pairs of parameters, with the correlation of their posterior.
+        together: pairs of parameters of which the data determine only a combination.
+        robot: completed from the table, see `preparation.prepare`.
+        doubts: notes to look at before a fit.
     """
 
     parameters: tuple[Determined, ...]
@@ -80,13 +80,13 @@ class Foresight:
 
 
 def foresee(runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS) -> Foresight:
-    """What `runs` can determine of `robot`, by the linear analysis at its own values.
+    """Returns which parameters of `robot` `runs` can determine, from the linear analysis at the robot's own values.
 
-    Rows that the robot does not reach with these values count for nothing.
+    Rows that the robot does not reach with these values are ignored.
 
     Args:
         noise: as `noise.parse`; None takes the file's sd columns, or shares of the readings.
-        rows: of a log over time from which on readings are used of fewer.
+        rows: number of rows of a log over time above which readings are thinned.
 
     Raises:
         BadData: data that cannot be used.

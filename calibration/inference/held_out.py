@@ -1,4 +1,4 @@
-"""Readings of rows that a fit has not seen: whole blocks left out."""
+"""Hold-out fits: predictions of rows by fits without their block."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ def search_each(
     active: Sequence | None = None,
     most: int | None = None,
 ) -> tuple[Optimum, Observation]:
-    """Fits from any number of starts, each to its own weights.
+    """Fits from several starts, each with its own weights.
 
     Args:
         starts: coordinates; weights: of the readings, (rows, channels) each; active: sets of effects, None for a
-            problem without slots; most: steps of each, None for as many as it takes.
+            problem without slots; most: largest number of steps of each, None for no limit.
 
     Returns:
-        Where each search ended, and what the model says of every row there; leading axis the starts.
+        Optimum of each search and the model's observation there; the leading axis is the starts.
     """
     z, weight = (np.stack([np.asarray(x) for x in xs]) for xs in (starts, weights))
     which = None if active is None else np.stack([np.asarray(x) for x in active])
@@ -38,10 +38,10 @@ class HeldOutFits:
     """Fits without each block.
 
     Attributes:
-        reading: of each row by the fit that has not seen its block [SI], NaN where no block holds the row or the
-            fit does not reach it, shape (rows, channels); status: of each row, -1 where no block holds it.
+        reading: of each row by the fit without its block [SI], NaN if no block holds the row or the fit does not
+            reach it, shape (rows, channels); status: of each row, -1 if no block holds it.
         block: index of each row's block, -1 for none; shape (rows,).
-        z: of each block's fit, shape (blocks, coordinates); converged: whether it is an optimum.
+        z: of each block's fit, shape (blocks, coordinates); converged: True if it is an optimum.
     """
 
     reading: np.ndarray
@@ -54,11 +54,11 @@ class HeldOutFits:
 def held_out(
     problem: Problem, start: np.ndarray, masks: Sequence[np.ndarray], active: Sequence[int] | None = None
 ) -> HeldOutFits:
-    """Refit without each block in turn, and read the rows left out.
+    """Refit without each block in turn, and predict the omitted rows.
 
     Args:
         problem: as fitted to all rows; start: its optimum; active: its effects, for one with slots.
-        masks: of the rows of each block, shape (rows of the table,); the table may be padded behind them.
+        masks: of the rows of each block, shape (rows of the table,); the problem's rows may be padded beyond these.
     """
     rows, weight = len(masks[0]), np.asarray(problem.data.weight)
     out = [np.concatenate([m, np.zeros(len(weight) - rows, bool)]) for m in masks]
@@ -76,9 +76,9 @@ def held_out(
 def unseen(
     problem: Problem, start: np.ndarray, masks: Sequence[np.ndarray], active: Sequence[int] | None = None
 ) -> HeldOutFits:
-    """As `held_out`, but where runs take long a refit is the step of Gauss and Newton from the fit to all rows.
+    """Hold-out fits as `held_out`; for long runs each refit is one Gauss-Newton step from the fit to all rows.
 
-    A log has hundreds of readings a parameter, and without one of its blocks a fit stays where the model is linear.
+    A log has hundreds of readings a parameter, and without one block a fit stays within the linear range.
     """
     if not problem.observe.long:
         return held_out(problem, start, masks, active)

@@ -1,4 +1,4 @@
-"""Searches from many starts, with the noise estimated on the way where nobody states it."""
+"""Searches from several starts, with an estimate of the noise between searches if nobody states it."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ from mmrjax.model.robot import Robot
 AGREE = 1e-3
 #: Rounds of fitting and estimating the noise, and the change of a share at which they end.
 ROUNDS, SETTLED_SHARE = 30, 1e-3
-#: Draws among which the starts of a rollout's searches are chosen.
+#: Number of draws from which the starts of a rollout's searches are chosen.
 DRAWS = 2000
-#: Tightenings of the penalty on adhesion, tenfold each.
+#: Number of times that the penalty on adhesion is increased, tenfold each.
 TIGHTENINGS = 3
 T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
 class Starts:
-    """How searches from many starts ended.
+    """Outcome of searches from several starts.
 
     Attributes:
         cost: objective of each [½σ²], shape (starts,).
-        converged: of each.
-        infeasible: starts at which some row slides or fails.
-        z: where each ended, shape (starts, parameters); None where that is not kept.
+        converged: True for converged searches.
+        infeasible: number of starts at which some row slides or fails.
+        z: end of each search, shape (starts, parameters); None if not kept.
     """
 
     cost: np.ndarray
@@ -55,30 +55,30 @@ class Starts:
 
     @property
     def agree(self) -> int:
-        """How many converged searches ended at the best optimum."""
+        """Number of converged searches that ended at the best optimum."""
         return int(np.sum(self.converged & self._at_best))
 
     @property
     def agreement(self) -> Agreement:
-        """Whether the starts agree."""
+        """Agreement of the starts, as a note."""
         other = self.converged & ~self._at_best
         more = float(self.cost[other].min() - self.cost.min()) if other.any() else 0.0
         return Agreement(len(self.cost), self.agree, int(other.sum()), more, int(np.sum(~self.converged)))
 
     def statement(self) -> str:
-        """Whether the starts agree, as a sentence."""
+        """Agreement of the starts, as a sentence."""
         return fit_words.agreement(self.agreement)
 
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """What searches found.
+    """Result of the searches.
 
     Attributes:
-        problem: with the noise (and stiffness) it ended with; best: its optimum.
-        starts: how the searches ended.
-        shares: estimated sd of each channel as a share of its size, NaN where the sd was known.
-        searched: the population that it began from, None without.
+        problem: with the noise (and stiffness) of the last round; best: its optimum.
+        starts: outcome of the searches.
+        shares: estimated sd of each channel as a share of its size, NaN if the sd was known.
+        searched: the population that preceded the search, None without one.
     """
 
     problem: Problem
@@ -89,15 +89,14 @@ class Found:
 
 
 def unreachable(posed: Problem, status: np.ndarray) -> np.ndarray:
-    """Whether the model has no operating point for a row that has a reading; shape of `status`, (..., rows)."""
+    """True for rows with readings for which the model has no operating point; shape of `status`, (..., rows)."""
     return posed.observe.unreachable(np.asarray(status)) & (np.asarray(posed.data.weight).max(1) > 0)
 
 
 def search(posed: Problem, noise: Noise, points: np.ndarray, solver: fit.Solver | None = None) -> Found:
-    """Search from all points in one batch; where the noise is not known, estimate it and search again until it
-    settles.
+    """Search from all points in one batch; if the noise is unknown, estimate it and repeat until it settles.
 
-    The best optimum so far starts beside the points, so that every round is the same compiled batch.
+    The best optimum so far is one more start, so that every round runs the same compiled batch.
 
     Args:
         solver: of optimistix; None for ours.
@@ -125,12 +124,14 @@ def search_one_by_one(
     tell: Callable[[Step], None],
     solver: fit.Solver | None = None,
 ) -> Found:
-    """As `search`, one search at a time: the noise settles on the first point's optimum, then the others start once
-    each. One that ends lower takes its place, and the noise settles again.
+    """Search as `search`, but with one search at a time.
+
+    The noise settles on the first point's optimum, then each other point starts one search. If one of these ends
+    lower, it takes the first one's place and the noise settles again.
 
     Args:
-        posed: with the noise to begin from; shares: of the reading, that it has.
-        tell: is given what was done after every step; solver: of optimistix, None for ours.
+        posed: with the initial noise; shares: that noise as shares of the readings.
+        tell: callback for progress after every step; solver: of optimistix, None for ours.
     """
     begun = time.perf_counter()
 
@@ -178,11 +179,11 @@ def search_one_by_one(
 
 
 def nearby(easy: Problem, z: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
-    """Draws from the posterior of `steady` at its optimum z, for a rollout's searches to begin at: such at which
-    no row slides and no friction law is steeper at rest than the base's, or the nearest to that.
+    """Starts of a rollout's searches, drawn from the posterior of `steady` at its optimum z.
 
-    Draws from the prior would take hundreds of rollouts along the limit of adhesion to come back from; whether
-    the problem has several optima is what the many starts of `steady` say.
+    Draws are kept if no row slides and no friction law is steeper at rest than the base's, or else if they are the
+    nearest to that. Draws from the prior would need hundreds of rollouts along the limit of adhesion to recover. The
+    starts of `steady` show whether the problem has several optima.
     """
     spread = np.linalg.cholesky(identifiability.analyse(easy, jnp.asarray(z)).covariance)
     draws = z + rng.standard_normal((DRAWS, len(z))) @ spread.T
@@ -207,7 +208,7 @@ def at_best(
     tell: Callable[[Step], None],
     solver: fit.Solver | None = None,
 ) -> Found:
-    """What a population found, its best member searched on by gradients where those are to be trusted."""
+    """Optimum of a population: its best member, improved by gradients if these are reliable."""
     z = searched.found.z[searched.at]
     if searched.slope is None:
         found = search_one_by_one(posed, noise, z[None], shares, tell, solver)
@@ -225,13 +226,13 @@ def at_best(
 
 
 def reestimate_noise_at(posed: Problem, noise: Noise, searched: Population, at: int) -> tuple[Problem, np.ndarray]:
-    """The problem with the noise that is most probable for a member, and the shares that it is of readings."""
+    """Problem with the noise that is most probable for a member, and that noise as shares of the readings."""
     shares = most_probable(posed, noise, searched.reading[at])
     return _noisier(posed, noise, shares), shares
 
 
 def first_shares(noise: Noise) -> np.ndarray:
-    """What the estimated shares begin at, NaN where the sd is known; shape (channels,)."""
+    """Initial estimated shares, NaN if the sd is known; shape (channels,)."""
     return np.where(noise.estimated, noise_room.START, np.nan)
 
 
@@ -245,7 +246,7 @@ def _ended(found: fit.Optimum, feasible: np.ndarray) -> Starts:
 
 
 def _settling(posed: Problem, noise: Noise, z: np.ndarray, shares: np.ndarray) -> np.ndarray | None:
-    """The shares estimated anew at z, or None where there is nothing to estimate or they have settled."""
+    """New estimates of the shares at z; None if there are none to estimate or they have settled."""
     if not noise.estimated.any():
         return None
     new = _shares(posed, noise, z)
@@ -260,10 +261,10 @@ def _noisier(posed: Problem, noise: Noise, shares: np.ndarray) -> Problem:
 def _tighten(
     posed: Problem, points: np.ndarray, search: Callable[..., Any]
 ) -> tuple[Problem, fit.Optimum, np.ndarray]:
-    """Search from all points, with the penalty on adhesion stiffer until no row slides at the best.
+    """Search from all points; the penalty on adhesion is increased until no row slides at the best optimum.
 
     Returns:
-        The problem, the searches, and whether each start was feasible.
+        The problem, the searches, and True for feasible starts.
     """
     for _ in range(TIGHTENINGS + 1):
         found, status_start, status_end = search(posed, jnp.asarray(points), posed.data)
@@ -276,13 +277,13 @@ def _tighten(
 
 
 def _shares(posed: Problem, noise: Noise, z: np.ndarray) -> np.ndarray:
-    """Sd over size of each channel from the misfit, degrees of freedom taken off; NaN where known.
+    """Sd over size of each channel from the misfit, corrected for degrees of freedom; NaN if known.
 
-    s² = Σ (error / size)² / (readings - Σ leverage). It holds model error as well as noise, so a fit with it can't
+    s² = Σ (error / size)² / (readings - Σ leverage). It contains model error as well as noise, so a fit with it can't
     be tested for adequacy.
     """
     data = posed.data
-    size = noise.sd / noise_room.START  # what an estimated share is of
+    size = noise.sd / noise_room.START  # the reference of an estimated share
     weight = np.asarray(data.weight)
     error = np.asarray(fit.observation(posed, jnp.asarray(z)).reading - data.measured) / size
     error = np.where(weight > 0, error, 0.0)

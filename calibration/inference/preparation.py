@@ -1,8 +1,8 @@
-"""What is done to a table and a robot before anything is fitted, in one order for all that fits or foresees.
+"""Preparation of a table and a robot before any fit, in one order for all fits and predictions.
 
-`calibrate`, `discover` (so `loop` and its campaigns) and `foresee` (so `rig check`) take a table and a robot by this
-one function: instruments and surfaces of which the table tells, priors by their names then, the mass that the table
-states, the noise, the beginnings of histories, and the checks of all that.
+`calibrate`, `discover` (so `loop` and its campaigns) and `foresee` (so `rig check`) share this one function. It
+completes the robot's instruments and surfaces from the table and renames priors accordingly. Then it takes the mass
+from the table, the noise and the initial states of histories, and checks all these.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from mmrjax.model.robot import Robot
 
 @dataclasses.dataclass(frozen=True)
 class Prepared:
-    """A table and its robot, ready for a problem to be posed.
+    """A table and its robot, ready for a problem.
 
     Attributes:
-        robot: with the instruments, the configurations and the mass that the table shows, and its runs' beginnings.
+        robot: with instruments, configurations and mass from the table, and the initial states of its runs.
         observe: the kind of the data; noise: of the readings.
-        stated: priors by the names that parameters now have, (mean, sd) [SI].
-        names: free parameters that were chosen, see `prepare`.
-        former: remarks on names as they were called before; foreign: on priors of another robot; checked: on the
-            table; begins: on how its runs begin; weighed: on the masses that it states; doubted: on units that may be
-            others, to be said before a fit.
+        stated: priors by the current names of parameters, (mean, sd) [SI].
+        names: selected free parameters, see `prepare`.
+        former: notes on former names; foreign: on priors of another robot; checked: on the table; begins: on how its
+            runs begin; weighed: on the masses that it states; doubted: on units that may be wrong, for a report
+            before a fit.
     """
 
     robot: Robot
@@ -57,16 +57,16 @@ def prepare(
     assume: bool = True,
     choose: Callable[[Prepared], Sequence[str]] = lambda prepared: (),
 ) -> Prepared:
-    """A table and a robot as every fit takes them.
+    """A table and a robot, prepared for any fit.
 
     Args:
         noise: as `noise.parse`; stated: parameter → (mean, sd) [SI], by the names that the user knows.
-        assume: whether a channel without an sd has a usual one, instead of one that the fit estimates.
-        choose: names of the free parameters, of what else is prepared.
+        assume: True to take a usual sd for a channel without one, False to let the fit estimate it.
+        choose: function from the preparation to the names of the free parameters.
 
     Raises:
         BadData: a table that contradicts itself, its robot or its model, see `checks.check`.
-        BadConfiguration: a noise or a prior that is none, what `choose` raises.
+        BadConfiguration: an invalid noise or prior, or any raised by `choose`.
     """
     observe = observers.kind(runs)
     robot = surfaces.with_surface_configurations(instruments.with_inferred_instruments(robot, runs), runs)
@@ -81,7 +81,7 @@ def prepare(
     robot = observe.with_initial_states(robot, runs, known)
     found = Prepared(robot, observe, known, priors, (), tuple(former), (), (), (), tuple(weighed))
     names = tuple(choose(found))
-    # Its masses are compared with those of the file, which the table's have not yet replaced there.
+    # The table's masses are compared with those of the file, which are not yet replaced there.
     checked = checks.check(runs, as_stated, names, known)
     begins = observe.check_start(runs, known, robot)
     return dataclasses.replace(

@@ -1,4 +1,4 @@
-"""What a careful engineer would say of a calibration, read from its result."""
+"""Remarks of a careful engineer on a calibration, computed from its result."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from calibration.inference.problem import MARGIN
 from calibration.inference.result import CalibrationResult
 from mmrjax.model.signals import DONE, STATUSES
 
-#: Shift from the prior above which the prior or the model is called wrong [prior sd].
+#: Shift from the prior above which a remark calls the prior or the model wrong [prior sd].
 FAR = 3.0
 
 
@@ -71,7 +71,7 @@ def _statuses(found: CalibrationResult) -> Iterator[Note]:
 
 
 def _parameters(found: CalibrationResult) -> Iterator[Note]:
-    far = {name for name, p in found.parameters.items() if abs(p.shift) > FAR}  # which is said of them instead
+    far = {name for name, p in found.parameters.items() if abs(p.shift) > FAR}  # these get a remark of their own
     if held := tuple(name for name in found.undetermined if name not in far):
         yield HeldByPrior(held)
     if pairs := found.together:
@@ -111,5 +111,5 @@ def _blocks(found: CalibrationResult) -> Iterator[Note]:
 
 
 def numbers(which: np.ndarray) -> tuple[int, ...]:
-    """Numbers of rows."""
+    """Row numbers of a mask, from 1."""
     return tuple(int(k) + 1 for k in np.flatnonzero(which))

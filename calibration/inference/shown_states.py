@@ -1,4 +1,4 @@
-"""States of a robot that a log shows, row by row, and windows of its runs in which the equations hold.
+"""States of a robot that a log shows, row by row, and windows of its runs for the equations.
 
 No window contains a jump of an imposed quantity, a gap between rows, or rest. After a jump the current rises within a
 fraction of the time between rows, and friction at rest is not a function of speed.
@@ -22,17 +22,17 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import State
 
-#: Times between rows that a window is long, within limits [s]; its fewest rows; and how far the next one begins after
-#: it, as a share of its length.
+#: Length of a window in times between rows, and its limits [s]; its fewest rows; distance between the starts of
+#: windows, as a share of their length.
 LONG, LENGTHS, FEWEST, APART = 16, (0.15, 0.3), 9, 0.25
-#: Share of its largest value by which what is imposed jumps, and the acceleration of an imposed speed, with which the
-#: current does; times the usual one, a time between rows that is a gap.
+#: Jump of an imposed quantity as a share of its largest value, and the same for the acceleration of an imposed speed,
+#: with which the current jumps; a time between rows that is a gap, over the usual one.
 JUMP, KINK, GAP = 0.05, 0.3, 3.0
-#: Speed at which a shaft may rest: in sds of its reading, and as a share of the largest.
+#: Speed below which a shaft may be at rest: in sds of its reading, and as a share of the largest.
 REST_SD, REST = 5.0, 0.01
-#: Sds of a delay that is not known within which a jump may act.
+#: Range of an unknown delay within which a jump may act [prior sd].
 DELAYED = 2.0
-#: Length of a window [s] beyond which it does not show how states change.
+#: Length of a window [s] beyond which it does not show changes of the states.
 LONGEST = 1.0
 
 
@@ -40,11 +40,11 @@ class Plan(eqx.Module):
     """States that a log shows, as indices of its channels.
 
     Attributes:
-        current: the channel that shows the current, -1: it follows from what is imposed.
-        motion: that which shows the motion, -1: it is imposed; angle: whether it is an angle, which is read twice
-            integrated; travels: whether it is of the load, and not of a shaft.
+        current: index of the channel of the current, -1 if it follows from an imposed quantity.
+        motion: index of the channel of the motion, -1 if it is imposed; angle: True if it is an angle, which enters
+            integrated twice; travels: True for motion of the load, not of a shaft.
         others: channels that follow from the states.
-        imposed: as of `Rig.imposed`.
+        imposed: as in `Rig.imposed`.
     """
 
     current: int = eqx.field(static=True)
@@ -73,7 +73,7 @@ def plan_of(problem: Problem) -> Plan | None:
         return None
     imposed = robot.rig.imposed
     pulsed = np.ptp(np.asarray(problem.observe.of_rows.duty)) > 0  # type: ignore[attr-defined]
-    drawn = "total_current"  # of which pulses take a share
+    drawn = "total_current"  # proportional to the duty of pulses
     currents = {k: c.name == drawn for k, c in shown.items() if c.rests_on == channels.CURRENT}
     speeds = [k for k, c in shown.items() if c.zero_at_rest and c.settled]
     angles = [k for k, c in shown.items() if c.zero_at_rest and not c.settled]
@@ -103,8 +103,8 @@ class Rows(eqx.Module):
     """Conditions, readings and states of each row, shape (rows, ...).
 
     Attributes:
-        conditions: as they are from the row on; shown: readings [SI].
-        rate: slope of the channel of the motion, where that is an angle [SI/s]; way: of travel, 0 where it may rest.
+        conditions: from the row on; shown: readings [SI].
+        rate: slope of the channel of the motion, if that is an angle [SI/s]; way: of travel, 0 if it may be at rest.
         angle: of the output since the run's first row [rad]; since: time since the row before [s], 0 for the first.
     """
 
@@ -127,8 +127,10 @@ class Windows:
 
 
 def window(share: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """w = sin⁴ π s, w' and w'' of a window at shares s of its length [s]; 0 outside, as its first three derivatives
-    are at its ends."""
+    """w = sin⁴ π s, w' and w'' of a window at shares s of its length [s]; 0 outside.
+
+    The first three derivatives are 0 at its ends.
+    """
     s, c = np.sin(np.pi * share), np.cos(np.pi * share)
     inside = (share > 0) & (share < 1)
     rise = np.pi / length
@@ -140,8 +142,8 @@ def windows_in(time: np.ndarray, usable: np.ndarray, broken: np.ndarray) -> list
     """Returns the windows of one run, each as (indices of its rows, their positions as shares of its length).
 
     Args:
-        time: of the rows [s], increasing; usable: whether a row may be in a window.
-        broken: whether no window may hold both a row and the one before it.
+        time: of the rows [s], increasing; usable: True for rows that may be in a window.
+        broken: True for rows that may not be in a window together with the previous row.
     """
     if len(time) < 2:
         return []
@@ -165,7 +167,7 @@ def windows_in(time: np.ndarray, usable: np.ndarray, broken: np.ndarray) -> list
 
 
 def windows_of(problem: Problem, plan: Plan, rate: np.ndarray) -> list[Windows]:
-    """Returns the windows of every run."""
+    """Returns the windows of each run."""
     observe: Any = problem.observe
     time, weight = np.asarray(observe.time), np.asarray(problem.data.weight)
     measured, sd = np.asarray(problem.data.measured), np.asarray(problem.data.sd)
@@ -183,7 +185,7 @@ def windows_of(problem: Problem, plan: Plan, rate: np.ndarray) -> list[Windows]:
         turned = np.r_[False, np.diff(moves[rows]) != 0]
         broken = gap | turned
         for jump in _jumps(observe, r):
-            # A reading at the instant of a jump still shows what was before it.
+            # A reading at the instant of a jump still shows the state before it.
             usable &= ~((at > jump + 1e-9) & (at <= jump + late + 1e-9))
             broken |= np.r_[False, (at[:-1] <= jump + 1e-9) & (at[1:] > jump + 1e-9)]
         made = windows_in(at, usable, broken)
@@ -219,7 +221,7 @@ def _jumps(observe: Any, run: int) -> np.ndarray:
 
 
 def ways_of(problem: Problem, plan: Plan, measured: np.ndarray, sd: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """Direction of travel at every row, 0 where the robot may be at rest."""
+    """Direction of travel at each row, 0 if the robot may be at rest."""
     if plan.imposed == "motor_speed":
         speed = np.asarray(problem.observe.of_rows.motor_speed)  # type: ignore[attr-defined]
         return np.where(np.abs(speed) > REST * np.abs(speed).max(initial=0.0), np.sign(speed), 0.0)
@@ -230,7 +232,7 @@ def ways_of(problem: Problem, plan: Plan, measured: np.ndarray, sd: np.ndarray, 
 
 
 def rates_of(problem: Problem, plan: Plan) -> np.ndarray:
-    """Rate of the channel of the motion at every row: the slope of a cubic over a window [unit / s]."""
+    """Rate of the channel of the motion at each row: the slope of a cubic over a window [unit / s]."""
     observe: Any = problem.observe
     time, measured = np.asarray(observe.time), np.asarray(problem.data.measured)
     out = np.zeros(len(time))

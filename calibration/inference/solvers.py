@@ -1,4 +1,4 @@
-"""Solvers of optimistix and optax by the names that `calibrate --solver` takes. Importable without jax."""
+"""Solvers of optimistix and optax by the names in `calibrate --solver`. Importable without jax."""
 
 from __future__ import annotations
 

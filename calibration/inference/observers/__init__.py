@@ -1,6 +1,6 @@
-"""Observers: what runs show, settled or over time, and how inference treats each kind. One file a kind.
+"""Observers: readings of runs, settled or over time, and the treatment of each kind in inference. One file a kind.
 
-No other room asks which kind a table holds (tests/test_structure.py reads the code for it).
+No other room tests which kind a table has (tests/test_structure.py checks the code for it).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mmrjax.model.robot import Robot
 
 __all__ = ["Histories", "Observer", "SettledRuns", "SettledTurns", "facts", "kind", "pose"]
 
-#: In the order in which they are asked whether a table is theirs.
+#: In the order in which a table is tested for them.
 KINDS: tuple[type[Observer], ...] = (Histories, SettledTurns, SettledRuns)
 
 
@@ -32,7 +32,7 @@ def kind(runs: Runs) -> type[Observer]:
 
 
 def facts(model: str) -> Facts:
-    """What is known of a fidelity, by its name.
+    """Facts about a fidelity, by its name.
 
     Raises:
         BadConfiguration: no such fidelity.
@@ -43,7 +43,7 @@ def facts(model: str) -> Facts:
 
 
 def pose(runs: Runs, base: Robot, coordinates: Coordinates, sd: np.ndarray, model: str | None = None) -> Problem:
-    """The problem of these runs.
+    """Inverse problem of these runs.
 
     Args:
         sd: of the readings [SI], shape (rows, channels).

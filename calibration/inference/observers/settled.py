@@ -42,20 +42,20 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import FAILED, SLIDES, TIPS, Result, Signals
 
-#: Column that a brake or a weight may set, so that a reading is a condition.
+#: Column that a brake or a weight may impose, so that a reading is a condition.
 LOAD = "output_torque_Nm"
-#: Replicates further apart than this many sds of their difference contradict each other.
+#: Replicates that differ by more than this many sds of their difference contradict each other.
 CONTRADICTION = 6.0
-#: The same for replicates whose sd is not known, as a share of their mean.
+#: The same for replicates with unknown sd, as a share of their mean.
 CONTRADICTION_SHARE = 0.25
-#: Searches side by side on a core: of a robot without effects, and with.
+#: Searches that run together on a core: for a robot without effects, and with effects.
 MANY, FEW = 16, 4
-#: Least spread of a fitted speed or current, over its largest, for curves to be over it [-].
+#: Least spread of a fitted speed or current, over its largest value, for curves over it [-].
 VARIES = 0.05
-#: Share of the torque that motors make which the torque at the output is at least taken to be about [-].
+#: Least size of the torque at the output as a share of the motors' torque [-].
 LOST = 0.1
-#: Balances to which the defect of a row is attributed, one for each equation that the channels close: what each is a
-#: part of, by its name among the signals.
+#: Balances to which the defect of a row is attributed, one for each equation that the channels close, with the signal
+#: that is the size of each equation.
 EQUATIONS = {"electrical": "voltage", "track": "torque_output", "slip": "speed_theoretical"}
 
 
@@ -63,7 +63,7 @@ def _unused(runs: Runs, first: int, second: int, but: str) -> tuple[str, ...]:
     """Columns that differ between two rows and are no condition: those without a role, and a load's torque.
 
     Args:
-        but: a column that is left out.
+        but: an omitted column.
     """
     without = [c for c, cells in runs.extras.items() if cells.dtype.kind == "f"]
     torque = [c for c in (LOAD,) if c != but and runs.has(c)]
@@ -72,8 +72,11 @@ def _unused(runs: Runs, first: int, second: int, but: str) -> tuple[str, ...]:
 
 
 class SettledLinearization(Linearization):
-    """Of settled rows: `defects` has shape (balances, rows, channels), a defect of each row of its own, or (balances,
-    sides, rows, channels) where sides are driven apart."""
+    """Linearization of settled rows.
+
+    `defects` has shape (balances, rows, channels), with an independent defect in each row, or (balances, sides, rows,
+    channels) for independently driven sides.
+    """
 
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         of_sides = shapes.reshape(-1, self.rows, shapes.shape[1])
@@ -81,11 +84,11 @@ class SettledLinearization(Linearization):
         return moved.sum(0).reshape(-1, shapes.shape[1])
 
     def of_sides(self, balance: Scalar | int) -> Float[Array, "sides rows channels"]:
-        """What a defect of a balance changes, of each side; sides that are alike are one."""
+        """Change of the readings by a defect of a balance on each side; identical sides are one."""
         return self.defects[balance].reshape(-1, *self.scale.shape)
 
     def along_of_sides(self, balance: str) -> np.ndarray:
-        """What a defect that counts along the travel changes, shape (sides, rows, channels)."""
+        """Change of the readings by a defect along the travel, shape (sides, rows, channels)."""
         way = self.variable(acts_along(balance)).reshape(-1, self.rows)
         return np.asarray(self.of_sides(self.probed.index(balance))) * way[:, :, None]
 
@@ -94,7 +97,7 @@ class SettledLinearization(Linearization):
 
 
 def shares(channel: str, sides: int) -> np.ndarray:
-    """What a channel shows of each side [-]: of one of a side that alone, else their mean."""
+    """Weights of the sides in a channel's reading [-]: one side, or the mean of all."""
     side = channels.find(channel).side
     return np.full(sides, 1 / sides) if side is None or sides == 1 else np.eye(sides)[side]
 
@@ -103,7 +106,7 @@ class SettledRuns(Observer):
     """Observer of settled rows: one run a row.
 
     Attributes:
-        fidelity: that simulates them.
+        fidelity: name of the fidelity that simulates them.
     """
 
     word: ClassVar[str] = "run"
@@ -117,7 +120,7 @@ class SettledRuns(Observer):
     rows_tell: ClassVar[bool] = True
     evidence: ClassVar[tuple[str, ...]] = ("single", "curve", "pair", "chi2")
     linearization: ClassVar[type[SettledLinearization]] = SettledLinearization
-    shape_sides: ClassVar[tuple[int, ...]] = ()  # of what each side has of its own
+    shape_sides: ClassVar[tuple[int, ...]] = ()  # of values that differ between sides
 
     conditions: Conditions
     fidelity: str = eqx.field(static=True)
@@ -139,18 +142,18 @@ class SettledRuns(Observer):
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
-        """The readings, and a hundredth of the channel's largest where one is smaller."""
+        """The readings, or a hundredth of the channel's largest if that is larger."""
         measured = np.abs(runs.measured())
         return np.maximum(measured, 0.01 * np.max(np.nan_to_num(measured), 0))
 
     @classmethod
     def least(cls, runs: Runs) -> np.ndarray:
-        """Sizes below which no reading counts when repeated ones are compared [SI], shape (rows, channels)."""
+        """Least sizes for comparisons of repeated readings [SI], shape (rows, channels)."""
         return np.zeros(runs.measured().shape)
 
     @classmethod
     def check(cls, runs: Runs, noise: Noise) -> list[Note | str]:
-        """Refuses a table of one condition whose readings differ; notes the repeats that differ most."""
+        """Refuses a table of one condition with readings that differ; notes the repeats that differ most."""
         measured, alike = runs.measured(), same_conditions(runs)
         least, found = cls.least(runs), list[Repeats]()
         shared = np.array([source == "series" for source in noise.source])
@@ -161,7 +164,7 @@ class SettledRuns(Observer):
             mean = np.maximum(np.abs(here[:, None] + here) / 2, least[rows])
             sd = np.hypot(sds[:, None], sds)
             allowed = np.where(noise.estimated, CONTRADICTION_SHARE * mean, CONTRADICTION * sd)
-            # Noise that is estimated by the scatter of these readings is no measure of it.
+            # An estimate of the noise from the scatter of these readings cannot test that scatter.
             allowed = np.where(shared, np.minimum(allowed, CONTRADICTION * np.sqrt(2) * usual * mean), allowed)
             for at in np.argwhere(apart > allowed)[:1]:
                 (one, other, k), at = at.tolist(), tuple(at)
@@ -190,7 +193,7 @@ class SettledRuns(Observer):
 
     @classmethod
     def identity(cls, runs: Runs) -> tuple[str, ...]:
-        own = () if "order" in runs.headings else ("order",)  # of the rows in the file
+        own = () if "order" in runs.headings else ("order",)  # the order of the rows in the file
         return tuple(c for c in runs.columns if c not in own)
 
     @classmethod
@@ -247,8 +250,11 @@ class SettledRuns(Observer):
     def linearise(
         self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]
     ) -> SettledLinearization:
-        """As the protocol says. A signature is the sensitivity of the readings to a defect of the effect's balance,
-        times its term: exact, as an effect enters one balance and is linear in its amplitude."""
+        """Linearization as in the protocol.
+
+        A signature is the sensitivity of the readings to a defect of the effect's balance, times the effect's term.
+        This is exact, because an effect enters one balance and is linear in its amplitude.
+        """
         kind = self.linearization
         probes = tuple(probe(b) for b in kind.probed)
         robot, size, shown = problem.robot(z), z.size, channels.names(problem.channels)
@@ -294,11 +300,13 @@ class SettledRuns(Observer):
     def draws(
         self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray
     ) -> tuple[Array, Array, Array]:
-        """As the protocol says: readings and priors of each table, and its fit. Readings are drawn with their sds,
-        and the bench values too: a prior is a measurement made beforehand. The refit is the search that found
-        the fit, from the truth."""
+        """Draws as in the protocol: readings and priors of each table, and its fit.
+
+        Readings are drawn with their sds, and bench values too, because a prior is an earlier measurement. Each refit
+        is the search that found the fit, from the true coordinates.
+        """
         data, count = problem.data, len(keys)
-        clean = data.measured + data.sd * linear.by_row()  # where a reading counts
+        clean = data.measured + data.sd * linear.by_row()  # for included readings
         measured, centre = jax.device_get(_drawn(clean, data.sd, z, keys, jnp.asarray(factors)))
         start, weight = (np.repeat(np.asarray(x)[None], count, 0) for x in (z, data.weight))
         members = Member(start, weight, measured, centre)
@@ -335,12 +343,15 @@ class SettledRuns(Observer):
         return searches_refilled(problem, members, steps, self.places(problem))
 
     def places(self, problem: Problem) -> int:
-        """Searches side by side on a core: fewer where effects make the model costly, so that few wait for one."""
+        """Number of searches that run together on a core.
+
+        Fewer if effects make the model costly, so that few searches wait for the slowest.
+        """
         return FEW if problem.base.effects else MANY
 
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
         weight = included.astype(float)
-        if "duty" in columns:  # what the motors get
+        if "duty" in columns:  # the motors' mean voltage
             columns = {**columns, "supply_voltage_V": columns["supply_voltage_V"] * columns["duty"]}
         if CURRENT in columns and CURRENT in bases_room.axes_of(robot):  # imposed: no channel measures it
             columns = {**columns, bases_room.VARIABLES["current"]: columns[CURRENT]}
@@ -350,16 +361,18 @@ class SettledRuns(Observer):
         return (*bases_room.families(*told), *bases_room.windows(*told))
 
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> EquationDefects:
-        """As the protocol says: a row's residual (simulated less measured) is split among the defects of the
-        balances `electrical`, `track` and `slip`, of each side where they are driven apart, that together make it."""
+        """Defects of `electrical`, `track` and `slip` that together make each row's residual.
+
+        Residuals are simulated less measured; sides have defects of their own if they are driven independently.
+        """
         return EquationDefects(_defects(before.linear, included), _defects(after.linear, included))
 
 
 def _unmeasured(
     observe: SettledRuns, robot: Robot, columns: Mapping[str, np.ndarray]
 ) -> dict[str, Float[np.ndarray, " rows"]]:
-    """Motor speed [rad/s] and motor current [A] of a fit by their columns, where no channel measures one; rigs may
-    show the output alone."""
+    """Fitted motor speed [rad/s] and motor current [A], by column, if no channel measures them (rigs may show only
+    the output)."""
     wanted = [v for v in ("speed_motor", "current") if bases_room.VARIABLES[v] not in columns]
     if bases_room.VARIABLES["speed"] in columns:
         wanted = [v for v in wanted if v != "speed_motor"]
@@ -370,7 +383,7 @@ def _unmeasured(
 
 
 def _varies(x: np.ndarray) -> bool:
-    """True if sizes differ by more than `VARIES` of the largest: a current that friction alone takes does not."""
+    """True if sizes differ by more than `VARIES` of the largest, unlike a current that only friction needs."""
     return bool(np.ptp(x) > VARIES * np.max(x))
 
 
@@ -383,12 +396,12 @@ def _signals(observe: SettledRuns, robot: Robot, names: tuple[str, ...]) -> tupl
 
 
 def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarray]:
-    """The defects along the travel of each row that make its residual r, of each side where sides are driven apart.
+    """Defects along the travel that make the residual r of each row, of each side if sides are driven independently.
 
-    The likeliest of r = -S δ + noise of one sd, where δ has the prior sds D^½, the size of what each equation is
-    about (rms over the table): δ = -D Sᵀ (S D Sᵀ + 1)⁻¹ r. A defect that the readings of a row hardly show is so next
-    to nothing, and never a residual over a vanishing slope; what they show of several together is shared out. The
-    torque is at least a share of what the motors make: one that turns nothing but itself may lack some too.
+    They are the most probable δ of r = -S δ + noise of one sd: δ = -D Sᵀ (S D Sᵀ + 1)⁻¹ r. Their prior sds D^½ are
+    the size of each equation (rms over the table). A defect that barely changes the readings of a row is therefore
+    near zero, never a residual over a vanishing slope. Defects that act on the same readings share the residual. The
+    size of the torque is at least a share of the motors' torque, as a free shaft may have a defect too.
     """
     assert isinstance(linear, SettledLinearization)
     rows = np.flatnonzero(included)
@@ -412,13 +425,13 @@ def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarra
 
 @functools.partial(compiled, options=SELDOM)
 def _directions(observe: SettledRuns, robot: Robot) -> Float[Array, " rows"]:
-    """Which way each run goes, 1 or -1."""
+    """Direction of each run, 1 or -1."""
     return jax.vmap(lambda c: direction(robot, c))(observe.conditions)
 
 
 @functools.partial(compiled, options=SELDOM)
 def _drawn(clean: Array, sd: Array, z: Array, keys: Array, factors: Array) -> tuple[Array, Array]:
-    """Readings and bench values of a table for each key, its sds times its factors."""
+    """Readings and bench values of a table for each key, with its sds times its factors."""
 
     def one(key: Array, factors: Array) -> tuple[Array, Array]:
         one, two = jax.random.split(jax.random.wrap_key_data(key))

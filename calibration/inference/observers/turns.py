@@ -1,4 +1,4 @@
-"""Settled turns: one row a run of a robot whose sides are driven apart, read when it circles."""
+"""Settled turns: one row a run of a robot with independently driven sides, read when it circles."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ VARIABLES = (*(v for v in IN_TURNS if v != "order"), *VARIABLES_ROUND)
 
 
 def by_point(signals: Signals, name: str) -> Float[Array, " points"]:
-    """A signal at every point [SI].
+    """A signal at each point [SI].
 
     Args:
         signals: shape (rows, sides).
@@ -45,8 +45,7 @@ def by_point(signals: Signals, name: str) -> Float[Array, " points"]:
 
 
 class TurnLinearization(SettledLinearization):
-    """Of settled turns: each side of each row is a point, and what each side has of `signals` is along their last
-    axis."""
+    """Linearization of settled turns: each side of each row is a point; `signals` have the sides as last axis."""
 
     probed: ClassVar[tuple[str, ...]] = (*PROBED, *ROUND)
 
@@ -72,8 +71,8 @@ class TurnLinearization(SettledLinearization):
 class SettledTurns(SettledRuns):
     """Observer of settled turns.
 
-    Contacts slide across the travel as far as the turn asks, so that the demand on adhesion, which bounds straight
-    travel, bounds nothing here.
+    Contacts slide sideways as far as the turn requires. So the demand on adhesion, a limit of straight travel, is no
+    limit here.
     """
 
     word: ClassVar[str] = "turns"
@@ -82,7 +81,7 @@ class SettledTurns(SettledRuns):
     library: ClassVar[Mapping[str, type[Effect]]] = effects.OF_TURNS
     menu: ClassVar[bool] = False
     policy: ClassVar[SearchPolicy] = SearchPolicy(searches=4)
-    searches: ClassVar[int | None] = 4  # a turn takes some hundred times as long to find as straight travel
+    searches: ClassVar[int | None] = 4  # solving a turn takes some hundred times as long as straight travel
     profiled: ClassVar[bool] = False
     linearization: ClassVar[type[SettledLinearization]] = TurnLinearization
     shape_sides: ClassVar[tuple[int, ...]] = (2,)
@@ -101,7 +100,7 @@ class SettledTurns(SettledRuns):
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
-        """The channel's root mean square: readings of turns either way cross zero."""
+        """Root mean square of each channel: readings of turns in either direction cross zero."""
         return Histories.sizes(runs)
 
     @classmethod
@@ -126,7 +125,7 @@ class SettledTurns(SettledRuns):
     def draws(
         self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray
     ) -> tuple[Any, ...]:
-        """As the protocol says, with the roots at each refit."""
+        """Draws as in the protocol, with the roots at each refit."""
         drawn = super().draws(problem, z, linear, keys, factors)
         return *drawn, roots_of(problem, drawn[2])
 
@@ -145,8 +144,10 @@ class SettledTurns(SettledRuns):
         return super().unreachable(status) | (status == NOT_SETTLED)
 
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
-        """As the protocol says: in the balances of both sides alike, and round the turn, over what each side does,
-        how fast the robot turns, and which side it is."""
+        """Bases as in the protocol, in the same balances of both sides and in those of the turn.
+
+        Curves are over each side's signals, the yaw rate, and the side.
+        """
         names = [v for v in VARIABLES if v != "voltage" or robot.rig.shows_voltage]
         signals = shown_batch(robot, self.conditions)[1]
         seen = {n: np.asarray(by_point(signals, n)) for n in (*names, *WAYS)}
