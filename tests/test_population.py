@@ -326,7 +326,7 @@ def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch):
     ("options", "says"),
     [
         (dict(generations=3), "there is no population"),
-        (dict(population=50), "settled rows with --model drive or track alone"),
+        (dict(population=50), "a population search needs settled rows and --model drive or track"),
         (dict(population=2, model="drive"), "at least 4 members"),
         (dict(generations=3, population=0, model="track"), "there is no population"),
     ],

@@ -1,4 +1,4 @@
-"""Classes: for each effect found, the effects and stated values that the same data cannot tell from it."""
+"""Classes: for each effect found, the effects and stated values that the same data cannot separate from it."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from calibration.discovery.search import without_each
 from calibration.discovery.settings import Settings
 from calibration.discovery.stated_values import Shift, shifts
 
-#: Effects that are tried in the place of each one.
+#: Number of effects that are tried in place of each one.
 TRIED = 16
-#: Rise of χ² by regression up to which a rival is simulated [σ²], and the same as a share of what an effect explains.
+#: Rise of χ² by regression up to which a rival is simulated [σ²], and the same as a share of the effect's decrease.
 NEAR, FAR = 50.0, 0.5
-#: Share of what an effect explains that the score of a shifted prior has to promise for it to be fitted.
+#: Least predicted decrease of χ² by a shifted prior for it to be fitted, as a share of the effect's.
 SURE = 0.7
 
 
 @dataclasses.dataclass(frozen=True)
 class Classes:
-    """What cannot be told apart.
+    """Alternatives that the data cannot separate.
 
     Attributes:
-        members: of each effect of the best candidate, effects indistinguishable from it, itself first.
-        stated: of each, base parameters whose stated value may be wrong instead.
-        families: of each, the families of its members, the leader's first.
-        ladder: every candidate that was fitted, those of the search among them.
+        members: for each effect of the best candidate, the effects indistinguishable from it, itself first.
+        stated: for each, base parameters whose stated value may be wrong instead.
+        families: for each, the families of its members, the leader's first.
+        ladder: all candidates that were fitted, including those of the search.
     """
 
     members: tuple[tuple[str, ...], ...]
@@ -42,12 +42,12 @@ class Classes:
 
     @property
     def single(self) -> bool:
-        """Whether each effect has one name."""
+        """True if each effect has one name."""
         return all(len(m) + len(s) == 1 for m, s in zip(self.members, self.stated, strict=True))
 
 
 def cosines(space: CandidateSpace, scores: ScoreTable) -> np.ndarray:
-    """Largest |cos| between what a fit leaves of two effects' signatures, over their shapes; (effects, effects)."""
+    """Largest |cos| between the projected signatures of two effects, over their shapes; (effects, effects)."""
     cosine, effect, count = np.abs(np.asarray(scores.cosine)), space.library.of, len(space.library)
     whole = np.zeros((count, count))
     np.maximum.at(whole, (effect[:, None], effect[None, :]), cosine)
@@ -63,13 +63,13 @@ def classes(
     after: Diagnosis,
     settings: Settings,
 ) -> Classes:
-    """For each effect of the best fit, the effects and the stated values that explain the data as well in its place.
+    """Effects and stated values that explain the data as well in place of each effect of the best fit.
 
-    The forms of nature are not those of a library: an effect explains as well what it explains but for a share
-    `settings.form` of the sigmas, or `form_family` where it is of the same family.
+    The forms of nature are not those of a library. So an alternative may explain less than an effect, by a share
+    `settings.form` of the sigmas, or `form_family` within the same family.
 
     Args:
-        left: what the base leaves; after: what the best fit leaves.
+        left: diagnosis of the base; after: diagnosis of the best fit.
     """
     cosine, names = cosines(space, left.scores), space.library.names
     fewer = [base] if len(best.effects) == 1 else without_each(space, best, settings, ladder)
@@ -87,7 +87,7 @@ def classes(
     if space.bare.observe.long:
         fitted = ranked(space, [(w, best, after) for w in new], settings)
         known |= {c.key: c for c in fitted}
-        # What may be of the class is simulated where the program of the fits has room for it.
+        # Possible members of the class are simulated if the program of the fits includes them.
         new = [c.active for c in fitted if 2 * (c.cost - best.cost) < max(NEAR, FAR * max(gains))]
         new = [active for active in new if {n for n in active if n} <= {*space.room, *best.effects}]
     wanted_fits = [(w, start(space, best, w, settings, left.scores)) for w in new]

@@ -1,7 +1,7 @@
-"""A discrepancy without a name: where it is, its shape as a smooth curve fitted with the base, a formula for it.
+"""Discrepancy without a name: its location, its shape as a smooth curve fitted with the base, and a formula.
 
-Defects and formulas are linear algebra at the fit that leaves it, every column projected against the free
-parameters; the curve itself is fitted with the base anew.
+Defects and formulas are linear algebra at a fit, with every column projected against the free parameters; the curve
+itself is fitted together with the base.
 """
 
 from __future__ import annotations
@@ -37,37 +37,38 @@ from mmrjax.effects.curve import PLACES
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 
-#: Starts of the curve's fit, from what the linear analysis says to none.
+#: Number of starts of the curve's fit, from the linear estimate to zero.
 STARTS = 8
-#: Points of a curve that are shown.
+#: Number of plotted points of a curve.
 POINTS = 61
-#: Evidence by which a curve over the supply's voltage, which acts by way of currents and speeds, has to be the better
-#: one [σ²].
+#: Additional evidence required of a curve over the supply's voltage, which acts only through currents and speeds [σ²].
 INDIRECT = 6.0
+#: Largest number of instants among which the ends of a window are chosen.
 #: Most instants between which the ends of a window are looked for.
 INSTANTS = 200
-#: How much less improbable a balance's best curve may be for it to act alike [normal deviate].
+#: Difference of the scores of two balances' best curves up to which they cannot be separated [normal deviate].
 ALIKE = 1.0
 
 
-# --- where it is ----------------------------------------------------------------------------------------
+# --- location -------------------------------------------------------------------------------------------
 
 
 def locate(left: Diagnosis, bases: Bases, included: np.ndarray) -> DiscrepancyLocation:
-    """Place of the curve whose score is the most improbable, the variable over which a curve there has the greatest
-    evidence, and the places in which one is as improbable.
+    """Location of a discrepancy: place, variable, and the places that are indistinguishable.
+
+    The place is that of the most significant curve. The variable is that of the curve with most evidence there.
 
     Args:
-        left: what a fit leaves; included: whether a row counts, shape (rows,).
+        left: diagnosis of a fit; included: True for included rows, shape (rows,).
     """
     names = bases_room.names(bases)
     deviate, explained = np.asarray(left.scores.curve), np.asarray(left.scores.explained)
     happens = np.array([bases_room.window(n[1]) is not None for n in names])
-    # A smooth curve shows something of what happens for a while, and the other way round.
+    # A smooth curve responds to a temporary change too, and a window to a smooth curve.
     for_a_while = bool(np.max(deviate[happens], initial=-np.inf) > np.max(deviate[~happens]) + ALIKE)
     those = [j for j in range(len(names)) if happens[j] == for_a_while]
     k = max(those, key=lambda j: deviate[j])
-    # What a balance does as well is not put down to an instrument; it is listed beside it.
+    # A balance takes precedence over an instrument with a similar score, which is listed as an alternative.
     lacks = [j for j in those if not bases_room.in_readings(names[j][0]) and deviate[j] > deviate[k] - ALIKE]
     k = max(lacks, key=lambda j: deviate[j]) if lacks else k
     place = names[k][0]
@@ -93,7 +94,7 @@ def locate(left: Diagnosis, bases: Bases, included: np.ndarray) -> DiscrepancyLo
 def alike_variables(
     names: Sequence[tuple[str, str]], deviate: np.ndarray, place: str, variable: str
 ) -> tuple[str, ...]:
-    """Over what else a curve in a place is as improbable, the most improbable first."""
+    """Other variables with curves of similar significance in a place, the most significant first."""
     by_variable = {names[j][1]: deviate[j] for j in np.argsort(-deviate) if names[j][0] == place}
     by_variable.pop(bases_room.CONDITIONS, None)
     found: dict[str, str] = {_axis(variable): variable}
@@ -104,17 +105,18 @@ def alike_variables(
 
 
 def _axis(variable: str) -> str:
-    """What is the same for all windows along an axis, and for a smooth curve over nothing else."""
+    """Key shared by all windows along an axis; a smooth curve has a key of its own."""
     happens = bases_room.window(variable)
     return variable if happens is None else f"{happens.axis} for a while"
 
 
 def refined(linear: Linearization, place: str, axis: str, included: np.ndarray) -> tuple[bases_room.Window, float]:
-    """The window of an axis, of all that begin and end at its instants and hold at most half of the rows, that
-    explains most, and how much [σ²]; those that are tried for evidence are coarse.
+    """Window of an axis that explains most, and its decrease of χ² [σ²].
+
+    Windows begin and end at the axis's instants and hold at most half of the rows; those of the tests are coarser.
 
     Args:
-        included: whether a row counts, shape (rows,).
+        included: True for included rows, shape (rows,).
     """
     (x, way), included = linear.in_travel(place, axis), linear.at_points(included)
     at, counts = np.unique(x[included], return_counts=True)
@@ -145,7 +147,7 @@ class Shaped(eqx.Module):
 
     Attributes:
         base: of the base; root: L, shape (ordinates, ordinates); names: dotted, of the ordinates.
-        fitted_once: whether few fits are made with such coordinates.
+        fitted_once: True, because few fits use such coordinates.
     """
 
     fitted_once: ClassVar[bool] = True
@@ -171,21 +173,20 @@ def _ordinates(shaped: Shaped, z: Array) -> tuple[Array, tuple[Array, ...]]:
 
 @dataclasses.dataclass(frozen=True)
 class Discrepancy:
-    """A discrepancy that was located, as a smooth curve fitted together with the base.
+    """A located discrepancy, as a smooth curve fitted together with the base.
 
     Attributes:
-        balance, variable, unit: where it is, over what, and the unit of the balance.
-        effect: name of the curve among the effects of `robot`, the fitted robot that has it.
-        defect: of the balance, by row, at the fit that leaves it; None where single rows do not show it.
+        balance, variable, unit: its place and variable, and the unit of the balance.
+        effect: name of the curve among the effects of `robot`, the fitted robot with the curve.
+        defect: of the balance, by row, at the fit without the curve; None if single rows do not show it.
         grid: of the variable [SI]; curve, sd: there [unit], shape (points,); the 95 % band is ±1.96 sd. The
-            band holds what these data and the priors leave open, so it is wide where base parameters can
-            take the place of the curve.
+            band includes the uncertainty of the base, so it is wide if base parameters can replace the curve.
         chi2: twice the objective before and after [σ²], priors included.
         z, covariance: posterior of the coordinates of `problem`, the ordinates last.
-        problem: in which it was fitted.
-        reading: what the robot says of every row [SI], shape (rows, channels).
-        converged: whether the fit is an optimum.
-        proposal: a formula for it.
+        problem: of the fit.
+        reading: of each row [SI], shape (rows, channels).
+        converged: True if the fit is an optimum.
+        proposal: a formula for the curve.
     """
 
     balance: str
@@ -209,10 +210,10 @@ class Discrepancy:
 def fit_discrepancy(
     space: CandidateSpace, base: Candidate, linear: Linearization, balance: str, variable: str
 ) -> Discrepancy:
-    """The discrepancy of a balance over a variable: its defects, its curve, a formula.
+    """Discrepancy of a balance over a variable: its defects, its curve, a formula.
 
     Args:
-        base: the fit that leaves it; linear: the same, linearised.
+        base: the fit without the curve; linear: the same, linearised.
         balance: one of `bases.BALANCES`, or a channel.
         variable: one of `bases.VARIABLES`, of `bases.ORDERS`, or a window.
     """
@@ -251,7 +252,7 @@ def fit_discrepancy(
 
 
 def diagnosis_beside(space: CandidateSpace, found: Discrepancy, bases: Bases, left: Diagnosis) -> Diagnosis:
-    """A look at the fit with a curve, against the thresholds of the base, which `left` has."""
+    """Diagnosis of the fit with a curve, with the thresholds of the base, which `left` has."""
     z, effects = jnp.asarray(found.z), space.library.scored
     linear, scores, strongest = diagnosed(found.problem, z, effects, bases, near=left.linear)
     return Diagnosis(linear, scores, AdequacyTest(strongest, left.test.null, left.test.settings))
@@ -259,11 +260,12 @@ def diagnosis_beside(space: CandidateSpace, found: Discrepancy, bases: Bases, le
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CurveBeside:
-    """Where the base leaves something, the smooth curve there and what it leaves, each found when it is first asked
-    for: both the verdict and its result may ask.
+    """Smooth curve of the base's discrepancy and its diagnosis, each computed once when it is first needed.
+
+    Both the verdict and its result may need them.
 
     Attributes:
-        space, base, left, bases: as of `fit_discrepancy` and `diagnosis_beside`.
+        space, base, left, bases: as in `fit_discrepancy` and `diagnosis_beside`.
     """
 
     space: CandidateSpace
@@ -273,7 +275,7 @@ class CurveBeside:
 
     @functools.cached_property
     def where(self) -> DiscrepancyLocation:
-        """The place, as `locate` has it."""
+        """Location, as from `locate`."""
         return locate(self.left, self.bases, self.space.included)
 
     @functools.cached_property
@@ -283,14 +285,14 @@ class CurveBeside:
 
     @functools.cached_property
     def diagnosis(self) -> Diagnosis:
-        """What the fit with the curve leaves."""
+        """Diagnosis of the fit with the curve."""
         return diagnosis_beside(self.space, self.curve, self.bases, self.left)
 
 
 def _with_curve(space: CandidateSpace, base: Candidate, curve: Smooth) -> Problem:
-    """The problem of the base and a curve; the coordinates of the curve's ordinates come last."""
+    """Problem of the base and a curve; the coordinates of the curve's ordinates come last."""
     problem = space.problem(base.active) if base.effects else space.bare
-    # A robot that has this curve from an earlier round keeps one of them: the names are its parameters'.
+    # A curve of this name from an earlier round is replaced, because its parameters have the same names.
     kept = tuple(e for e in problem.base.effects if e.name != curve.effect)
     added = params.replace(UNNAMED[curve.effect](), {n: jnp.asarray(v) for n, v in curve.values.items()})
     robot = dataclasses.replace(problem.base, effects=(*kept, added))
@@ -301,6 +303,6 @@ def _with_curve(space: CandidateSpace, base: Candidate, curve: Smooth) -> Proble
 
 
 def _present(robot: Robot, space: CandidateSpace, base: Candidate, curve: str) -> Robot:
-    """The robot with the effects that are in it: its own, those of the fit, the curve."""
+    """Robot with only the effects that are present: its own, those of the fit, and the curve."""
     names = {e.name for e in space.bare.base.effects} | set(base.effects) | {curve}
     return dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in names))

@@ -1,4 +1,4 @@
-"""Power that a fit's balances take: an effect may be negative where its whole balance still dissipates."""
+"""Power balance of fits: an effect may be negative if its whole balance still dissipates."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.model.energy import sinks
 from mmrjax.model.robot import Robot
 
-#: The sink of `energy.SINKS` that holds all that a balance takes.
+#: The sink of `energy.SINKS` that contains the whole power of a balance.
 SINK = {
     "supply": "driver", "electrical": "winding", "motor": "motor", "gearbox": "gearbox", "track": "track",
     "ground": "rolling", "slip": "sliding",
 }  # fmt: skip
-#: Share of the largest power of a balance that rounding may make of none.
+#: Rounding error of a power, as a share of the largest in its balance.
 ROUNDING = 1e-9
 
 
 def supplying(space: CandidateSpace, active: Sequence[str], amplitude: np.ndarray, z: np.ndarray) -> tuple[str, ...]:
-    """Dissipative effects of negative amplitude whose balance would supply power in a row that counts.
+    """Dissipative effects of negative amplitude with a balance that would supply power in an included row.
 
-    An effect corrects the law of its balance: below zero it says that the law takes too much. Histories and turns,
-    which have no operating point for each row, are judged by the sign of the term alone.
+    An effect corrects the law of its balance; a negative one means that the law takes too much. Histories and turns
+    have no operating point for each row and are judged only by the sign of the term.
 
     Args:
         active: name of the effect in each slot; amplitude: of each; z: coordinates of the fit.
@@ -45,7 +45,7 @@ def supplying(space: CandidateSpace, active: Sequence[str], amplitude: np.ndarra
 
 
 def _dissipates(power: np.ndarray | None) -> bool:
-    """True where a balance takes power in every row in which that is known, and is known in one."""
+    """True if a balance takes power in every row with a known power, and there is at least one."""
     if power is None or not np.isfinite(power).any():
         return False
     return bool(np.nanmin(power) >= -ROUNDING * np.nanmax(np.abs(power)))
@@ -53,7 +53,7 @@ def _dissipates(power: np.ndarray | None) -> bool:
 
 @functools.partial(compiled, options=SELDOM)
 def _taken(observe: Observer, robot: Robot) -> Float[Array, "balances rows"] | None:
-    """Power that each balance of `SINK` takes in every row [W]; None where rows have no operating point."""
+    """Power that each balance of `SINK` takes in each row [W]; None if rows have no operating point."""
     signals = observe.operating(robot)
     if signals is None:
         return None

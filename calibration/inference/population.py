@@ -233,8 +233,8 @@ def most_probable(
 def objective(posed: Problem, noise: Noise) -> Objective:
     """Objective of members: half the sum of squares of misfit and prior.
 
-    If the sd of a channel is unknown, the most probable one for each member is used: n ln s replaces the squares, with
-    s the rms of the errors as shares of the readings. A measured row that a member does not reach costs `LOST`. A
+    If the sd of a channel is unknown, the most probable one for each member is used: n ln s replaces the squares,
+    with s the rms of the errors as shares of the readings. A measured row that a member does not reach costs `LOST`. A
     member with an included reading that could not be computed costs inf.
     """
     data = posed.data
