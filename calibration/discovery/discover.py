@@ -1,6 +1,6 @@
-"""The closed loop: fit, outliers, score tests, adequacy, search, classes, discrepancy, next experiment, in turn.
+"""The closed loop: fit, outliers, score tests, adequacy, search, classes, discrepancy, next experiment, in order.
 
-Each stage is a function of what the stages before it found; none changes anything.
+Each stage is a pure function of the results of the stages before it.
 """
 
 from __future__ import annotations
@@ -107,25 +107,26 @@ from mmrjax.errors import counted
 from mmrjax.model import channels
 from mmrjax.model.robot import Robot
 
-#: Factors on a noise that nobody states at which the verdict is looked at too: on what is assumed, and on what the
-#: table shows.
+#: Factors on unstated noise for which the verdict is repeated: on an assumed noise, and on one estimated from the
+#: table.
 FACTORS = {"assumed": (0.5, 2.0), "estimated": (0.7, 1.4)}
-#: Times that rows are looked through for such as stand alone, with what was found.
+#: Number of times that rows are screened for isolated outliers, with the effects found.
 SCREENINGS = 4
-#: Share of the largest speed or voltage that is no noise about rest [-].
+#: Share of the largest speed or voltage above which a value is not noise about rest [-].
 EITHER_WAY = 0.05
-#: Sds of a delay from zero from which on it is one.
+#: Size of a delay in its sds from which a note reports it.
 LATE = 4.0
-#: Share of rows set aside beyond which that is said first.
+#: Share of excluded rows above which the summary begins with it.
 MANY = 0.03
-#: Share of the range of a series by which levels differ that are not the same one as measured [-].
+#: Relative difference of two levels of a series, by its range, above which they are distinct [-].
 LEVEL = 0.02
-#: Error of a refit over that of the robot as stated above which it is said [-].
+#: Ratio of the error of a refit to that of the robot as stated above which a note reports it [-].
 WORSE = 1.1
-#: Root of a score from which on it is likely that something is missing, before the bootstrap tells [σ].
+#: Root of a score from which an effect is probably missing, before the bootstrap's result [σ].
 LIKELY = 4.0
-#: Prior sds beyond which a base parameter is worth a look.
+#: Distance from the prior above which a note reports a base parameter [prior sd].
 FAR = 3.0
+#: Callback for progress notes.
 #: Is told what the loop does next.
 Tell = Callable[[Note | str], None]
 
@@ -147,25 +148,25 @@ def discover(
     keep: Keep = kept.nothing,
     left: Callable[[], float | None] = lambda: None,
 ) -> DiscoveryResult:
-    """Find what a robot's model lacks against measured runs.
+    """Find the model error of a robot against measured runs, and trace it to a balance or an effect.
 
     Args:
         runs: settled runs, or time histories from rest.
-        robot: its values are the prior means; a mass that the table states takes the place of its own.
-        noise: sds as `noise.parse`; None takes the file's columns, else what series of conditions show,
-            or where there are none a usual one, halved and doubled.
-        stated: parameter → (mean, sd) [SI], priors in place of the fields'.
-        library: effects to look for.
+        robot: its values are the prior means; a mass in the table replaces its own.
+        noise: sds as `noise.parse`; None takes the file's columns, else an estimate from series of conditions,
+            or without series a usual one, halved and doubled.
+        stated: parameter → (mean, sd) [SI], priors that replace the fields'.
+        library: effects to test.
         replicates: of the bootstrap; seed: random seed.
-        prefer: by what the leader of a class is chosen, `fit` or `held-out`.
-        forbidden: kinds of experiments (`menu.KINDS`) and configurations that are not to be proposed.
-        rows: of a log over time from which on readings are used of fewer, evenly in time, which its notes say.
-        progress: called with a sentence as the work goes on; keep: by which stages are kept as they end.
-        left: time that is left once there is a verdict [s], for which verdicts at other noises are waited; None: all.
+        prefer: criterion for the leader of a class, `fit` or `held-out`.
+        forbidden: kinds of experiments (`menu.KINDS`) and configurations that are not proposed.
+        rows: number of rows of a log over time above which readings are thinned evenly in time; a note reports it.
+        progress: callback for progress messages; keep: function that stores each stage when it ends.
+        left: remaining time after the verdict [s], for which verdicts at other noises are awaited; None: no limit.
 
     Raises:
-        BadData, BadConfiguration: data that contradict themselves or are too few, priors that cannot be, experiments
-            that are not known; or a call inside `jax.jit` where JAX is single.
+        BadData, BadConfiguration: data that contradict themselves or are too few, invalid priors, unknown
+            experiments; or a call inside `jax.jit` while JAX uses single precision.
     """
     if not is_double():
         raise BadConfiguration(f"discover: {SINGLE}")
@@ -182,7 +183,7 @@ def discover(
         traced, notes = keep("verdict", lambda: ready.trace(progress=tell, later=later, keep=keep)), ready.notes
     silent = channels.names(known.silent)
     factors = FACTORS.get(known.word, ())
-    # Verdicts at other noises run the programs of the first one: beside what follows it, on other cores.
+    # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
     others = Threads(2, kept.BESIDE)
     sensitivity, outstanding = list[Sensitivity](), list[float]()
     try:
@@ -205,7 +206,7 @@ def discover(
                 sensitivity.append(in_short(f, verdict.result(left()), ready.numbers))
             except concurrent.futures.TimeoutError:
                 outstanding.append(f)
-    finally:  # one that is interrupted, or out of time, waits for none
+    finally:  # an interruption or the time limit waits for none of them
         others.shutdown(wait=False, cancel_futures=True)
     if outstanding:
         notes = (Outstanding(tuple(outstanding), known.word), *notes)
@@ -219,13 +220,13 @@ def discover(
 
 @dataclasses.dataclass(frozen=True)
 class LoopInput:
-    """What the stages of the loop are given: a table, its robot, and how to look.
+    """Input of the loop's stages: a table, its robot, and the settings.
 
     Attributes:
-        runs: without copies; numbers: of the rows, as messages call them.
-        robot: as `preparation.prepare` leaves it; noise: of the readings; stated: priors (mean, sd) [SI].
-        settings: statistical; library: effects to look for.
-        notes: what to say of all that; at_first: those that are said before the first fit.
+        runs: without copies; numbers: of the rows, as in messages.
+        robot: as `preparation.prepare` returns it; noise: of the readings; stated: priors (mean, sd) [SI].
+        settings: statistical; library: effects to test.
+        notes: on all of these; at_first: those to report before the first fit.
     """
 
     runs: Runs
@@ -246,7 +247,7 @@ class LoopInput:
         later: Callable[[BaseFit], None] = lambda base: None,
         keep: Keep = kept.nothing,
     ) -> LoopStages:
-        """The stages up to a verdict, with this noise or another; the others as of the function `trace`."""
+        """Stages up to a verdict, with this noise or another; other arguments as in the function `trace`."""
         sds = self.noise if noise is None else noise
         return trace(
             self.runs, self.robot, sds, self.settings, self.stated, self.library, progress, known, later, keep
@@ -266,9 +267,9 @@ def prepared(
     forbidden: Sequence[str] = (),
     rows: int = ROWS,
 ) -> LoopInput:
-    """What `discover` does before its first fit; arguments and errors as of `discover`.
+    """Input of the stages from the arguments of `discover`; arguments and errors as there.
 
-    A campaign that wants verdicts alone goes on with `LoopInput.trace`, so that it takes the way that users take.
+    A campaign that needs only verdicts continues with `LoopInput.trace`, and so follows the same path as users.
     """
     menu.check_forbidden(forbidden, robot)
     if not robot.rig.inherits:
@@ -297,11 +298,11 @@ def prepared(
 
 @dataclasses.dataclass(frozen=True)
 class Sds:
-    """The noise that a verdict is with.
+    """Noise of a verdict.
 
     Attributes:
-        noise: of the readings; factors: of the sds as given by which each channel's were changed, empty for none.
-        remarks: what to say of that.
+        noise: of the readings; factors: changes of the given sds by channel, empty for none.
+        remarks: notes on the noise.
     """
 
     noise: Noise
@@ -311,19 +312,19 @@ class Sds:
 
 @dataclasses.dataclass(frozen=True)
 class LoopStages:
-    """What the stages up to a verdict found.
+    """Results of the stages up to a verdict.
 
     Attributes:
         verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
-        screened: the base fit, rows that stand alone set aside; left: what it leaves.
-        sds: the noise that the verdict is with.
-        searched: what was tried; alike: what cannot be told apart, where a name is given.
-        where: something is missing, or remains.
-        standing: why names that were looked at do not stand, or what was put beside them.
-        held_out: the alternatives compared by data held out, where these chose the leader.
-        beside: the curve of what the base leaves, where something is missing.
-        predicted: what fits predict of data held out, as of `prediction.smallest`.
-        mechanism: where no name stands, established or not.
+        screened: the base fit without outliers; left: its diagnosis.
+        sds: noise of the verdict.
+        searched: the search; alike: effects that cannot be separated, if a name is given.
+        where: location of the discrepancy, or of the remaining one.
+        standing: tests of the names.
+        held_out: alternatives by hold-out errors, if these chose the leader.
+        beside: the curve of the base's discrepancy, if there is one.
+        predicted: hold-out predictions of fits, as from `prediction.smallest`.
+        mechanism: if no name is established; it may not be established either.
         missed: channels that the model does not describe; unused: columns that vary and have no role.
     """
 
@@ -344,7 +345,7 @@ class LoopStages:
 
     @property
     def members(self) -> tuple[tuple[str, ...], ...]:
-        """Of each effect that is established, those that these data cannot tell from it, itself first."""
+        """For each established effect, those that these data cannot separate from it, itself first."""
         return tuple(m for m, name in zip(self._classes, self._named, strict=True) if name)
 
     @property
@@ -357,12 +358,12 @@ class LoopStages:
 
     @property
     def noise_factor(self) -> float | None:
-        """By what factor sds are off, the mean of the channels; None where they are right."""
+        """Factor of the sds, the geometric mean of the channels; None if they are unchanged."""
         return float(np.exp(np.mean(np.log(list(self.sds.factors.values()))))) if self.sds.factors else None
 
     @property
     def families(self) -> tuple[str, ...]:
-        """Families of what is established: of the members of each class, or where something without a name is."""
+        """Families of the members of each established class, or of the location of an unnamed discrepancy."""
         if self.alike is not None and self.verdict not in WITHOUT_NAME:
             return tuple(f for each, name in zip(self.alike.families, self._named, strict=True) if name for f in each)
         if self.verdict == "mechanism" and self.mechanism is not None:
@@ -371,12 +372,12 @@ class LoopStages:
 
     @property
     def events(self) -> tuple[dict[str, Any], ...]:
-        """Where something happens for a while: axis and window, and numbers of the rows in it."""
+        """Temporary changes: axis and window, and numbers of the rows in it."""
         return () if self.where is None else self._happening(self.where.variable)
 
     @property
     def events_alike(self) -> tuple[dict[str, Any], ...]:
-        """The same of what it cannot be told from."""
+        """Temporary changes that cannot be separated from `events`, in the same form."""
         alike = () if self.where is None else self.where.variables_alike
         return tuple(event for variable in alike for event in self._happening(variable))
 
@@ -392,20 +393,20 @@ class LoopStages:
 
     @property
     def simulated(self) -> dict[tuple[str, ...], np.ndarray]:
-        """Coordinates of every fit by simulation, by its effects."""
+        """Coordinates of each simulated fit, by its effects."""
         every = (self.screened.base.candidate, *(() if self.searched is None else self.searched.ladder))
         return {c.active: c.z for c in reversed(every) if c.simulated and np.isfinite(c.cost)}
 
     @property
     def best(self) -> Candidate:
-        """The candidate that is proposed: the base, where no effect is named."""
+        """The proposed candidate: the base if no effect is named."""
         if self.alike is None or self.searched is None or self.searched.best is None:
             return self.screened.base.candidate
         return self.searched.best
 
     @property
     def ends(self) -> Diagnosis:
-        """What that candidate leaves."""
+        """Diagnosis of that candidate."""
         if self.alike is None or self.searched is None or self.searched.diagnosis is None:
             return self.left
         return self.searched.diagnosis
@@ -423,17 +424,18 @@ def trace(
     later: Callable[[BaseFit], None] = lambda base: None,
     keep: Keep = kept.nothing,
 ) -> LoopStages:
-    """The stages of the loop up to a verdict, in order; the noise is known. `later` is told the base
-    fit as soon as something is likely to be missing. What is kept of a stage holds what those before it found, which
-    is one whole.
+    """Stages of the loop up to a verdict, in order, with known noise.
 
-    What replicates of a bootstrap show in units of their own sds hardly depends on these: where the stages of the
-    same table with other sds are `known`, and the same rows count, their replicates serve. Fits of histories then
-    take a few steps of Gauss and Newton from those. Sets for which their program has no room are not simulated, and
-    no row is set aside anew.
+    `later` is called with the base fit as soon as an effect is probably missing. A stored stage contains the results
+    of the stages before it.
 
-    Where residuals are without structure and everywhere as many times the sds, it is the sds that are wrong: the
-    stages go through again with such as the residuals show.
+    The bootstrap's statistics, in units of their sds, depend only weakly on the sds. If the stages of the same table
+    with other sds are `known`, with the same included rows, their replicates are reused. Fits of histories then take
+    a few Gauss-Newton steps from those. Sets of effects outside their program are not simulated, and no further
+    row is excluded.
+
+    If the residuals have no structure and exceed the sds by the same factor everywhere, the sds are wrong. The
+    stages are then repeated with sds from the residuals.
     """
     task = _Task(runs, robot, noise, settings, stated, library, progress, known, later, keep)
     ranked = list[Ranking]()
@@ -448,7 +450,7 @@ def trace(
 
 @dataclasses.dataclass(frozen=True)
 class _Task:
-    """The arguments of `trace`, which its stages share."""
+    """Arguments of `trace`, shared by its stages."""
 
     runs: Runs
     robot: Robot
@@ -465,7 +467,7 @@ class _Task:
         """The base fit with this noise, from `near` if given, and its outliers; see `windows`."""
         space = pose(self.runs, self.robot, noise.sd, self.settings, self.stated, self.library)
         known, at = self.known, functools.partial(bases_at, self.runs)
-        if known is not None and space.bare.observe.long:  # whose rows count here too
+        if known is not None and space.bare.observe.long:  # the same rows are included here
             space = dataclasses.replace(space.without(np.array(known.screened.outliers, int)), near=known.simulated)
             self.progress(Step("base"))
             base = fit_base(space, self.settings, self.runs.source, near)
@@ -476,8 +478,8 @@ class _Task:
         return screen(fit_base(space, self.settings, self.runs.source, near), at, self.runs, self.settings)
 
     def windows(self, space: CandidateSpace, ranked: list[Ranking]) -> Candidate | None:
-        """Where the base fit begins by the equations of a log in weak form; their ranking of the library is appended
-        to `ranked`."""
+        """Start of the base fit from a log's equations in weak form; their ranking of the library is appended to
+        `ranked`."""
         found = beforehand(space, self.settings)
         if found is None:
             return None
@@ -487,7 +489,7 @@ class _Task:
 
 
 def _base(task: _Task, ranked: list[Ranking]) -> tuple[Screening, Sds]:
-    """The base fit and the noise, which is scaled where residuals without structure exceed it by one factor."""
+    """The base fit and the noise, rescaled if residuals without structure exceed it by one factor."""
     known, noise = task.known, task.noise
     screened = task.screen(noise, None if known is None else known.screened.base.candidate, ranked)
     residuals = residuals_of(screened, task.runs)
@@ -501,7 +503,7 @@ def _base(task: _Task, ranked: list[Ranking]) -> tuple[Screening, Sds]:
 
 
 def _tested(task: _Task, sds: Sds, screened: Screening) -> tuple[Screening, Diagnosis]:
-    """A base fit with room for the sets of effects that are simulated, and the bootstrap of what it leaves."""
+    """A base fit with the sets of effects to be simulated in its program, and the bootstrap of its residuals."""
     known, weight = task.known, screened.base.space.weight
     null = None if known is None or np.any(known.screened.base.space.weight != weight) else known.left.test.null
     room = () if known is None else known.screened.base.space.room
@@ -516,7 +518,7 @@ def _tested(task: _Task, sds: Sds, screened: Screening) -> tuple[Screening, Diag
 
 
 def _tried(task: _Task, screened: Screening, left: Diagnosis) -> tuple[Screening, Diagnosis, Search]:
-    """The search for effects that explain what the base leaves."""
+    """Search for effects that explain the residuals of the base."""
     base = screened.base
     found = search(base.space, base.candidate, left, screened.bases, task.settings, task.progress)
     base = dataclasses.replace(base, space=base.space.with_room(found.room))
@@ -526,7 +528,7 @@ def _tried(task: _Task, screened: Screening, left: Diagnosis) -> tuple[Screening
 def _searched(
     task: _Task, screened: Screening, sds: Sds, ranked: list[Ranking]
 ) -> tuple[Screening, Diagnosis, Search | None]:
-    """The search, repeated while it leaves outliers; None where the base leaves nothing."""
+    """Search, repeated while it leaves outliers; None if the base leaves no discrepancy."""
     settings, keep, progress = task.settings, task.keep, task.progress
     for k in range(SCREENINGS):
         progress(Step("bootstrap", (settings.replicates,)))
@@ -549,7 +551,7 @@ def _searched(
 
 
 def _verdict(task: _Task, screened: Screening, left: Diagnosis, sds: Sds, searched: Search) -> LoopStages:
-    """The verdict where the base leaves something: names, classes, a mechanism or a place."""
+    """Verdict on a base with a discrepancy: names, classes, a mechanism or a place."""
     runs, settings, progress = task.runs, task.settings, task.progress
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
     beside, predicted = CurveBeside(space, base, left, bases), Predicted()
@@ -597,15 +599,15 @@ def choose(
     beside: CurveBeside,
     predicted: Predicted,
 ) -> tuple[tuple[Candidate, Diagnosis] | None, Search, NameSupport]:
-    """The effects that belong in the model: those whose names stand by themselves, and those of the smallest set that
-    predicts as well as any, but what only stands in for a curve; None for none. With what was searched, and which
-    names stand.
+    """Effects that belong in the model, the updated search, and the tests of their names.
 
-    Where the largest set leaves nothing its effects are judged, else those of the set that predicts.
+    They are those with an established name, and those of the smallest set that predicts as well as any, except
+    stand-ins for a curve; None for no effects. If the largest set leaves no discrepancy, its effects are judged, else
+    those of the set that predicts.
 
     Args:
-        left: what the base leaves; beside: its curve.
-        predicted: takes what fits predict of data held out.
+        left: diagnosis of the base; beside: its curve.
+        predicted: collects hold-out predictions of fits.
     """
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
     best, after, long = searched.best, searched.diagnosis, space.bare.observe.long
@@ -644,7 +646,7 @@ def choose(
     return (known[0], seen or diagnose(space, known[0], bases, left.test.null, settings)), searched, stood
 
 
-# --- the stages that are no room of their own -----------------------------------------------------------
+# --- stages without a module of their own ---------------------------------------------------------------
 
 
 def pose(
@@ -655,11 +657,11 @@ def pose(
     stated: Mapping[str, tuple[float, float]] | None = None,
     library: Library = effects.BY_NAME,
 ) -> CandidateSpace:
-    """The base problem of a table, and room for the effects that its data can show.
+    """Base problem of a table, with slots for the effects that its data can show.
 
-    Rows are padded to one of a few sizes, so that tables of about one size share what is compiled; what is padded
-    counts for nothing. A mass that the table states takes the place of the robot's own, and the ground may be any
-    surface whose friction is not stated: its own prior, of another surface, would pull on what depends on slip.
+    Rows are padded to one of a few sizes, so that tables of similar size share compiled programs; padding has weight
+    0. A mass in the table replaces the robot's own. Ground friction without a stated prior has that of any surface,
+    because the prior of another surface would bias parameters that depend on slip.
     """
     robot = own_mass.with_table_mass(robot, runs)
     kind = observers.kind(runs)
@@ -679,10 +681,10 @@ def visible(
     either_way: bool = True,
     at_duties: bool = False,
 ) -> tuple[Effect, ...]:
-    """The effects of a library that such data can show and the robot does not have yet.
+    """Effects of a library that such data can show and the robot does not have yet.
 
     Args:
-        either_way: whether the runs go both ways, see `both_ways`; at_duties: see `pulsed`.
+        either_way: True if the runs go both ways, see `both_ways`; at_duties: see `pulsed`.
     """
     have = {e.name for e in robot.effects}
     return tuple(
@@ -703,7 +705,7 @@ def pulsed(runs: Runs) -> bool:
 
 
 def both_ways(runs: Runs) -> bool:
-    """Whether runs go forward as well as backward, by any speed that they state or by what drives them."""
+    """True if runs go both forward and backward, by any speed that they state or by their drive."""
     moved = [c.column for c in channels.EVERY if c.zero_at_rest and c.directed]
     columns = [runs[name] for name in (*moved, runs.layout.imposed_column, "duty") if runs.has(name)]
     found = [x[np.isfinite(x)] for x in columns]
@@ -711,15 +713,15 @@ def both_ways(runs: Runs) -> bool:
 
 
 def padded(rows: int, sizes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Rows with repeats of the first behind them, to the next of `sizes` or a multiple of the last, and which of them
-    are real."""
+    """Row indices padded by repeats of the first to the next of `sizes` (or a multiple of the last), and True for
+    the real rows."""
     size = next((s for s in sizes if s >= rows), rows + (-rows % sizes[-1] if sizes else 0))
     index = np.concatenate([np.arange(rows), np.zeros(size - rows, int)])
     return index, np.arange(len(index)) < rows
 
 
 def bases_at(runs: Runs, base: BaseFit) -> Bases:
-    """Bases of curves over the readings of a fit: over measured ones they would share their noise."""
+    """Bases of curves over the fitted readings, because curves over measured ones would share their noise."""
     problem = base.space.bare
     index, _ = padded(len(runs), problem.observe.sizes_padded)
     columns = dict(runs.where(index).columns)
@@ -733,10 +735,10 @@ def bases_at(runs: Runs, base: BaseFit) -> Bases:
 def diagnosis_of_base(
     screened: Screening, settings: Settings, freedom: np.ndarray | None = None, null: Statistics | None = None
 ) -> Diagnosis:
-    """What the base leaves, tested against the bootstrap of itself.
+    """Diagnosis of the base by its own bootstrap.
 
     Args:
-        freedom: degrees of freedom of the sd of each channel; null: replicates where they are known.
+        freedom: degrees of freedom of the sd of each channel; null: replicates, if known.
     """
     space, base = screened.base.space, screened.base.candidate
     linear, scores, found = screened.diagnosed
@@ -749,16 +751,16 @@ def diagnosis_of_base(
 
 
 def _once(columns: Sequence[np.ndarray]) -> int:
-    """Number of rows after which a table begins anew, row for row."""
+    """Number of rows after which a table repeats itself exactly."""
     rows = list(zip(*(column.astype(str).tolist() for column in columns), strict=True))
     return next(n for n in range(1, len(rows) + 1) if len(rows) % n == 0 and rows[:-n] == rows[n:])
 
 
 def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Note]]:
-    """The runs without exact copies of one another, their row numbers, and what to say of that.
+    """Runs without exact copies of each other, their row numbers, and notes on the copies.
 
-    Rows that a file tells apart by no name, order or time are repeats, even if a coarse display shows them the same.
-    They are copies where the whole table is: the same rows in the same sequence, several times.
+    Equal rows that a file does not distinguish by name, order or time are repeats, perhaps read from a coarse
+    display. They are copies only if the whole table repeats: the same rows in the same sequence, several times.
     """
     columns = [*(runs[c] for c in observers.kind(runs).identity(runs)), *runs.extras.values()]
     seen: set[tuple[str, ...]] = set()
@@ -778,14 +780,14 @@ def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Note]]:
 
 
 def in_short(factor: float, traced: LoopStages, numbers: np.ndarray) -> Sensitivity:
-    """What the loop says with another noise."""
+    """Verdict and summary for another noise."""
     adequate = not traced.ends.test.rejected_with_margin
     near = bool(traced.screened.base.space.near)
     return Sensitivity(factor, traced.verdict, summary(traced, numbers), traced.members, adequate, near)
 
 
 def summary(traced: LoopStages, numbers: np.ndarray) -> Summary:
-    """The verdict of these stages, with what else its statement says; `numbers` as of `assemble_result`."""
+    """Summary of a verdict, as data of its statement; `numbers` as in `assemble_result`."""
     space, alike = traced.screened.base.space, traced.alike
     support = None if traced.standing is None else traced.standing.numbered(numbers)
     best = None if traced.searched is None else traced.searched.best
@@ -811,7 +813,7 @@ def summary(traced: LoopStages, numbers: np.ndarray) -> Summary:
 
 
 def missing(space: CandidateSpace, alike: Classes, support: NameSupport | None) -> tuple[Missing, ...]:
-    """Each effect in the model, with what it cannot be told from and whether it is established."""
+    """Effects in the model, each with its alternatives and whether it is established."""
     c, p = space.coordinates.base, space.free
     return tuple(
         Missing(
@@ -832,12 +834,12 @@ def missing(space: CandidateSpace, alike: Classes, support: NameSupport | None) 
 
 @dataclasses.dataclass(frozen=True)
 class _Written:
-    """The fit that a result is about: with the named effects, or with the curve where no name is given.
+    """Fit of a result: with the named effects, or with the curve if no name is given.
 
     Attributes:
-        before, after: the fits of the base and of what is proposed, None where that is the base.
+        before, after: fits of the base and of the proposal, None if that is the base.
         robot: of the fit, with its coordinates z, their sds, its cost, and whether it converged.
-        ends: what it leaves; curve, beside: the curve and what remains beside it, where no name is given.
+        ends: its diagnosis; curve, beside: the curve and the diagnosis with it, if no name is given.
     """
 
     before: findings.Fitted
@@ -853,7 +855,7 @@ class _Written:
     beside: Diagnosis | None = None
 
     def or_refit(self, traced: LoopStages, kept: bool) -> _Written:
-        """The same where it is `kept`, else with the robot and the posterior of the refit."""
+        """Copy that is unchanged if `kept`, else has the robot and the posterior of the refit."""
         if kept:
             return self
         space, base = traced.screened.base.space, traced.screened.base.candidate
@@ -863,7 +865,7 @@ class _Written:
 
 
 def _written(traced: LoopStages, progress: Tell) -> _Written:
-    """The fit that the result of a verdict is about."""
+    """Fit of a verdict's result."""
     space, base, best, ends = traced.screened.base.space, traced.screened.base.candidate, traced.best, traced.ends
     curve = beside = None
     if traced.verdict in WITHOUT_NAME and traced.beside is not None:
@@ -883,9 +885,9 @@ def _written(traced: LoopStages, progress: Tell) -> _Written:
 
 
 def _keeps(traced: LoopStages, written: _Written, gain: prediction.Gain | None) -> bool:
-    """True if what is found predicts well enough to be written in place of the refit.
+    """True if the proposal predicts well enough to be written instead of the refit.
 
-    What is written never predicts worse than the refit; a curve, which claims no cause, has to predict better.
+    A written fit never predicts worse than the refit; a curve, which claims no cause, has to predict better.
     """
     refit = traced.best is traced.screened.base.candidate
     if gain is None or (written.curve is None and refit):
@@ -896,7 +898,7 @@ def _keeps(traced: LoopStages, written: _Written, gain: prediction.Gain | None) 
 def _claims(
     traced: LoopStages, settings: Settings
 ) -> tuple[tuple[FoundEffect, ...], DiscrepancyLocation | None, tuple[HiddenEffect, ...]]:
-    """Effects that a verdict names, the place where something remains, and effects that they may conceal."""
+    """Effects that a verdict names, location of the remaining discrepancy, and effects that they may conceal."""
     screened, left, alike = traced.screened, traced.left, traced.alike
     space, base, best = screened.base.space, screened.base.candidate, traced.best
     if alike is None:
@@ -917,7 +919,7 @@ def assemble_result(
     library: Library,
     progress: Tell,
 ) -> DiscoveryResult:
-    """The result of a verdict, with what only now is worth its time: errors held out, and the next experiment."""
+    """Result of a verdict, with the final computations: hold-out errors, and the next experiment."""
     screened, noise = traced.screened, traced.sds.noise
     space, base, best = screened.base.space, screened.base.candidate, traced.best
     included = space.included[: len(runs)]
@@ -939,18 +941,18 @@ def assemble_result(
     remaining = _residuals(space, runs, written.ends.linear, seen.after, written.z)
     found = _Found(traced, written, seen, compared, gain, kept, remaining)
     result = _result(found, runs, numbers, settings, library)
-    # What happens for a while is not everywhere alike.
+    # A temporary change is not uniform.
     of_noise = of_sds(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
     return dataclasses.replace(result, remarks=(*of_noise, *refit_worse(seen, noise, included), *remarks(result)))
 
 
 @dataclasses.dataclass(frozen=True)
 class _Found:
-    """Verdict, fit and predictions of which a result is made.
+    """Verdict, fit and predictions as input of a result.
 
     Attributes:
-        seen: readings of every row; compared: alternatives by data held out; remaining: residuals of the fit.
-        gain: by how much the fit predicts better than the refit; kept: True if it is written.
+        seen: readings of each row; compared: alternatives by hold-out errors; remaining: residuals of the fit.
+        gain: of the fit's predictions over the refit's; kept: True if the fit is written.
     """
 
     traced: LoopStages
@@ -971,7 +973,7 @@ def _alternatives(found: _Found, settings: Settings) -> tuple[tuple[Alternative,
 
 
 def _unnamed(found: _Found, rows: int) -> UnnamedDiscrepancy | None:
-    """The discrepancy that a curve describes, where no name is given."""
+    """Discrepancy described by a curve, if no name is given."""
     written, where = found.written, found.traced.where
     if written.curve is None or where is None or written.beside is None:
         return None
@@ -979,7 +981,7 @@ def _unnamed(found: _Found, rows: int) -> UnnamedDiscrepancy | None:
 
 
 def _result(about: _Found, runs: Runs, numbers: np.ndarray, settings: Settings, library: Library) -> DiscoveryResult:
-    """The result without its remarks."""
+    """Result without its remarks."""
     traced, written, seen = about.traced, about.written, about.seen
     screened, left, ends = traced.screened, traced.left, written.ends
     space, base = screened.base.space, screened.base.candidate
@@ -1039,11 +1041,12 @@ def _result(about: _Found, runs: Runs, numbers: np.ndarray, settings: Settings, 
 
 
 def refit_worse(seen: ReadingsOfRows, noise: Noise, included: np.ndarray) -> list[RefitWorse]:
-    """Channels whose sds nobody states and that the refit misses by more than the robot as stated does, beyond their
-    noise: the estimate gives some readings too large a weight.
+    """Channels with unstated sds and a refit that is worse than the robot as stated, beyond their noise.
+
+    The estimated sds then give some readings too much weight.
 
     Args:
-        included: True for rows that count, shape (rows,).
+        included: True for included rows, shape (rows,).
     """
     found = []
     for k, channel in enumerate(noise.channels):
@@ -1068,8 +1071,8 @@ def on_same_rows(
 
 
 def of_sds(sds: Sds, remaining: Residuals) -> tuple[NoiseOff, ...]:
-    """What to say of sds of which something is said before the answer: by what the answer leaves; that they were
-    changed, where it leaves what they now say."""
+    """Remarks on sds that are reported before the verdict: from the residuals of the final fit, or that the sds were
+    changed if those residuals agree with them."""
     off = tuple(noise_remarks(remaining, sds.noise.word)) if sds.remarks else ()
     if sds.factors:
         return () if off else sds.remarks
@@ -1077,7 +1080,7 @@ def of_sds(sds: Sds, remaining: Residuals) -> tuple[NoiseOff, ...]:
 
 
 def _gain(space: CandidateSpace, runs: Runs, seen: ReadingsOfRows) -> prediction.Gain | None:
-    """By how much what was found predicts better than the refit; None where nothing can be held out."""
+    """Gain of the proposal's predictions over the refit's; None if no block can be held out."""
     if not seen.held_out:
         return None
     counts, kinds = space.weight[: len(runs)] > 0, blocks_room.predictable(runs, space.bare)
@@ -1089,7 +1092,7 @@ def _gain(space: CandidateSpace, runs: Runs, seen: ReadingsOfRows) -> prediction
 
 
 def residuals_of(screened: Screening, runs: Runs) -> Residuals:
-    """What the base fit leaves of every reading."""
+    """Residuals of the base fit, by reading."""
     base, free = screened.base, screened.base.space.free
     return _residuals(base.space, runs, screened.diagnosed[0], base.reading, base.candidate.z[:free])
 
@@ -1097,10 +1100,10 @@ def residuals_of(screened: Screening, runs: Runs) -> Residuals:
 def _residuals(
     space: CandidateSpace, runs: Runs, linear: Linearization, reading: np.ndarray, z: np.ndarray
 ) -> Residuals:
-    """What a fit leaves of every reading.
+    """Residuals of a fit, by reading.
 
     Args:
-        linear: the fit at z, linearised; reading: what it says of every row [SI], shape (rows or more, channels).
+        linear: the fit at z, linearised; reading: of each row [SI], shape (rows or more, channels).
     """
     rows, count = len(runs), len(runs.channels)
     counts = (space.weight[:rows] > 0) & np.isfinite(reading[:rows])
@@ -1112,7 +1115,7 @@ def _residuals(
 
 
 def _proposal(space: CandidateSpace, traced: LoopStages, settings: Settings) -> Proposal | None:
-    """What to do next; None where nothing is left to tell apart, or the model does not describe the runs."""
+    """Next experiment; None if there are no alternatives to separate, or if the model does not describe the runs."""
     if traced.verdict == "undescribed":
         return None
     if not space.bare.observe.menu:
@@ -1123,17 +1126,17 @@ def _proposal(space: CandidateSpace, traced: LoopStages, settings: Settings) -> 
 
 
 def _needs_histories(library: Library, kind: type[observers.Observer]) -> tuple[str, ...]:
-    """Effects of the library that data of this kind cannot show at all, and a history could."""
+    """Effects of the library that data of this kind cannot show, but histories could."""
     return tuple(sorted(name for name, e in library.items() if e.transient and not kind.shows(e)))
 
 
 def _needs_reverse(library: Library, runs: Runs) -> tuple[str, ...]:
-    """Effects of the library that these runs cannot show since they all go one way."""
+    """Effects of the library that these runs cannot show because they all go in one direction."""
     return tuple(sorted(name for name, e in library.items() if e.needs_reverse and not both_ways(runs)))
 
 
 def _noise(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str, dict[str, object]]:
-    """Channel → where its sd comes from, and its median share of the reading [%]."""
+    """Channel → source of its sd, and its median share of the reading [%]."""
     with np.errstate(invalid="ignore"):
         share = 100 * noise.sd / np.maximum(kind.sizes(runs), 1e-12)
     return {
@@ -1144,7 +1147,7 @@ def _noise(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str
 
 
 def remarks(found: DiscoveryResult) -> Notes:
-    """What a careful engineer would say of this result."""
+    """Remarks of a careful engineer on a result."""
     said: list[Note] = []
     for rows, why in ((found.unusable, "unusable"), (found.outliers, "outliers")):
         if rows:
@@ -1180,8 +1183,8 @@ def remarks(found: DiscoveryResult) -> Notes:
 
 
 def _rests_on(found: DiscoveryResult, test: NameTest) -> RestsOn:
-    """What would tell whether a run that an effect rests on is right: it again, and half steps on either side of it
-    along a series that it is in."""
+    """Experiment to test the run that an effect depends on: a repeat, and half steps to either side along a series
+    of that run."""
     runs = found.runs
     if test.what == "run":
         return RestsOn(test)
@@ -1198,11 +1201,12 @@ def _rests_on(found: DiscoveryResult, test: NameTest) -> RestsOn:
 
 
 def levels_beside(x: np.ndarray, here: float) -> tuple[float, ...]:
-    """Levels half a step below and above one of a series, rounded to what a person sets; none where the others do
-    not differ from it by `LEVEL` of their range.
+    """Levels half a step below and above one of a series, rounded to practical values.
+
+    Empty if all other levels are within `LEVEL` of its range.
 
     Args:
-        x: levels of the series; here: that of the row.
+        x: levels of the series; here: level of the row.
     """
     apart = np.abs(x - here)
     others = apart[apart > LEVEL * np.ptp(x)]

@@ -41,7 +41,7 @@ from mmrjax.model.robot import Robot
 STARTS = 8
 #: Number of plotted points of a curve.
 POINTS = 61
-#: Additional evidence required of a curve over the supply's voltage, which acts only through currents and speeds [σ²].
+#: Extra evidence required of a curve over the supply's voltage, which acts only through currents and speeds [σ²].
 INDIRECT = 6.0
 #: Largest number of instants among which the ends of a window are chosen.
 #: Most instants between which the ends of a window are looked for.

@@ -1,13 +1,13 @@
-"""The next experiment: of a menu, the one that best tells apart what a finished loop could not.
+"""The next experiment: the one of a menu that best separates the alternatives of a finished loop.
 
-Alternatives are hypotheses that explain the same table equally well. Each foresees every reading y of the menu,
-with the covariance S = diag(sd²) + J C Jᵀ: of the instruments, and to first order of its fitted coordinates,
-C = (JᵀJ)⁻¹ over readings and priors of the table (Chaloner and Verdinelli, Bayesian experimental design,
-Statistical Science 10 (1995)). Two alternatives A, B are √(dᵀ S⁻¹ d) apart, d = y_A - y_B, with the S of the
-two that leaves less (Hunter and Reiner, Designs for discriminating between two rival models, Technometrics 7
-(1965)). If one of them is true, the χ² of the other is larger by σ² ± 2σ, σ being that distance, so that the
-chance that the false one is refuted is Φ((σ² - refuted) / 2σ). What is proposed is what is expected to tell the
-most of all pairs apart; where one experiment does not do, two.
+Alternatives are hypotheses that explain the same table equally well. Each predicts every reading y of the menu
+with the covariance S = diag(sd²) + J C Jᵀ. Its terms are that of the instruments and, to first order, that of the
+fitted coordinates, with C = (JᵀJ)⁻¹ over readings and priors of the table (Chaloner and Verdinelli, Bayesian
+experimental design, Statistical Science 10 (1995)). The separation of two alternatives A, B is √(dᵀ S⁻¹ d),
+d = y_A - y_B. It takes the S with the smaller result (Hunter and Reiner, Designs for discriminating between two
+rival models, Technometrics 7 (1965)). If one of them is true, the χ² of the other is larger by σ² ± 2σ, where σ is
+their separation. So the probability that the false one is refuted is Φ((σ² - refuted) / 2σ). The proposal is expected to separate most of
+all pairs; if one experiment is not enough, two are proposed.
 """
 
 from __future__ import annotations
@@ -50,23 +50,23 @@ from mmrjax.model.robot import Robot
 from mmrjax.numerics.linear_equations import half_solved
 from mmrjax.numerics.newton import implicit_slopes
 
-#: Alternatives are foreseen in batches of a multiple of this, so that most classes share what is compiled.
+#: Alternatives are predicted in batches of a multiple of this, so that most classes share compiled programs.
 PAD = 4
 NONE = "none on this menu"
 
 
 @dataclasses.dataclass(frozen=True)
 class PredictedReadings:
-    """What every alternative foresees of every reading of the menu.
+    """Predictions of every reading of the menu, by alternative.
 
     Attributes:
         names: of the alternatives, the best fit first.
         experiments: the menu.
         value: readings [SI], shape (alternatives, readings); sd: of the instruments [SI], shape (readings,).
-        half: J C^½, so that the covariance that the fit leaves is half halfᵀ; shape
+        half: J C^½, so that the covariance due to the fit is half halfᵀ; shape
             (alternatives, readings, coordinates).
-        exists: which readings do for every alternative, shape (readings,).
-        settings: from which separation an experiment counts.
+        exists: True for readings that every alternative has, shape (readings,).
+        settings: thresholds of the separation.
     """
 
     names: tuple[str, ...]
@@ -96,10 +96,10 @@ class Ranked:
     """One experiment of the menu, or several carried out together.
 
     Attributes:
-        experiments: their names; sigma: between every two alternatives, the pairs of the best fit first, as
-            `itertools.combinations` has them [σ].
-        separates: alternatives that they tell from the best fit, at `Settings.apart`.
-        settings: from which separation an experiment counts.
+        experiments: their names; sigma: separation of every two alternatives, in the order of
+            `itertools.combinations`, so with the pairs of the best fit first [σ].
+        separates: alternatives that they separate from the best fit, at `Settings.apart`.
+        settings: thresholds of the separation.
     """
 
     experiments: tuple[str, ...]
@@ -109,31 +109,31 @@ class Ranked:
 
     @property
     def smallest(self) -> float:
-        """Separation of the pair that is told apart worst [σ]."""
+        """Separation of the pair that is separated worst [σ]."""
         return min(self.sigma, default=0.0)
 
     @property
     def told(self) -> tuple[float, ...]:
-        """Separations that are worth while."""
+        """Separations that are worth an experiment."""
         return tuple(s for s in self.sigma if s >= self.settings.worth)
 
     @property
     def chances(self) -> np.ndarray:
-        """For each pair, that the false one is refuted if either is true."""
+        """Probability for each pair that the false one is refuted if either is true."""
         sigma = np.maximum(self.sigma, 1e-9)
         return ndtr((sigma**2 - self.settings.refuted) / (2 * sigma))
 
 
 @dataclasses.dataclass(frozen=True)
 class Proposal:
-    """The next experiment, or two where one does not do.
+    """The next experiment, or two if one is not enough.
 
     Attributes:
-        experiments: names of what to carry out; `NONE` alone where the menu holds nothing.
-        instruction: what to do and what to read.
-        separates: alternatives that it tells from the best fit.
-        expected_sigma: the smallest separation of a pair that it is worth doing for; 0 for none.
-        settles: whether it tells every two alternatives apart, at `Settings.apart`.
+        experiments: names of the experiments; only `NONE` if no experiment helps.
+        instruction: instruction for the experimenter.
+        separates: alternatives that it separates from the best fit.
+        expected_sigma: smallest separation of a pair that is worth an experiment; 0 for none.
+        settles: True if it separates every two alternatives, at `Settings.apart`.
         table: the whole menu, the most useful experiment first.
     """
 
@@ -146,7 +146,7 @@ class Proposal:
 
     @property
     def name(self) -> str:
-        """Of all of it."""
+        """Name of the proposal, with all its experiments."""
         return " and ".join(self.experiments)
 
 
@@ -154,10 +154,10 @@ class Proposal:
 
 
 def alternatives(best: Candidate, found: Classes, *, stated: bool = True) -> dict[str, Candidate]:
-    """The candidates that a table leaves, by the names of their effects; the best fit first.
+    """Candidates that the table cannot separate, by the names of their effects; the best fit first.
 
     Args:
-        stated: whether values that may be wrong in the place of an effect are among them, by their names.
+        stated: True to include stated values that may be wrong instead of an effect, by their names.
     """
     fitted = {c.key: c for c in sorted(found.ladder, key=lambda c: -c.cost)}
     kept = {best.active: best}
@@ -172,7 +172,7 @@ def alternatives(best: Candidate, found: Classes, *, stated: bool = True) -> dic
     return named
 
 
-# --- what they foresee ------------------------------------------------------------------------------
+# --- predictions ------------------------------------------------------------------------------------
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -184,10 +184,10 @@ def _predicted(
     z: Array,
     informed: Array,
 ) -> tuple[predicted.Predicted, Array]:
-    """Readings of the menu, and ½ of what the fit leaves of their covariance, by alternative.
+    """Readings of the menu, and the square root of their covariance due to the fit, by alternative.
 
-    `other` are coordinates of what the table does not show at all, known by their priors alone; `informed` the
-    Jacobian of what informs each fit.
+    `other` are coordinates that the table does not show at all, known only by their priors; `informed` is the
+    Jacobian of the readings and priors of each fit.
     """
 
     def one(w: Array, z: Float[Array, " coordinates"], informed: Array) -> tuple[predicted.Predicted, Array]:
@@ -219,10 +219,10 @@ def _informed(problem: Problem, at: Candidate, active: tuple[int, ...]) -> Array
 
 
 def predict(space: CandidateSpace, candidates: Mapping[str, Candidate], settings: Settings) -> PredictedReadings:
-    """What these alternatives foresee of the menu, with instruments as good as those of the table.
+    """Predictions of the menu by these alternatives, with instruments as good as those of the table.
 
-    The menu holds what is within reach of the table, what the robots of all alternatives manage, and what is not
-    forbidden.
+    The menu has the experiments within reach of the table that the robots of all alternatives can do and that
+    are not forbidden.
     """
     names, those = list(candidates), list(candidates.values())
     those += [those[0]] * (-len(those) % PAD)
@@ -248,10 +248,10 @@ def predict(space: CandidateSpace, candidates: Mapping[str, Candidate], settings
 def _possible(
     experiments: Sequence[menu.Experiment], found: predicted.Predicted, within: Reach, settings: Settings
 ) -> tuple[tuple[menu.Experiment, ...], np.ndarray]:
-    """What of a menu is possible and not forbidden, and whether each reading of the whole menu is of that.
+    """Possible and allowed experiments of a menu, and True for their readings among those of the whole menu.
 
     Args:
-        found: of every alternative, the best fit first.
+        found: of each alternative, the best fit first.
     """
     runs = [e for e in experiments if isinstance(e, menu.Run)]
     ends = dict(zip((r.name for r in runs), np.cumsum([len(r.voltage) for r in runs]).tolist(), strict=True))
@@ -286,18 +286,18 @@ def _ranked(seen: PredictedReadings, *experiments: str) -> Ranked:
 
 
 def _use(r: Ranked) -> tuple[bool, float]:
-    """Whether it is worth while for any pair, and how many pairs it is expected to tell apart."""
+    """True if it is worth an experiment for any pair, and the expected number of separated pairs."""
     return bool(r.told), float(np.sum(np.minimum(r.chances, r.settings.enough)))
 
 
 def ranked(seen: PredictedReadings) -> tuple[Ranked, ...]:
-    """The whole menu by the number of pairs that an experiment is expected to tell apart; of those that tell as many
-    by `Settings.enough`, in the menu's order, the least effort first."""
+    """The whole menu by the expected number of separated pairs; ties, within `Settings.enough`, keep the menu's
+    order, the least effort first."""
     return tuple(sorted((_ranked(seen, e.name) for e in seen.experiments), key=_use, reverse=True))
 
 
 def choose(seen: PredictedReadings) -> Proposal:
-    """The experiment of the menu that tells most apart, with the best one beside it where that adds enough."""
+    """The experiment of the menu that separates most pairs, with a second one if that adds enough."""
     table = ranked(seen)
     if not table:
         return Proposal((NONE,), NothingPossible(), (), 0.0, False, ())
@@ -316,12 +316,12 @@ def choose(seen: PredictedReadings) -> Proposal:
     )
 
 
-#: Runs of a series that covers the variable of a curve more densely, and repeats of each that are averaged.
+#: Number of runs in a series that covers the variable of a curve more densely, and of repeats that are averaged.
 SERIES, REPEATS = 15, 3
 
 
 def more_runs(place: str, variable: str, within: Reach, by_duty: bool = False) -> MoreRuns:
-    """How the variable of a curve is covered more densely, within reach of the table."""
+    """Instruction to cover the variable of a curve more densely, within reach of the table."""
     volts = within.voltages
     low, high = (volts[0], volts[-1]) if volts[-1] > volts[0] else (menu.round_significant(0.5 * volts[0]), volts[0])
     slope = max(u.steepest for u in within.used)
@@ -336,10 +336,9 @@ def more_runs(place: str, variable: str, within: Reach, by_duty: bool = False) -
 
 
 def denser(space: CandidateSpace, where: DiscrepancyLocation, settings: Settings) -> Proposal:
-    """More runs along the variable of a discrepancy without a name.
+    """Proposal of more runs along the variable of an unnamed discrepancy.
 
-    Its expected separation from nothing is that of the table [σ], whose curve explains so much a run, over the
-    runs of the series.
+    Its expected separation from no discrepancy is the table's χ² per run, times the runs of the series [σ].
     """
     variable, within = where.variable, reach_of(space)
     runs = space.bare.observe.runs_counting(space.included)
@@ -353,11 +352,11 @@ def denser(space: CandidateSpace, where: DiscrepancyLocation, settings: Settings
 
 
 def no_menu(space: CandidateSpace) -> Proposal:
-    """Nothing: the menu holds no runs of the kind that the table does."""
+    """Empty proposal, because the menu has no runs of the table's kind."""
     return Proposal((NONE,), NoMenu(space.bare.observe.word), (), 0.0, False, ())
 
 
 def separating(space: CandidateSpace, best: Candidate, found: Classes, settings: Settings) -> Proposal | None:
-    """What tells the alternatives of a class apart; None where each effect has one name."""
+    """Experiment that separates the alternatives of a class; None if each effect has one name."""
     left = alternatives(best, found)
     return choose(predict(space, left, settings)) if len(left) > 1 else None

@@ -1,4 +1,4 @@
-"""From the loop's stages to its result: effects, evidence, shifts, errors, each by name and in its unit."""
+"""Parts of the loop's result from its stages: effects, evidence, shifts and errors, by name and in their units."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def found_effects(
     """Each effect of the best candidate, with its class, amplitude and evidence.
 
     Args:
-        test: of the base fit, whose bootstrap gives the p-values.
+        test: of the base fit; its bootstrap gives the p-values.
     """
     gains = _without_each(space, base, best, found.ladder, settings)
     null, excess = np.asarray(test.null.single), excess_misfit(space, base)
@@ -129,7 +129,7 @@ _shaped = jax.jit(jax.value_and_grad(shaped, argnums=1))
 
 
 def _member(space: CandidateSpace, best: Candidate, found: Classes, slot: int, name: str) -> Member:
-    """An effect of a class in the leader's place."""
+    """An effect of a class in place of the leader."""
     wanted = frozenset(name if s == slot else n for s, n in enumerate(best.active)) - {""}
     other = next(c for c in (best, *found.ladder) if c.key == wanted)
     at = other.active.index(name)
@@ -147,7 +147,7 @@ def _stated(space: CandidateSpace, best: Candidate, shift: Shift) -> StatedValue
 def _without_each(
     space: CandidateSpace, base: Candidate, best: Candidate, ladder: Sequence[Candidate], settings: Settings
 ) -> list[float]:
-    """What each effect explains that the others cannot: the rise of χ² when it is taken away and all is refitted."""
+    """Unique contribution of each effect: the rise of χ² if it is removed and everything is refitted."""
     if len(best.effects) == 1:
         return [2 * (base.cost - best.cost)]
     return [2 * (c.cost - best.cost) for c in without_each(space, best, settings, ladder)]
@@ -156,7 +156,7 @@ def _without_each(
 def unnamed(
     found: Discrepancy, where: DiscrepancyLocation, p_value: float, linear: Linearization, rows: int
 ) -> UnnamedDiscrepancy:
-    """The discrepancy of an `unnamed` verdict, over the rows of the table; curve and rows are of one fit.
+    """Discrepancy of an `unnamed` verdict, over the rows of the table; curve and rows are of one fit.
 
     Args:
         linear: the fit with the curve, linearised.
@@ -189,14 +189,13 @@ def unnamed(
 def alternatives(
     space: CandidateSpace, best: Candidate, cost: float, ladder: Sequence[Candidate], settings: Settings
 ) -> tuple[tuple[Alternative, ...], tuple[Alternative, ...]]:
-    """Simulated candidates that explain the data nearly as well as what is proposed; and those that would but for
-    their size.
+    """Simulated candidates that explain the data nearly as well as the proposal; and those of implausible size.
 
-    One that only adds effects to what is proposed, or to another one of these, is left out where these explain next
-    to nothing.
+    A candidate that only adds effects to the proposal, or to another candidate of the list, is omitted if they
+    explain little.
 
     Args:
-        cost: of what is proposed [½σ²]; best: the same, where it is a candidate.
+        cost: of the proposal [½σ²]; best: the proposal, if it is a candidate.
     """
     near: tuple[list[Alternative], list[Alternative]] = ([], [])
     simpler = {best.key: cost} if best.key else {}
@@ -246,7 +245,7 @@ def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Set
 
 
 def proposed_robot(space: CandidateSpace, best: Candidate) -> Robot:
-    """The base fitted, with what was found and no other effect."""
+    """Fitted base with the effects of the proposal and no other."""
     whole = space.problem(best.active).robot(jnp.asarray(best.z))
     keep = set(best.effects) | {e.name for e in space.bare.base.effects}
     return dataclasses.replace(whole, effects=tuple(e for e in whole.effects if e.name in keep))
@@ -270,7 +269,7 @@ def next_experiment(proposal: Proposal | None) -> NextExperiment | None:
 
 
 def evidence(test: AdequacyTest, adequate: bool) -> Evidence:
-    """The strongest statistic of each kind, what it has to exceed, and its share among bootstrap tables."""
+    """Strongest statistic of each kind, its critical value, and its p-value among bootstrap tables."""
     kinds = {
         kind: KindOfEvidence(
             float(getattr(test.found, kind)), test.threshold(kind), test.p(kind), np.asarray(getattr(test.null, kind))
@@ -284,7 +283,7 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
     """Every base parameter before and after, in its unit and in prior sds.
 
     Args:
-        before, after: coordinates, those of the base first; sd: of the latter.
+        before, after: coordinates, the base's first; sd: of `after`.
     """
     coordinates, p = space.coordinates.base, space.free
     z = [np.asarray(x[:p]) for x in (before, after)]
@@ -308,7 +307,7 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
 
 
 def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[EffectScore, ...]:
-    """Every effect at its best shape and plausible size, strongest first; by name where equal to rounding."""
+    """Every effect at its best shape and plausible size, strongest first; equal scores are sorted by name."""
     listed = []
     for effect in space.library.effects:
         amplitude, explained = _plausible_score(space, effect, scores, settings)
@@ -326,14 +325,14 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
 
 
 def ranking(space: CandidateSpace, left: Diagnosis, settings: Settings) -> Ranking:
-    """The library by what each effect alone would explain of what the base leaves."""
+    """Ranking of the library by the share of the base's residuals that each single effect would explain."""
     test = left.test
     listed = _ranked(space, left.scores, settings)
     return Ranking(test.rejected, test.p_value, test.threshold("single") ** 2, listed)
 
 
 def ranking_beforehand(space: CandidateSpace, known: Beforehand, settings: Settings) -> Ranking:
-    """The same by the equations of the log in weak form, before anything is simulated."""
+    """Ranking by the equations of the log in weak form, before any simulation."""
     p = own_p(float(np.max(known.scores.single**2)), known.null)
     chance = float(np.quantile(known.null, 1 - settings.family_wise_error, method="higher")) ** 2
     listed = _ranked(space, known.scores, settings)
@@ -341,7 +340,7 @@ def ranking_beforehand(space: CandidateSpace, known: Beforehand, settings: Setti
 
 
 def _ranked(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[Ranked, ...]:
-    """The library by its scores, those last that would supply power."""
+    """Library sorted by score, with effects that would supply power last."""
     listed = []
     for s in effect_scores(space, scores, settings):
         effect = space.library[s.name]
@@ -355,7 +354,7 @@ def _ranked(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tu
 def _plausible_score(
     space: CandidateSpace, effect: Effect, scores: ScoreTable, settings: Settings
 ) -> tuple[float, float]:
-    """Amplitude [prior sds] and what it explains [σ²], no larger than plausible."""
+    """Plausible amplitude [prior sds] and the decrease of χ² that it explains [σ²]."""
     m = space.library.best_instance(effect.name, np.asarray(scores.single))
     wanted, left = float(scores.amplitude[m]), float(scores.left[m])
     low = max(-settings.plausible, amplitude_of(effect).spec.bounds[0] / size_of(effect))
@@ -364,7 +363,7 @@ def _plausible_score(
 
 
 def invisible(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[str, ...]:
-    """Effects of which the largest plausible amplitude leaves too few sigmas, and that explain no more than that."""
+    """Effects that the data cannot show: even the largest plausible amplitude changes the readings too little."""
     left = space.library.largest(np.asarray(scores.left))
     return tuple(
         e.name
@@ -379,18 +378,18 @@ def invisible(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> 
 
 @dataclasses.dataclass(frozen=True)
 class Fitted:
-    """A fit whose readings are shown: its problem, coordinates and active effects (None without slots)."""
+    """A fit with its problem, coordinates and active effects (None without slots)."""
 
     problem: Problem
     z: np.ndarray
     active: tuple[int, ...] | None
 
     def observation(self) -> Observation:
-        """What it says of every row."""
+        """Observation of the fit."""
         return self.problem.observe.observed(self.problem, self.z, self.active)
 
 
-#: Kind of block → what a fit predicts of each row that it has not seen, shape (rows, channels).
+#: Kind of block → hold-out predictions of each row, shape (rows, channels).
 HeldOutReadings = dict[str, np.ndarray]
 
 
@@ -405,7 +404,7 @@ def readings(
     """Fitted and held-out readings, for every kind of block; `after` None is the same as before.
 
     Args:
-        known_before, known_after: what of it is known.
+        known_before, known_after: hold-out readings, if they are already known.
     """
     rows = len(runs)
 
@@ -433,6 +432,6 @@ def readings(
 def errors(
     problem: Problem, simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray, included: np.ndarray
 ) -> Errors:
-    """Errors of every channel [%, and in σ] over the rows that count and have a simulated value."""
+    """Errors of each channel [%, and in σ] over the included rows with a simulated value."""
     simulated = np.where(included[:, None], simulated, np.nan)
     return channel_errors(problem.channels, simulated, measured, sd)

@@ -1,4 +1,4 @@
-"""A formula proposed for a discrepancy: one term of a dictionary of dimensionless monomials."""
+"""A formula for a discrepancy: one term of a dictionary of dimensionless monomials."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from calibration.inference.linearization import Linearization
 from mmrjax.effects.curve import PLACES, READINGS
 from mmrjax.model import channels
 
-#: What a formula is called, in the symbols of the paper.
+#: Left side of a formula, in the symbols of the paper.
 SYMBOL = {"electrical": "ΔU", "track": "ΔM_t", "ground": "ΔF_f", "slip": "ΔV", "yaw": "ΔM_ψ"} | {
     c.name: f"Δ({c.label})" for c in channels.EVERY if c.name in READINGS
 }
-#: Variables over which things fade: symbol, and unit of its constant.
+#: Variables of decays: symbol, and unit of the time constant.
 FADING = {"time": ("t", " s"), "order": ("k", "")}
-#: Exponents of a factor alone, and in a product of two.
+#: Exponents of a single factor, and in a product of two.
 POWERS, POWERS_PRODUCT = (-1.0, 0.5, 1.0, 2.0, 3.0), (-1.0, 0.5, 1.0, 2.0)
-#: Share of what the curve explains that a single term has to explain to be proposed [-].
+#: Least share of the curve that a single term has to explain [-].
 MOST = 0.9
 #: Signals that settled travel ties to a ratio of the dictionary.
 SAME_AS = {"speed": "speed_motor"}
@@ -30,7 +30,7 @@ SAME_AS = {"speed": "speed_motor"}
 SAFE = 0.1
 #: A simpler formula is preferred up to this rise of the BIC: no evidence worth a mention (Kass and Raftery 1995).
 NO_EVIDENCE = 2.0
-#: How every formula is marked.
+#: Label of each formula.
 MARK = "a proposal, not a finding"
 
 
@@ -45,12 +45,12 @@ class Ratio:
 
     @property
     def value(self) -> str:
-        """What the signal is divided by, with its unit."""
+        """Divisor of the signal, with its unit."""
         return f"{self.over:g} {self.unit}".rstrip()
 
     def scaled(self, x: np.ndarray) -> Ratio:
-        """The same over the largest of these ratios, rounded to one digit, so that factors are of the size of what
-        they are of."""
+        """Ratio over the largest of these values, rounded to one digit, so that coefficients have the size of the
+        term."""
         most = float(np.max(np.abs(x), initial=0.0)) * self.over
         return dataclasses.replace(self, over=float(f"{most:.0e}")) if most > 0 else self
 
@@ -67,7 +67,7 @@ RATIOS = (
     Ratio("m_c", "kg", "payload"),
     Ratio("ω", "rad/s", "yaw_rate"),
 )
-#: Rise of the BIC for each variable but the one that the curve is over: one of so many is looked for.
+#: Rise of the BIC for each variable other than the curve's, because it is one of several tested.
 FOREIGN = 2 * float(np.log(len(RATIOS)))
 
 
@@ -80,12 +80,12 @@ class Monomial:
 
     @property
     def complexity(self) -> float:
-        """What makes it harder to believe: factors, and exponents other than one."""
+        """Penalty for factors, and for exponents other than one."""
         return sum(1 + 0.1 * abs(p - 1) for _, p in self.factors)
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """Signals that it depends on."""
+        """Signals of the monomial."""
         return tuple(self.ratios[k].of for k, _ in self.factors)
 
     def __str__(self) -> str:
@@ -94,10 +94,10 @@ class Monomial:
 
 
 def dictionary(ratios: np.ndarray, kinds: tuple[Ratio, ...] = RATIOS) -> dict[Monomial, np.ndarray]:
-    """Monomials that can be written down for these ratios, with their values by row.
+    """Monomials that are defined for these ratios, with their values by row.
 
-    A root needs ratios that are never negative, an inverse ones that stay off zero; a ratio that does not vary
-    is left out, as is all but the first of monomials that are proportional to each other here.
+    A root needs ratios that are never negative, an inverse needs ratios away from zero. A ratio that does not vary
+    is omitted, and so are all but the first of several proportional monomials.
 
     Args:
         ratios: values, shape (rows, ratios); kinds: signal and scale of each.
@@ -133,13 +133,12 @@ class Proposal:
     """A formula for a discrepancy: one term of a dictionary of dimensionless monomials.
 
     Attributes:
-        formula: e.g. `ΔU = 0.42 V (I/2 A)^2`, "" where no single term shows `MOST` of the curve; mark: that it is a
-            proposal.
+        formula: e.g. `ΔU = 0.42 V (I/2 A)^2`, "" if no single term explains `MOST` of the curve; mark: its label.
         terms: its monomials; coefficients, sds: of each [unit of the balance].
-        variables: signals that it depends on, without repeats.
-        explained: fall of χ² at the base fit.
-        gain: BIC of the smooth curve less that of the formula; positive speaks for the formula.
-        tried: size of the dictionary: the more, the less a formula that stands out means.
+        variables: signals of the terms, without repeats.
+        explained: decrease of χ² at the base fit.
+        gain: BIC of the smooth curve less that of the formula; positive favours the formula.
+        tried: size of the dictionary: a larger one makes a good formula less significant.
     """
 
     formula: str
@@ -156,14 +155,14 @@ class Proposal:
 def propose(
     linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth, *, voltage: bool = True
 ) -> Proposal:
-    """The term with the least BIC that explains `MOST` of the curve; a simpler one where that costs no evidence. None
-    is proposed where no single term does: the curve is then described by its values.
+    """Term with the least BIC that explains `MOST` of the curve, or a simpler one without loss of evidence.
 
-    A variable other than the curve's has to earn its place.
+    The formula is empty if no single term does; the curve is then described by its values. Variables other than
+    the curve's add a penalty.
 
     Args:
-        counts: whether a row counts, shape (rows,); curve: what the formula is weighed against.
-        voltage: True for a rig on which a voltage is set or read.
+        counts: True for included rows, shape (rows,); curve: for comparison with the formula.
+        voltage: True for a rig with an imposed or measured voltage.
     """
     if curve.wave:
         return _harmonic(balance, curve)
@@ -177,7 +176,7 @@ def propose(
     ratios = np.stack([r(linear, balance) for r in scaled], 1)
     known = dictionary(ratios[counts], scaled)
     terms = list(known)
-    if not terms:  # all runs alike
+    if not terms:  # all runs have the same conditions
         return Proposal("", (), (), (), (), 0.0, 0.0, 0)
     shapes = np.zeros((linear.points, len(terms)))
     _, way = linear.in_travel(balance, curve.variable)
@@ -211,7 +210,7 @@ def propose(
 
 
 def _harmonic(balance: str, curve: Smooth) -> Proposal:
-    """A wave is its own formula."""
+    """Formula of a wave."""
     sine, cosine = curve.scale * curve.root @ curve.start
     size, phase = float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
     order, unit = ORDERS[curve.variable][0], PLACES[balance][0]
@@ -222,7 +221,7 @@ def _harmonic(balance: str, curve: Smooth) -> Proposal:
 
 
 def _while(balance: str, curve: Smooth) -> Proposal:
-    """What happens for a while: its mean over that."""
+    """Formula of a temporary change: its mean."""
     level = float(np.mean((curve.scale * curve.root @ curve.start)[1:-1]))
     formula = f"{SYMBOL[balance]} = {level:.2g} {PLACES[balance][0]} while {curve.variable}"
     axis = curve.variable.split()[0]
@@ -230,8 +229,10 @@ def _while(balance: str, curve: Smooth) -> Proposal:
 
 
 def _decay(linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth) -> Proposal:
-    """What fades with the time since the start or from run to run: an exponential, its constant from a grid over the
-    length of the runs or of the table. A level beside it is left to the base."""
+    """Formula of a decay with time or from run to run: an exponential without offset.
+
+    Its constant is from a grid over the length of the runs or of the table. The base takes up a constant level.
+    """
     (t, way), counts = linear.in_travel(balance, curve.variable), linear.at_points(counts)
     symbol, unit = FADING[curve.variable]
     constants = np.geomspace(0.02, 2.0, 40) * max(float(t[counts].max()), 1e-9)

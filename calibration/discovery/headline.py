@@ -1,4 +1,4 @@
-"""The claim that comes first: established at every noise that was tried."""
+"""The main claim of a verdict: established at every noise that was tried."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from calibration.discovery.settings import WITHOUT_NAME
 
 
 def headline(said: Summary, others: Sequence[tuple[float, Summary]] = ()) -> Headline:
-    """The deepest claims that hold in a verdict and in those at other noises.
+    """Deepest claims that hold in a verdict and in those at other noises.
 
     Args:
         others: factor on the noise and verdict, of each.
@@ -32,18 +32,18 @@ def headline(said: Summary, others: Sequence[tuple[float, Summary]] = ()) -> Hea
 
 
 def _silent(said: Summary) -> str:
-    """The verdict of a table in which nothing is said to be missing; empty for others."""
+    """Verdict of a table without a claim of a missing effect; empty for other verdicts."""
     return said.verdict if said.verdict in ("none", "undescribed") else ""
 
 
 def _mechanisms(said: Summary) -> list[tuple[str, ...]]:
-    """Families of each thing that is established as a law or a mechanism."""
+    """Families of each established law or mechanism."""
     found = [m.families for m in said.missing if m.established]
     return [*found, said.mechanism.families] if said.verdict == "mechanism" and said.mechanism is not None else found
 
 
 def _places(said: Summary) -> list[tuple[str, ...]]:
-    """Equations that lack something, in words: a family without what drives it."""
+    """Equations with a discrepancy, in words: families without their driver."""
     families = _mechanisms(said)
     if said.verdict in WITHOUT_NAME and said.where is not None:
         families.append((said.where.family,))
@@ -51,9 +51,10 @@ def _places(said: Summary) -> list[tuple[str, ...]]:
 
 
 def _common(claims: Sequence[Sequence[tuple[str, ...]]]) -> tuple[tuple[tuple[str, ...], ...], tuple[int, ...]]:
-    """Claims of the first verdict that share a member with one of each other verdict, and how many members all list.
+    """Claims of the first verdict that share a member with a claim of each other verdict, and their shared members.
 
-    These come first in a claim, then what some noises do not tell from them. A claim within another is left out.
+    Members in all verdicts come first, then any that some noises cannot separate from them. A claim within another
+    is omitted. The second result is the number of shared members of each claim.
     """
     found: dict[tuple[str, ...], int] = {}
     for claim in claims[0]:

@@ -1,4 +1,4 @@
-"""Where something is missing: the balance or the channel, and over what it shows."""
+"""Location of a discrepancy: the balance or the channel, and the variable."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
 from mmrjax.effects.base import EQUATION, THE_SIDE
 
-#: Balances in which the current stands for the load that the motors carry.
+#: Balances in which the current is a measure of the motors' load.
 OF_LOAD = ("motor", "gearbox", "track", "ground", "slip", "yaw")
-#: Spread of the supply voltage over that of the duty, each over its largest, below which the duty alone is set [-].
+#: Range of the supply voltage over that of the duty, each over its largest, below which only the duty is varied [-].
 SAGS = 0.3
 
 
 def varied_by_duty(runs: Runs) -> bool:
-    """True if the motors' voltage varies in a table by the duty, at about one supply voltage: one that is measured
-    sags a little."""
+    """True if a table varies the motors' voltage by the duty, at nearly constant supply voltage (which may sag)."""
     if not (runs.has("duty") and runs.has(SUPPLY)):
         return False
     duty, supply = (float(np.ptp(x) / max(np.max(x), 1e-300)) for x in map(np.abs, (runs["duty"], runs[SUPPLY])))
@@ -29,17 +28,16 @@ def varied_by_duty(runs: Runs) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class DiscrepancyLocation:
-    """Where something is missing.
+    """Location of a discrepancy.
 
     Attributes:
-        place: balance in which a curve explains most, or channel whose readings it shifts; variable: over which it
-            does.
-        alike: places in which one explains as much, or would if it had curves of its own.
-        variables_alike: over which a curve there is as improbable, beside `variable`: the most improbable first, of
-            what happens for a while one along each axis.
-        explained: what the curves of that balance and variable explain [σ²]; strongest: what the most improbable
-            family does.
-        by_duty: whether the motors' voltage varied with the duty alone.
+        place: balance with the curve that explains most, or channel with shifted readings; variable: of the curve.
+        alike: places with curves that explain as much, or that represent balances without curves of their own.
+        variables_alike: other variables with curves of similar significance there, the most significant first; of
+            temporary changes one along each axis.
+        explained: decrease of χ² by the curves of that balance and variable [σ²]; strongest: by the most significant
+            family.
+        by_duty: True if the motors' voltage varied only with the duty.
     """
 
     place: str
@@ -52,22 +50,22 @@ class DiscrepancyLocation:
 
     @property
     def balance(self) -> str:
-        """The balance, `sensor` where it is in what an instrument shows."""
+        """The balance; `sensor` for an error of an instrument."""
         return bases_room.balance_of(self.place)
 
     @property
     def channel(self) -> str:
-        """The channel whose readings are off, empty for none."""
+        """The channel with wrong readings, empty for none."""
         return self.place if bases_room.in_readings(self.place) else ""
 
     @property
     def balances_alike(self) -> tuple[str, ...]:
-        """Balances of the places that act alike."""
+        """Balances of the indistinguishable places."""
         return tuple(dict.fromkeys(map(bases_room.balance_of, self.alike)))
 
     @property
     def family(self) -> str:
-        """Its equation and what drives it, in the words of `Effect.family`."""
+        """Its equation and driver, in the words of `Effect.family`."""
         happens = bases_room.window(self.variable)
         variable = self.variable if happens is None else happens.axis
         what = bases_room.in_words(self.place) if self.channel else EQUATION[self.balance]
@@ -78,7 +76,7 @@ class DiscrepancyLocation:
         return f"{what} that changes with {drivers.get(variable, variable)}"
 
     def to_json(self) -> dict[str, Any]:
-        """As in result.json."""
+        """Entries of result.json."""
         return {
             "balance": self.balance,
             "channel": self.channel,

@@ -1,4 +1,4 @@
-"""The posterior of what the loop found: base parameters, effects' amplitudes and shapes, curves' ordinates."""
+"""Posterior of the loop's result: base parameters, effects' amplitudes and shapes, curves' ordinates."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from mmrjax.model.params import Spec
 
 
 def of_fit(space: CandidateSpace, active: tuple[str, ...], z: np.ndarray, linear: Linearization) -> Posterior:
-    """The posterior of a fit of the base with the active effects, from its linearization.
+    """Posterior of a fit of the base with the active effects, from its linearization.
 
     Args:
-        active: effect in each slot, "" where empty; z: its coordinates, those of the base alone or of all.
+        active: effect in each slot, "" if empty; z: its coordinates, those of the base only or of all.
         linear: of that fit.
     """
     jacobian = np.asarray(linear.jacobian)
@@ -34,7 +34,7 @@ def of_fit(space: CandidateSpace, active: tuple[str, ...], z: np.ndarray, linear
 
 
 def of_curve(space: CandidateSpace, active: tuple[str, ...], curve: Discrepancy) -> Posterior:
-    """The posterior of a fit with a curve: the ordinates, which are linear in their coordinates, come last."""
+    """Posterior of a fit with a curve; the ordinates, linear in their coordinates, come last."""
     shaped: Shaped = curve.problem.coordinates
     inner = len(shaped.base)
     turn = np.eye(len(shaped))
@@ -61,7 +61,7 @@ def _of(
 def _parts(
     coordinates: Coordinates | ActiveSet, space: CandidateSpace, active: tuple[str, ...], z: np.ndarray
 ) -> tuple[list[Posterior], list[int]]:
-    """Sets of coordinates of a fit, and where in z they are; empty slots and effects without shape have none."""
+    """Posteriors of a fit's groups of coordinates, and their indices in z, without empty slots and missing shapes."""
     if not isinstance(coordinates, ActiveSet):
         return [of_coordinates(coordinates, z, np.eye(len(z)))], list(range(len(z)))
     p, slots = len(coordinates.base), coordinates.slots
@@ -94,7 +94,7 @@ def _parts(
 
 
 def _cut(names: tuple[str, ...], specs: list[Spec], mean: np.ndarray) -> Posterior:
-    """Parameters that are their own coordinates, cut at their bounds."""
+    """Posterior of parameters that are their own coordinates, clipped at their bounds."""
     size = len(names)
     return Posterior(
         coordinates=names, units=tuple(s.unit for s in specs), mean=mean, covariance=np.eye(size),

@@ -1,4 +1,4 @@
-"""Outliers: rows with a reading that stands alone."""
+"""Outliers: rows with an isolated wrong reading."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from mmrjax.compile.precision import Threads
 
 @dataclasses.dataclass(frozen=True)
 class Screening:
-    """The base fit after rows that stand alone were set aside.
+    """The base fit after isolated outliers were excluded.
 
     Attributes:
-        base: the fit; outliers: indices of the rows set aside, in the order in which they were.
-        bases: of the curves that a discrepancy is looked for with, at that fit.
-        diagnosed: the fit linearised, and what effects and curves could explain of its residual.
-        cluster: what rows that lie off have in common, so that they were not set aside; None for nothing.
+        base: the fit; outliers: indices of the excluded rows, in the order of their exclusion.
+        bases: of the curves for a discrepancy, at that fit.
+        diagnosed: the fit linearised, and scores of effects and curves on its residuals.
+        cluster: common property of outliers, which were then not excluded; None for none.
     """
 
     base: BaseFit
@@ -49,10 +49,12 @@ class Screening:
 def ahead(
     space: CandidateSpace, bases_at: Callable[[BaseFit], Bases], settings: Settings
 ) -> Iterator[Callable[[BaseFit], None]]:
-    """Beside what is done meanwhile, a first look at the prior's mean, a replicate of a bootstrap there and a fit
-    with room for effects, on other cores: what every later one needs is then compiled. A call of what this gives,
-    with the base fit, has experiments foreseen too, or where runs are long what fits with room for effects take. What
-    they find is not read."""
+    """Context that compiles programs on other cores, in parallel with the base fit.
+
+    It runs a first diagnosis at the prior's mean, a replicate of a bootstrap there and a fit with slots for effects.
+    The function that it gives takes the base fit; it compiles the prediction of experiments too, or for long runs the
+    fits with slots for effects. All results are discarded.
+    """
     nothing, none = np.zeros(len(space.coordinates)), empty(settings)
     mean = Candidate(none, nothing, nothing, np.inf, nothing, nothing, False, False, False)
     start = BaseFit(mean, np.full(np.shape(space.bare.data.measured), np.nan), space, ())
@@ -67,9 +69,9 @@ def ahead(
         bootstrap(space.bare, nothing[: space.free], linear, space.library.scored, bases, 1, settings.seed)
 
     def fit() -> None:
-        if space.bare.observe.long:  # whose programs have what is found to be missing, which is not known yet
+        if space.bare.observe.long:  # its programs depend on the effects found, which are not known yet
             return
-        looked.wait()  # needed last: what compiles beside the base fit shares two cores with it
+        looked.wait()  # needed last: compilation shares two cores with the base fit
         search_each(space.equipped, [nothing], [space.weight], [space.library.indices(none)])
 
     def make_room(base: BaseFit) -> None:
@@ -90,9 +92,9 @@ def ahead(
 
 
 def screen(base: BaseFit, bases_at: Callable[[BaseFit], Bases], runs: Runs, settings: Settings) -> Screening:
-    """Set aside rows with a reading that stands alone: its own shift is less probable than any effect or curve.
+    """Exclude rows with an isolated wrong reading: its own shift is more significant than any effect or curve.
 
-    Rows that stand together are none: they stay, and `cluster` says where.
+    Outliers that form a cluster are not excluded; `cluster` describes it.
 
     Args:
         bases_at: bases of curves at a fit of the base; runs: the table.
@@ -109,16 +111,16 @@ def screen(base: BaseFit, bases_at: Callable[[BaseFit], Bases], runs: Runs, sett
 
 
 def same_rows(base: BaseFit, bases_at: Callable[[BaseFit], Bases], known: Screening, settings: Settings) -> Screening:
-    """A base fit to the rows that counted in another trace of the same table, looked at: no row is set aside anew.
+    """Diagnosis of a base fit to the included rows of another trace of the same table; no further row is excluded.
 
     Args:
-        base: fitted without the rows that `known` sets aside.
+        base: fitted without the rows that `known` excludes.
     """
     return Screening(base, known.outliers, *_look(base, bases_at, settings), known.cluster)
 
 
 def _together(found: Screening, outliers: np.ndarray, runs: Runs, settings: Settings) -> Cluster | None:
-    """What outliers have in common."""
+    """Common property of outliers."""
     rows = len(runs)
     axes = {a: runs[c] for a, c in (("time", "time_s"), ("order", "order")) if runs.has(c)}
     turned = found.diagnosed[0].turned()
@@ -132,11 +134,12 @@ def _together(found: Screening, outliers: np.ndarray, runs: Runs, settings: Sett
 def screen_beside(
     found: Screening, left: ScoreTable, bases_at: Callable[[BaseFit], Bases], runs: Runs, settings: Settings
 ) -> Screening | None:
-    """Rows that stand alone at a fit with effects, set aside too: what was missing hid them. None where there are no
-    further ones, or they stand together.
+    """Exclude rows that are outliers of a fit with effects, whose absence hid them before.
+
+    None if there are no further ones, or if they form a cluster.
 
     Args:
-        left: what could explain what that fit leaves.
+        left: scores of that fit's residuals.
     """
     counting = found.base.space.included.sum() + len(found.outliers)
     allowed = settings.outliers(int(counting)) - len(found.outliers)
@@ -151,7 +154,7 @@ def screen_beside(
 
 
 def _alone(base: BaseFit, scores: ScoreTable, bases: Bases, allowed: int, settings: Settings) -> np.ndarray:
-    """Indices of rows of which a reading's own shift is less probable than any effect or curve, at most so many."""
+    """Indices of at most `allowed` rows with a reading's shift more significant than any effect or curve."""
     included = base.space.included
     level = -ndtri(settings.outlier_error / 2 / (base.space.weight.shape[1] * included.sum()))
     alone = (np.abs(np.asarray(scores.row)) * included[:, None]).max(1)
@@ -163,7 +166,7 @@ def _alone(base: BaseFit, scores: ScoreTable, bases: Bases, allowed: int, settin
 
 
 def _screened(base: BaseFit, bases_at: Callable[[BaseFit], Bases], settings: Settings, where: str) -> Screening:
-    """Rows whose own shift is less probable by chance than any effect or curve, set aside."""
+    """Base fit without rows whose own shift is more significant than any effect or curve."""
     allowed = settings.outliers(int(base.space.included.sum()))
     base, outliers = _set_gross_aside(base, settings, where)
     bases, seen = _look(base, bases_at, settings)
@@ -180,7 +183,7 @@ def _screened(base: BaseFit, bases_at: Callable[[BaseFit], Bases], settings: Set
 def _look(base: BaseFit, bases_at: Callable[[BaseFit], Bases], settings: Settings) -> tuple[Bases, Diagnosed]:
     space, bases = base.space, bases_at(base)
     problem, z = space.problem(empty(settings)), base.candidate.z
-    if problem.observe.long:  # by the program that has fitted it
+    if problem.observe.long:  # by the program of its fit
         problem, z = space.bare, z[: space.free]
     return bases, jax.device_get(diagnosed(problem, jnp.asarray(z), space.library.scored, bases))
 
@@ -191,9 +194,9 @@ def _again(base: BaseFit, rows: np.ndarray, settings: Settings, where: str) -> B
 
 
 def _set_gross_aside(base: BaseFit, settings: Settings, where: str) -> tuple[BaseFit, tuple[int, ...]]:
-    """Set aside rows that lie so far off that they bend the fit, and with it every score.
+    """Exclude rows so far from the fit that they distort it, and with it every score.
 
-    They are looked for at a robust fit: Cauchy's weights, iterated (Holland and Welsch 1977).
+    They are found at a robust fit: Cauchy's weights, iterated (Holland and Welsch 1977).
     """
     space = base.space
     data, included = space.bare.data, space.included

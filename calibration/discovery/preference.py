@@ -1,4 +1,4 @@
-"""What data held out say: which errors rise with what was found, and which alternative of a class predicts best."""
+"""Use of hold-out errors: errors that rise with the effects found, and the choice of a class's leader."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import Bases
 from calibration.inference.held_out import unseen
 
-#: Share of itself by which held-out errors have to differ to be told apart; less is not seen in two digits.
+#: Least relative difference of hold-out errors that counts; less is invisible in two digits.
 TOLD = 0.01
 
 
@@ -30,11 +30,11 @@ TOLD = 0.01
 def worse(
     readings: Mapping[str, tuple[np.ndarray, np.ndarray]], errors: Callable[[np.ndarray], Errors]
 ) -> tuple[Worse, ...]:
-    """Every kind of block and channel in which the error of data held out rises, over the rows that both predict.
+    """Kinds of block and channels with a hold-out error that rises, over the rows that both fits predict.
 
     Args:
-        readings: kind of block → readings before and after [SI], NaN where a fit predicts none.
-        errors: of readings, by channel.
+        readings: kind of block → readings before and after [SI], NaN if a fit predicts none.
+        errors: function of readings to their errors, by channel.
     """
     found = []
     for kind, (before, after) in readings.items():
@@ -51,9 +51,9 @@ def worse(
 
 
 def compared(space: CandidateSpace, runs: Runs, best: Candidate, alike: Classes) -> tuple[HeldOutAlternative, ...]:
-    """Held-out errors of a fit and of those with one effect replaced by a member of its class, that fit first.
+    """Hold-out errors of a fit and of those with one effect replaced by a member of its class, that fit first.
 
-    Those that are not quite plausible cannot lead, and are left out. Empty where there is but one, or no block.
+    Members that are not plausible cannot lead, and are omitted. Empty for a single one, or without blocks.
     """
     others = [c for c in experiments.alternatives(best, alike, stated=False).values() if c.plausible]
     data, rows = space.equipped.data, len(runs)
@@ -89,9 +89,9 @@ def compared(space: CandidateSpace, runs: Runs, best: Candidate, alike: Classes)
 
 
 def _order(table: Sequence[HeldOutAlternative]) -> list[int]:
-    """Alternatives that predict no fewer readings than the best fit, which is the first, by their held-out error.
+    """Alternatives that predict no fewer readings than the best fit, which is the first, by their hold-out error.
 
-    Of those within `TOLD` of the smallest the best fit comes first: between these held-out data decide nothing.
+    The best fit precedes others within `TOLD` of the smallest error, because hold-out errors do not decide there.
     """
     able = _able(table)
     least = min((table[k] for k in able), key=lambda a: a.rms_sigma)
@@ -99,21 +99,21 @@ def _order(table: Sequence[HeldOutAlternative]) -> list[int]:
 
 
 def _able(table: Sequence[HeldOutAlternative]) -> list[int]:
-    """Those that predict no fewer readings than the first."""
+    """Indices of alternatives that predict no fewer readings than the first."""
     return [k for k, a in enumerate(table) if a.lost <= table[0].lost]
 
 
 def _draw(a: HeldOutAlternative, b: HeldOutAlternative) -> bool:
-    """Whether held-out data decide nothing between two."""
+    """True if hold-out errors do not decide between two."""
     return not a.rms_sigma > (1 + TOLD) * b.rms_sigma
 
 
 def prefer_by_held_out(
     space: CandidateSpace, runs: Runs, searched: Search, alike: Classes, bases: Bases, settings: Settings
 ) -> tuple[Search, Classes, tuple[HeldOutAlternative, ...]]:
-    """The search and its classes, led by the alternative that predicts data held out best, see `_order`.
+    """The search and its classes, led by the alternative with the best hold-out errors, see `_order`.
 
-    One that is not adequate where the best fit is does not lead.
+    An inadequate alternative does not lead if the best fit is adequate.
     """
     best, before = searched.best, searched.diagnosis
     if best is None or before is None:
@@ -138,7 +138,7 @@ def prefer_by_held_out(
 
 
 def _led(space: CandidateSpace, best: Candidate, leader: Candidate, alike: Classes, settings: Settings) -> Classes:
-    """The classes of another leader: its effect comes first in its class; what is missing of them is fitted."""
+    """Classes of another leader, with its effect first in its class; missing members are fitted."""
     members = dict(zip(best.effects, alike.members, strict=True))
     (new,), (old,) = leader.key - best.key, best.key - leader.key
     members[new] = (new, *(n for n in members.pop(old) if n != new))
@@ -161,7 +161,7 @@ def _led(space: CandidateSpace, best: Candidate, leader: Candidate, alike: Class
 
 
 def remarks(table: Sequence[HeldOutAlternative], prefer: str) -> list[Led]:
-    """By what the leader was chosen among the alternatives, and whether the other way would have chosen another."""
+    """Notes on the choice of the leader, and whether the other criterion would have chosen another."""
     if not table:
         return []
     shared = set.intersection(*(set(a.effects) for a in table))

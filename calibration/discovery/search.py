@@ -1,4 +1,4 @@
-"""The search for effects: singles, then further ones beside the best, as long as the fit is rejected."""
+"""Search for effects: single ones, then further ones in addition to the best, while the fit is rejected."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from calibration.discovery.settings import Settings
 from calibration.inference.bases import Bases
 from calibration.inference.fit_notes import Step
 
-#: Pairs of instances that are looked through for pairs of effects.
+#: Largest number of pairs of instances that are examined for pairs of effects.
 PAIRS = 4000
 
 
 @dataclasses.dataclass(frozen=True)
 class Search:
-    """What was tried.
+    """Outcome of the search.
 
     Attributes:
         ladder: every candidate that was fitted.
-        best: the one that is proposed, None where none is plausible; diagnosis: what it leaves.
-        asked, otherwise: fits by simulation of what was screened by regression, and how many of these did not confirm
-            it, see `screening.Confirmed`; room: for which effects the program of these fits has room.
+        best: the proposed one, None without a plausible one; diagnosis: of its residuals.
+        asked, otherwise: number of simulated sets that were screened by regression, and of unconfirmed ones among
+            them, see `screening.Confirmed`; room: effects in the program of these fits.
     """
 
     ladder: tuple[Candidate, ...]
@@ -44,7 +44,7 @@ class Search:
 def diagnose(
     space: CandidateSpace, fitted: Candidate, bases: Bases, null: Statistics, settings: Settings
 ) -> Diagnosis:
-    """Look at a fit, and test what it leaves."""
+    """Diagnosis of a fit."""
     z = jnp.asarray(fitted.z)
     seen = diagnosed(space.problem(fitted.active), z, space.library.scored, bases)
     linear, scores, found = jax.device_get(seen)
@@ -59,10 +59,10 @@ def search(
     settings: Settings,
     progress: Callable[[Step], None],
 ) -> Search:
-    """Effects that explain what the base leaves, as few as leave nothing that is beyond doubt.
+    """Smallest set of effects that explains the discrepancy of the base to within the test's margin.
 
     Args:
-        base: the fit without effects; left: what it leaves.
+        base: the fit without effects; left: its diagnosis.
     """
     rounds = [_singles(space, base, left, settings)]
     space = space.with_room(rounds[0].room)
@@ -92,7 +92,7 @@ def search(
 
 
 def path(found: Search) -> list[Candidate]:
-    """The best plausible candidate of each number of effects, up to that of what the search proposes."""
+    """Best plausible candidate of each number of effects, up to the number in the search's proposal."""
     if found.best is None:
         return []
     sizes = range(1, len(found.best.effects))
@@ -105,7 +105,7 @@ def own_p(gain: float, null: np.ndarray) -> float:
     1 / (replicates + 1).
 
     Args:
-        null: root of what it explains in each [σ].
+        null: root of its score in each table [σ].
     """
     return (1 + int(np.sum(null**2 >= gain))) / (1 + len(null))
 
@@ -113,10 +113,10 @@ def own_p(gain: float, null: np.ndarray) -> float:
 def without_each(
     space: CandidateSpace, best: Candidate, settings: Settings, ladder: Sequence[Candidate] = ()
 ) -> list[Candidate]:
-    """The candidate without each of its effects in turn, all else fitted again.
+    """The candidate without each of its effects in turn, refitted.
 
     Args:
-        ladder: fits that are known, of which none is made again.
+        ladder: known fits, which are not repeated.
     """
     fewer = [tuple("" if s == slot else n for s, n in enumerate(best.active)) for slot in range(len(best.effects))]
     known = {c.active: c for c in ladder if c.simulated}
@@ -126,19 +126,19 @@ def without_each(
 
 
 def _most(space: CandidateSpace, settings: Settings) -> int:
-    """Effects that the data allow, no more than there are slots."""
+    """Largest number of effects that the data allow, at most the number of slots."""
     return int(min(settings.slots, max(1, space.included.sum() // settings.rows_per_effect)))
 
 
 def _ranked(space: CandidateSpace, scores: ScoreTable, without: Sequence[str] = ()) -> list[str]:
-    """Effects by their best |score|, the strongest first; those to leave out come last."""
+    """Effects by their best |score|, the strongest first; those in `without` come last."""
     strength = space.library.largest(np.abs(np.asarray(scores.single)))
     strength[list(space.library.indices(without))] = 0.0
     return [space.library.names[k] for k in np.argsort(-strength)]
 
 
 def _singles(space: CandidateSpace, base: Candidate, left: Diagnosis, settings: Settings) -> Confirmed:
-    """Single effects: those that score highest, or where a run takes long all of them by regression."""
+    """Single effects: those with the highest scores, or for long runs all of them by regression."""
     names = _ranked(space, left.scores)
     if not space.bare.observe.long:
         names = names[: _batch(space)]
@@ -148,8 +148,8 @@ def _singles(space: CandidateSpace, base: Candidate, left: Diagnosis, settings: 
 def _tried(
     space: CandidateSpace, wanted: Sequence[tuple[tuple[str, ...], Candidate, Diagnosis]], settings: Settings
 ) -> Confirmed:
-    """Sets of effects, each beside another fit and what that leaves: fitted, or screened by regression first where a
-    run takes long."""
+    """Sets of effects, each in addition to another fit and its diagnosis; for long runs first screened by
+    regression."""
     if not space.bare.observe.long:
         return Confirmed(tuple(fit_beside(space, [(w, at, by.scores) for w, at, by in wanted], settings)))
     return confirmed(space, ranked(space, wanted, settings), settings)
@@ -167,7 +167,7 @@ def _extend(
     left: Diagnosis,
     settings: Settings,
 ) -> Confirmed:
-    """One effect more beside the best, and pairs from the base."""
+    """Sets with one more effect than the best, and pairs for the base."""
     names = _ranked(space, left_by_best.scores, best.effects)[: _batch(space)]
     sources = {filled([*best.effects, name], settings): (best, left_by_best) for name in names}
     if len(best.effects) == 1:
@@ -179,7 +179,7 @@ def _extend(
 
 
 def _pairs(space: CandidateSpace, scores: ScoreTable) -> list[tuple[str, str]]:
-    """Pairs of effects by their joint score, the strongest first, a batch of them."""
+    """One batch of pairs of effects by their joint score, the strongest first."""
     effect, names = space.library.of, space.library.names
     pair = np.triu(np.asarray(scores.pair))
     found: list[tuple[str, str]] = []
@@ -198,7 +198,7 @@ def _best(candidates: Sequence[Candidate]) -> Candidate | None:
 
 
 def _accepted(c: Candidate | None, ladder: Sequence[Candidate], settings: Settings) -> Candidate | None:
-    """The candidate, if it explains so much more than any with one effect fewer that every effect is needed."""
+    """The candidate if each of its effects is needed: it explains clearly more than any with one effect fewer."""
     if c is None:
         return None
     fewer = [x.cost for x in ladder if len(x.effects) == len(c.effects) - 1 and x.plausible]

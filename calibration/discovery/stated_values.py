@@ -1,7 +1,7 @@
-"""Stated values that may be the wrong ones: base parameters whose shift explains the data as well as an effect.
+"""Stated values that may be wrong: base parameters with a shift that explains the data as well as an effect.
 
-A prior is a measurement made beforehand, and may be off like any reading. The score of a shift of one prior's mean is
-that of a column that is 1 in its residual; where it is large, the fit is made again with that prior left out.
+A prior is an earlier measurement, and may be wrong like any reading. The score of a shift of one prior's mean is
+that of a column that is 1 in its residual. If it is large, the fit is repeated without that prior.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from calibration.discovery.settings import Settings
 from calibration.inference.held_out import search_each
 from calibration.inference.linearization import Linearization
 
-#: Refits with a prior's mean where the last one ended, until it pulls no longer [prior sds].
+#: Refits with a prior's mean at the end of the last one, until its pull is small [prior sds].
 ROUNDS, PULL = 3, 0.3
 
 
 @dataclasses.dataclass(frozen=True)
 class Shift:
-    """A base parameter freed of its prior, in the place of an effect.
+    """A base parameter without its prior, instead of an effect.
 
     Attributes:
         name: dotted, of the parameter; index: of its coordinate.
-        fit: all else fitted again; cost of its prior left out.
+        fit: of all other parameters; its cost excludes the prior.
     """
 
     name: str
@@ -37,8 +37,8 @@ class Shift:
 
 
 def scores(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What a shift of the mean of each coordinate's prior would explain [σ²], and where the data alone would have the
-    coordinate, as far as a line tells [prior sds].
+    """Score of a shift of the mean of each coordinate's prior [σ²], and the linear estimate of each coordinate
+    without its prior [prior sds].
 
     Args:
         jacobian, residual: of a fit, the priors' residuals last.
@@ -55,10 +55,10 @@ def scores(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.n
 def shifts(
     space: CandidateSpace, at: Candidate, needed: float, settings: Settings, linear: Linearization | None = None
 ) -> list[Shift]:
-    """Base parameters that, freed of their prior, would explain at least `needed` σ² of what a fit leaves.
+    """Base parameters that, without their prior, would explain at least `needed` σ² of a fit's discrepancy.
 
     Args:
-        at: the fit; its effects stay; linear: the same, linearised, where that is known.
+        at: the fit; its effects stay; linear: the same, linearised, if known.
     """
     if linear is None:
         problem, (active,) = space.fitted_by([at.active])
@@ -79,9 +79,9 @@ def shifts(
 def _without_prior(
     space: CandidateSpace, at: Candidate, k: int, value: float, settings: Settings
 ) -> Candidate | None:
-    """The fit with the prior of coordinate k left out: with its mean where the data have it.
+    """Fit without the prior of coordinate k: the prior's mean is moved to the data's estimate.
 
-    None where that is beyond the parameter's bounds, or no optimum.
+    None if that is beyond the parameter's bounds, or without an optimum.
     """
     p, mean, start = space.free, value, np.array(at.z)
     equipped, (indices,) = space.fitted_by([at.active])
