@@ -214,7 +214,7 @@ REFUSED = {
     "the paper's figures": ("bench", False, ["reproduce"], r"reproduce: the robot's load is a shaft"),
     "steepest slope": (
         "bench", False, ["sensitivity", "--voltages", "9", "--outputs", "steepest_slope"],
-        r"--outputs steepest_slope: the robot's load is a shaft, which stands on no ground",
+        r"--outputs steepest_slope: the robot's load is a shaft, which has no ground",
     ),
     "a stance": (
         "wheeled", False, ["sensitivity", "--voltages", "9", "--outputs", "pitch"],

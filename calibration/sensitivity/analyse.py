@@ -1,4 +1,4 @@
-"""A whole sensitivity study: what matters where, and what would tell more."""
+"""A whole sensitivity study: important inputs at each point, and the most informative next runs."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from calibration.sensitivity.study import Study
 from calibration.sensitivity.uncertain_inputs import Inputs
 from mmrjax import derived, fidelities
 
-#: Model evaluations in all where none are stated: of solves, of solves for Shapley effects, whose design costs as
-#: much again, and where a run over time is among the outputs.
+#: Default number of model evaluations: of solves, of solves for Shapley effects, whose design costs as much again,
+#: and with a run over time among the outputs.
 EVALUATIONS, EVALUATIONS_SHAPLEY, EVALUATIONS_LONG = 1_000_000, 300_000, 100_000
-#: Fewest that may be asked for.
+#: Least number of evaluations.
 LEAST = 1_000
 
 
 def default_evaluations(outputs: tuple[OutputRow, ...], model: str, method: str) -> int:
-    """Model evaluations where none are stated."""
+    """Default number of model evaluations."""
     long = fidelities.facts(model).rollout or any(o in derived.OF_START for o in outputs)
     return EVALUATIONS_LONG if long else EVALUATIONS_SHAPLEY if method == "shapley" else EVALUATIONS
 
@@ -42,25 +42,25 @@ def default_evaluations(outputs: tuple[OutputRow, ...], model: str, method: str)
 def analyse(
     study: Study, method: str, evaluations: int | None = None, seed: int = 0, candidates: Candidates | None = None
 ) -> SensitivityResult:
-    """A whole study.
+    """Result of a whole study.
 
     Args:
         method: one of `METHODS`.
-        evaluations: at least so many of the model, in all; None takes the default.
+        evaluations: least number of model evaluations in all; None takes the default.
         seed: random seed.
-        candidates: runs that could be made; None proposes none.
+        candidates: possible next runs; None proposes none.
 
     Raises:
-        BadConfiguration: a method that is not known or that needs independent inputs, too few evaluations, inputs
-            none of which changes an output, or points none of which can be studied.
+        BadConfiguration: an unknown method, a method that needs independent inputs, too few evaluations, inputs
+            that change no output, or no point that can be studied.
     """
     inputs, model = study.inputs, study.model
     if method not in METHODS:
         raise BadConfiguration(f"--method: got {method}; expected one of {', '.join(METHODS)}")
     if inputs.is_posterior and method in ("sobol", "morris", "derivative"):
         raise BadConfiguration(
-            f"--method {method}: takes inputs for independent, and those of a posterior are not; "
-            "expected shapley, or local"
+            f"--method {method}: needs independent inputs, and those of a posterior are correlated; "
+            "expected shapley or local"
         )
     usual = default_evaluations(model.outputs, model.fidelity, method)
     evaluations = usual if evaluations is None else evaluations
@@ -73,7 +73,7 @@ def analyse(
     idle = inert(study, found, seed)
     if idle.all():
         raise BadConfiguration(
-            "--parameters: the derivative of every output by every input is zero; choose others, or other --outputs"
+            "--parameters: the derivative of every output by every input is zero; choose others, or change --outputs"
         )
     parts = _by_method(study, method, ~idle, evaluations, seed)
     comparison: dict[str, dict[str, Any]] = {}
@@ -180,7 +180,7 @@ def _study_of(row: OutputRow, study: Study, found: Local, part: Part | None) -> 
 
 
 def _compared(study: Study, bounds: dict[str, Part], sampled: dict[str, Part]) -> dict[str, dict[str, Any]]:
-    """How the bounds of derivatives compare with Sobol indices of the same points, by output."""
+    """Comparison of derivative bounds with Sobol indices of the same points, by output."""
     found: dict[str, dict[str, Any]] = {}
     for name, bound in bounds.items():
         beside = sampled[name]
@@ -208,8 +208,8 @@ def _compared(study: Study, bounds: dict[str, Part], sampled: dict[str, Part]) -
 def _none_converges(study: Study, statuses: dict[str, dict[str, int]]) -> str:
     said = "; ".join(f"{s}: " + ", ".join(f"{n} {w}" for w, n in by.items()) for s, by in statuses.items())
     return (
-        f"no operating point can be studied, since too many robots do not travel there ({said}); choose gentler "
-        "--slopes, another --voltages, or state what is known of the adhesion with --set or by calibrating"
+        f"no operating point can be studied, because too many robots do not travel there ({said}); choose smaller "
+        "--slopes, another --voltages, or reduce the uncertainty of the adhesion with --set or by calibrating"
     )
 
 

@@ -1,4 +1,4 @@
-"""The methods, over all operating points of a study: each gives a part of what is said of every output."""
+"""Methods over all operating points of a study; each gives a part of every output's result."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from calibration.sensitivity.replicates import REPLICATES, Estimate
 from calibration.sensitivity.study import Study
 from calibration.sensitivity.uncertain_inputs import Inputs
 
-#: Largest share of base points that may be without numbers for a point to be studied.
+#: Largest share of base points without a value for a point to be studied.
 MOST_LOST = 0.5
 #: Replicates of the derivative method, and points of each.
 GRADIENTS = (8, 8)
-#: Correlation above which inputs are drawn together.
+#: Least correlation of inputs that are drawn together.
 LINKED = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """What a method found of one output: as fields of `OutputStudy`."""
+    """Result of a method for one output, as fields of `OutputStudy`."""
 
     overall: dict[str, Estimate]
     at_points: dict[str, Estimate]
@@ -45,7 +45,7 @@ def _sampled(study: Study, unit: np.ndarray, which: np.ndarray) -> np.ndarray:
 
 
 def groups(study: Study, moving: np.ndarray) -> dict[tuple[int, ...], list[int]]:
-    """Points by the inputs that act there."""
+    """Points grouped by the inputs that act there."""
     found: dict[tuple[int, ...], list[int]] = {}
     for k in range(len(study.points)):
         which = tuple(i for i in study.acting(k) if moving[i])
@@ -57,8 +57,8 @@ def groups(study: Study, moving: np.ndarray) -> dict[tuple[int, ...], list[int]]
 def correlated(inputs: Inputs, which: Sequence[int] | np.ndarray) -> tuple[int, ...]:
     """These inputs and all that are correlated with one of them, directly or through others.
 
-    Knowing any of them tells something of what these do, so that by definition it has a Shapley effect, also where
-    it does nothing itself.
+    An inert input that is correlated with these has, by definition, a Shapley effect, because its value is
+    informative about theirs.
     """
     p = len(inputs.parameters)
     covariance = inputs.parameters.covariance
@@ -82,7 +82,7 @@ def _put(into: Estimate, k: int, found: Estimate) -> None:
 def sobol_indices(
     study: Study, moving: np.ndarray, evaluations: int, seed: int, second: bool = True
 ) -> dict[str, Part]:
-    """First, total and second-order indices at every point, and over all of them."""
+    """First, total and second-order indices at each point, and over all of them."""
     points, d = len(study.points), len(study.inputs)
     names = [o.name for o in study.model.outputs]
     terms: dict[str, dict[int, sobol.Terms]] = {name: {} for name in names}
@@ -131,7 +131,7 @@ def sobol_indices(
 
 
 def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
-    """Elementary effects over the 95 % range of every input, at every point."""
+    """Elementary effects over the 95 % range of each input, at each point."""
     points, d = len(study.points), len(study.inputs)
     names = [o.name for o in study.model.outputs]
     found: dict[str, dict[int, tuple[morris.Effects, tuple[int, ...]]]] = {name: {} for name in names}
@@ -140,7 +140,7 @@ def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: i
         count = max(int(np.ceil(evaluations / points / (len(which) + 1))), 10)
         unit = morris.design(len(which), count, seed)
         scores = np.array(_sampled(study, 0.025 + 0.95 * unit, np.array(which)))
-        # Trajectories go in equal steps of the scores, whose ends are those of the 95 % interval.
+        # Trajectories have equal steps in the scores, between the ends of the 95 % interval.
         normal = np.arange(d) < len(study.inputs.parameters)
         for j, i in enumerate(which):
             if normal[i]:
@@ -187,7 +187,7 @@ def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: i
 
 
 def derivative_bounds(study: Study, moving: np.ndarray, seed: int) -> dict[str, Part]:
-    """Bounds of first-order and total indices from exact gradients, at every point."""
+    """Bounds of first-order and total indices from exact gradients, at each point."""
     points, d = len(study.points), len(study.inputs)
     names = [o.name for o in study.model.outputs]
     normal = np.arange(d) < len(study.inputs.parameters)
@@ -228,9 +228,9 @@ def derivative_bounds(study: Study, moving: np.ndarray, seed: int) -> dict[str, 
 
 
 def shapley_effects(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
-    """Shapley effects at every point, and over all of them.
+    """Shapley effects at each point, and over all of them.
 
-    Inputs that do nothing at a point are drawn with those that they are correlated with; the others have no effect.
+    Inputs that are inert at a point are drawn if they are correlated with active ones; the others have no effect.
     """
     points, d = len(study.points), len(study.inputs)
     names = [o.name for o in study.model.outputs]

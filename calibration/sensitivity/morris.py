@@ -1,7 +1,8 @@
-"""Screening by elementary effects: how much an output changes when one input alone moves (Morris 1991).
+"""Screening by elementary effects: changes of an output by single inputs (Morris 1991).
 
-μ* is the mean size of the change per whole range of the input (Campolongo et al., Environ. Model. Softw. 22 (2007)),
-σ how much it changes from place to place: non-linear, or together with others. Trajectories and measures are SALib's.
+μ* is the mean magnitude of the change per whole range of the input (Campolongo et al., Environ. Model. Softw. 22
+(2007)). σ is the variation of the change between places, by nonlinearity or interactions. Trajectories and measures
+are SALib's.
 """
 
 from __future__ import annotations
@@ -13,17 +14,17 @@ from scipy import stats
 
 from calibration.sensitivity.replicates import LEVEL, Estimate
 
-#: Levels of the grid on which trajectories go.
+#: Levels of the grid of the trajectories.
 LEVELS = 4
 
 
 @dataclasses.dataclass(frozen=True)
 class Effects:
-    """Elementary effects of every input on an output [its unit per range of the input], shape (inputs,) each.
+    """Elementary effects of each input on an output [its unit per range of the input], shape (inputs,) each.
 
     Attributes:
         mean: μ; size: μ* with its interval; spread: σ.
-        trajectories: that count; lost: those left out, because the model has no number at one of their points.
+        trajectories: number included; lost: number of those with a point without a value of the model.
     """
 
     mean: np.ndarray
@@ -37,7 +38,7 @@ def design(inputs: int, trajectories: int, seed: int) -> np.ndarray:
     """Points of the unit cube, shape (trajectories · (inputs + 1), inputs)."""
     from SALib.sample import morris as sampling
 
-    # The sampler draws from NumPy's global generator, whatever seed it is given; its state is put back.
+    # The sampler draws from NumPy's global generator, whatever its seed argument; its state is restored.
     state = np.random.get_state()  # noqa: NPY002
     try:
         return sampling.sample(_problem(inputs), trajectories, num_levels=LEVELS, seed=seed)
@@ -52,7 +53,7 @@ def effects(points: np.ndarray, values: np.ndarray) -> Effects | None:
         points: from `design`; values: of the output there.
 
     Returns:
-        None where fewer than two trajectories have numbers all along.
+        None if fewer than two trajectories have values at all points.
     """
     from SALib.analyze.morris import analyze
 
@@ -81,7 +82,7 @@ def effects(points: np.ndarray, values: np.ndarray) -> Effects | None:
 
 
 def _elementary(points: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Change of the output over that of the input that moved, shape (trajectories, inputs)."""
+    """Change of the output per change of the moved input, shape (trajectories, inputs)."""
     moved = np.diff(points, axis=1)
     which = np.abs(moved).argmax(-1)
     change = np.diff(values, axis=1) / np.take_along_axis(moved, which[..., None], -1)[..., 0]
