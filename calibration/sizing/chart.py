@@ -1,4 +1,4 @@
-"""The chart of a robot's use: over payload and slope, which limit is nearest and what it leaves."""
+"""Chart of a robot's use: over payload and slope, the nearest limit and its margin."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mmrjax.derived.requirements import Point, Ratings, heat_left, ratings, trav
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 
-#: What can end a use, in the order of the chart.
+#: Limits of a use, in the order of the chart.
 LIMITS = (
     "adhesion",
     "stall",
@@ -27,16 +27,16 @@ LIMITS = (
     "cell cut-off",
     "speed",
 )
-#: Points along payload and slope, and how far beyond the envelope the chart goes.
+#: Number of points along payload and slope, and the chart's extent over the envelope's.
 POINTS, BEYOND = 33, 1.6
 
 
 @dataclasses.dataclass(frozen=True)
 class Chart:
-    """Which limit is nearest, shape (slopes, payloads).
+    """Nearest limit, shape (slopes, payloads).
 
     Attributes:
-        payload, slope: axes [kg], [deg]; nearest: index into `LIMITS`; margin: what that leaves, negative beyond it.
+        payload, slope: axes [kg], [deg]; nearest: index into `LIMITS`; margin: to it, negative beyond it.
     """
 
     payload: np.ndarray
@@ -59,7 +59,7 @@ def _left(robot: Robot, rated: Ratings, points: Point, speeds: Array, wanted: Ar
             jnp.minimum(found["cell"] / rated.voltage_cutoff, 1.0),
             jnp.where(wanted > 0, found["speed_m_s"] / jnp.where(wanted > 0, wanted, 1.0) - 1, 1.0),
         ]  # fmt: skip
-        # A robot at the limit of adhesion has its margin of both; it is adhesion's.
+        # At the limit of adhesion both margins are zero; it is assigned to adhesion.
         each[1] = jnp.where(each[0] <= each[1], 1.0, each[1])
         return jnp.stack([jnp.asarray(x, float) for x in each])
 
@@ -67,12 +67,12 @@ def _left(robot: Robot, rated: Ratings, points: Point, speeds: Array, wanted: Ar
 
 
 def chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -> Chart:
-    """Of a robot, at the worse of the ends of charge, in the warmest ambient of the envelope.
+    """Chart of a robot, at the worse end of charge, in the warmest ambient of the envelope.
 
-    A required speed counts within the payloads and slopes that it is required at.
+    A required speed applies only within its own payloads and slopes.
 
     Args:
-        most: payload [kg] and slope [deg] to which the chart goes.
+        most: largest payload [kg] and slope [deg] of the chart.
     """
     payload, slope = np.linspace(0, most[0], POINTS), np.linspace(0, most[1], POINTS)
     e = asked.envelope
@@ -102,7 +102,7 @@ def chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -> Chart
 
 
 def extent(asked: Requirements) -> tuple[float, float]:
-    """Payload [kg] and slope [deg] to which a chart of these requirements goes."""
+    """Largest payload [kg] and slope [deg] of a chart of these requirements."""
     payloads = [asked.envelope.payload_kg[1], *(r.limit or 0.0 for r in asked.each if r.name == "payload_kg")]
     slopes = [asked.envelope.slope_deg[1], *(r.limit or 0.0 for r in asked.each if r.name == "slope_deg")]
     return BEYOND * max(*payloads, 2.0), min(BEYOND * max(*slopes, 10.0), 40.0)

@@ -1,4 +1,4 @@
-"""The search for a size: parts enumerated, the rest by gradients from many starts in one batch."""
+"""Search for a size: parts are enumerated, the other numbers found by gradients from many starts in one batch."""
 
 from __future__ import annotations
 
@@ -24,23 +24,24 @@ from calibration.sizing.part_options import Drive, Options, options
 from mmrjax.compile.compiling import compiled
 from mmrjax.model.robot import Robot
 
-#: Cells in series that are tried, cells in parallel, and the radius as a multiple of the robot's (on tracks 1.3 is as
-#: much as the height of 100 mm of Section 2.2 allows).
+#: Ranges of cells in series, cells in parallel, and the radius as a multiple of the robot's (on tracks the height of
+#: 100 mm of Section 2.2 allows 1.3).
 CELLS, PARALLEL, RADIUS = (3, 14), (1.0, 12.0), (0.6, 1.3)
-#: Random designs of each enumerated choice, among which the starts are; starts of each motor at least; of one choice
-#: at most.
+#: Random designs of each enumerated choice, from which the starts are taken; least number of starts for each motor;
+#: largest number for one choice.
 TRIES, OF_MOTOR, OF_CHOICE = 6, 6, 3
 #: Rows of one call of `_measured`.
 ROWS = 8192
-#: Steps of each start; after how many the multipliers follow; first and last length in the logarithms.
+#: Steps of each start; steps between updates of the multipliers; first and last step length in the logarithms.
 STEPS, EVERY, RATE = 120, 12, (0.06, 0.003)
-#: Weight of a violated margin: at first, factor each time, at most.
+#: Weight of a violated margin: initial, factor of each update, largest.
 WEIGHT, GROWTH, HEAVIEST = 5.0, 1.7, 500.0
-#: Designs that are then refined, points along each of their axes, rounds, and how the box shrinks.
+#: Number of designs that are then refined, points along each of their axes, rounds, and shrinkage of the box.
 REFINED, ALONG, ROUNDS, SHRINK = 24, 7, 7, 0.45
-#: Choices of which every ratio of the sheets is tried with whole cells, the most in parallel, and how many are kept.
+#: Number of choices for which all ratios of the sheets are tried with whole cells, most cells in parallel, and number
+#: of designs that are kept.
 WHOLE, MOST_WHOLE, KEPT_WHOLE = 600, 8, 192
-#: Margin of a limit that binds.
+#: Largest margin of an active limit.
 BINDS = 0.01
 
 
@@ -51,7 +52,7 @@ class Found:
     Attributes:
         drive, cell: sheets; ratio, radius: total ratio and rolling radius [m]; in_series, parallel: cells.
         objectives: by name of `OBJECTIVES`; margins: by label, shares of what is required or permitted.
-        bounds: of the search that it is at; robot: that it makes.
+        bounds: active bounds of the search; robot: of the design.
     """
 
     drive: Drive
@@ -67,17 +68,17 @@ class Found:
 
     @property
     def feasible(self) -> bool:
-        """Whether every margin holds."""
+        """True if all margins are met."""
         return all(m >= 0 for m in self.margins.values())
 
     @property
     def binds(self) -> list[str]:
-        """The limits that it is at, or violates, the nearest first; then the bounds of the search."""
+        """Active or violated limits, the nearest first; then active bounds of the search."""
         order = sorted(self.margins.items(), key=lambda item: item[1])
         return [*(label for label, m in order if m < BINDS), *self.bounds]
 
     def to_json(self) -> dict[str, Any]:
-        """As in `result.json`."""
+        """Entry of `result.json`."""
         return {
             "motor": self.drive.motor.name, "gearbox": f"{self.drive.family}, stages {self.drive.stages}",
             "ratio": self.ratio, "radius_m": self.radius, "cell": self.cell.name, "cells": self.in_series,
@@ -88,17 +89,17 @@ class Found:
 
 @dataclasses.dataclass(frozen=True)
 class Sizing:
-    """What a search found.
+    """Result of a search.
 
     Attributes:
-        task, options: of the search; objective: that was made small, of a Pareto front the first.
-        unmeetable: labels that no design of the choice meets, which were left out.
-        ideal: the best with any ratio and part of a cell; None where there is none.
-        best: the best with a ratio of the sheets and whole cells; alternatives: the next best, of other motors or
+        task, options: of the search; objective: that is minimised, of a Pareto front the first.
+        unmeetable: labels that no choice of parts meets, which were dropped.
+        ideal: the best with any ratio and fraction of a cell; None without one.
+        best: the best with a ratio of the sheets and whole cells; alternatives: the next best, with other motors or
             cells.
         motors: by motor, its best design, feasible or the nearest to it.
-        front: designs of which none is better in both objectives; empty unless asked for.
-        starts, evaluated: how many searches, and designs in all.
+        front: designs of the Pareto front of two objectives; empty unless requested.
+        starts, evaluated: number of searches, and of all designs.
     """
 
     task: Task
@@ -129,13 +130,13 @@ def _descended(
     weights: Float[Array, "designs objectives"],
     kept: Float[Array, " margins"],
 ) -> Float[Array, "designs 3"]:
-    """Where searches end that start at designs: the best they passed that meets every margin, or their last.
+    """Ends of searches that start at designs: the best feasible point on the way, or the last point.
 
-    An augmented Lagrangian, f + Σ (max(0, λ - w g)² - λ²) / 2w over the logarithms of the continuous numbers, its
-    steps by Adam and held within bounds.
+    The objective is an augmented Lagrangian, f + Σ (max(0, λ - w g)² - λ²) / 2w over the logarithms of the continuous
+    numbers. Steps are Adam's, clipped to bounds.
 
     Args:
-        weights: of the logarithms of the objectives in f; kept: 1 for margins that count, 0 for those left out.
+        weights: of the logarithms of the objectives in f; kept: 1 for included margins, 0 for others.
     """
     rate = optax.cosine_decay_schedule(RATE[0], STEPS, RATE[1] / RATE[0])
     adam = optax.adam(rate, b1=0.8, b2=0.95)
@@ -170,7 +171,7 @@ def _descended(
 
 @dataclasses.dataclass(frozen=True)
 class Space:
-    """Every enumerated choice, a row each, with the bounds of the continuous numbers.
+    """All enumerated choices, a row each, with the bounds of the continuous numbers.
 
     Attributes:
         drive, cell, in_series: of each choice; low, high: logarithms, shape (choices, 3).
@@ -195,7 +196,7 @@ class Space:
 
 
 def space(robot: Robot, problem: Task, options: Options) -> Space:
-    """The choices for a robot."""
+    """Choices for a robot."""
     n_drives, n_cells = len(options.drives), len(options.cells)
     every = list(itertools.product(range(n_drives), range(n_cells), range(CELLS[0], CELLS[1] + 1)))
     drive, cell, series = (np.array(x) for x in zip(*every, strict=True))
@@ -224,7 +225,7 @@ def measured(problem: Task, choice: Space, rows: np.ndarray, x: np.ndarray) -> t
         f, g = jax.device_get(_measured(problem, choice.designs(rows[some], x[some])))
         parts.append((f[: len(rows) - first], g[: len(rows) - first]))
     f, g = (np.concatenate(p) for p in zip(*parts, strict=True))
-    f = np.where(f > 0, f, np.inf)  # not moving, or no price: worse than any
+    f = np.where(f > 0, f, np.inf)  # no motion, or no price: worse than any
     return f, np.where(np.isfinite(g), g, -5.0)
 
 
@@ -240,11 +241,11 @@ def size(
     """Search ratio, radius, cells and motor of a robot so that it meets requirements.
 
     Args:
-        objectives: of `OBJECTIVES`, one to make small, or two for a Pareto front.
-        starts: searches in the batch; motors: names of those to choose from, empty: all; seed: of the starts.
+        objectives: of `OBJECTIVES`, one to minimise, or two for a Pareto front.
+        starts: number of searches in the batch; motors: names of the choices, empty: all; seed: of the starts.
 
     Raises:
-        BadConfiguration: what `sheet.refuse` raises; an unknown objective or motor.
+        BadConfiguration: any raised by `sheet.refuse`; an unknown objective or motor.
     """
     for name in objectives:
         if name not in OBJECTIVES:
@@ -261,7 +262,7 @@ def size(
     weights = search.weights(starts)
     free = search.descended(drawn, weights)
     real = search.real(drawn, free, weights)
-    # The best of these with any ratio and parts of a cell: no search may have begun from their choice of parts.
+    # Also the best of these with any ratio and fraction of a cell, because no search may have begun with their parts.
     top = np.argsort(search.cost(real))[:REFINED]
     free = free + search.refined(real.rows[top], real.x[top], search.first(len(top)), np.ones(3))
     evaluated = len(drawn.rows) + starts * STEPS + search.evaluated
@@ -273,7 +274,7 @@ def size(
     everything, by_motor = free + real, dict[str, Found]()
     for k in np.argsort(search.cost(everything)):
         name = chosen.drives[choice.drive[everything.rows[k]]].motor.name
-        if name not in by_motor:  # a design is a robot to build, and these are a thousand
+        if name not in by_motor:  # building a robot takes time, and there are a thousand designs
             by_motor[name] = found(everything, int(k))
     good = [k for k in range(len(real.rows)) if np.all(real.g[k][kept] >= 0)]
     different: dict[tuple[int, int], int] = {}
@@ -291,8 +292,13 @@ def size(
 
 @dataclasses.dataclass(frozen=True)
 class _Designs:
-    """Designs: rows of the choice of parts, shape (designs,); logarithms of ratio, radius and cells in parallel,
-    shape (designs, 3); objectives and margins, shapes (designs, objectives) and (designs, limits)."""
+    """Designs with their objectives and margins.
+
+    Attributes:
+        rows: of the choice of parts, shape (designs,).
+        x: logarithms of ratio, radius and cells in parallel, shape (designs, 3).
+        f, g: objectives and margins, shapes (designs, objectives) and (designs, limits).
+    """
 
     rows: np.ndarray
     x: np.ndarray
@@ -307,10 +313,10 @@ class _Designs:
 
 
 def _drawn(problem: Task, choice: Space, costed: bool, rng: np.random.Generator) -> _Designs:
-    """Random designs of every choice of parts: what can be met at all, and where to start.
+    """Random designs of every choice of parts: they show which limits can be met, and give the starts.
 
     Args:
-        costed: whether only drives count whose price is known.
+        costed: True to include only drives with a known price.
     """
     rows = np.repeat(np.arange(len(choice.drive)), TRIES)
     if costed:
@@ -322,10 +328,10 @@ def _drawn(problem: Task, choice: Space, costed: bool, rng: np.random.Generator)
 
 @dataclasses.dataclass
 class _Search:
-    """The steps of a search.
+    """Steps of a search.
 
     Attributes:
-        kept: which limits some design meets; columns: of the objectives; evaluated: designs so far.
+        kept: True for limits that some design meets; columns: of the objectives; evaluated: designs so far.
     """
 
     problem: Task
@@ -339,7 +345,7 @@ class _Search:
         return _Designs(rows, x, *measured(self.problem, self.choice, rows, x))
 
     def first(self, count: int) -> np.ndarray:
-        """Weights of the first objective alone, shape (count, objectives)."""
+        """Weights of only the first objective, shape (count, objectives)."""
         return np.tile(np.eye(len(OBJECTIVES))[self.columns[0]], (count, 1))
 
     def weights(self, starts: int) -> np.ndarray:
@@ -352,21 +358,21 @@ class _Search:
         return weights
 
     def cost(self, designs: _Designs) -> np.ndarray:
-        """What is to be small by the first objective, shape (designs,)."""
+        """Cost by the first objective, shape (designs,)."""
         return _cost(designs.f, designs.g, self.kept, self.first(len(designs.rows)))
 
     def misses(self, drawn: _Designs) -> np.ndarray:
-        """How far designs are from the limits that can be met, shape (designs,)."""
+        """Violation of the limits that can be met, shape (designs,)."""
         return 5 * np.sum(np.maximum(-drawn.g[:, self.kept], 0.0), axis=1)
 
     def refined(self, rows: np.ndarray, x: np.ndarray, weights: np.ndarray, free: np.ndarray) -> _Designs:
-        """Designs after a search on shrinking boxes around them, see `_refine`."""
+        """Designs refined on shrinking boxes around them, see `_refine`."""
         x, count = _refine(self.problem, self.choice, rows, x, self.kept, weights, free)
         self.evaluated += count
         return self.designs(rows, x)
 
     def descended(self, drawn: _Designs, weights: np.ndarray) -> _Designs:
-        """Designs with any ratio and parts of a cell, by gradients from the best of those drawn."""
+        """Designs with any ratio and fraction of a cell, by gradients from the best random ones."""
         choice, misses = self.choice, self.misses(drawn)
         shares = [len(s) for s in np.array_split(np.arange(len(weights)), len(self.columns))]
         picked = [
@@ -399,7 +405,7 @@ class _Search:
 
 
 def _starts(choice: Space, rows: np.ndarray, merit: np.ndarray, count: int) -> np.ndarray:
-    """The best designs to start from: some of each motor, then the best of all, few of one choice."""
+    """Best designs as starts: some of each motor, then the best of all, few of one choice."""
     order = np.argsort(np.where(np.isfinite(merit), merit, 1e9))
     motor = [choice.options.drives[d].motor.name for d in choice.drive]
     taken: list[int] = []
@@ -419,7 +425,7 @@ def _starts(choice: Space, rows: np.ndarray, merit: np.ndarray, count: int) -> n
 
 
 def _cost(f: np.ndarray, g: np.ndarray, kept: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """What is to be small: logarithm of the objective, above any feasible one where a margin is violated."""
+    """Cost of designs: logarithm of the objective; with a violated margin it is above that of any feasible design."""
     value = np.sum(np.where(weights > 0, weights * np.log(np.where(weights > 0, f, 1.0)), 0.0), axis=1)
     short = np.sum(np.maximum(-g[:, kept], 0.0), axis=1)
     return np.where(np.isfinite(value), value + np.where(short > 0, 100 + short, 0.0), 1e6)
@@ -434,7 +440,7 @@ def _refine(
     weights: np.ndarray,
     free: np.ndarray,
 ) -> tuple[np.ndarray, int]:
-    """Designs after a search on shrinking boxes around them, and how many were evaluated.
+    """Designs refined on shrinking boxes around them, and the number of evaluations.
 
     Args:
         free: 1 for continuous numbers that may move.
@@ -455,7 +461,7 @@ def _refine(
 def _real(
     choice: Space, rows: np.ndarray, x: np.ndarray, weights: np.ndarray, order: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Designs near those found with ratios of the sheets and whole cells: the two nearest of each."""
+    """Designs near the given ones with ratios of the sheets and whole cells: the two nearest of each."""
     made: dict[tuple, tuple] = {}
     for k in order:
         drive = choice.options.drives[choice.drive[rows[k]]]
@@ -473,8 +479,8 @@ def _real(
 def _enumerated(
     problem: Task, choice: Space, rows: np.ndarray, kept: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """The best designs of choices with every ratio of their sheets, few whole cells in parallel and three radii, and
-    how many were evaluated."""
+    """Best designs of choices with every ratio of their sheets, few whole cells in parallel and three radii, and
+    the number of evaluations."""
     of_row, points = [], []
     for row in rows:
         low, high = choice.low[row, 1], choice.high[row, 1]
@@ -489,7 +495,7 @@ def _enumerated(
 
 
 def _undominated(f: np.ndarray, among: list[int]) -> list[int]:
-    """Those of which none other is at least as good in both and better in one, by the first objective."""
+    """Pareto front of two objectives, sorted by the first."""
     order = sorted(among, key=lambda k: (f[k, 0], f[k, 1]))
     front: list[int] = []
     for k in order:

@@ -1,4 +1,4 @@
-"""The sheet of requirements: each at the worst corner of its envelope, with margin, and what would meet it."""
+"""Sheet of requirements: each at the worst corner of its envelope, with its margin and changes that would meet it."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from mmrjax.model.quantities import MM
 from mmrjax.model.robot import Robot, cannot_turn
 from mmrjax.model.signals import CONVERGED, STATUSES
 
-#: Values along each axis of an envelope: its ends, and between them where an output may turn.
+#: Number of values along each axis of an envelope: its ends, and between them if an output may have an extremum.
 VALUES = {PAYLOAD: 3, SLOPE: 5, CHARGE: 5, AMBIENT: 2}
-#: Of what a designer can change, the parameters; those of a configuration without its name. `battery.cells` is whole.
+#: Parameters that a designer can change; those of a configuration without its name. `battery.cells` is an integer.
 CELLS = "battery.cells"
 CHANGEABLE = (
     "gearbox.ratio", "gearbox.efficiency_load", "motor.resistance", "motor.torque_constant",
@@ -34,22 +34,22 @@ CHANGEABLE = (
 )  # fmt: skip
 OF_CONFIGURATION = ("mass", "radius", "ground.friction.static", "ground.rolling_resistance", "track.loss_coulomb",
                     "turning.width")  # fmt: skip
-#: The same of what a posture allows.
+#: Parameters that a designer can change for a posture.
 OF_LEVERS = ("running_gear.lever_length", "running_gear.levers.roller")
-#: Bounds within which a change is looked for, beside those of the field: least and greatest multiple of what it is.
+#: Range of a change, in addition to the field's bounds: least and greatest multiple of the present value.
 REACH = (0.1, 10.0)
-#: Values of a parameter in one call, calls along a ladder, and digits that a stated change has.
+#: Values of a parameter in one call, values along a ladder, and digits of a stated change.
 ROWS, LADDER, DIGITS = 32, 24, 4
 
 
 @dataclasses.dataclass(frozen=True)
 class Change:
-    """A change of one parameter, everything else as it is, that meets a requirement.
+    """A change of a single parameter that meets a requirement.
 
     Attributes:
         parameter: by dotted name; before, after: [unit]; unit: of its field.
         gradient: derivative of the quantity by the parameter at the worst corner [unit of quantity / unit].
-        breaks: names of requirements that are met now and would not be.
+        breaks: names of requirements that are met now and would be violated.
     """
 
     parameter: str
@@ -60,7 +60,7 @@ class Change:
     breaks: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """As in `result.json`."""
+        """Entry of `result.json`."""
         return {
             "parameter": self.parameter, "from": self.before, "to": self.after, "unit": self.unit,
             "gradient": self.gradient, "breaks": list(self.breaks),
@@ -69,15 +69,15 @@ class Change:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """A requirement held against a robot.
+    """Result of a requirement for a robot.
 
     Attributes:
-        requirement: as stated, its rating in place.
-        value: of the quantity at the worst corner, in the unit of its name; None where it has none there.
-        margin: by how much it is met, negative where it is missed; None where there is no value.
+        requirement: as stated, with its rating filled in.
+        value: of the quantity at the worst corner, in the unit of its name; None without a value there.
+        margin: to the limit, negative if it is missed; None without a value.
         status: of the worst corner, of `STATUSES`.
         at: the worst corner.
-        change: what single change would meet it, the smallest first; empty where it is met or nothing does.
+        change: single changes that would meet it, the smallest first; empty if it is met or none does.
     """
 
     requirement: Requirement
@@ -89,11 +89,11 @@ class Outcome:
 
     @property
     def met(self) -> bool:
-        """Whether the requirement holds."""
+        """True if the requirement is met."""
         return self.margin is not None and self.margin >= 0
 
     def to_json(self) -> dict[str, Any]:
-        """As in `result.json`."""
+        """Entry of `result.json`."""
         r = self.requirement
         return {
             "name": r.name, "required": r.limit, "sense": r.sense, "value": self.value, "margin": self.margin,
@@ -103,7 +103,7 @@ class Outcome:
 
 
 def rated(robot: Robot, asked: Requirements) -> Requirements:
-    """Requirements with the robot's own ratings where they state no number.
+    """Requirements with the robot's own ratings for those without a number.
 
     Raises:
         BadConfiguration: the robot states no such rating.
@@ -125,12 +125,12 @@ def rated(robot: Robot, asked: Requirements) -> Requirements:
 
 
 def refuse(robot: Robot, asked: Requirements) -> None:
-    """Refuse requirements that no robot of these configurations could be held against.
+    """Refuse requirements that cannot be evaluated for a robot of these configurations.
 
     Raises:
         BadConfiguration: a configuration that the robot does not have; a turn that it cannot make; a posture of a
-            robot that does not state how it stands; an
-            envelope with a slope that the surface does not hold, whatever drives the robot: tan α above μ_s.
+            robot without a stated stance; an envelope with a slope that the surface does not hold, whatever drives
+            the robot: tan α above μ_s.
     """
     for r in asked.each:
         e = r.envelope
@@ -161,9 +161,9 @@ def _configuration(robot: Robot, envelope: Envelope) -> str:
 
 
 def points(robot: Robot, requirement: Requirement) -> Point:
-    """The points of a requirement's envelope: ends of each range and values between, shape (points,).
+    """Points of a requirement's envelope: ends of each range and values between, shape (points,).
 
-    An axis on which the quantity does not depend has one value. The number of points depends on the quantity alone.
+    An axis without influence on the quantity has one value. The number of points depends only on the quantity.
     """
     e, axes = requirement.envelope, requirement.quantity.axes
     ambient = e.ambient_C or (float(robot.motor.temperature_ambient),) * 2
@@ -187,16 +187,16 @@ def points(robot: Robot, requirement: Requirement) -> Point:
 
 
 def _changed(robot: Robot, rated: Ratings, names: tuple[str, ...], theta: Array) -> tuple[Robot, Ratings]:
-    """The robot with parameters from a vector, and its ratings; `battery.cells` is among the latter."""
+    """Robot with parameters from a vector, and its ratings, which include `battery.cells`."""
     values = dict(zip(names, theta, strict=True))
     cells = values.pop(CELLS)
     return params.replace(robot, values), dataclasses.replace(rated, cells=cells)
 
 
 def _unrated(robot: Robot) -> Robot:
-    """The robot with one cell and the ratings that a robot has where none are stated.
+    """Robot with one cell and default ratings.
 
-    Cells and ratings come beside it, as numbers: one program for robots of any.
+    Cells and ratings are separate numbers, so that all robots share one program.
     """
     usual, shaft, gear = type(robot.battery)(), type(robot.motor)(), type(robot.gearbox)()
     limits = ("voltage_charge", "voltage_cutoff", "delay_cutoff", "current_limit", "current_charge")
@@ -246,7 +246,7 @@ def _gradient(robot: Robot, rated: Ratings, names: tuple[str, ...], theta: Array
 
 @dataclasses.dataclass(frozen=True)
 class _Held:
-    """A requirement's quantity over its envelope, as a function of what a designer can change."""
+    """A requirement's quantity over its envelope, as a function of the designer's parameters."""
 
     robot: Robot
     requirement: Requirement
@@ -257,7 +257,7 @@ class _Held:
         return points(self.robot, self.requirement)
 
     def over(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Values in the unit of the name, outcomes, and margins (-inf without value), shape (rows, points)."""
+        """Values in the unit of the name, outcomes, and margins (-inf without a value), shape (rows, points)."""
         r, at, parts = self.requirement, self.at, []
         robot, rated = _unrated(self.robot), ratings(self.robot)
         for first in range(0, len(rows), ROWS):
@@ -277,22 +277,22 @@ class _Held:
 
 
 def _computed(requirement: Requirement) -> str:
-    """Of several names of one quantity the one that it is computed by: one program for both."""
+    """Common name of a quantity with several names, so that these share one program."""
     return "speed_m_s" if requirement.name == "speed_end_of_charge_m_s" else requirement.name
 
 
 def parameters(robot: Robot, configuration: str) -> dict[str, params.Parameter]:
-    """What a designer can change of a robot, by name, cells left out."""
+    """Parameters of a robot that a designer can change, by name, without cells."""
     known = {p.name: p for p in params.walk(robot)}
     names = (*CHANGEABLE, *(f"{configuration}.{n}" for n in OF_CONFIGURATION))
     return {name: known[name] for name in names if name in known}
 
 
 def check(robot: Robot, asked: Requirements, *, changes: bool = True) -> tuple[Outcome, ...]:
-    """Hold a robot against requirements.
+    """Evaluate requirements for a robot.
 
     Args:
-        changes: whether to look for what would meet the missed ones.
+        changes: True to search for changes that would meet the missed ones.
 
     Raises:
         BadConfiguration: see `refuse` and `rated`.
@@ -318,7 +318,7 @@ def _now(held: _Held) -> np.ndarray:
 def _outcome(held: _Held) -> Outcome:
     r = held.requirement
     value, outcome, margin = (x[0] for x in held.over(_now(held)[None]))
-    # A point without value is worse than any; the most of those with the same outcome is at its worst corner.
+    # A point without a value is worse than any; the largest of those with the same outcome is at its worst corner.
     k = int(np.argmin(margin))
     status = STATUSES[outcome[k]]
     counts = np.isfinite(margin[k])
@@ -330,7 +330,7 @@ def _outcome(held: _Held) -> Outcome:
 
 
 def _corner(held: _Held, k: int) -> dict[str, Any]:
-    """A point in the words of a file."""
+    """A point in the names of a file."""
     r, at = held.requirement, held.at
     e = r.envelope
     known = {
@@ -359,7 +359,7 @@ def _with_changes(held: _Held, outcome: Outcome, every: Sequence[_Held], now: Se
     for other, before in zip(every, now, strict=True):
         if other is held or not before.met:
             continue
-        # Another configuration has other names: those that both have are changed.
+        # Another configuration has other names; names in common are changed.
         own = np.tile(_now(other), (len(rows), 1))
         for k, name in enumerate(held.names):
             if name in other.names:
@@ -378,8 +378,11 @@ def _with(held: _Held, name: str, value: float) -> np.ndarray:
 
 
 def _changes(held: _Held, outcome: Outcome) -> list[Change]:
-    """What single changes meet a requirement: direction by the derivative at the worst corner, then the nearest value
-    that meets it at every corner, on a ladder and by division of its interval; each stated value is verified."""
+    """Single changes that meet a requirement.
+
+    The direction is that of the derivative at the worst corner. The nearest value that meets the requirement at every
+    corner is found on a ladder and by division of its interval. Each stated value is verified.
+    """
     now, names = _now(held), held.names
     worst = int(np.argmin(held.over(now[None])[2][0]))
     point = jax.tree.map(lambda x: x[worst], held.at)
@@ -402,7 +405,7 @@ def _changes(held: _Held, outcome: Outcome) -> list[Change]:
         uphill = slopes[k] if np.isfinite(slopes[k]) else 0.0
         if outcome.margin is not None and uphill == 0:
             continue  # the quantity does not depend on it
-        # Where there is no value the derivative says nothing: both ways.
+        # Without a value the derivative is not informative, so both directions are tried.
         ends = (low, high) if outcome.margin is None or uphill == 0 else (high if uphill > 0 else low,)
         options = [v for end in ends if (v := _nearest(held, name, now[k], end)) is not None]
         if options:
@@ -413,7 +416,7 @@ def _changes(held: _Held, outcome: Outcome) -> list[Change]:
 
 
 def _nearest(held: _Held, name: str, begin: float, end: float) -> float | None:
-    """The value of a parameter nearest `begin` towards `end` that meets the requirement, None: there is none."""
+    """Value of a parameter nearest to `begin` towards `end` that meets the requirement; None without one."""
     if begin == end:
         return None
 
@@ -439,7 +442,7 @@ def _nearest(held: _Held, name: str, begin: float, end: float) -> float | None:
         inside = np.flatnonzero(meets(finer))
         k = int(inside[0]) if inside.size else len(finer) - 1
         a, b = (a if k == 0 else finer[k - 1]), finer[k]
-    # As few digits as a person would write, away from where it began; each is tried.
+    # Rounded to few digits, away from `begin`; each rounding is tested.
     for digits in (DIGITS, DIGITS + 2, DIGITS + 4):
         rounded = _rounded(b, digits, up=end > begin)
         if min(begin, end) <= rounded <= max(begin, end) and meets(np.array([rounded]))[0]:
@@ -453,6 +456,6 @@ def _rounded(value: float, digits: int, up: bool) -> float:
 
 
 def counts(outcomes: Sequence[Outcome]) -> Mapping[str, int]:
-    """How many are met and missed."""
+    """Number of met and of missed requirements."""
     met = sum(o.met for o in outcomes)
     return {"met": met, "missed": len(outcomes) - met}
