@@ -165,7 +165,7 @@ def channels_of(robot: Robot | None) -> tuple[Channel, ...]:
 
 
 def axes_of(robot: Robot | None) -> tuple[str, ...]:
-    """Columns of conditions over which curves are fitted for a robot; for None, for the packaged one."""
+    """Columns of conditions that are variables of a robot's curves; for None, of the packaged robot's."""
     axes = Layout.of(robot).axes
     return tuple(c for c in (SPEED, CURRENT, *EVERY_AXIS) if c in axes)
 

@@ -89,7 +89,7 @@ def calibrate(
         population: members of each generation of a search without gradients, which precedes a rollout's search;
             None takes `POPULATION` if parameters are free that `steady` does not read, else 0.
         generations: largest number of generations, None `population.GENERATIONS`; members: file that stores the
-            members run so far, from which the same calibration can resume.
+            members run so far, so that the same calibration can resume.
         seed: random seed of the starts and of all other draws; profiles: True to profile each parameter.
         blocks: kinds of blocks to hold out; True: all that are informative for such data.
             Defaults of these two depend on the kind of data and the fidelity.

@@ -44,7 +44,7 @@ class HeldByPrior(Note):
 
 
 class Pair(NamedTuple):
-    """Two parameters of which the data determine only a combination.
+    """Two parameters that the data determine only in combination.
 
     Attributes:
         one, other: their names; correlation: of their posterior.
@@ -286,7 +286,7 @@ class OffBy(Note):
     """Readings that a robot like this one cannot have.
 
     Attributes:
-        column, unit: of the channel; factor: by which readings are too large (or, below 1, too small).
+        column, unit: of the channel; factor: of the readings over possible ones.
         units: that would make the readings possible; others: columns with the same factor.
         imposed: column of the quantity imposed on the motors.
     """

@@ -60,6 +60,6 @@ def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tup
 
 
 def undetermined(held: Collection[str], pairs: Collection[Pair]) -> tuple[str, ...]:
-    """Names held by priors, without those of a pair, of which the data determine a combination."""
+    """Names held by priors, without names in a pair with a determined combination."""
     paired = {name for pair in pairs for name in (pair.one, pair.other)}
     return tuple(name for name in held if name not in paired)

@@ -65,7 +65,7 @@ class Foresight:
         status: of each row, for the values in the file.
         noise: source of each channel's sd.
         alike: strongly correlated pairs of parameters, with the correlation of their posterior.
-        together: pairs of parameters of which the data determine only a combination.
+        together: pairs of parameters that the data determine only in combination.
         robot: completed from the table, see `preparation.prepare`.
         doubts: notes to look at before a fit.
     """

@@ -200,6 +200,6 @@ def profile(problem: Problem, z: Array, cost: float, about: Identifiability, dat
 
 
 def _ends(at: np.ndarray, root: np.ndarray) -> tuple[float, float]:
-    """Coordinates at which a profile's signed root reaches ∓Z95; its end points if it does not reach them."""
+    """Coordinates where a profile's signed root reaches ∓Z95; its end points if it does not reach them."""
     rising = np.maximum.accumulate(root)
     return float(np.interp(-Z95, rising, at)), float(np.interp(Z95, rising, at))

@@ -1,4 +1,4 @@
-"""Least-squares solver of optimistix for residuals some of which count only if they are positive.
+"""Least-squares solver of optimistix for residuals of two kinds: some count only if they are positive.
 
 The objective is ½ Σ r² over the two-sided residuals and the positive one-sided ones. The solver is
 Levenberg-Marquardt, built from optimistix's parts: a descent that determines which one-sided residuals are positive
@@ -149,7 +149,7 @@ class OneSidedDescent(optx.AbstractDescent[Z, Linearisation, Linearisation]):
 
 
 class OneSidedTrustRegion(optx.ClassicalTrustRegion):
-    """Classical trust region (Conn, Gould, Toint 2000, alg. 6.1.1) for residuals some of which are one-sided."""
+    """Classical trust region (Conn, Gould, Toint 2000, alg. 6.1.1) for partly one-sided residuals."""
 
     high_cutoff: float = NEARLY_ALL
     low_cutoff: float = LITTLE
@@ -200,7 +200,7 @@ class Searching(eqx.Module):
 
 
 class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, Searching]):
-    """Levenberg-Marquardt for residuals some of which are one-sided; evaluates the function once a step.
+    """Levenberg-Marquardt for partly one-sided residuals; evaluates the function once a step.
 
     A step is rejected, and the next one shortened, if the objective falls by less than `LITTLE` of the prediction.
     The next one may be longer if it falls by `NEARLY_ALL` of it. A `mixed_step` has to leave the same one-sided

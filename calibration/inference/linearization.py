@@ -212,7 +212,7 @@ class Linearization(eqx.Module):
 
     @property
     def points(self) -> int:
-        """Number of points at which a balance may have a defect."""
+        """Number of points where a balance may have a defect."""
         return self.rows
 
     def at_points(self, rows: np.ndarray) -> np.ndarray:
@@ -241,7 +241,7 @@ class Linearization(eqx.Module):
         return (mine[:, :, None] * shapes[:, None, :]).reshape(-1, shapes.shape[1])
 
     def places(self) -> np.ndarray:
-        """Indices of the rows at which a defect of a single row is identifiable."""
+        """Indices of the rows with an identifiable defect of a single row."""
         raise NotImplementedError
 
     def variable(self, name: str) -> np.ndarray:

@@ -40,7 +40,7 @@ class Starts:
     Attributes:
         cost: objective of each [½σ²], shape (starts,).
         converged: True for converged searches.
-        infeasible: number of starts at which some row slides or fails.
+        infeasible: number of starts where some row slides or fails.
         z: end of each search, shape (starts, parameters); None if not kept.
     """
 
@@ -246,7 +246,7 @@ def _ended(found: fit.Optimum, feasible: np.ndarray) -> Starts:
 
 
 def _settling(posed: Problem, noise: Noise, z: np.ndarray, shares: np.ndarray) -> np.ndarray | None:
-    """New estimates of the shares at z; None if there are none to estimate or they have settled."""
+    """New estimates of the shares at z; None without unknown noise, or if the shares have settled."""
     if not noise.estimated.any():
         return None
     new = _shares(posed, noise, z)

@@ -20,7 +20,7 @@ ALIKE = 1.3
 
 
 def noise_factors(fit: Residuals, level: float = LEVEL) -> dict[str, float]:
-    """Factors by which the residuals of each channel exceed its sds, if significant; empty if they have structure.
+    """Ratios of the residuals of each channel to its sds, if significant; empty if they have structure.
 
     Structure is tested with sds estimated from the misfit, so that it does not depend on the stated ones.
 

@@ -150,7 +150,7 @@ def saved_members(file: Path) -> tuple[str, list[np.ndarray]]:
 
 
 class Members:
-    """Runs members and stores their results, optionally in a file from which a search can resume.
+    """Runs members and stores their results, optionally in a file, so that a search can resume.
 
     Args:
         posed: the problem; file: of members; together: number of members in one batch, None takes `TOGETHER`.
@@ -234,8 +234,8 @@ def objective(posed: Problem, noise: Noise) -> Objective:
     """Objective of members: half the sum of squares of misfit and prior.
 
     If the sd of a channel is unknown, the most probable one for each member is used: n ln s replaces the squares,
-    with s the rms of the errors as shares of the readings. A measured row that a member does not reach costs `LOST`. A
-    member with an included reading that could not be computed costs inf.
+    with s the rms of the errors as shares of the readings. A measured row that a member does not reach costs `LOST`.
+    A member with an included reading that could not be computed costs inf.
     """
     data = posed.data
     weight, measured, sd = np.asarray(data.weight), np.asarray(data.measured), np.asarray(data.sd)
@@ -366,6 +366,7 @@ def edges(coordinates: Coordinates, z: np.ndarray) -> dict[str, Edge]:
 class Searched:
     """Outcome of a search by generations.
 
+    Attributes:
         found: all members; at: index of the best one.
         apart: names of parameters with derivatives of a run that disagree with finite differences.
         slope: of the whitened readings, from the members, if derivatives are unreliable; else None.

@@ -301,8 +301,8 @@ def _drive(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
 def guided(robot: Robot, configuration: str) -> tuple[Robot, dict[str, tuple[float, float]]]:
     """`robot` with the track model's guide share, and the resulting prior of its guide friction.
 
-    The prior is that of the product of friction and share, on which all fidelities agree. Table 4 measured
-    the friction only, and its 0.20 on all of the weight contradicts every measured current.
+    The prior is that of the product of friction and share, because all fidelities agree on the product. Table 4
+    measured the friction only, and its 0.20 on all of the weight contradicts every measured current.
 
     Args:
         configuration: one on tracks.
@@ -427,7 +427,7 @@ def coordinates(
         any_surface: True for the priors of `SURFACE` on ground friction without a stated prior.
 
     Raises:
-        BadConfiguration: a stated prior for an unknown or a fixed parameter, a mean out of bounds, or a free
+        BadConfiguration: a stated prior for an unknown or a fixed parameter; a mean out of bounds; or a free
             parameter with a prior of zero width (nominal value 0 with a relative sd, or stated as exact).
     """
     stated = stated or {}

@@ -44,7 +44,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
     """Refuse readings that no robot like this one has under these conditions; return notes on other doubts.
 
     Each channel's readings are compared with steady travel of the robot in its file, and with a tenth and four times
-    its friction. The comparison is the median factor by which they are outside that range. Of histories, only settled
+    its friction. The result is the median factor between the readings and that range. Of histories, only settled
     ones are compared.
 
     Raises:
@@ -139,7 +139,7 @@ def _rubbing(robot: Robot, factor: float) -> Robot:
 
 
 def _factor(measured: np.ndarray, possible: np.ndarray) -> float:
-    """Median factor by which readings are outside the possible range; 1 inside, or if it cannot be determined.
+    """Median factor between readings and the possible range; 1 inside, or if it cannot be determined.
 
     Args:
         measured: shape (runs,); possible: of several robots, NaN if one does not move, shape (robots, runs).

@@ -110,7 +110,7 @@ class ResidualCluster(Note):
 
 
 def residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, ...]:
-    """Columns without a role by which the residuals of a fit cluster, the most significant first.
+    """Clusters of a fit's residuals by columns without a role, the most significant first.
 
     Args:
         fit: residuals of the fit; of histories the mean of each run is tested.
@@ -150,7 +150,7 @@ def residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, .
 def _coarse_first(
     found: list[tuple[float, _Comparison]], columns: Mapping[str, np.ndarray]
 ) -> list[tuple[float, _Comparison]]:
-    """Findings in the order of their p-values, but each column before those that divide its levels further."""
+    """Findings in the order of their p-values, but with a column before any finer division of its levels."""
     words = {test.column: _words(columns[test.column]) for _, test in found}
     levels = {name for name in words if not _numbers(columns[name])}
     ordered: list[tuple[float, _Comparison]] = []

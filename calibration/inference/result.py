@@ -279,7 +279,7 @@ class CalibrationResult:
         objective: at the optimum [½σ²]; converged: True if the search converged.
         starts: outcome of all searches; searched: the population before them, None without.
         chi_square: of the finite readings; adequacy: tests whether the residuals are consistent with noise.
-        residual_clusters: columns without a role by which residuals cluster.
+        residual_clusters: clusters of the residuals by columns without a role.
         identifiability: the linear analysis; posterior: of the free parameters.
         remarks: notes to read before the result is used.
     """
@@ -333,7 +333,7 @@ class CalibrationResult:
 
     @property
     def together(self) -> tuple[Pair, ...]:
-        """Pairs of parameters of which the data determine only a combination."""
+        """Pairs of parameters that the data determine only in combination."""
         return determined_together(self.posterior, self.held_by_prior)
 
     @property

@@ -208,7 +208,7 @@ def _late(problem: Problem) -> float:
 
 
 def _jumps(observe: Any, run: int) -> np.ndarray:
-    """Times at which an imposed quantity of a run jumps [s]."""
+    """Times of jumps of a run's imposed quantities [s]."""
     conditions, times = observe.conditions, np.asarray(observe.times[run])
     jumps = np.zeros(len(times) - 1, bool)
     imposed = "voltage", "motor_current", "duty", "open", "load_torque", "slope_deg", "payload", "total_mass"

@@ -63,7 +63,7 @@ def _tied(one: Channel, other: Channel, robot: Robot) -> bool:
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
-    """Intercept and slope of a line through all points, within their digits; None if there is none."""
+    """Intercept and slope of a line through all points, within their digits; None without such a line."""
     if len(x) < ROWS or min(len(np.unique(x)), len(np.unique(y))) < LEVELS:
         return None
     slope, intercept = np.polyfit(x - x.mean(), y, 1)

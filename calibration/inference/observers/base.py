@@ -122,7 +122,7 @@ class Observer(eqx.Module):
 
     @classmethod
     def axes_of(cls, runs: Runs) -> tuple[str, ...]:
-        """Columns of a table over which its readings vary."""
+        """Columns of a table that its readings vary with."""
         return (*runs.axes, *([cls.axis] if cls.axis else []))
 
     @classmethod

@@ -168,8 +168,10 @@ def _apart(points: np.ndarray) -> np.ndarray:
 
 
 def _recombined(problem: Problem, points: np.ndarray) -> np.ndarray:
-    """Points with the parameters of each configuration exchanged, so that the k-th has those that fit its runs k-th
-    best; shared parameters are those of the point that fits all runs best."""
+    """Points with the parameters of each configuration exchanged: the k-th point has the k-th best fit of its runs.
+
+    Shared parameters are from the point that fits all runs best.
+    """
     by_run = _misfit_of_runs(problem, points)
     mixed = np.tile(points[int(np.argmin(by_run.sum(1)))], (len(points), 1))
     which = np.asarray(problem.observe.conditions.configuration)
@@ -197,7 +199,7 @@ def _spread(problem: Problem, draws: np.ndarray) -> np.ndarray:
 
 
 def _coordinate(problem: Problem, k: int, value: float) -> float:
-    """Coordinate at which a parameter has a value [SI]."""
+    """Coordinate of a parameter's value [SI]."""
     c = problem.coordinates
     location, spread, scale = (np.asarray(x)[k] for x in (c.location, c.spread, c.scale))
     return float(((np.log(value) if scale else value) - location) / spread)

@@ -681,9 +681,7 @@ class Histories(Observer):
 
         found = searched(starts)
         near = np.asarray(found[0].cost) < np.nanmin(found[0].cost) + NEAR
-        if most is None and np.any(
-            near & ~np.asarray(found[0].converged)
-        ):  # a proposal has to be an optimum
+        if most is None and np.any(near & ~np.asarray(found[0].converged)):  # a proposal has to be an optimum
             found = searched(np.asarray(found[0].z))
         if not rivals or not scans.scanned(problem):
             return found
@@ -762,7 +760,7 @@ def _autocorrelation(linear: Linearization, lags: int) -> dict[str, list[float]]
 
 
 def _changes(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Instants at which the drive of each run's motors jumps [s], and the jumps as shares of its largest value."""
+    """Times of jumps of the drive of each run's motors [s], and the jumps as shares of its largest value."""
     driven, time = applied(runs), runs["time_s"]
     # An imposed speed determines the current; a linear drive does not jump; an unknown drive is refused later.
     known = rig.imposed != "motor_speed" and rig.between_rows == "held" and np.isfinite(driven).all() and driven.any()
@@ -943,7 +941,7 @@ def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) ->
 
 
 def _changed(runs: Runs, rows: np.ndarray, share: float = 0.0) -> np.ndarray:
-    """True for rows of a run at which its drive changes, the motors' supply by more than a share of its largest."""
+    """True for rows of a run with a change of its drive (of the motors' supply: above a share of its largest)."""
     supplied = (runs.layout.imposed_column, SUPPLY, "duty")
     found = differs(rows, (runs[column] for column in changing(runs) if column not in supplied))
     found[1:] |= _jumps(applied(runs)[rows]) > share
