@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibration.data.posterior_file import LOG, NORMAL, Posterior
-from calibration.inference.fit_posterior import determined_together, undetermined
+from calibration.inference.fit_posterior import determined_together, undetermined_names
 from calibration.words.fit_words import determined
 
 
@@ -46,4 +46,4 @@ def test_a_pair_that_priors_hold_or_that_hardly_trades_is_none():
     assert determined_together(posterior(0.99, (LOG, LOG)), held=("a", "b")) == ()
     (pair,) = determined_together(posterior(0.99, (LOG, LOG)), held=("a",))  # b is known by the prior of a
     assert determined("a", True, (pair,)) == "only with b" and determined("b", False, (pair,)) == "only with a"
-    assert determined("c", True, (pair,)) == "no" and undetermined(("a", "c"), (pair,)) == ("c",)
+    assert determined("c", True, (pair,)) == "no" and undetermined_names(("a", "c"), (pair,)) == ("c",)

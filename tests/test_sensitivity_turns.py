@@ -46,7 +46,7 @@ def test_outputs_of_straight_travel_are_refused_of_turns(name):
 
 def test_turns_have_inputs_of_turns():
     straight, turns = (
-        uncertain_inputs.default_names(ROBOT, ("6T2A",), False, turns=turns) for turns in (False, True)
+        uncertain_inputs.default_input_names(ROBOT, ("6T2A",), False, turns=turns) for turns in (False, True)
     )
     assert {*turns} - {*straight} == {f"6T2A.turning.{n}" for n in ("width", "lateral", "rule", "inertia")}
 

@@ -16,10 +16,10 @@ from calibration.data.effect_file import Library
 from calibration.inference.linearization import (
     ScoredEffect,
     amplitude_of,
-    scored,
+    shape_at,
     shape_of,
     shape_scales,
-    shaped,
+    with_shape_grid,
 )
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem
@@ -87,7 +87,7 @@ def _parts(space: ActiveSet, z: Array) -> tuple[Array, tuple[Array, ...], tuple[
     base, amplitude, shape = space.parts(z)
     held = space.held()
     amplitudes = space.sd * (amplitude @ held)
-    shapes = shaped(space.scales, shape @ held)
+    shapes = shape_at(space.scales, shape @ held)
     return base, params.one_by_one(amplitudes), params.one_by_one(shapes)
 
 
@@ -136,7 +136,7 @@ class ScoredLibrary:
 
 def scored_library(effects: Sequence[Effect]) -> ScoredLibrary:
     """Library of the effects, each at every point of its shape's grid."""
-    grids = tuple(scored(e) for e in effects)
+    grids = tuple(with_shape_grid(e) for e in effects)
     effect = np.repeat(np.arange(len(grids)), [len(s.at) for s in grids])
     return ScoredLibrary(tuple(effects), grids, effect, np.concatenate([s.at for s in grids]))
 

@@ -11,13 +11,13 @@ import numpy as np
 
 from calibration.data.input_errors import BadData
 from calibration.discovery.active_set import CandidateSpace
-from calibration.discovery.dissipation import supplying
+from calibration.discovery.dissipation import supplying_effects
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import Settings
 from calibration.inference import scans
 from calibration.inference.held_out import search_each
 from calibration.inference.linearization import amplitude_of
-from calibration.inference.optimizers import Optimum, observation
+from calibration.inference.optimizers import Optimum, observe_at
 from calibration.inference.problem import Observation
 from mmrjax.model.signals import SLIDES
 
@@ -72,33 +72,37 @@ class Candidate:
         return frozenset(self.effects)
 
 
-def empty(settings: Settings) -> tuple[str, ...]:
+def empty_slots(settings: Settings) -> tuple[str, ...]:
     """Slots without effects."""
     return ("",) * settings.slots
 
 
-def filled(effects: Sequence[str], settings: Settings) -> tuple[str, ...]:
+def fill_slots(effects: Sequence[str], settings: Settings) -> tuple[str, ...]:
     """Slots with these effects first."""
     return (*effects, *("",) * (settings.slots - len(effects)))
 
 
-def candidate(space: CandidateSpace, active: tuple[str, ...], best: Optimum, settings: Settings) -> Candidate:
+def candidate_of_fit(space: CandidateSpace, active: tuple[str, ...], best: Optimum, settings: Settings) -> Candidate:
     """Candidate from a fit of the effects in its slots."""
     amplitude = settings.width * np.asarray(space.coordinates.parts(best.z)[1])
     spread = settings.width * np.asarray(space.coordinates.parts(best.sd)[1])
     amplitude = np.where([bool(name) for name in active], amplitude, 0.0)
-    size = np.array([_size(space, n, a, settings) if n else 0.0 for n, a in zip(active, amplitude, strict=True)])
-    near = np.array([_size(space, n, s, settings) if n else 0.0 for n, s in zip(active, spread, strict=True)])
+    size = np.array(
+        [_relative_amplitude(space, n, a, settings) if n else 0.0 for n, a in zip(active, amplitude, strict=True)]
+    )
+    near = np.array(
+        [_relative_amplitude(space, n, s, settings) if n else 0.0 for n, s in zip(active, spread, strict=True)]
+    )
     cost = float(best.cost) if np.isfinite(best.cost) else np.inf
     z, sd = np.asarray(best.z), np.asarray(best.sd)
-    supplies = supplying(space, active, amplitude, z) if np.isfinite(cost) else ()
+    supplies = supplying_effects(space, active, amplitude, z) if np.isfinite(cost) else ()
     # An amplitude within an sd of a bound is held by it, unless its sd is as large as the whole plausible range.
     ok = bool(np.all(size + np.where(near < 0.25, near, 0.0) < 1.0)) and not supplies
     nearly = bool(np.all(size < settings.stretched)) and not supplies
     return Candidate(active, z, sd, cost, amplitude, size, ok, nearly, bool(best.converged), supplies)
 
 
-def _size(space: CandidateSpace, name: str, amplitude: float, settings: Settings) -> float:
+def _relative_amplitude(space: CandidateSpace, name: str, amplitude: float, settings: Settings) -> float:
     """An amplitude [prior sds] over the largest plausible one in its direction."""
     spec = amplitude_of(space.library[name]).spec
     unit = spec.prior_sd(0.0)
@@ -149,7 +153,10 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candid
             z, sd = np.concatenate([best.z[: space.free], slots]), np.concatenate([best.sd[: space.free], slots + 1])
             best = dataclasses.replace(best, z=z, sd=sd)
             return BaseFit(
-                candidate(space, empty(settings), best, settings), np.asarray(seen.reading[k]), space, unusable
+                candidate_of_fit(space, empty_slots(settings), best, settings),
+                np.asarray(seen.reading[k]),
+                space,
+                unusable,
             )
         unusable = tuple(sorted({*unusable, *map(int, np.flatnonzero(lost))}))
         space = space.without(lost)
@@ -167,7 +174,7 @@ def _beyond_adhesion(space: CandidateSpace) -> np.ndarray:
     if problem.observe.long:
         return np.zeros(len(space.included), bool)
     ground = [name.endswith("ground.friction.static") for name in problem.coordinates.names]
-    seen = observation(problem, jnp.where(jnp.asarray(ground), ADHESION, 0.0))
+    seen = observe_at(problem, jnp.where(jnp.asarray(ground), ADHESION, 0.0))
     return (np.asarray(seen.status) == SLIDES) & space.included
 
 
@@ -180,7 +187,7 @@ def _base_searches(space: CandidateSpace, settings: Settings, near: Candidate | 
     elif near is not None and observe.long:
         starts = np.stack([near.z[: space.free], np.zeros(space.free)])
         if not near.simulated:
-            starts = scans.placed(space.bare, starts)
+            starts = scans.place_at_minimum(space.bare, starts)
     else:
         starts = observe.starts(space.bare, np.random.default_rng(settings.seed), observe.policy.searches)
     weights = np.repeat(space.weight[None], len(starts), 0)
@@ -205,11 +212,11 @@ def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], setting
         found, _ = search_each(problem, starts, [space.weight] * len(mine), [active[k] for k in mine], most)
         for j, k in enumerate(mine):
             one = jax.tree.map(lambda x: x[j], found)  # noqa: B023
-            made[k] = candidate(space, proposals[k][0], one, settings)
+            made[k] = candidate_of_fit(space, proposals[k][0], one, settings)
     return [made[k] for k in range(len(proposals))]
 
 
-def fit_beside(
+def fit_in_addition(
     space: CandidateSpace, wanted: Sequence[tuple[tuple[str, ...], Candidate, ScoreTable]], settings: Settings
 ) -> list[Candidate]:
     """Fit effects in addition to those of another fit, from the starts that their scores give.
@@ -221,9 +228,9 @@ def fit_beside(
     Args:
         wanted: (active effects, the other fit, scores of its residuals); all of its effects are active.
     """
-    found = fit_candidates(space, [(w, start(space, at, w, settings, by)) for w, at, by in wanted], settings)
+    found = fit_candidates(space, [(w, start_of_fit(space, at, w, settings, by)) for w, at, by in wanted], settings)
     stuck = [k for k, (_, at, _) in enumerate(wanted) if not found[k].cost <= at.cost + STUCK]
-    again = [(k, start(space, wanted[k][1], wanted[k][0], settings)) for k in stuck]
+    again = [(k, start_of_fit(space, wanted[k][1], wanted[k][0], settings)) for k in stuck]
     for k in sorted(range(len(found)), key=lambda k: found[k].cost)[:1]:
         again.append((k, np.where(np.arange(len(found[k].z)) < space.free, 0.0, found[k].z)))
     others = fit_candidates(space, [(wanted[k][0], z) for k, z in again], settings)
@@ -232,7 +239,7 @@ def fit_beside(
     return found
 
 
-def start(
+def start_of_fit(
     space: CandidateSpace,
     at: Candidate,
     active: tuple[str, ...],

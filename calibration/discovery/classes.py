@@ -9,12 +9,12 @@ import numpy as np
 
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
-from calibration.discovery.candidates import Candidate, fit_candidates, start
+from calibration.discovery.candidates import Candidate, fit_candidates, start_of_fit
 from calibration.discovery.score_tests import ScoreTable
-from calibration.discovery.screening import ranked
+from calibration.discovery.screening import fit_by_regression
 from calibration.discovery.search import without_each
 from calibration.discovery.settings import Settings
-from calibration.discovery.stated_values import Shift, shifts
+from calibration.discovery.stated_values import Shift, find_prior_shifts
 
 #: Number of effects that are tried in place of each one.
 TRIED = 16
@@ -46,7 +46,7 @@ class Classes:
         return all(len(m) + len(s) == 1 for m, s in zip(self.members, self.stated, strict=True))
 
 
-def cosines(space: CandidateSpace, scores: ScoreTable) -> np.ndarray:
+def signature_cosines(space: CandidateSpace, scores: ScoreTable) -> np.ndarray:
     """Largest |cos| between the projected signatures of two effects, over their shapes; (effects, effects)."""
     cosine, effect, count = np.abs(np.asarray(scores.cosine)), space.library.of, len(space.library)
     whole = np.zeros((count, count))
@@ -54,7 +54,7 @@ def cosines(space: CandidateSpace, scores: ScoreTable) -> np.ndarray:
     return whole
 
 
-def classes(
+def find_classes(
     space: CandidateSpace,
     base: Candidate,
     best: Candidate,
@@ -71,7 +71,7 @@ def classes(
     Args:
         left: diagnosis of the base; after: diagnosis of the best fit.
     """
-    cosine, names = cosines(space, left.scores), space.library.names
+    cosine, names = signature_cosines(space, left.scores), space.library.names
     fewer = [base] if len(best.effects) == 1 else without_each(space, best, settings, ladder)
     gains = [2 * (c.cost - best.cost) for c in fewer]
     wanted: list[tuple[int, str, tuple[str, ...]]] = []
@@ -85,12 +85,12 @@ def classes(
     new = [active for _, _, active in wanted if frozenset(n for n in active if n) not in known]
     fitted = []
     if space.bare.observe.long:
-        fitted = ranked(space, [(w, best, after) for w in new], settings)
+        fitted = fit_by_regression(space, [(w, best, after) for w in new], settings)
         known |= {c.key: c for c in fitted}
         # Possible members of the class are simulated if the program of the fits includes them.
         new = [c.active for c in fitted if 2 * (c.cost - best.cost) < max(NEAR, FAR * max(gains))]
         new = [active for active in new if {n for n in active if n} <= {*space.room, *best.effects}]
-    wanted_fits = [(w, start(space, best, w, settings, left.scores)) for w in new]
+    wanted_fits = [(w, start_of_fit(space, best, w, settings, left.scores)) for w in new]
     fitted += fit_candidates(space, wanted_fits, settings)
     known |= {c.key: c for c in fitted if c.simulated}
     members, stated = [], []
@@ -108,14 +108,14 @@ def classes(
                 same.append(other)
         members.append(tuple(same))
         linear = left.linear if len(best.effects) == 1 else None
-        found = shifts(space, fewer[slot], SURE * gain, settings, linear)
+        found = find_prior_shifts(space, fewer[slot], SURE * gain, settings, linear)
         stated.append(tuple(s for s in found if 2 * (s.fit.cost - best.cost) <= within[settings.form]))
     by_regression = [c for c in (*ladder, *fitted) if not c.simulated and c.key not in known]
     latest = {c.key: c for c in by_regression} | {k: c for k, c in known.items() if not c.simulated}
     whole = (*latest.values(), *(c for c in (*ladder, *fitted) if c.simulated))
-    return Classes(tuple(members), tuple(stated), tuple(families(space, same) for same in members), whole)
+    return Classes(tuple(members), tuple(stated), tuple(families_of_members(space, same) for same in members), whole)
 
 
-def families(space: CandidateSpace, members: Sequence[str]) -> tuple[str, ...]:
+def families_of_members(space: CandidateSpace, members: Sequence[str]) -> tuple[str, ...]:
     """Families of the members of a class, the leader's first."""
     return tuple(dict.fromkeys(space.library[m].family() for m in members))

@@ -40,7 +40,7 @@ class Cluster:
     p: float
 
 
-def cluster(
+def find_cluster(
     outliers: np.ndarray,
     included: np.ndarray,
     axes: Mapping[str, np.ndarray],
@@ -59,7 +59,7 @@ def cluster(
     mine = np.flatnonzero(outliers)
     if len(mine) < FEWEST:
         return None
-    found = [_along(name, np.asarray(x, float), mine, pool, seed) for name, x in axes.items()]
+    found = [_cluster_along_axis(name, np.asarray(x, float), mine, pool, seed) for name, x in axes.items()]
     found += [c for name, x in levels.items() for c in _at_levels(name, np.asarray(x), mine, pool)]
     if not found:
         return None
@@ -68,7 +68,7 @@ def cluster(
     return dataclasses.replace(best, p=p) if p < error else None
 
 
-def _along(name: str, x: np.ndarray, mine: np.ndarray, pool: np.ndarray, seed: int) -> Cluster:
+def _cluster_along_axis(name: str, x: np.ndarray, mine: np.ndarray, pool: np.ndarray, seed: int) -> Cluster:
     """The fullest window of an axis, compared with random draws of as many rows."""
     low, high = x[pool].min(), x[pool].max()
     random = np.random.default_rng(seed)
@@ -76,8 +76,8 @@ def _along(name: str, x: np.ndarray, mine: np.ndarray, pool: np.ndarray, seed: i
     found: list[Cluster] = []
     for share in WINDOWS:
         width = share * (high - low)
-        count, first = _fullest(x[mine][None], width)
-        null, _ = _fullest(x[drawn], width)
+        count, first = _fullest_window(x[mine][None], width)
+        null, _ = _fullest_window(x[drawn], width)
         p = (1 + int(np.sum(null >= count[0]))) / (1 + PERMUTATIONS)
         if p == 1 / (1 + PERMUTATIONS):  # beyond the resolution of permutations: a normal approximation
             p = min(p, float(ndtr((null.mean() - count[0]) / max(null.std(), 0.3))))
@@ -87,7 +87,7 @@ def _along(name: str, x: np.ndarray, mine: np.ndarray, pool: np.ndarray, seed: i
     return dataclasses.replace(best, p=min(1.0, best.p * len(WINDOWS)))
 
 
-def _fullest(x: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+def _fullest_window(x: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
     """Largest number of places within a window of a width, for each set, and the start of that window."""
     x = np.sort(x, 1)
     inside = np.stack([np.searchsorted(row, row + width, side="right") - np.arange(len(row)) for row in x])

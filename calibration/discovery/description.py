@@ -17,7 +17,7 @@ from calibration.inference.noise import UNSTATED, Noise
 MENDED = 0.05
 
 
-def undescribed(
+def undescribed_channels(
     space: CandidateSpace, runs: Runs, noise: Noise, refit: Linearization, found: Linearization | None = None
 ) -> tuple[Missed, ...]:
     """Channels that the refit misses by more than `UNDESCRIBED` of their rms, or with estimated noise that large.
@@ -29,9 +29,9 @@ def undescribed(
         refit, found: the fits without and with effects, linearised; None without effects.
     """
     stated = np.array([source not in UNSTATED for source in noise.source])
-    share, sigma = _missed(space, runs, noise, refit)
+    share, sigma = _error_shares(space, runs, noise, refit)
     large = (share > UNDESCRIBED) & ~(stated & (sigma <= EXPLAINED))
-    if large.any() and found is not None and np.nanmax(_missed(space, runs, noise, found)[0]) < MENDED:
+    if large.any() and found is not None and np.nanmax(_error_shares(space, runs, noise, found)[0]) < MENDED:
         large[:] = False
     counts = space.weight[: len(runs)] > 0
     measured = np.where(counts, runs.measured(), np.nan)
@@ -45,7 +45,9 @@ def undescribed(
     )
 
 
-def _missed(space: CandidateSpace, runs: Runs, noise: Noise, fit: Linearization) -> tuple[np.ndarray, np.ndarray]:
+def _error_shares(
+    space: CandidateSpace, runs: Runs, noise: Noise, fit: Linearization
+) -> tuple[np.ndarray, np.ndarray]:
     """rms error of each channel over its measured rms [-], and in sds [σ], over included readings; 0 without any."""
     rows = len(runs)
     counts = space.weight[:rows] > 0
@@ -55,7 +57,7 @@ def _missed(space: CandidateSpace, runs: Runs, noise: Noise, fit: Linearization)
     return error / np.maximum(size, 1e-300), np.sqrt(np.sum(off**2, 0) / np.maximum(counts.sum(0), 1))
 
 
-def unused(runs: Runs) -> tuple[str, ...]:
+def unused_inputs(runs: Runs) -> tuple[str, ...]:
     """Columns of numbers that vary and have no role, and an output torque that a brake may impose."""
-    torques = (f"{note.theirs} as a condition" for note in unused_room.no_load_gives(runs))
+    torques = (f"{note.theirs} as a condition" for note in unused_room.unexplained_torque_notes(runs))
     return (*unused_room.unused_columns(runs), *torques)

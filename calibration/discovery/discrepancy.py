@@ -20,11 +20,11 @@ from jaxtyping import Array, Float
 from calibration.discovery.active_set import ActiveSet, CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
-from calibration.discovery.formula import Proposal, propose
+from calibration.discovery.formula import Proposal, propose_formula
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.projection import Defect, Projection, defect
-from calibration.discovery.score_tests import diagnosed
-from calibration.discovery.smooth import Smooth, smooth
+from calibration.discovery.projection import Defect, Projection, defect_by_row
+from calibration.discovery.score_tests import diagnose_fit
+from calibration.discovery.smooth import Smooth, smooth_curve
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.held_out import search_each
@@ -53,7 +53,7 @@ ALIKE = 1.0
 # --- location -------------------------------------------------------------------------------------------
 
 
-def locate(left: Diagnosis, bases: Bases, included: np.ndarray) -> DiscrepancyLocation:
+def locate_discrepancy(left: Diagnosis, bases: Bases, included: np.ndarray) -> DiscrepancyLocation:
     """Location of a discrepancy: place, variable, and the places that are indistinguishable.
 
     The place is that of the most significant curve. The variable is that of the curve with most evidence there.
@@ -61,37 +61,37 @@ def locate(left: Diagnosis, bases: Bases, included: np.ndarray) -> DiscrepancyLo
     Args:
         left: diagnosis of a fit; included: True for included rows, shape (rows,).
     """
-    names = bases_room.names(bases)
+    names = bases_room.family_names(bases)
     deviate, explained = np.asarray(left.scores.curve), np.asarray(left.scores.explained)
-    happens = np.array([bases_room.window(n[1]) is not None for n in names])
+    happens = np.array([bases_room.window_from_name(n[1]) is not None for n in names])
     # A smooth curve responds to a temporary change too, and a window to a smooth curve.
     for_a_while = bool(np.max(deviate[happens], initial=-np.inf) > np.max(deviate[~happens]) + ALIKE)
     those = [j for j in range(len(names)) if happens[j] == for_a_while]
     k = max(those, key=lambda j: deviate[j])
     # A balance takes precedence over an instrument with a similar score, which is listed as an alternative.
-    lacks = [j for j in those if not bases_room.in_readings(names[j][0]) and deviate[j] > deviate[k] - ALIKE]
+    lacks = [j for j in those if not bases_room.is_channel_place(names[j][0]) and deviate[j] > deviate[k] - ALIKE]
     k = max(lacks, key=lambda j: deviate[j]) if lacks else k
     place = names[k][0]
     over = [j for j in those if names[j][0] == place and names[j][1] != bases_room.CONDITIONS]
     j = k if for_a_while else max(over, key=lambda j: deviate[j])
     if names[j][1] in bases_room.VARIABLES:
-        smoothly = [i for i in over if bases_room.window(names[i][1]) is None]
-        evidence = {i: smooth(left.linear, *names[i], included).evidence for i in smoothly}
+        smoothly = [i for i in over if bases_room.window_from_name(names[i][1]) is None]
+        evidence = {i: smooth_curve(left.linear, *names[i], included).evidence for i in smoothly}
         j = max(smoothly, key=lambda i: evidence[i] - INDIRECT * (names[i][1] == "voltage"))
     every = dict.fromkeys(names[i][0] for i in those)
     best = {b: max(deviate[i] for i in those if names[i][0] == b) for b in every}
     alike = [(b, *bases_room.STANDS_FOR.get(b, ())) for b, d in best.items() if d > deviate[k] - ALIKE]
     variable, strength = names[j][1], float(explained[j])
-    happening = bases_room.window(variable)
+    happening = bases_room.window_from_name(variable)
     if happening is not None and happening.axis in bases_room.AXES:
-        happening, strength = refined(left.linear, place, happening.axis, included)
+        happening, strength = refine_window(left.linear, place, happening.axis, included)
         variable = str(happening)
     strongest = max(strength, float(explained[k]))
-    also = alike_variables(names, deviate, place, variable)
+    also = similar_variables(names, deviate, place, variable)
     return DiscrepancyLocation(place, variable, tuple(itertools.chain(*alike)), also, strength, strongest)
 
 
-def alike_variables(
+def similar_variables(
     names: Sequence[tuple[str, str]], deviate: np.ndarray, place: str, variable: str
 ) -> tuple[str, ...]:
     """Other variables with curves of similar significance in a place, the most significant first."""
@@ -106,11 +106,13 @@ def alike_variables(
 
 def _axis(variable: str) -> str:
     """Key shared by all windows along an axis; a smooth curve has a key of its own."""
-    happens = bases_room.window(variable)
+    happens = bases_room.window_from_name(variable)
     return variable if happens is None else f"{happens.axis} for a while"
 
 
-def refined(linear: Linearization, place: str, axis: str, included: np.ndarray) -> tuple[bases_room.Window, float]:
+def refine_window(
+    linear: Linearization, place: str, axis: str, included: np.ndarray
+) -> tuple[bases_room.Window, float]:
     """Window of an axis that explains most, and its decrease of χ² [σ²].
 
     Windows begin and end at the axis's instants and hold at most half of the rows; those of the tests are coarser.
@@ -124,7 +126,7 @@ def refined(linear: Linearization, place: str, axis: str, included: np.ndarray) 
     edges = at[::merged]
     index = np.searchsorted(edges, x, side="right") - 1
     shapes = (index[:, None] == np.arange(len(edges))) & included[:, None]
-    a, b = Projection(linear)(bases_room.signature(linear, place, way[:, None] * shapes))
+    a, b = Projection(linear)(bases_room.place_signature(linear, place, way[:, None] * shapes))
     sums = np.zeros((len(edges) + 1,) * 2)
     sums[1:, 1:] = a.cumsum(0).cumsum(1)
     pull = np.append(0.0, b.cumsum())
@@ -218,7 +220,7 @@ def fit_discrepancy(
         variable: one of `bases.VARIABLES`, of `bases.ORDERS`, or a window.
     """
     included = space.included
-    at_base = smooth(linear, balance, variable, included)
+    at_base = smooth_curve(linear, balance, variable, included)
     problem = _with_curve(space, base, at_base)
     inner = len(problem.coordinates.base)
     starts = np.zeros((STARTS, len(problem.coordinates)))
@@ -237,7 +239,7 @@ def fit_discrepancy(
         unit=PLACES[balance][0],
         effect=at_base.effect,
         robot=_present(problem.robot(jnp.asarray(z)), space, base, at_base.effect),
-        defect=defect(linear, balance) if space.bare.observe.rows_tell else None,
+        defect=defect_by_row(linear, balance) if space.bare.observe.rows_tell else None,
         grid=grid,
         curve=shape @ z[inner:],
         sd=np.sqrt(np.einsum("ij,jk,ik->i", shape, ordinates, shape)),
@@ -247,14 +249,14 @@ def fit_discrepancy(
         problem=problem,
         reading=np.asarray(seen.reading[k]),
         converged=bool(found.converged[k]),
-        proposal=propose(linear, balance, included, at_base, voltage=space.bare.base.rig.shows_voltage),
+        proposal=propose_formula(linear, balance, included, at_base, voltage=space.bare.base.rig.shows_voltage),
     )
 
 
-def diagnosis_beside(space: CandidateSpace, found: Discrepancy, bases: Bases, left: Diagnosis) -> Diagnosis:
+def diagnose_with_curve(space: CandidateSpace, found: Discrepancy, bases: Bases, left: Diagnosis) -> Diagnosis:
     """Diagnosis of the fit with a curve, with the thresholds of the base, which `left` has."""
     z, effects = jnp.asarray(found.z), space.library.scored
-    linear, scores, strongest = diagnosed(found.problem, z, effects, bases, near=left.linear)
+    linear, scores, strongest = diagnose_fit(found.problem, z, effects, bases, near=left.linear)
     return Diagnosis(linear, scores, AdequacyTest(strongest, left.test.null, left.test.settings))
 
 
@@ -265,7 +267,7 @@ class CurveBeside:
     Both the verdict and its result may need them.
 
     Attributes:
-        space, base, left, bases: as in `fit_discrepancy` and `diagnosis_beside`.
+        space, base, left, bases: as in `fit_discrepancy` and `diagnose_with_curve`.
     """
 
     space: CandidateSpace
@@ -275,8 +277,8 @@ class CurveBeside:
 
     @functools.cached_property
     def where(self) -> DiscrepancyLocation:
-        """Location, as from `locate`."""
-        return locate(self.left, self.bases, self.space.included)
+        """Location, as from `locate_discrepancy`."""
+        return locate_discrepancy(self.left, self.bases, self.space.included)
 
     @functools.cached_property
     def curve(self) -> Discrepancy:
@@ -286,7 +288,7 @@ class CurveBeside:
     @functools.cached_property
     def diagnosis(self) -> Diagnosis:
         """Diagnosis of the fit with the curve."""
-        return diagnosis_beside(self.space, self.curve, self.bases, self.left)
+        return diagnose_with_curve(self.space, self.curve, self.bases, self.left)
 
 
 def _with_curve(space: CandidateSpace, base: Candidate, curve: Smooth) -> Problem:

@@ -25,7 +25,9 @@ SINK = {
 ROUNDING = 1e-9
 
 
-def supplying(space: CandidateSpace, active: Sequence[str], amplitude: np.ndarray, z: np.ndarray) -> tuple[str, ...]:
+def supplying_effects(
+    space: CandidateSpace, active: Sequence[str], amplitude: np.ndarray, z: np.ndarray
+) -> tuple[str, ...]:
     """Dissipative effects of negative amplitude with a balance that would supply power in an included row.
 
     An effect corrects the law of its balance; a negative one means that the law takes too much. Histories and turns
@@ -37,7 +39,7 @@ def supplying(space: CandidateSpace, active: Sequence[str], amplitude: np.ndarra
     negative = [n for n, a in zip(active, amplitude, strict=True) if n and a <= 0 and space.library[n].dissipative]
     if not negative or space.bare.observe.long:
         return tuple(negative)
-    power = _taken(space.bare.observe, space.problem(active).robot(jnp.asarray(z)))
+    power = _dissipated_power(space.bare.observe, space.problem(active).robot(jnp.asarray(z)))
     if power is None:
         return tuple(negative)
     taken = dict(zip(SINK, np.asarray(power)[:, space.included], strict=True))
@@ -52,7 +54,7 @@ def _dissipates(power: np.ndarray | None) -> bool:
 
 
 @functools.partial(compiled, options=SELDOM)
-def _taken(observe: Observer, robot: Robot) -> Float[Array, "balances rows"] | None:
+def _dissipated_power(observe: Observer, robot: Robot) -> Float[Array, "balances rows"] | None:
     """Power that each balance of `SINK` takes in each row [W]; None if rows have no operating point."""
     signals = observe.operating(robot)
     if signals is None:

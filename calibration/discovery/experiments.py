@@ -38,10 +38,10 @@ from calibration.discovery.instructions import (
     TooWeak,
 )
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.reach import Reach, reach_of
+from calibration.discovery.reach import Reach, reach_of_space
 from calibration.discovery.settings import Settings
 from calibration.inference import bases, priors
-from calibration.inference.optimizers import informing
+from calibration.inference.optimizers import informative_residuals
 from calibration.inference.problem import Problem
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.fidelities.steady import IMPLICIT
@@ -79,7 +79,7 @@ class PredictedReadings:
 
     def apart(self, a: int, b: int, *experiments: str) -> float:
         """Expected separation of two alternatives by experiments, all carried out [σ]."""
-        where = predicted.spans(self.experiments)
+        where = predicted.reading_spans(self.experiments)
         spans = [where[e] for e in experiments]
         at = np.concatenate([np.flatnonzero(self.exists[k]) + k.start for k in spans])
         d = self.value[a, at] - self.value[b, at]
@@ -153,7 +153,7 @@ class Proposal:
 # --- alternatives -----------------------------------------------------------------------------------
 
 
-def alternatives(best: Candidate, found: Classes, *, stated: bool = True) -> dict[str, Candidate]:
+def alternatives_of_class(best: Candidate, found: Classes, *, stated: bool = True) -> dict[str, Candidate]:
     """Candidates that the table cannot separate, by the names of their effects; the best fit first.
 
     Args:
@@ -198,15 +198,15 @@ def _predicted(
             return here.robot(base, x[: z.size])
 
         wide = jnp.concatenate([z, jnp.zeros(0 if other is None else len(other))])
-        unknowns, solved = predicted.of_runs(IMPLICIT.solve, robot(wide), batch)
+        unknowns, solved = predicted.map_over_runs(IMPLICIT.solve, robot(wide), batch)
 
         def readings(x: Array) -> tuple[Any, predicted.Predicted]:
-            return predicted.readings(robot(x[: wide.size]), batch, unknowns + x[wide.size :], solved)
+            return predicted.predict_readings(robot(x[: wide.size]), batch, unknowns + x[wide.size :], solved)
 
         (acts, every, left), found = jax.jacfwd(readings, has_aux=True)(
             jnp.concatenate([wide, jnp.zeros(unknowns.shape[1])])
         )
-        slopes = predicted.arranged(batch, [a[:, : wide.size] for a in acts], implicit_slopes(every, left))
+        slopes = predicted.arrange_readings(batch, [a[:, : wide.size] for a in acts], implicit_slopes(every, left))
         half = jnp.concatenate([half_solved(informed.T @ informed, slopes[:, : z.size].T).T, slopes[:, z.size :]], 1)
         exists = found.exists & jnp.all(jnp.isfinite(half), 1) & jnp.isfinite(found.value)
         return dataclasses.replace(found, exists=exists), half
@@ -215,10 +215,10 @@ def _predicted(
 
 
 def _informed(problem: Problem, at: Candidate, active: tuple[int, ...]) -> Array:
-    return problem.observe.at(problem, at.z, active)[1][informing(problem.data)]
+    return problem.observe.at(problem, at.z, active)[1][informative_residuals(problem.data)]
 
 
-def predict(space: CandidateSpace, candidates: Mapping[str, Candidate], settings: Settings) -> PredictedReadings:
+def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], settings: Settings) -> PredictedReadings:
     """Predictions of the menu by these alternatives, with instruments as good as those of the table.
 
     The menu has the experiments within reach of the table that the robots of all alternatives can do and that
@@ -229,18 +229,20 @@ def predict(space: CandidateSpace, candidates: Mapping[str, Candidate], settings
     robot = space.bare.base
     whole = priors.free_names(robot, robot.configurations.names)
     more = [n for n in whole if n not in space.coordinates.base.names]
-    other = priors.coordinates(robot, more) if more else None
+    other = priors.parameter_coordinates(robot, more) if more else None
     equipped, indices = space.fitted_by(c.active for c in those)
     active = jnp.asarray(indices)
     z = jnp.asarray(np.stack([c.z for c in those]))
     informed = jnp.stack([_informed(equipped, c, mine) for c, mine in zip(those, indices, strict=True)])
-    within = reach_of(space, space.bare.robot(jnp.asarray(those[0].z[: space.free])))
-    everything, shown = menu.menu(within), channels.names(space.bare.channels)
-    found, half = jax.device_get(_predicted(equipped, other, predicted.batch(everything, shown), active, z, informed))
+    within = reach_of_space(space, space.bare.robot(jnp.asarray(those[0].z[: space.free])))
+    everything, shown = menu.experiment_menu(within), channels.names(space.bare.channels)
+    found, half = jax.device_get(
+        _predicted(equipped, other, predicted.batch_experiments(everything, shown), active, z, informed)
+    )
     found, half = jax.tree.map(lambda x: np.asarray(x)[: len(names)], (found, half))
     experiments, kept = _possible(everything, found, within, settings)
     medians = np.median(np.asarray(space.equipped.data.sd), 0)
-    sd = predicted.sds(experiments, dict(zip(shown, medians, strict=True)))
+    sd = predicted.reading_sds(experiments, dict(zip(shown, medians, strict=True)))
     value, half = np.nan_to_num(found.value[:, kept]), np.nan_to_num(half[:, kept])
     return PredictedReadings(tuple(names), experiments, value, half, sd, np.all(found.exists, 0)[kept], settings)
 
@@ -258,14 +260,14 @@ def _possible(
     left: list[menu.Experiment] = []
     kept: list[np.ndarray] = []
     for e in experiments:
-        rows = np.ones(predicted.size(e), bool)
+        rows = np.ones(predicted.reading_count(e), bool)
         if isinstance(e, menu.Run):
             at = slice(ends[e.name] - len(e.voltage), ends[e.name])
             grips = np.abs(found.grip[:, at]) < np.where(np.asarray(e.slope) > e.beyond, menu.GRIP, np.inf)
-            done = menu.possible(e, np.all(found.does[:, at] & grips, 0))
+            done = menu.possible_runs(e, np.all(found.does[:, at] & grips, 0))
             if done.any():
                 hot, fast = np.asarray(found.temperature)[0, at], np.asarray(found.speed)[0, at]
-                e = menu.carried_out(e, done, hot, fast, within)
+                e = menu.restrict_run(e, done, hot, fast, within)
             rows = np.repeat(done, len(e.channels))
         if set(e.kinds) & set(settings.forbidden):
             rows = np.zeros(len(rows), bool)
@@ -278,34 +280,34 @@ def _possible(
 # --- the choice -------------------------------------------------------------------------------------
 
 
-def _ranked(seen: PredictedReadings, *experiments: str) -> Ranked:
+def _rank_experiment(seen: PredictedReadings, *experiments: str) -> Ranked:
     pairs = itertools.combinations(range(len(seen.names)), 2)
     sigma = tuple(seen.apart(a, b, *experiments) for a, b in pairs)
     others = zip(seen.names[1:], sigma, strict=False)  # the pairs of the best fit come first
     return Ranked(experiments, sigma, tuple(n for n, s in others if s >= seen.settings.apart), seen.settings)
 
 
-def _use(r: Ranked) -> tuple[bool, float]:
+def _usefulness(r: Ranked) -> tuple[bool, float]:
     """True if it is worth an experiment for any pair, and the expected number of separated pairs."""
     return bool(r.told), float(np.sum(np.minimum(r.chances, r.settings.enough)))
 
 
-def ranked(seen: PredictedReadings) -> tuple[Ranked, ...]:
+def rank_experiments(seen: PredictedReadings) -> tuple[Ranked, ...]:
     """The whole menu by the expected number of separated pairs; ties, within `Settings.enough`, keep the menu's
     order, the least effort first."""
-    return tuple(sorted((_ranked(seen, e.name) for e in seen.experiments), key=_use, reverse=True))
+    return tuple(sorted((_rank_experiment(seen, e.name) for e in seen.experiments), key=_usefulness, reverse=True))
 
 
-def choose(seen: PredictedReadings) -> Proposal:
+def choose_experiment(seen: PredictedReadings) -> Proposal:
     """The experiment of the menu that separates most pairs, with a second one if that adds enough."""
-    table = ranked(seen)
+    table = rank_experiments(seen)
     if not table:
         return Proposal((NONE,), NothingPossible(), (), 0.0, False, ())
     plan = table[0]
     (first,) = plan.experiments
-    both = (_ranked(seen, first, e.name) for e in seen.experiments if e.name != first)
-    more = max(both, key=_use, default=plan)
-    if more.told and (not plan.told or _use(more)[1] > _use(plan)[1] + seen.settings.gain):
+    both = (_rank_experiment(seen, first, e.name) for e in seen.experiments if e.name != first)
+    more = max(both, key=_usefulness, default=plan)
+    if more.told and (not plan.told or _usefulness(more)[1] > _usefulness(plan)[1] + seen.settings.gain):
         plan = more
     if not plan.told:
         return Proposal((NONE,), NothingTells(seen.names, seen.settings.worth), (), 0.0, False, table)
@@ -320,7 +322,7 @@ def choose(seen: PredictedReadings) -> Proposal:
 SERIES, REPEATS = 15, 3
 
 
-def more_runs(place: str, variable: str, within: Reach, by_duty: bool = False) -> MoreRuns:
+def denser_runs_instruction(place: str, variable: str, within: Reach, by_duty: bool = False) -> MoreRuns:
     """Instruction to cover the variable of a curve more densely, within reach of the table."""
     volts = within.voltages
     low, high = (volts[0], volts[-1]) if volts[-1] > volts[0] else (menu.round_significant(0.5 * volts[0]), volts[0])
@@ -335,28 +337,30 @@ def more_runs(place: str, variable: str, within: Reach, by_duty: bool = False) -
     return MoreRuns(place, variable, SERIES, low, high, volts[-1], slope, payload, steps, within, by_duty)
 
 
-def denser(space: CandidateSpace, where: DiscrepancyLocation, settings: Settings) -> Proposal:
+def propose_denser_runs(space: CandidateSpace, where: DiscrepancyLocation, settings: Settings) -> Proposal:
     """Proposal of more runs along the variable of an unnamed discrepancy.
 
     Its expected separation from no discrepancy is the table's χ² per run, times the runs of the series [σ].
     """
-    variable, within = where.variable, reach_of(space)
+    variable, within = where.variable, reach_of_space(space)
     runs = space.bare.observe.runs_counting(space.included)
     sigma = float(np.sqrt(max(where.strongest, 0.0) * SERIES * REPEATS / max(runs, 1)))
     if sigma < settings.worth:
         return Proposal((NONE,), TooWeak(variable, sigma), (), 0.0, False, ())
     name = f"steady speeds for {variable}" if variable in bases.ORDERS else f"finer steps in {variable}"
-    name = name if bases.window(variable) is None else "the same runs again"
-    curve = f"curve of the {bases.in_words(where.place)} over {variable}"
-    return Proposal((name,), more_runs(where.place, variable, within, where.by_duty), (curve,), sigma, False, ())
+    name = name if bases.window_from_name(variable) is None else "the same runs again"
+    curve = f"curve of the {bases.place_in_words(where.place)} over {variable}"
+    return Proposal(
+        (name,), denser_runs_instruction(where.place, variable, within, where.by_duty), (curve,), sigma, False, ()
+    )
 
 
-def no_menu(space: CandidateSpace) -> Proposal:
+def propose_nothing(space: CandidateSpace) -> Proposal:
     """Empty proposal, because the menu has no runs of the table's kind."""
     return Proposal((NONE,), NoMenu(space.bare.observe.word), (), 0.0, False, ())
 
 
-def separating(space: CandidateSpace, best: Candidate, found: Classes, settings: Settings) -> Proposal | None:
+def propose_separating(space: CandidateSpace, best: Candidate, found: Classes, settings: Settings) -> Proposal | None:
     """Experiment that separates the alternatives of a class; None if each effect has one name."""
-    left = alternatives(best, found)
-    return choose(predict(space, left, settings)) if len(left) > 1 else None
+    left = alternatives_of_class(best, found)
+    return choose_experiment(predict_menu(space, left, settings)) if len(left) > 1 else None

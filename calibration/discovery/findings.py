@@ -21,7 +21,7 @@ from calibration.discovery.hidden import Hidden
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import RuledOut
 from calibration.discovery.mechanism import excess_misfit, share_of_excess
-from calibration.discovery.projection import Defect, defect
+from calibration.discovery.projection import Defect, defect_by_row
 from calibration.discovery.result import (
     Alternative,
     BaseShift,
@@ -44,15 +44,15 @@ from calibration.discovery.result import (
 )
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.screening import Beforehand
-from calibration.discovery.search import own_p, without_each
+from calibration.discovery.search import single_p_value, without_each
 from calibration.discovery.settings import Settings
 from calibration.discovery.stated_values import Shift
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
 from calibration.inference import priors
-from calibration.inference.held_out import unseen
+from calibration.inference.held_out import predict_unseen
 from calibration.inference.identifiability import held_by_prior
-from calibration.inference.linearization import Linearization, amplitude_of, shape_of, shape_scales, shaped
+from calibration.inference.linearization import Linearization, amplitude_of, shape_at, shape_of, shape_scales
 from calibration.inference.problem import Observation, Problem
 from calibration.inference.simulation_errors import channel_errors
 from mmrjax.effects import Effect
@@ -60,12 +60,12 @@ from mmrjax.model.balances import BALANCES
 from mmrjax.model.robot import Robot
 
 
-def size_of(effect: Effect) -> float:
+def amplitude_unit(effect: Effect) -> float:
     """One prior sd of an effect's amplitude [its unit]."""
     return amplitude_of(effect).spec.prior_sd(0.0)
 
 
-def equation(effect: Effect) -> tuple[str, str]:
+def equation_and_source(effect: Effect) -> tuple[str, str]:
     """Equation and source of an effect, from its docstring."""
     head, _, source = (inspect.getdoc(type(effect)) or "").partition("Source:")
     return " ".join(head.split()), " ".join(source.split())
@@ -87,7 +87,7 @@ def found_effects(
     listed = []
     for slot, members in enumerate(found.members):
         effect = space.library[members[0]]
-        words, source = equation(effect)
+        words, source = equation_and_source(effect)
         listed.append(
             FoundEffect(
                 name=effect.name,
@@ -99,7 +99,7 @@ def found_effects(
                 equation=words,
                 source=source,
                 parameters=_parameters(space, best, slot, settings),
-                p_value=own_p(gains[slot], null),
+                p_value=single_p_value(gains[slot], null),
                 score=float(gains[slot]),
                 share=share_of_excess(excess, float(gains[slot])),
             )
@@ -109,7 +109,7 @@ def found_effects(
 
 def _parameters(space: CandidateSpace, best: Candidate, slot: int, settings: Settings) -> dict[str, Estimate]:
     effect, p = space.library[best.active[slot]], space.free
-    amplitude, unit = amplitude_of(effect), size_of(effect)
+    amplitude, unit = amplitude_of(effect), amplitude_unit(effect)
     sd = settings.width * best.sd[p + slot] * unit
     held = held_by_prior(best.sd)
     values = {
@@ -125,7 +125,7 @@ def _parameters(space: CandidateSpace, best: Candidate, slot: int, settings: Set
     return values
 
 
-_shaped = jax.jit(jax.value_and_grad(shaped, argnums=1))
+_shaped = jax.jit(jax.value_and_grad(shape_at, argnums=1))
 
 
 def _member(space: CandidateSpace, best: Candidate, found: Classes, slot: int, name: str) -> Member:
@@ -133,7 +133,7 @@ def _member(space: CandidateSpace, best: Candidate, found: Classes, slot: int, n
     wanted = frozenset(name if s == slot else n for s, n in enumerate(best.active)) - {""}
     other = next(c for c in (best, *found.ladder) if c.key == wanted)
     at = other.active.index(name)
-    amplitude = other.amplitude[at] * size_of(space.library[name])
+    amplitude = other.amplitude[at] * amplitude_unit(space.library[name])
     return Member(float(amplitude), float(other.size[at]), float(2 * (other.cost - best.cost)))
 
 
@@ -153,7 +153,7 @@ def _without_each(
     return [2 * (c.cost - best.cost) for c in without_each(space, best, settings, ladder)]
 
 
-def unnamed(
+def unnamed_discrepancy(
     found: Discrepancy, where: DiscrepancyLocation, p_value: float, linear: Linearization, rows: int
 ) -> UnnamedDiscrepancy:
     """Discrepancy of an `unnamed` verdict, over the rows of the table; curve and rows are of one fit.
@@ -161,10 +161,10 @@ def unnamed(
     Args:
         linear: the fit with the curve, linearised.
     """
-    f, lacks, happens = found.proposal, None, bases_room.window(where.variable)
+    f, lacks, happens = found.proposal, None, bases_room.window_from_name(where.variable)
     x, way = linear.in_travel(found.balance, where.variable if happens is None else happens.axis)
     if found.defect is not None:
-        lacks = defect(linear, found.balance)
+        lacks = defect_by_row(linear, found.balance)
         turn = 2 * np.pi if where.variable in bases_room.ORDERS else None
         lacks = Defect(np.interp(x, found.grid, found.curve, period=turn) + way * lacks.value, lacks.sd)
     return UnnamedDiscrepancy(
@@ -186,7 +186,7 @@ def unnamed(
     )
 
 
-def alternatives(
+def listed_alternatives(
     space: CandidateSpace, best: Candidate, cost: float, ladder: Sequence[Candidate], settings: Settings
 ) -> tuple[tuple[Alternative, ...], tuple[Alternative, ...]]:
     """Simulated candidates that explain the data nearly as well as the proposal; and those of implausible size.
@@ -216,7 +216,7 @@ def hidden_effects(space: CandidateSpace, found: Sequence[Hidden]) -> tuple[Hidd
     return tuple(
         HiddenEffect(
             h.name,
-            h.amplitude * size_of(space.library[h.name]),
+            h.amplitude * amplitude_unit(space.library[h.name]),
             amplitude_of(space.library[h.name]).spec.unit,
             h.sigmas,
             h.experiment,
@@ -240,7 +240,7 @@ def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Set
             why.append(RuledOut(name, "size", float(size), tuple(check)))
         elif not c.plausible and size * (1 + sd / max(abs(float(amplitude)), 1e-12)) >= 1:
             why.append(RuledOut(name, "edge"))
-    amplitudes = {name: a * size_of(space.library[name]) for name, a in sds.items()}
+    amplitudes = {name: a * amplitude_unit(space.library[name]) for name, a in sds.items()}
     return Alternative(amplitudes, sds, sizes, float(rise), tuple(why))
 
 
@@ -268,7 +268,7 @@ def next_experiment(proposal: Proposal | None) -> NextExperiment | None:
 # --- the base and the library ---------------------------------------------------------------------------
 
 
-def evidence(test: AdequacyTest, adequate: bool) -> Evidence:
+def evidence_of_test(test: AdequacyTest, adequate: bool) -> Evidence:
     """Strongest statistic of each kind, its critical value, and its p-value among bootstrap tables."""
     kinds = {
         kind: KindOfEvidence(
@@ -289,7 +289,7 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
     z = [np.asarray(x[:p]) for x in (before, after)]
     value = [coordinates.value(np.asarray(x)) for x in (np.zeros(p), *z)]
     slope = np.asarray(coordinates.slope(jnp.asarray(z[1])))
-    fields, held = priors.known(space.bare.base), held_by_prior(sd)
+    fields, held = priors.parameters_by_name(space.bare.base), held_by_prior(sd)
     return {
         name: BaseShift(
             prior=float(value[0][k]),
@@ -317,23 +317,23 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
                 name=effect.name,
                 balance=effect.balance,
                 score=max(explained, 0.0),
-                amplitude=amplitude * size_of(effect),
+                amplitude=amplitude * amplitude_unit(effect),
                 sigmas_per_prior_sd=float(scores.left[m]),
             )
         )
     return tuple(sorted(listed, key=lambda s: (-round(s.score, 9), s.name)))
 
 
-def ranking(space: CandidateSpace, left: Diagnosis, settings: Settings) -> Ranking:
+def rank_library(space: CandidateSpace, left: Diagnosis, settings: Settings) -> Ranking:
     """Ranking of the library by the share of the base's residuals that each single effect would explain."""
     test = left.test
     listed = _ranked(space, left.scores, settings)
     return Ranking(test.rejected, test.p_value, test.threshold("single") ** 2, listed)
 
 
-def ranking_beforehand(space: CandidateSpace, known: Beforehand, settings: Settings) -> Ranking:
+def rank_by_weak_form(space: CandidateSpace, known: Beforehand, settings: Settings) -> Ranking:
     """Ranking by the equations of the log in weak form, before any simulation."""
-    p = own_p(float(np.max(known.scores.single**2)), known.null)
+    p = single_p_value(float(np.max(known.scores.single**2)), known.null)
     chance = float(np.quantile(known.null, 1 - settings.family_wise_error, method="higher")) ** 2
     listed = _ranked(space, known.scores, settings)
     return Ranking(p <= settings.family_wise_error, p, chance, listed, known.windows)
@@ -344,9 +344,10 @@ def _ranked(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tu
     listed = []
     for s in effect_scores(space, scores, settings):
         effect = space.library[s.name]
-        sd = size_of(effect) / max(s.sigmas_per_prior_sd, 1e-300)
+        sd = amplitude_unit(effect) / max(s.sigmas_per_prior_sd, 1e-300)
         unit = amplitude_of(effect).spec.unit
-        supplies = space.bare.observe.long and effect.dissipative and s.amplitude < 0  # as of `dissipation.supplying`
+        # as in `dissipation.supplying_effects`
+        supplies = space.bare.observe.long and effect.dissipative and s.amplitude < 0
         listed.append(Ranked(s.name, effect.family(), unit, s.score, s.amplitude, sd, supplies))
     return tuple(sorted(listed, key=lambda e: e.supplies))
 
@@ -357,12 +358,12 @@ def _plausible_score(
     """Plausible amplitude [prior sds] and the decrease of χ² that it explains [σ²]."""
     m = space.library.best_instance(effect.name, np.asarray(scores.single))
     wanted, left = float(scores.amplitude[m]), float(scores.left[m])
-    low = max(-settings.plausible, amplitude_of(effect).spec.bounds[0] / size_of(effect))
+    low = max(-settings.plausible, amplitude_of(effect).spec.bounds[0] / amplitude_unit(effect))
     amplitude = min(max(wanted, low), settings.plausible)
     return amplitude, float(scores.single[m] ** 2 - ((wanted - amplitude) * left) ** 2)
 
 
-def invisible(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[str, ...]:
+def invisible_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[str, ...]:
     """Effects that the data cannot show: even the largest plausible amplitude changes the readings too little."""
     left = space.library.largest(np.asarray(scores.left))
     return tuple(
@@ -393,7 +394,7 @@ class Fitted:
 HeldOutReadings = dict[str, np.ndarray]
 
 
-def readings(
+def readings_of_rows(
     runs: Runs,
     sd: np.ndarray,
     before: Fitted,
@@ -414,10 +415,10 @@ def readings(
         return np.where(lost, np.nan, np.asarray(found.reading)[:rows])
 
     def left_out(fitted: Fitted, masks: list[np.ndarray]) -> np.ndarray:
-        return unseen(fitted.problem, fitted.z, masks, fitted.active).reading
+        return predict_unseen(fitted.problem, fitted.z, masks, fitted.active).reading
 
     held, labels = {}, {}
-    for kind, by in blocks_room.predictable(runs, before.problem).items():
+    for kind, by in blocks_room.predictable_blocks(runs, before.problem).items():
         masks = list(by.values())
         first = left_out(before, masks) if known_before is None else known_before[kind]
         later = first
@@ -429,7 +430,7 @@ def readings(
     return ReadingsOfRows(runs.measured(), sd[:rows], stated, fitted, later, held, labels)
 
 
-def errors(
+def errors_of_readings(
     problem: Problem, simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray, included: np.ndarray
 ) -> Errors:
     """Errors of each channel [%, and in σ] over the included rows with a simulated value."""

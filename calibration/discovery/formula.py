@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.discovery.projection import Projection
 from calibration.discovery.smooth import Smooth
-from calibration.inference.bases import ORDERS, signature
+from calibration.inference.bases import ORDERS, place_signature
 from calibration.inference.linearization import Linearization
 from mmrjax.effects.curve import PLACES, READINGS
 from mmrjax.model import channels
@@ -93,7 +93,7 @@ class Monomial:
         return " ".join(f"({r.symbol}/{r.value})" + (f"^{p:g}" if p != 1 else "") for r, p in over)
 
 
-def dictionary(ratios: np.ndarray, kinds: tuple[Ratio, ...] = RATIOS) -> dict[Monomial, np.ndarray]:
+def monomial_dictionary(ratios: np.ndarray, kinds: tuple[Ratio, ...] = RATIOS) -> dict[Monomial, np.ndarray]:
     """Monomials that are defined for these ratios, with their values by row.
 
     A root needs ratios that are never negative, an inverse needs ratios away from zero. A ratio that does not vary
@@ -152,7 +152,7 @@ class Proposal:
     mark: str = MARK
 
 
-def propose(
+def propose_formula(
     linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth, *, voltage: bool = True
 ) -> Proposal:
     """Term with the least BIC that explains `MOST` of the curve, or a simpler one without loss of evidence.
@@ -165,16 +165,16 @@ def propose(
         voltage: True for a rig with an imposed or measured voltage.
     """
     if curve.wave:
-        return _harmonic(balance, curve)
+        return _wave_formula(balance, curve)
     if curve.happening:
-        return _while(balance, curve)
+        return _temporary_formula(balance, curve)
     if curve.variable in FADING:
-        return _decay(linear, balance, counts, curve)
+        return _decay_formula(linear, balance, counts, curve)
     counts = linear.at_points(counts)
     known_of = [r for r in RATIOS if voltage or r.of != "voltage"]
     scaled = tuple(r.scaled(r(linear, balance)[counts]) for r in known_of)
     ratios = np.stack([r(linear, balance) for r in scaled], 1)
-    known = dictionary(ratios[counts], scaled)
+    known = monomial_dictionary(ratios[counts], scaled)
     terms = list(known)
     if not terms:  # all runs have the same conditions
         return Proposal("", (), (), (), (), 0.0, 0.0, 0)
@@ -182,9 +182,9 @@ def propose(
     _, way = linear.in_travel(balance, curve.variable)
     for k, value in enumerate(known.values()):
         shapes[counts, k] = way[counts] * value
-    a, b = Projection(linear)(signature(linear, balance, shapes))
+    a, b = Projection(linear)(place_signature(linear, balance, shapes))
     scale = np.sqrt(np.maximum(np.diag(a), 0))
-    visible = scale > 1e-3 * np.linalg.norm(signature(linear, balance, shapes), axis=0)
+    visible = scale > 1e-3 * np.linalg.norm(place_signature(linear, balance, shapes), axis=0)
     scale = np.where(visible, scale, 1.0)
     b = np.where(visible, b / scale, 0.0)
     cost = np.log(3 * counts.sum())
@@ -209,7 +209,7 @@ def propose(
     )
 
 
-def _harmonic(balance: str, curve: Smooth) -> Proposal:
+def _wave_formula(balance: str, curve: Smooth) -> Proposal:
     """Formula of a wave."""
     sine, cosine = curve.scale * curve.root @ curve.start
     size, phase = float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
@@ -220,7 +220,7 @@ def _harmonic(balance: str, curve: Smooth) -> Proposal:
     return Proposal(formula, (), (size,), (float("nan"),), ("angle of the driving shaft",), curve.explained, 0.0, 1)
 
 
-def _while(balance: str, curve: Smooth) -> Proposal:
+def _temporary_formula(balance: str, curve: Smooth) -> Proposal:
     """Formula of a temporary change: its mean."""
     level = float(np.mean((curve.scale * curve.root @ curve.start)[1:-1]))
     formula = f"{SYMBOL[balance]} = {level:.2g} {PLACES[balance][0]} while {curve.variable}"
@@ -228,7 +228,7 @@ def _while(balance: str, curve: Smooth) -> Proposal:
     return Proposal(formula, (), (level,), (float("nan"),), (axis,), curve.explained, 0.0, 1)
 
 
-def _decay(linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth) -> Proposal:
+def _decay_formula(linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth) -> Proposal:
     """Formula of a decay with time or from run to run: an exponential without offset.
 
     Its constant is from a grid over the length of the runs or of the table. The base takes up a constant level.
@@ -239,7 +239,7 @@ def _decay(linear: Linearization, balance: str, counts: np.ndarray, curve: Smoot
     best: tuple[float, tuple] = (np.inf, ())
     project, cost = Projection(linear), np.log(3 * counts.sum())
     for tau in constants:
-        a, b = project(signature(linear, balance, (way * np.exp(-t / tau) * counts)[:, None]))
+        a, b = project(place_signature(linear, balance, (way * np.exp(-t / tau) * counts)[:, None]))
         if a[0, 0] > 0 and 2 * cost - b[0] ** 2 / a[0, 0] < best[0]:
             best = 2 * cost - b[0] ** 2 / a[0, 0], (tau, b[0] / a[0, 0], a[0, 0] ** -0.5)
     if not best[1]:

@@ -16,22 +16,22 @@ def headline(said: Summary, others: Sequence[tuple[float, Summary]] = ()) -> Hea
     """
     every = [said, *(summary for _, summary in others)]
     factors = tuple(sorted([1.0, *(factor for factor, _ in others)]))
-    if len({_silent(s) for s in every}) > 1:
+    if len({_verdict_without_claim(s) for s in every}) > 1:
         return Headline("open", (), factors)
-    if _silent(said):
+    if _verdict_without_claim(said):
         return Headline(said.verdict, (), factors)
-    laws, _ = _common([[m.names for m in s.missing if m.established] for s in every])
+    laws, _ = _shared_claims([[m.names for m in s.missing if m.established] for s in every])
     if laws:
         alone = all(len(names) == 1 for names in laws) and not any(m.values for s in every for m in s.missing)
         return Headline("named" if alone else "class", laws, factors)
-    mechanisms, shared = _common([_mechanisms(s) for s in every])
+    mechanisms, shared = _shared_claims([_mechanisms(s) for s in every])
     if mechanisms:
         return Headline("mechanism", mechanisms, factors, shared)
-    places, shared = _common([_places(s) for s in every])
+    places, shared = _shared_claims([_places(s) for s in every])
     return Headline("place", places, factors, shared)
 
 
-def _silent(said: Summary) -> str:
+def _verdict_without_claim(said: Summary) -> str:
     """Verdict of a table without a claim of a missing effect; empty for other verdicts."""
     return said.verdict if said.verdict in ("none", "undescribed") else ""
 
@@ -50,7 +50,9 @@ def _places(said: Summary) -> list[tuple[str, ...]]:
     return [tuple(dict.fromkeys(f.partition(" that ")[0] for f in those)) for those in families]
 
 
-def _common(claims: Sequence[Sequence[tuple[str, ...]]]) -> tuple[tuple[tuple[str, ...], ...], tuple[int, ...]]:
+def _shared_claims(
+    claims: Sequence[Sequence[tuple[str, ...]]],
+) -> tuple[tuple[tuple[str, ...], ...], tuple[int, ...]]:
     """Claims of the first verdict that share a member with a claim of each other verdict, and their shared members.
 
     Members in all verdicts come first, then any that some noises cannot separate from them. A claim within another

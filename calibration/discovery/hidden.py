@@ -15,10 +15,10 @@ import numpy as np
 from calibration.discovery import experiments
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
-from calibration.discovery.candidates import Candidate, fit_candidates, start
+from calibration.discovery.candidates import Candidate, fit_candidates, start_of_fit
 from calibration.discovery.classes import Classes
 from calibration.discovery.settings import Settings
-from calibration.inference.optimizers import informing, linearised
+from calibration.inference.optimizers import informative_residuals, linearise
 
 #: Rise of the objective up to which a joint fit is as good [σ²]; largest number of reported effects; number of them
 #: with an experiment.
@@ -42,7 +42,7 @@ class Hidden:
     separation: float = 0.0
 
 
-def hidden(
+def find_hidden_effects(
     space: CandidateSpace,
     best: Candidate,
     alike: Classes,
@@ -76,28 +76,30 @@ def hidden(
     found = sorted(found, key=lambda h: -h.sigmas)[:MOST]
     if not ask or len(best.effects) >= settings.slots:
         return tuple(found)
-    return tuple(_shown(space, best, h, after, settings) if k < ASKED else h for k, h in enumerate(found))
+    return tuple(_with_experiment(space, best, h, after, settings) if k < ASKED else h for k, h in enumerate(found))
 
 
-def _shown(space: CandidateSpace, best: Candidate, what: Hidden, after: Diagnosis, settings: Settings) -> Hidden:
+def _with_experiment(
+    space: CandidateSpace, best: Candidate, what: Hidden, after: Diagnosis, settings: Settings
+) -> Hidden:
     """Hidden effect with the experiment that separates the fit with its largest amplitude from the fit without it."""
     slot = best.active.index("")
     active = tuple(what.name if s == slot else n for s, n in enumerate(best.active))
-    (joint,) = fit_candidates(space, [(active, start(space, best, active, settings, after.scores))], settings)
+    (joint,) = fit_candidates(space, [(active, start_of_fit(space, best, active, settings, after.scores))], settings)
     if not np.isfinite(joint.cost):
         return what
     problem = space.problem(active)
-    _, jacobian, _ = linearised(problem, jnp.asarray(joint.z), problem.data)
-    informed = np.asarray(jacobian)[informing(problem.data)]
+    _, jacobian, _ = linearise(problem, jnp.asarray(joint.z), problem.data)
+    informed = np.asarray(jacobian)[informative_residuals(problem.data)]
     covariance = np.linalg.inv(informed.T @ informed)
     k = space.free + slot
     move = what.amplitude / settings.width - joint.z[k]
     z = joint.z + covariance[:, k] / covariance[k, k] * move
     moved = dataclasses.replace(joint, z=z, cost=joint.cost + 0.5 * move**2 / covariance[k, k])
-    seen = experiments.predict(space, {"without": best, "with": moved}, settings)
+    seen = experiments.predict_menu(space, {"without": best, "with": moved}, settings)
     if not seen.experiments:
         return what
-    first = experiments.ranked(seen)[0]
+    first = experiments.rank_experiments(seen)[0]
     if first.smallest < settings.worth:
         return what
     return dataclasses.replace(what, experiment=first.experiments[0], separation=float(first.smallest))

@@ -16,7 +16,7 @@ class Keep(Protocol):
     def __call__(self, name: str, make: Callable[[], T]) -> T: ...
 
 
-def nothing(name: str, make: Callable[[], T]) -> T:
+def keep_nothing(name: str, make: Callable[[], T]) -> T:
     """Computes the result of a stage without storing it."""
     return make()
 

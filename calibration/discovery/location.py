@@ -56,7 +56,7 @@ class DiscrepancyLocation:
     @property
     def channel(self) -> str:
         """The channel with wrong readings, empty for none."""
-        return self.place if bases_room.in_readings(self.place) else ""
+        return self.place if bases_room.is_channel_place(self.place) else ""
 
     @property
     def balances_alike(self) -> tuple[str, ...]:
@@ -66,9 +66,9 @@ class DiscrepancyLocation:
     @property
     def family(self) -> str:
         """Its equation and driver, in the words of `Effect.family`."""
-        happens = bases_room.window(self.variable)
+        happens = bases_room.window_from_name(self.variable)
         variable = self.variable if happens is None else happens.axis
-        what = bases_room.in_words(self.place) if self.channel else EQUATION[self.balance]
+        what = bases_room.place_in_words(self.place) if self.channel else EQUATION[self.balance]
         drivers = {"speed_motor": "speed", "current": "load" if self.balance in OF_LOAD else "current"}
         drivers |= {"payload": "load", "slope": "demand" if self.balance == "slip" else "slope"}
         drivers |= {"voltage": "duty"} if self.by_duty else {}

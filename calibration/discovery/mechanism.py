@@ -26,7 +26,7 @@ from calibration.discovery.standing import chosen_again
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import Bases
-from calibration.inference.held_out import unseen
+from calibration.inference.held_out import predict_unseen
 
 #: Least change of a reading by a mechanism, over the largest rms change of a channel, for it to count [σ over σ].
 CHANGED = 0.5
@@ -36,7 +36,7 @@ BLOCKS = 3
 OF_CURVE = 5.0
 
 
-def mechanism(
+def find_mechanism(
     space: CandidateSpace,
     runs: Runs,
     base: Candidate,
@@ -56,7 +56,7 @@ def mechanism(
         left: diagnosis of the base; ladder: candidates that were fitted; beside: the curve of the discrepancy.
         predicted: known hold-out predictions of fits.
     """
-    ladder = first_simulated(space, base, ladder, settings)
+    ladder = simulate_leading_families(space, base, ladder, settings)
     best, own = _of_one_family(space, ladder), _families_of(beside.where)
     if space.bare.observe.long:  # fits of curves take long
         by_curve = beside.where.explained - OF_CURVE
@@ -71,7 +71,7 @@ def mechanism(
     # Families that the curve cannot separate from its own may predict better by an effect.
     over = [f for f in own if f not in alike and explained[alike[0]] == by_curve]
     by_name = [f for f in (*alike, *over) if f in best and (space.bare.observe.long or by_effects[f] >= HALF * most)]
-    blocks = [mask for by in blocks_room.predictable(runs, space.bare).values() for mask in by.values()]
+    blocks = [mask for by in blocks_room.predictable_blocks(runs, space.bare).values() for mask in by.values()]
     found: list[Mechanism] = []
     excess = excess_misfit(space, base)
     curve = () if space.bare.observe.long or own[0] in by_name or own[0] not in alike else own[:1]
@@ -98,7 +98,7 @@ def mechanism(
     return found[0] if found else None
 
 
-def first_simulated(
+def simulate_leading_families(
     space: CandidateSpace, base: Candidate, ladder: Sequence[Candidate], settings: Settings
 ) -> list[Candidate]:
     """Candidates in which the best one of each family that may explain most is simulated, not a regression."""
@@ -182,7 +182,7 @@ def _of_one_family(space: CandidateSpace, ladder: Sequence[Candidate]) -> dict[s
 
 def _in_equations_alike(family: str, where: DiscrepancyLocation) -> tuple[str, ...]:
     """Family with the same driver in each equation that these data cannot separate from its own."""
-    places = [p for p in where.alike if not bases_room.in_readings(p)]  # instruments are excluded
+    places = [p for p in where.alike if not bases_room.is_channel_place(p)]  # instruments are excluded
     equations = [dataclasses.replace(where, place=p).family.partition(" that ") for p in places]
     what, joint, driver = family.partition(" that ")
     alike = dict.fromkeys(equation for equation, *_ in equations)
@@ -202,11 +202,11 @@ def _families_of(where: DiscrepancyLocation) -> tuple[str, ...]:
 def _gain_of(space: CandidateSpace, runs: Runs, pair: Pair, predicted: Predicted) -> Gain:
     """Hold-out gain by the effects of a mechanism, over the readings that they change."""
     seen, before = (_held_out(space, runs, c, predicted) for c in (pair.having, pair.without))
-    changed = _changed(space, runs, _reading(space, pair.without), _reading(space, pair.having))
-    return _gain(seen, before, changed)
+    changed = _changed_readings(space, runs, _reading(space, pair.without), _reading(space, pair.having))
+    return _gain_over_changed(seen, before, changed)
 
 
-def _gain(score: HeldOutScore, over: HeldOutScore, changed: np.ndarray) -> Gain:
+def _gain_over_changed(score: HeldOutScore, over: HeldOutScore, changed: np.ndarray) -> Gain:
     """Gain of a score, over the readings that a mechanism changes.
 
     Each kind of block omits the same readings, so errors of kinds do not average out. The standard error is the
@@ -231,17 +231,17 @@ def _gain_of_curve(
 
     A curve does not extrapolate.
     """
-    curve, kinds = beside.curve, blocks_room.predictable(runs, space.bare)
-    told = {kind: unseen(curve.problem, curve.z, list(by.values())).reading for kind, by in kinds.items()}
-    changed = _changed(space, runs, _reading(space, base), curve.reading)
+    curve, kinds = beside.curve, blocks_room.predictable_blocks(runs, space.bare)
+    told = {kind: predict_unseen(curve.problem, curve.z, list(by.values())).reading for kind, by in kinds.items()}
+    changed = _changed_readings(space, runs, _reading(space, base), curve.reading)
     score = _scored(space, runs, told)
-    seen = {kind: _seen(space, beside, list(by.values())) for kind, by in kinds.items()}
+    seen = {kind: _within_seen_range(space, beside, list(by.values())) for kind, by in kinds.items()}
     inside = {kind: np.where(seen[kind][:, None], x, np.nan) for kind, x in score.by_kind.items()}
     score = dataclasses.replace(score, by_kind=inside)
-    return _gain(score, _held_out(space, runs, base, predicted), changed)
+    return _gain_over_changed(score, _held_out(space, runs, base, predicted), changed)
 
 
-def _seen(space: CandidateSpace, beside: CurveBeside, masks: Sequence[np.ndarray]) -> np.ndarray:
+def _within_seen_range(space: CandidateSpace, beside: CurveBeside, masks: Sequence[np.ndarray]) -> np.ndarray:
     """True for rows with a curve's variable within the range of the rows outside their block, shape (rows,).
 
     Args:
@@ -262,18 +262,18 @@ def _seen(space: CandidateSpace, beside: CurveBeside, masks: Sequence[np.ndarray
 
 
 def _held_out(space: CandidateSpace, runs: Runs, candidate: Candidate, predicted: Predicted) -> HeldOutScore:
-    known = predicted.get(prediction.key(candidate))
+    known = predicted.get(prediction.candidate_key(candidate))
     if known is not None:
         return _scored(space, runs, known)
-    score = prediction.score_of(space, runs, candidate)
-    predicted[prediction.key(candidate)] = score.reading
+    score = prediction.score_candidate(space, runs, candidate)
+    predicted[prediction.candidate_key(candidate)] = score.reading
     return score
 
 
 def _scored(space: CandidateSpace, runs: Runs, reading: dict[str, np.ndarray]) -> HeldOutScore:
     data, rows = space.equipped.data, len(runs)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
-    return prediction.scored(reading, measured, sd, counts, blocks_room.predictable(runs, space.bare))
+    return prediction.score_readings(reading, measured, sd, counts, blocks_room.predictable_blocks(runs, space.bare))
 
 
 def _reading(space: CandidateSpace, candidate: Candidate) -> np.ndarray:
@@ -288,7 +288,7 @@ def _whitened(space: CandidateSpace, candidate: Candidate) -> np.ndarray:
     return np.where(np.asarray(space.weight) > 0, np.nan_to_num(off), 0.0)
 
 
-def _changed(space: CandidateSpace, runs: Runs, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+def _changed_readings(space: CandidateSpace, runs: Runs, before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """True for readings that a mechanism changes by at least `CHANGED` of the rms of the most changed channel, in
     sds; others would dilute its gain; shape (rows, channels)."""
     rows = len(runs)
@@ -314,7 +314,7 @@ def _curve_again(
 
     1 without such blocks. An informative block leaves half of the information on the curve.
     """
-    linear, names = left.linear, bases_room.names(bases)
+    linear, names = left.linear, bases_room.family_names(bases)
     smooth = [k for k, (_, v) in enumerate(names) if v in bases_room.VARIABLES]
     here = DiscrepancyLocation("", "", (), (), 0.0, 0.0)
     akin = [dataclasses.replace(here, place=names[k][0], variable=names[k][1]).family in families for k in smooth]

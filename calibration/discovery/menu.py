@@ -191,7 +191,7 @@ class _Zero:
         return _show(robot, self.channel, [Signals(current=0.0, voltage=0.0, torque_output=0.0)])
 
 
-def acts(reach: Reach) -> tuple[Act, ...]:
+def calibration_acts(reach: Reach) -> tuple[Act, ...]:
     """Calibration acts, the least effort first, without those of instruments that the table's bench lacks."""
     payload = round_significant(max(u.payloads[-1] for u in reach.used))
     loads = (0.0, payload) if payload > 0 else (0.0,)
@@ -203,10 +203,10 @@ def acts(reach: Reach) -> tuple[Act, ...]:
     weighing = Act("weigh", ("weigh",), _weighed, at, 0.02, repeats=1)
     ammeter = [
         Act("zero current", ("zero current",), _shunted, ((0.0,),), 0.02),
-        Act("shunt", ("shunt",), _shunted, _each(amperes), 0.02),
+        Act("shunt", ("shunt",), _shunted, _one_tuple_each(amperes), 0.02),
     ]
-    strobe = Act("strobe", ("strobe",), _strobed, _each(turning), 5 * RPM)
-    timing = Act("timing", ("timing",), _timed, _each(paces), 3e-3)
+    strobe = Act("strobe", ("strobe",), _strobed, _one_tuple_each(turning), 5 * RPM)
+    timing = Act("timing", ("timing",), _timed, _one_tuple_each(paces), 3e-3)
     found = [weighing] * reach.has_ground
     found += ammeter * ("total_current" in reach.measured)
     meters = [c for c in channels.rows(reach.measured) if c.misses_zero]
@@ -218,7 +218,7 @@ def acts(reach: Reach) -> tuple[Act, ...]:
     return tuple(found)
 
 
-def _each(values: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+def _one_tuple_each(values: Sequence[float]) -> tuple[tuple[float, ...], ...]:
     return tuple((v,) for v in values)
 
 
@@ -281,7 +281,7 @@ def other_torques(used: Sequence[float]) -> tuple[float, ...]:
     return tuple(sorted({*found, floor_significant(levels[-1]) if levels[-1] > 0 else 0.0}))
 
 
-def _travels(reach: Reach, used: Used) -> tuple[Run, ...]:
+def _travel_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
     """Runs with one configuration."""
 
     volts = used.voltages
@@ -309,7 +309,7 @@ def _travels(reach: Reach, used: Used) -> tuple[Run, ...]:
     return tuple(r for r in found if not lacks.get(r.kinds[0], False))
 
 
-def _alone(reach: Reach) -> tuple[Run, ...]:
+def _motor_runs(reach: Reach) -> tuple[Run, ...]:
     """Runs of the motors without the robot."""
     volts = spaced_settings(0.2 * reach.alone, reach.alone, 5)
     stalling = spaced_settings(
@@ -327,19 +327,19 @@ def _alone(reach: Reach) -> tuple[Run, ...]:
     return tuple(r for r in found if reach.motors > 1 or r.sides is None)
 
 
-def menu(reach: Reach) -> tuple[Experiment, ...]:
+def experiment_menu(reach: Reach) -> tuple[Experiment, ...]:
     """Experiments within reach, in the order of their effort, the least first.
 
-    Limits of the robot (steep slopes, low voltages) show only in its predicted readings: see `possible`.
+    Limits of the robot (steep slopes, low voltages) show only in its predicted readings: see `possible_runs`.
     """
     if reach.imposed != "voltage" or not reach.has_ground:
-        runs: tuple[Run, ...] = tuple(r for used in reach.used for r in _turns(reach, used))
+        runs: tuple[Run, ...] = tuple(r for used in reach.used for r in _shaft_runs(reach, used))
     else:
-        runs = (*_alone(reach), *(r for used in reach.used for r in _travels(reach, used)))
-    return (*acts(reach), *(r for r in runs if r.channels))
+        runs = (*_motor_runs(reach), *(r for used in reach.used for r in _travel_runs(reach, used)))
+    return (*calibration_acts(reach), *(r for r in runs if r.channels))
 
 
-def _turns(reach: Reach, used: Used) -> tuple[Run, ...]:
+def _shaft_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
     """Runs of a load on a shaft, or with imposed speed or current: at other levels, and in the other direction."""
     others_of = {"voltage": "other voltages", "motor_speed": "other speeds", "motor_current": "other currents"}
     levels = used.voltages if reach.imposed == "voltage" else reach.levels
@@ -386,7 +386,7 @@ def check_forbidden(forbidden: Sequence[str], robot: Robot) -> None:
 # --- possible experiments -----------------------------------------------------------------------------
 
 
-def possible(run: Run, does: np.ndarray) -> np.ndarray:
+def possible_runs(run: Run, does: np.ndarray) -> np.ndarray:
     """True for runs to carry out: only slopes, voltages and payloads in all combinations that the robot can do.
 
     Args:
@@ -403,12 +403,12 @@ def possible(run: Run, does: np.ndarray) -> np.ndarray:
     return kept
 
 
-def carried_out(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.ndarray, reach: Reach) -> Run:
+def restrict_run(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.ndarray, reach: Reach) -> Run:
     """A run with only its possible conditions, and with the risks to watch.
 
     Args:
-        kept: by `possible`; temperature: of a winding after long running [°C]; speed: of the motor shaft [rad/s];
-            both predicted, shape (runs,).
+        kept: by `possible_runs`; temperature: of a winding after long running [°C]; speed: of the motor shaft
+            [rad/s]; both predicted, shape (runs,).
     """
     voltage, slope, payload, torque = (
         tuple(v for v, k in zip(x, kept, strict=True) if k) if x else ()

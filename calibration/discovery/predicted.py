@@ -67,7 +67,7 @@ class Predicted(eqx.Module):
     speed: Float[Array, " runs"]
 
 
-def batch(experiments: Sequence[Experiment], shown: tuple[str, ...]) -> Batch:
+def batch_experiments(experiments: Sequence[Experiment], shown: tuple[str, ...]) -> Batch:
     """These experiments as one batch, for a robot with these channels."""
     acts = [e for e in experiments if isinstance(e, Act)]
     runs = [e for e in experiments if isinstance(e, Run)]
@@ -98,7 +98,7 @@ def _conditions(run: Run) -> Conditions:
     return Conditions(run.configuration, run.voltage, run.slope, run.payload, total_mass=mass, load_torque=torque)
 
 
-def of_runs(function: Callable[..., T], robot: Robot, experiments: Batch, *own: Array) -> T:
+def map_over_runs(function: Callable[..., T], robot: Robot, experiments: Batch, *own: Array) -> T:
     """`function` of the robot as set up for each run, its conditions, and further values of each run; the leading
     axis is the runs."""
     conditions = experiments.conditions
@@ -120,28 +120,28 @@ def of_runs(function: Callable[..., T], robot: Robot, experiments: Batch, *own: 
     return jax.vmap(function, in_axes=(axes, 0, *[0] * len(own)))(robots, conditions, *own)
 
 
-def readings(
+def predict_readings(
     robot: Robot, experiments: Batch, unknowns: Float[Array, "runs unknowns"], found: Bool[Array, " runs"]
 ) -> tuple[tuple[tuple[Array, ...], Array, Array], Predicted]:
     """Readings of each act, readings of each run at some unknowns, shape (runs, channels), residuals of its equations
     there, (runs, unknowns); and all predictions."""
     acts = tuple(act(robot, at) for act, at in zip(experiments.acts, experiments.at, strict=True))
-    result, _, left = of_runs(IMPLICIT.shown, robot, experiments, unknowns, found)
+    result, _, left = map_over_runs(IMPLICIT.shown, robot, experiments, unknowns, found)
     every = jnp.stack([result.reading[c] for c in channels.names(robot.channels)], -1)
     held = np.array([experiments.set_up[k][0] is setups.blocked for k in experiments.which])
     does = jnp.where(jnp.asarray(held), result.status == STALLED, done(result.status))
-    exists = arranged(
+    exists = arrange_readings(
         experiments, [jnp.ones(a.shape, bool) for a in acts], jnp.broadcast_to(does[:, None], every.shape)
     )
     speed = jnp.where(jnp.asarray(held), 0.0, result.reading["motor_speed"])
     shown = Predicted(
-        arranged(experiments, acts, every), exists, does, jnp.asarray(result.adhesion_used),
+        arrange_readings(experiments, acts, every), exists, does, jnp.asarray(result.adhesion_used),
         jnp.asarray(result.winding_settled), speed,
     )  # fmt: skip
     return (acts, every, left), shown
 
 
-def arranged(experiments: Batch, acts: Sequence[Array], every: Float[Array, "runs channels ..."]) -> Array:
+def arrange_readings(experiments: Batch, acts: Sequence[Array], every: Float[Array, "runs channels ..."]) -> Array:
     """Values of each act, and of each run by channel, in the order of the readings."""
     parts, first = list(acts), 0
     for read, runs in experiments.read:
@@ -153,20 +153,20 @@ def arranged(experiments: Batch, acts: Sequence[Array], every: Float[Array, "run
 # --- positions --------------------------------------------------------------------------------------
 
 
-def size(experiment: Experiment) -> int:
+def reading_count(experiment: Experiment) -> int:
     """Number of readings of an experiment, with repeats averaged."""
     if isinstance(experiment, Act):
         return len(experiment.at)
     return len(experiment.voltage) * len(experiment.channels)
 
 
-def spans(experiments: Sequence[Experiment]) -> dict[str, slice]:
+def reading_spans(experiments: Sequence[Experiment]) -> dict[str, slice]:
     """Slice of each experiment's readings among all readings."""
-    ends = np.cumsum([size(e) for e in experiments]).tolist()
-    return {e.name: slice(end - size(e), end) for e, end in zip(experiments, ends, strict=True)}
+    ends = np.cumsum([reading_count(e) for e in experiments]).tolist()
+    return {e.name: slice(end - reading_count(e), end) for e, end in zip(experiments, ends, strict=True)}
 
 
-def sds(experiments: Sequence[Experiment], of_channels: Mapping[str, float]) -> np.ndarray:
+def reading_sds(experiments: Sequence[Experiment], of_channels: Mapping[str, float]) -> np.ndarray:
     """Sd of each reading [SI], with repeats averaged; runs, and zeros, are read with the instruments of the table.
 
     Args:

@@ -16,7 +16,7 @@ from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate
 from calibration.inference import blocks as blocks_room
-from calibration.inference.held_out import unseen
+from calibration.inference.held_out import predict_unseen
 
 #: Degrees of freedom of Student's t for the score of a reading, so that a single outlier does not decide.
 FREEDOM = 4.0
@@ -70,7 +70,7 @@ class HeldOutScore:
         off = np.nansum(each, (0, 2)) - mean * counts
         several = [by for by in self.blocks.values() if len(np.unique(by[by >= 0])) >= fewest]
         groups = [np.arange(len(rows)), *several]
-        return Gain(mean, max(_error(off[rows], by[rows]) for by in groups) / total)
+        return Gain(mean, max(_clustered_standard_error(off[rows], by[rows]) for by in groups) / total)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Gain:
     errors: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
-def _error(off: np.ndarray, groups: np.ndarray) -> float:
+def _clustered_standard_error(off: np.ndarray, groups: np.ndarray) -> float:
     """Standard error of a sum with terms correlated within groups."""
     _, which = np.unique(groups, return_inverse=True)
     count = which.max() + 1
@@ -94,7 +94,7 @@ def _error(off: np.ndarray, groups: np.ndarray) -> float:
     return float(np.sqrt(np.sum(sums**2) * count / (count - 1))) if count > 1 else 0.0
 
 
-def scored(
+def score_readings(
     reading: dict[str, Readings],
     measured: Readings,
     sd: Readings,
@@ -121,25 +121,25 @@ def scored(
     return HeldOutScore(by_kind, blocks)
 
 
-#: `key` of a candidate → kind of block → hold-out predictions of each row.
+#: `candidate_key` of a candidate → kind of block → hold-out predictions of each row.
 Predicted = dict[tuple[tuple[str, ...], bytes], dict[str, Readings]]
 
 
-def key(candidate: Candidate) -> tuple[tuple[str, ...], bytes]:
+def candidate_key(candidate: Candidate) -> tuple[tuple[str, ...], bytes]:
     """Key of a candidate's hold-out predictions."""
     return candidate.active, np.asarray(candidate.z).tobytes()
 
 
-def score_of(space: CandidateSpace, runs: Runs, candidate: Candidate) -> HeldOutScore:
+def score_candidate(space: CandidateSpace, runs: Runs, candidate: Candidate) -> HeldOutScore:
     """Scores of a candidate, refitted without each block of each kind."""
-    data, rows, kinds = space.equipped.data, len(runs), blocks_room.predictable(runs, space.bare)
+    data, rows, kinds = space.equipped.data, len(runs), blocks_room.predictable_blocks(runs, space.bare)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
     problem, z, active = space.fit_of(candidate.active, candidate.z)
-    reading = {kind: unseen(problem, z, list(by.values()), active).reading for kind, by in kinds.items()}
-    return dataclasses.replace(scored(reading, measured, sd, counts, kinds), reading=reading)
+    reading = {kind: predict_unseen(problem, z, list(by.values()), active).reading for kind, by in kinds.items()}
+    return dataclasses.replace(score_readings(reading, measured, sd, counts, kinds), reading=reading)
 
 
-def smallest(
+def smallest_predictive_set(
     space: CandidateSpace,
     runs: Runs,
     base: Candidate,
@@ -155,12 +155,12 @@ def smallest(
         path: candidates by the number of their effects.
         predicted: collects the hold-out predictions of each.
     """
-    if not blocks_room.predictable(runs, space.bare):
+    if not blocks_room.predictable_blocks(runs, space.bare):
         return None
     candidates = [base, *path]
-    scores = [score_of(space, runs, c) for c in candidates]
+    scores = [score_candidate(space, runs, c) for c in candidates]
     if predicted is not None:
-        predicted |= {key(c): score.reading for c, score in zip(candidates, scores, strict=True)}
+        predicted |= {candidate_key(c): score.reading for c, score in zip(candidates, scores, strict=True)}
     best = scores[max(range(len(scores)), key=lambda k: scores[k].gain(scores[0]).mean)]
     for candidate, score in zip(candidates, scores, strict=True):
         behind = best.gain(score)

@@ -10,15 +10,15 @@ import numpy as np
 from calibration.data.runs import Runs
 from calibration.discovery import experiments
 from calibration.discovery.active_set import CandidateSpace
-from calibration.discovery.candidates import Candidate, fit_candidates, start
-from calibration.discovery.classes import Classes, families
+from calibration.discovery.candidates import Candidate, fit_candidates, start_of_fit
+from calibration.discovery.classes import Classes, families_of_members
 from calibration.discovery.loop_notes import DRAW, Led
 from calibration.discovery.result import Errors, HeldOutAlternative, Worse
-from calibration.discovery.search import Search, diagnose
+from calibration.discovery.search import Search, diagnose_candidate
 from calibration.discovery.settings import HELD_OUT, Settings
 from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import Bases
-from calibration.inference.held_out import unseen
+from calibration.inference.held_out import predict_unseen
 
 #: Least relative difference of hold-out errors that counts; less is invisible in two digits.
 TOLD = 0.01
@@ -27,7 +27,7 @@ TOLD = 0.01
 # --- before and after -----------------------------------------------------------------------------------
 
 
-def worse(
+def worse_predictions(
     readings: Mapping[str, tuple[np.ndarray, np.ndarray]], errors: Callable[[np.ndarray], Errors]
 ) -> tuple[Worse, ...]:
     """Kinds of block and channels with a hold-out error that rises, over the rows that both fits predict.
@@ -50,21 +50,23 @@ def worse(
 # --- among alternatives ---------------------------------------------------------------------------------
 
 
-def compared(space: CandidateSpace, runs: Runs, best: Candidate, alike: Classes) -> tuple[HeldOutAlternative, ...]:
+def compare_alternatives(
+    space: CandidateSpace, runs: Runs, best: Candidate, alike: Classes
+) -> tuple[HeldOutAlternative, ...]:
     """Hold-out errors of a fit and of those with one effect replaced by a member of its class, that fit first.
 
     Members that are not plausible cannot lead, and are omitted. Empty for a single one, or without blocks.
     """
-    others = [c for c in experiments.alternatives(best, alike, stated=False).values() if c.plausible]
+    others = [c for c in experiments.alternatives_of_class(best, alike, stated=False).values() if c.plausible]
     data, rows = space.equipped.data, len(runs)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
-    kinds = blocks_room.predictable(runs, space.bare)
+    kinds = blocks_room.predictable_blocks(runs, space.bare)
     if len(others) < 2 or not kinds:
         return ()
 
     def sigma(c: Candidate, masks: list[np.ndarray]) -> np.ndarray:
         problem, z, active = space.fit_of(c.active, c.z)
-        reading = unseen(problem, z, masks, active).reading
+        reading = predict_unseen(problem, z, masks, active).reading
         return np.where(counts, (reading - measured) / sd, np.nan)
 
     errors = [{kind: sigma(c, list(by.values())) for kind, by in kinds.items()} for c in others]
@@ -93,17 +95,17 @@ def _order(table: Sequence[HeldOutAlternative]) -> list[int]:
 
     The best fit precedes others within `TOLD` of the smallest error, because hold-out errors do not decide there.
     """
-    able = _able(table)
+    able = _full_predictors(table)
     least = min((table[k] for k in able), key=lambda a: a.rms_sigma)
-    return sorted(able, key=lambda k: (k != 0 or not _draw(table[0], least), table[k].rms_sigma))
+    return sorted(able, key=lambda k: (k != 0 or not _is_draw(table[0], least), table[k].rms_sigma))
 
 
-def _able(table: Sequence[HeldOutAlternative]) -> list[int]:
+def _full_predictors(table: Sequence[HeldOutAlternative]) -> list[int]:
     """Indices of alternatives that predict no fewer readings than the first."""
     return [k for k, a in enumerate(table) if a.lost <= table[0].lost]
 
 
-def _draw(a: HeldOutAlternative, b: HeldOutAlternative) -> bool:
+def _is_draw(a: HeldOutAlternative, b: HeldOutAlternative) -> bool:
     """True if hold-out errors do not decide between two."""
     return not a.rms_sigma > (1 + TOLD) * b.rms_sigma
 
@@ -118,26 +120,28 @@ def prefer_by_held_out(
     best, before = searched.best, searched.diagnosis
     if best is None or before is None:
         return searched, alike, ()
-    table = compared(space, runs, best, alike)
+    table = compare_alternatives(space, runs, best, alike)
     if not table:
         return searched, alike, ()
-    fitted = {c.key: c for c in experiments.alternatives(best, alike, stated=False).values()}
+    fitted = {c.key: c for c in experiments.alternatives_of_class(best, alike, stated=False).values()}
     for k in _order(table):
         leader = fitted[frozenset(table[k].effects)]
         if leader is best:
             break
         if not leader.simulated:
             (leader,) = fit_candidates(space, [(leader.active, leader.z)], settings)
-        diagnosis = diagnose(space, leader, bases, before.test.null, settings)
+        diagnosis = diagnose_candidate(space, leader, bases, before.test.null, settings)
         sound = before.test.rejected_with_margin or not diagnosis.test.rejected_with_margin
         if sound:
             led = tuple(dataclasses.replace(a, leads=j == k) for j, a in enumerate(table))
             searched = dataclasses.replace(searched, best=leader, diagnosis=diagnosis)
-            return searched, _led(space, best, leader, alike, settings), led
+            return searched, _classes_of_leader(space, best, leader, alike, settings), led
     return searched, alike, table
 
 
-def _led(space: CandidateSpace, best: Candidate, leader: Candidate, alike: Classes, settings: Settings) -> Classes:
+def _classes_of_leader(
+    space: CandidateSpace, best: Candidate, leader: Candidate, alike: Classes, settings: Settings
+) -> Classes:
     """Classes of another leader, with its effect first in its class; missing members are fitted."""
     members = dict(zip(best.effects, alike.members, strict=True))
     (new,), (old,) = leader.key - best.key, best.key - leader.key
@@ -151,23 +155,23 @@ def _led(space: CandidateSpace, best: Candidate, leader: Candidate, alike: Class
         for other in members[name][1:]
     ]
     missing = [w for w in wanted if frozenset(n for n in w if n) not in known]
-    fitted = fit_candidates(space, [(w, start(space, leader, w, settings)) for w in missing], settings)
+    fitted = fit_candidates(space, [(w, start_of_fit(space, leader, w, settings)) for w in missing], settings)
     return Classes(
         tuple(members[name] for name in leader.effects),
         tuple(stated[name] for name in leader.effects),
-        tuple(families(space, members[name]) for name in leader.effects),
+        tuple(families_of_members(space, members[name]) for name in leader.effects),
         (best, *alike.ladder, *fitted),
     )
 
 
-def remarks(table: Sequence[HeldOutAlternative], prefer: str) -> list[Led]:
+def leader_remarks(table: Sequence[HeldOutAlternative], prefer: str) -> list[Led]:
     """Notes on the choice of the leader, and whether the other criterion would have chosen another."""
     if not table:
         return []
     shared = set.intersection(*(set(a.effects) for a in table))
     leader = next(k for k, a in enumerate(table) if a.leads)
     wins = _order(table)[0]
-    alike = any(_draw(table[k], table[0]) for k in _able(table)[1:])
+    alike = any(_is_draw(table[k], table[0]) for k in _full_predictors(table)[1:])
     return [
         Led(
             tuple(" and ".join(n for n in a.effects if n not in shared) for a in table),

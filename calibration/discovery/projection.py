@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from calibration.inference.bases import signature
+from calibration.inference.bases import place_signature
 from calibration.inference.linearization import Linearization
 
 
@@ -46,7 +46,7 @@ class Defect:
     sd: np.ndarray
 
 
-def defect(linear: Linearization, place: str) -> Defect:
+def defect_by_row(linear: Linearization, place: str) -> Defect:
     """Defect of a place in each row: least squares of the row's residual along its sensitivity.
 
     δ_i = -(r_i·e) / ‖r_i‖², sd 1/‖r_i‖, r_i = (I - P) g_i, g_i the change of all readings by a defect of row i
@@ -55,7 +55,7 @@ def defect(linear: Linearization, place: str) -> Defect:
     places = linear.places()
     shapes = np.zeros((linear.rows, len(places)))
     shapes[places, np.arange(len(places))] = 1.0
-    columns = signature(linear, place, shapes)
+    columns = place_signature(linear, place, shapes)
     a, b = Projection(linear)(columns)
     norm2, whole = np.diag(a), np.sum(columns**2, 0)
     seen = norm2 > 1e-6 * np.maximum(whole, 1e-300)

@@ -100,7 +100,7 @@ def _levels(x: np.ndarray) -> tuple[float, ...]:
     return tuple(np.unique(np.round(x, 6)).tolist())
 
 
-def reach(robot: Robot, conditions: Conditions, measured: tuple[str, ...]) -> Reach:
+def reach_of_table(robot: Robot, conditions: Conditions, measured: tuple[str, ...]) -> Reach:
     """Limits of the next experiments with a table's robot.
 
     Args:
@@ -141,8 +141,8 @@ def reach(robot: Robot, conditions: Conditions, measured: tuple[str, ...]) -> Re
     )  # fmt: skip
 
 
-def reach_of(space: CandidateSpace, robot: Robot | None = None) -> Reach:
+def reach_of_space(space: CandidateSpace, robot: Robot | None = None) -> Reach:
     """Limits of the next experiments with the robot of a space, or with a fitted one if given."""
     weight = space.weight
     measured = tuple(c for k, c in enumerate(channels.names(space.bare.channels)) if weight[:, k].any())
-    return reach(space.bare.base if robot is None else robot, space.bare.observe.driven, measured)
+    return reach_of_table(space.bare.base if robot is None else robot, space.bare.observe.driven, measured)

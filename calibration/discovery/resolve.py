@@ -36,7 +36,7 @@ FRICTION = ("ground.friction.static", "ground.friction.dynamic", "ground.frictio
 POPULATION, GENERATIONS = 128, 20
 
 
-def asked(found: DiscoveryResult) -> Asked | None:
+def question_of_verdict(found: DiscoveryResult) -> Asked | None:
     """Part of a verdict that the running gear could explain; None for none."""
     places = [w for w in (found.unnamed, found.remains) if w is not None]
     for place in places:
@@ -46,13 +46,13 @@ def asked(found: DiscoveryResult) -> Asked | None:
     named = [e.name for e in found.effects if e.balance in BALANCES]
     if named:
         return Asked("found", effects=tuple(named))
-    weighed = [a for a in found.alternatives if any(found_in(name, found) for name in a.effects)]
+    weighed = [a for a in found.alternatives if any(enters_gear_balance(name, found) for name in a.effects)]
     if weighed:
-        return Asked("near", effects=tuple(n for n in weighed[0].effects if found_in(n, found)))
+        return Asked("near", effects=tuple(n for n in weighed[0].effects if enters_gear_balance(n, found)))
     return None
 
 
-def found_in(name: str, found: DiscoveryResult) -> bool:
+def enters_gear_balance(name: str, found: DiscoveryResult) -> bool:
     """True if an effect of the library enters one of `BALANCES`."""
     return any(s.name == name and s.balance in BALANCES for s in found.scores)
 
@@ -63,7 +63,7 @@ def check_resolvable(runs: Runs, members: Path | None = None) -> None:
     Raises:
         BadConfiguration: the data are histories, or the file of members cannot be read.
     """
-    if not observers.kind(runs).rows_tell:
+    if not observers.observer_kind(runs).rows_tell:
         raise BadConfiguration("--resolve: the track model needs settled rows; got time histories")
     if members is not None and members.exists():
         saved_members(members)
@@ -93,7 +93,7 @@ def resolve(
         BadConfiguration: the data are histories.
     """
     check_resolvable(found.runs)
-    reason, robot = asked(found), found.robot
+    reason, robot = question_of_verdict(found), found.robot
     tracked = [name for name, chassis in robot.configurations.items() if float(chassis.on_tracks) > 0.5]
     rows = found.runs.where(found.included & np.isin(found.runs["configuration"], tracked))
     if reason is None or not len(rows):
@@ -144,7 +144,7 @@ def resolve(
 def _noise(found: DiscoveryResult, stated: str | None) -> str | None:
     """Option `noise` of `calibrate` for the loop's sds."""
     assumed = [name for name, about in found.noise.items() if about["source"] == "assumed"]
-    return ",".join(part for part in (stated, noise_room.default(channels.rows(assumed))) if part) or None
+    return ",".join(part for part in (stated, noise_room.default_noise(channels.rows(assumed))) if part) or None
 
 
 def _slip_rms(fitted: CalibrationResult, robot: Robot) -> float:

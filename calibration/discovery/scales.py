@@ -83,12 +83,12 @@ LOADS = (
 SPEEDS = ("speed_motor", "speed_wheel", "speed_theoretical", "speed", "speed_output")
 
 
-def library_for(robot: Robot, conditions: Conditions, library: Library, turned: float = math.nan) -> Library:
+def library_of_size(robot: Robot, conditions: Conditions, library: Library, turned: float = math.nan) -> Library:
     """`library` with priors of a rig's size; unchanged for robots that inherit the nominal one.
 
     Args:
         robot: of the rig; conditions: of its table, shape (runs,).
-        turned: rotation of its output, see `turned_in`; NaN: not known.
+        turned: rotation of its output, see `output_rotation`; NaN: not known.
     """
     if robot.rig.inherits:
         return library
@@ -96,18 +96,20 @@ def library_for(robot: Robot, conditions: Conditions, library: Library, turned: 
     nominal, theirs = _nominal()
     sized = {}
     for name, kind in library.items():
-        if not present(kind, robot):
+        if not effect_applies(kind, robot):
             continue
-        sized[name] = _sized(kind, (robot, _placed(mine, kind, turned)), (nominal, _placed(theirs, kind)))
+        sized[name] = _scale_effect(
+            kind, (robot, _at_position(mine, kind, turned)), (nominal, _at_position(theirs, kind))
+        )
     return sized
 
 
-def nominal_ahead() -> None:
-    """Compute the nominal robot's signals for `library_for` on another core."""
+def precompute_nominal() -> None:
+    """Compute the nominal robot's signals for `library_of_size` on another core."""
     threading.Thread(target=in_double(_nominal), daemon=True).start()
 
 
-def turned_in(runs: Runs, robot: Robot) -> float:
+def output_rotation(runs: Runs, robot: Robot) -> float:
     """Root mean square of the output's angles in a table [rad]; NaN without such a channel."""
     measured = runs.measured()
     for k, channel in enumerate(runs.channels):
@@ -116,7 +118,7 @@ def turned_in(runs: Runs, robot: Robot) -> float:
     return math.nan
 
 
-def _placed(signals: Signals, kind: type[Effect], turned: float | None = None) -> Signals:
+def _at_position(signals: Signals, kind: type[Effect], turned: float | None = None) -> Signals:
     """Signals of an effect that depends on position, at a given angle, or for None at its reference angle."""
     if kind.driver != "position" or kind.memory_size is None:
         return signals
@@ -124,7 +126,7 @@ def _placed(signals: Signals, kind: type[Effect], turned: float | None = None) -
     return dataclasses.replace(signals, memory={**signals.memory, kind.name: at})
 
 
-def present(kind: type[Effect], robot: Robot) -> bool:
+def effect_applies(kind: type[Effect], robot: Robot) -> bool:
     """True if a rig has the balance that an effect enters, and the parts that it needs there."""
     if kind.balance in absent(robot) or (not robot.has_ground and (kind.movers or kind.needs_belt)):
         return False
@@ -171,7 +173,7 @@ def _ratio(mine: float, theirs: float) -> float:
     return mine / theirs if math.isfinite(mine) and math.isfinite(theirs) else 1.0
 
 
-def _sized(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple[Robot, Signals]) -> type[Effect]:
+def _scale_effect(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple[Robot, Signals]) -> type[Effect]:
     """The effect with its priors scaled from one robot to another."""
     effect = kind()
     shape, amplitude = shape_of(effect), amplitude_of(effect)
@@ -194,7 +196,7 @@ def _sized(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple[Robot,
     factor *= SLIPPERY if slips else 1.0 if kind.balance == "mass" else UNKNOWN
     limits = factor
     if kind.balance != "sensor":
-        own, rated = (_unit_share(grown, mine[0], s) for s in (mine[1], _rated(*mine)))
+        own, rated = (_unit_share(grown, mine[0], s) for s in (mine[1], _at_rated_load(*mine)))
         limits = factor * min(1.0, _ratio(own, rated))
     else:
         low, high = amplitude_of(grown).spec.bounds
@@ -202,7 +204,7 @@ def _sized(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple[Robot,
     return scaled(kind, (float(factor), float(stretch), float(limits)))
 
 
-def _rated(robot: Robot, signals: Signals) -> Signals:
+def _at_rated_load(robot: Robot, signals: Signals) -> Signals:
     """Operating points of a rig scaled to the largest load and speed of its motors, never reduced.
 
     That load is at the continuous current, or at a share of the stall current if resistance and voltage are known.

@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from calibration.inference.bases import Bases, signature
+from calibration.inference.bases import Bases, place_signature
 from calibration.inference.linearization import Linearization, ScoredEffect
-from calibration.inference.optimizers import CORES, rooted
+from calibration.inference.optimizers import CORES, with_roots
 from calibration.inference.problem import Problem
 from mmrjax.compile.compiling import SELDOM, SMALL, compiled
 from mmrjax.compile.precision import Threads
@@ -168,7 +168,7 @@ class Statistics(eqx.Module):
     settled: Array
 
 
-def strongest(scores: ScoreTable, linear: Linearization) -> Statistics:
+def strongest_statistics(scores: ScoreTable, linear: Linearization) -> Statistics:
     """Largest statistics of a table; a bootstrap draws their distribution."""
     return Statistics(
         jnp.max(jnp.abs(scores.single)),
@@ -183,7 +183,7 @@ def strongest(scores: ScoreTable, linear: Linearization) -> Statistics:
 Diagnosed = tuple[Linearization, ScoreTable, Statistics]
 
 
-def diagnosed(
+def diagnose_fit(
     problem: Problem, z: Array, effects: tuple[ScoredEffect, ...], bases: Bases, near: Linearization | None = None
 ) -> Diagnosed:
     """A linearised fit, the scores of effects and curves on its residuals, and the strongest of these.
@@ -193,13 +193,13 @@ def diagnosed(
             changes the residuals, but barely the signatures.
     """
     if not problem.observe.long:
-        linear = _linearised(rooted(problem, z), z, effects)
+        linear = _linearised(with_roots(problem, z), z, effects)
     elif near is None:  # by separate programs
         linear = problem.observe.linearise(problem, z, problem.data, effects)
     else:
         residual, jacobian, _ = problem.observe.at(problem, z)
         linear = dataclasses.replace(near, residual=residual, jacobian=jacobian)
-    return linear, *_looked_at(linear, bases)
+    return linear, *_padded_scores(linear, bases)
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -207,7 +207,7 @@ def _linearised(problem: Problem, z: Array, effects: tuple[ScoredEffect, ...]) -
     return problem.observe.linearise(problem, z, problem.data, effects)
 
 
-def _looked_at(linear: Linearization, bases: Bases) -> tuple[ScoreTable, Statistics]:
+def _padded_scores(linear: Linearization, bases: Bases) -> tuple[ScoreTable, Statistics]:
     """Scores and the strongest of them, by a program that serves fits of any number of coordinates.
 
     Coordinates are padded by ones without influence on the readings, so that there are few sizes.
@@ -221,7 +221,7 @@ def _looked_at(linear: Linearization, bases: Bases) -> tuple[ScoreTable, Statist
 @functools.partial(compiled, options=SELDOM)
 def _scores_and_strongest(linear: Linearization, bases: Bases) -> tuple[ScoreTable, Statistics]:
     scores = score_tests(linear, bases)
-    return scores, strongest(scores, linear)
+    return scores, strongest_statistics(scores, linear)
 
 
 def family_columns(linear: Linearization, bases: Bases, chosen: int) -> np.ndarray:
@@ -233,7 +233,7 @@ def family_columns(linear: Linearization, bases: Bases, chosen: int) -> np.ndarr
     linear = jax.tree.map(np.asarray, linear)
     for basis in bases:
         if chosen < len(basis.places):
-            columns = signature(linear, basis.places[chosen], np.asarray(basis.columns)[chosen])
+            columns = place_signature(linear, basis.places[chosen], np.asarray(basis.columns)[chosen])
             norm = np.linalg.norm(columns, axis=0)
             return columns[:, norm > 0] / norm[norm > 0] * WIDE
         chosen -= len(basis.places)
@@ -255,7 +255,7 @@ def augment_with_columns(linear: Linearization, extra: np.ndarray) -> tuple[np.n
     return whole, np.concatenate([np.asarray(linear.residual), np.zeros(wide)])
 
 
-def beside_columns(
+def statistics_with_columns(
     linear: Linearization, bases: Bases, extra: np.ndarray, names: Sequence[str]
 ) -> tuple[Statistics, np.ndarray]:
     """Strongest statistics after further columns are fitted with the free parameters, and the normal deviate of each
@@ -265,7 +265,7 @@ def beside_columns(
         extra: columns over the readings, shape (readings, columns); names: their places.
     """
     wide: tuple[Any, Any] = augment_with_columns(linear, extra)
-    scores, _ = _looked_at(dataclasses.replace(linear, jacobian=wide[0], residual=wide[1]), bases)
+    scores, _ = _padded_scores(dataclasses.replace(linear, jacobian=wide[0], residual=wide[1]), bases)
     balances = np.array([n[0] for b in bases for n in b.names])
     deviate = np.where(np.isin(balances, list(names)), -np.inf, np.asarray(scores.curve))
     nothing = jnp.asarray(-jnp.inf)
@@ -344,6 +344,6 @@ def _replicates(
 
     def one(drawn: Any) -> Statistics:
         again = problem.observe.replicate(problem, problem.data, effects, linear, drawn)
-        return strongest(score_tests(again, bases), again)
+        return strongest_statistics(score_tests(again, bases), again)
 
     return jax.vmap(one)(drawn)

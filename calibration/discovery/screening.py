@@ -4,7 +4,7 @@ A signature is the derivative of the readings by an amplitude. With the signatur
 effects is a least-squares problem of a few unknowns. (Gautier and Khalil 1990 do so with torques, their inverse
 dynamic identification model.) It ranks every effect in milliseconds. Simulation then confirms the first of them,
 because a signature does not show the nonlinearity of a run. The equations of a log in weak form rank every effect
-before the first simulation, and give the start of the base fit (`beforehand`).
+before the first simulation, and give the start of the base fit (`screen_by_weak_form`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
-from calibration.discovery.candidates import Candidate, candidate, empty, fit_candidates
+from calibration.discovery.candidates import Candidate, candidate_of_fit, empty_slots, fit_candidates
 from calibration.discovery.score_tests import ABSORBED, ScoreTable
 from calibration.discovery.settings import Settings
 from calibration.inference.linearization import Linearization
@@ -101,10 +101,10 @@ class Regression:
         cost = np.asarray(0.5 * np.sum((left + whole @ step) ** 2))
         parts: tuple[Any, ...] = (z, sd, covariance, cost, np.asarray(0.0), np.asarray(True), np.asarray(0))
         found = Optimum(*parts)
-        return dataclasses.replace(candidate(self.space, active, found, self.settings), simulated=False)
+        return dataclasses.replace(candidate_of_fit(self.space, active, found, self.settings), simulated=False)
 
 
-def confirmed(space: CandidateSpace, screened: Sequence[Candidate], settings: Settings) -> Confirmed:
+def confirm_by_simulation(space: CandidateSpace, screened: Sequence[Candidate], settings: Settings) -> Confirmed:
     """Simulate the first sets of a round that was screened by regression.
 
     These are the plausible set that explains most, its nearest rival, the nearest of another family, and any
@@ -118,7 +118,7 @@ def confirmed(space: CandidateSpace, screened: Sequence[Candidate], settings: Se
     screened = [c for c in screened if fits(c)] if space.near else screened
     order = sorted(screened, key=lambda c: c.cost + (0.0 if fits(c) else settings.same / 2))
     order = [c for c in order if np.isfinite(c.cost)]
-    first, found = _first(space, order), dict[tuple[str, ...], Candidate]()
+    first, found = _first_to_simulate(space, order), dict[tuple[str, ...], Candidate]()
     space = space.with_room([*space.room, *(n for c in first for n in c.effects)])  # one program for all of them
     said = {c.active: c for c in order}
 
@@ -131,11 +131,11 @@ def confirmed(space: CandidateSpace, screened: Sequence[Candidate], settings: Se
         Sets that explain less there, and the first of all, are repeated from the prior mean: a model error may have
         led the fit without the effect elsewhere.
         """
-        made = fit_candidates(space, [(c.active, _begins(space, c)) for c in those], settings)
+        made = fit_candidates(space, [(c.active, _start_of_simulation(space, c)) for c in those], settings)
         found.update({c.active: c for c in made})
         new = [c for c in those if c.active not in space.near]
         doubted = [c for c in new if less(found[c.active]) or c is first[0]]
-        at_mean = [np.where(np.arange(len(c.z)) < space.free, 0.0, _begins(space, c)) for c in doubted]
+        at_mean = [np.where(np.arange(len(c.z)) < space.free, 0.0, _start_of_simulation(space, c)) for c in doubted]
         again = fit_candidates(space, [(c.active, z) for c, z in zip(doubted, at_mean, strict=True)], settings)
         found.update({c.active: c for c in again if c.cost < found[c.active].cost})
 
@@ -153,14 +153,14 @@ def confirmed(space: CandidateSpace, screened: Sequence[Candidate], settings: Se
     return Confirmed(every, len(found), sum(less(c) for c in found.values()), space.room)
 
 
-def _begins(space: CandidateSpace, screened: Candidate) -> np.ndarray:
+def _start_of_simulation(space: CandidateSpace, screened: Candidate) -> np.ndarray:
     """Start of a simulation of a screened set: amplitudes limited to the largest step of a search."""
     z, p, slots = screened.z.copy(), space.free, len(screened.active)
     z[p : p + slots] = np.clip(z[p : p + slots], -FAR, FAR)
     return z
 
 
-def _first(space: CandidateSpace, order: Sequence[Candidate]) -> list[Candidate]:
+def _first_to_simulate(space: CandidateSpace, order: Sequence[Candidate]) -> list[Candidate]:
     """Sets that are simulated first, from those sorted by what they explain."""
     families = lambda c: frozenset(space.library[n].family() for n in c.effects)  # noqa: E731
     sound = [c for c in order if c.plausible]
@@ -189,7 +189,7 @@ class Beforehand:
     null: np.ndarray
 
 
-def beforehand(space: CandidateSpace, settings: Settings) -> Beforehand | None:
+def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> Beforehand | None:
     """Base parameters and effects by regression on a log's equations in weak form; None if it does not show its
     states (`weak_form`)."""
     problem = space.bare
@@ -215,12 +215,12 @@ def beforehand(space: CandidateSpace, settings: Settings) -> Beforehand | None:
     cost = np.asarray(0.5 * np.sum(found.residual**2))
     of_fit: tuple[Any, ...] = (z, sd, np.zeros((0, 0)), cost, np.asarray(0.0), np.asarray(True), np.asarray(0))
     at = Optimum(*of_fit)
-    base = dataclasses.replace(candidate(space, empty(settings), at, settings), simulated=False)
+    base = dataclasses.replace(candidate_of_fit(space, empty_slots(settings), at, settings), simulated=False)
     slides = problem.base.has_ground and problem.base.rig.imposed == "voltage"
     return Beforehand(None if slides else base, scores, found.windows, null)
 
 
-def ranked(
+def fit_by_regression(
     space: CandidateSpace, wanted: Sequence[tuple[tuple[str, ...], Candidate, Diagnosis]], settings: Settings
 ) -> list[Candidate]:
     """Sets of effects by regression, each in addition to another fit.
@@ -232,7 +232,7 @@ def ranked(
     return [known[id(left)](active) for active, _, left in wanted]
 
 
-def with_room(
+def with_program_room(
     space: CandidateSpace, base: Candidate, linear: Linearization, scores: ScoreTable, settings: Settings
 ) -> CandidateSpace:
     """Space with a program for the effects simulated first, for similar ones, and for the best of other families.
@@ -242,8 +242,8 @@ def with_room(
     if not space.bare.observe.long:
         return space
     beside, library = Regression(space, base, linear, scores, settings), space.library
-    order = sorted((beside((name, *empty(settings)[1:])) for name in library.names), key=lambda c: c.cost)
-    first = [c.active[0] for c in _first(space, order)]
+    order = sorted((beside((name, *empty_slots(settings)[1:])) for name in library.names), key=lambda c: c.cost)
+    first = [c.active[0] for c in _first_to_simulate(space, order)]
     cosine = np.abs(np.asarray(scores.cosine)[library.best_instance(first[0], np.asarray(scores.single))])
     alike = library.largest(cosine)
     near = [library.names[k] for k in np.argsort(-alike) if alike[k] > settings.alike]

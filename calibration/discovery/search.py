@@ -11,9 +11,9 @@ import numpy as np
 
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
-from calibration.discovery.candidates import Candidate, filled, fit_beside, fit_candidates, start
-from calibration.discovery.score_tests import ScoreTable, Statistics, diagnosed
-from calibration.discovery.screening import Confirmed, confirmed, ranked
+from calibration.discovery.candidates import Candidate, fill_slots, fit_candidates, fit_in_addition, start_of_fit
+from calibration.discovery.score_tests import ScoreTable, Statistics, diagnose_fit
+from calibration.discovery.screening import Confirmed, confirm_by_simulation, fit_by_regression
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import Bases
 from calibration.inference.fit_notes import Step
@@ -41,17 +41,17 @@ class Search:
     room: tuple[str, ...] = ()
 
 
-def diagnose(
+def diagnose_candidate(
     space: CandidateSpace, fitted: Candidate, bases: Bases, null: Statistics, settings: Settings
 ) -> Diagnosis:
     """Diagnosis of a fit."""
     z = jnp.asarray(fitted.z)
-    seen = diagnosed(space.problem(fitted.active), z, space.library.scored, bases)
+    seen = diagnose_fit(space.problem(fitted.active), z, space.library.scored, bases)
     linear, scores, found = jax.device_get(seen)
     return Diagnosis(linear, scores, AdequacyTest(found, null, settings))
 
 
-def search(
+def search_effects(
     space: CandidateSpace,
     base: Candidate,
     left: Diagnosis,
@@ -69,12 +69,12 @@ def search(
     ladder = list(rounds[0].candidates)
     null = np.asarray(left.test.null.single)
     best, diagnosis, seen = _best(ladder), None, None
-    if best is not None and own_p(2 * (base.cost - best.cost), null) > settings.family_wise_error:
+    if best is not None and single_p_value(2 * (base.cost - best.cost), null) > settings.family_wise_error:
         best = None
     while best is not None:
         seen = best
-        diagnosis = diagnose(space, best, bases, left.test.null, settings)
-        if not diagnosis.test.rejected_with_margin or len(best.effects) == _most(space, settings):
+        diagnosis = diagnose_candidate(space, best, bases, left.test.null, settings)
+        if not diagnosis.test.rejected_with_margin or len(best.effects) == _largest_set_size(space, settings):
             break
         progress(Step("more effects", (best.effects,)))
         rounds.append(_extend(space, best, diagnosis, base, left, settings))
@@ -85,13 +85,13 @@ def search(
             fewer = without_each(space, best, settings)
             ladder += fewer
             gains = [2 * (c.cost - best.cost) for c in fewer]
-            if any(own_p(gain, null) > settings.family_wise_error for gain in gains):
+            if any(single_p_value(gain, null) > settings.family_wise_error for gain in gains):
                 best = None
     asked, otherwise = (sum(getattr(r, name) for r in rounds) for name in ("asked", "otherwise"))
     return Search(tuple(ladder), seen, diagnosis, asked, otherwise, space.room)
 
 
-def path(found: Search) -> list[Candidate]:
+def best_of_each_size(found: Search) -> list[Candidate]:
     """Best plausible candidate of each number of effects, up to the number in the search's proposal."""
     if found.best is None:
         return []
@@ -100,7 +100,7 @@ def path(found: Search) -> list[Candidate]:
     return [*(c for c in smaller if c is not None), found.best]
 
 
-def own_p(gain: float, null: np.ndarray) -> float:
+def single_p_value(gain: float, null: np.ndarray) -> float:
     """Share of bootstrap tables in which the strongest single effect explains as much [σ²], never below
     1 / (replicates + 1).
 
@@ -120,12 +120,14 @@ def without_each(
     """
     fewer = [tuple("" if s == slot else n for s, n in enumerate(best.active)) for slot in range(len(best.effects))]
     known = {c.active: c for c in ladder if c.simulated}
-    new = fit_candidates(space, [(w, start(space, best, w, settings)) for w in fewer if w not in known], settings)
+    new = fit_candidates(
+        space, [(w, start_of_fit(space, best, w, settings)) for w in fewer if w not in known], settings
+    )
     known |= {c.active: c for c in new}
     return [known[w] for w in fewer]
 
 
-def _most(space: CandidateSpace, settings: Settings) -> int:
+def _largest_set_size(space: CandidateSpace, settings: Settings) -> int:
     """Largest number of effects that the data allow, at most the number of slots."""
     return int(min(settings.slots, max(1, space.included.sum() // settings.rows_per_effect)))
 
@@ -142,17 +144,17 @@ def _singles(space: CandidateSpace, base: Candidate, left: Diagnosis, settings: 
     names = _ranked(space, left.scores)
     if not space.bare.observe.long:
         names = names[: _batch(space)]
-    return _tried(space, [(filled([name], settings), base, left) for name in names], settings)
+    return _fit_sets(space, [(fill_slots([name], settings), base, left) for name in names], settings)
 
 
-def _tried(
+def _fit_sets(
     space: CandidateSpace, wanted: Sequence[tuple[tuple[str, ...], Candidate, Diagnosis]], settings: Settings
 ) -> Confirmed:
     """Sets of effects, each in addition to another fit and its diagnosis; for long runs first screened by
     regression."""
     if not space.bare.observe.long:
-        return Confirmed(tuple(fit_beside(space, [(w, at, by.scores) for w, at, by in wanted], settings)))
-    return confirmed(space, ranked(space, wanted, settings), settings)
+        return Confirmed(tuple(fit_in_addition(space, [(w, at, by.scores) for w, at, by in wanted], settings)))
+    return confirm_by_simulation(space, fit_by_regression(space, wanted, settings), settings)
 
 
 def _batch(space: CandidateSpace) -> int:
@@ -169,13 +171,13 @@ def _extend(
 ) -> Confirmed:
     """Sets with one more effect than the best, and pairs for the base."""
     names = _ranked(space, left_by_best.scores, best.effects)[: _batch(space)]
-    sources = {filled([*best.effects, name], settings): (best, left_by_best) for name in names}
+    sources = {fill_slots([*best.effects, name], settings): (best, left_by_best) for name in names}
     if len(best.effects) == 1:
         for pair in _pairs(space, left.scores):
-            one, other = filled(pair, settings), filled(pair[::-1], settings)
+            one, other = fill_slots(pair, settings), fill_slots(pair[::-1], settings)
             if one not in sources and other not in sources:
                 sources[one] = (base, left)
-    return _tried(space, [(w, at, by) for w, (at, by) in sources.items()], settings)
+    return _fit_sets(space, [(w, at, by) for w, (at, by) in sources.items()], settings)
 
 
 def _pairs(space: CandidateSpace, scores: ScoreTable) -> list[tuple[str, str]]:

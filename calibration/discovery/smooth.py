@@ -11,7 +11,7 @@ from jaxtyping import Array
 from numpy.polynomial import legendre
 
 from calibration.discovery.projection import Projection
-from calibration.inference.bases import ORDERS, scaled, signature, window
+from calibration.inference.bases import ORDERS, place_signature, scale_to_unit_range, window_from_name
 from calibration.inference.linearization import Linearization
 from mmrjax.compile.compiling import compiled
 from mmrjax.effects.curve import ORDINATES, weights
@@ -59,7 +59,7 @@ class Smooth:
     @property
     def happening(self) -> bool:
         """True for a temporary change."""
-        return window(self.variable) is not None
+        return window_from_name(self.variable) is not None
 
     @property
     def ordinates(self) -> tuple[str, ...]:
@@ -87,7 +87,7 @@ def _basis(variable: str, x: np.ndarray, low: float, high: float) -> np.ndarray:
 _weights: Callable[..., Array] = compiled(weights)
 
 
-def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarray) -> Smooth:
+def smooth_curve(linear: Linearization, balance: str, variable: str, counts: np.ndarray) -> Smooth:
     """Curve over a variable in a balance, linear at the base fit.
 
     The ordinates are a Gaussian process with covariance s² exp(-½ (Δ/l)²) over their distance Δ. A level
@@ -97,7 +97,7 @@ def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarra
     Args:
         counts: True for included rows, shape (rows,).
     """
-    happens = window(variable)
+    happens = window_from_name(variable)
     axis = variable if happens is None else happens.axis
     (x, way), counts = linear.in_travel(balance, axis), linear.at_points(counts)
     low, high = (0.0, 2 * np.pi) if variable in ORDERS else (float(x[counts].min()), float(x[counts].max()))
@@ -107,7 +107,7 @@ def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarra
     if not high - low > 1e-9 * max(abs(high), abs(low), 1e-9):
         high = low + max(abs(low), 1.0)  # a constant variable: only an offset can be seen
     basis = _basis(variable, x, low, high)
-    a, b = Projection(linear)(signature(linear, balance, way[:, None] * basis))
+    a, b = Projection(linear)(place_signature(linear, balance, way[:, None] * basis))
     size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))
     roots = [np.eye(2)] if variable in ORDERS else [_smoothness(length, happens is not None) for length in LENGTHS]
     best: tuple[float, tuple] = (-np.inf, ())
@@ -153,7 +153,7 @@ class Surface:
     evidence: float
 
 
-def surface(
+def smooth_surface(
     linear: Linearization, balance: str, variables: tuple[str, str], counts: np.ndarray, project: Projection
 ) -> Surface:
     """Discrepancy over two variables, as products of Legendre polynomials.
@@ -165,9 +165,12 @@ def surface(
     """
     weight = linear.at_points(counts).astype(float)
     each, ways = zip(*(linear.in_travel(balance, v) for v in variables), strict=True)
-    sides = [legendre.legvander(scaled(x, weight), PRODUCT - 1) * np.exp(-FALL * np.arange(PRODUCT)) for x in each]
+    sides = [
+        legendre.legvander(scale_to_unit_range(x, weight), PRODUCT - 1) * np.exp(-FALL * np.arange(PRODUCT))
+        for x in each
+    ]
     shapes = ways[0][:, None] * (sides[0][:, :, None] * sides[1][:, None, :]).reshape(linear.points, -1)
-    columns = signature(linear, balance, shapes)
+    columns = place_signature(linear, balance, shapes)
     a, b = project(columns)
     size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))
     best = (-np.inf, 0.0, 0.0)

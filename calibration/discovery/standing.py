@@ -19,13 +19,13 @@ import numpy as np
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
-from calibration.discovery.discrepancy import CurveBeside, locate
+from calibration.discovery.discrepancy import CurveBeside, locate_discrepancy
 from calibration.discovery.loop_notes import CurveOver, NameSupport, NameTest
 from calibration.discovery.projection import Projection
-from calibration.discovery.score_tests import ABSORBED, augment_with_columns, beside_columns, family_columns
-from calibration.discovery.search import Search, diagnose, without_each
+from calibration.discovery.score_tests import ABSORBED, augment_with_columns, family_columns, statistics_with_columns
+from calibration.discovery.search import Search, diagnose_candidate, without_each
 from calibration.discovery.settings import Settings
-from calibration.discovery.smooth import smooth, surface
+from calibration.discovery.smooth import smooth_curve, smooth_surface
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.linearization import Linearization
@@ -45,12 +45,12 @@ EQUATION = {"mass": "ground", "speed": "slip"} | {
 VARIABLES = ("voltage", "current", "speed_motor", "slope", "payload")
 
 
-def equation(place: str) -> str:
+def equation_of_place(place: str) -> str:
     """Place with the curves that represent effects in a balance, or in the readings of a channel."""
     return EQUATION.get(place, place)
 
 
-def standing(
+def judge_names(
     space: CandidateSpace,
     base: Candidate,
     searched: Search,
@@ -132,8 +132,8 @@ def _against_curves(
     space: CandidateSpace, base: Candidate, best: Candidate, linear: Linearization, bases: Bases, settings: Settings
 ) -> NameSupport:
     """Test of names against one smooth curve of one variable anywhere, or of two in a balance with several names."""
-    equations = [equation(space.library[e].channel or space.library[e].balance) for e in best.effects]
-    places = {place for place, _ in bases_room.names(bases)}
+    equations = [equation_of_place(space.library[e].channel or space.library[e].balance) for e in best.effects]
+    places = {place for place, _ in bases_room.family_names(bases)}
     crowded = {e for e in equations if equations.count(e) > 1 and e in places}
     tried = _curves(space, linear, bases, crowded)
     if not tried:
@@ -151,7 +151,7 @@ def _curves(
     space: CandidateSpace, linear: Linearization, bases: Bases, crowded: set[str]
 ) -> list[tuple[float, CurveOver]]:
     """Evidence of each smooth curve and wave: of one variable in any place, of two in the crowded ones."""
-    included, offered = space.included, dict.fromkeys(bases_room.names(bases))
+    included, offered = space.included, dict.fromkeys(bases_room.family_names(bases))
     known = [
         v
         for v in (*bases_room.VARIABLES, *bases_room.ORDERS)
@@ -160,17 +160,17 @@ def _curves(
     tried = []
     for place, variable in offered:
         if variable in known:
-            found = smooth(linear, place, variable, included)
+            found = smooth_curve(linear, place, variable, included)
             tried.append((found.evidence, CurveOver(place, (variable,))))
     project = Projection(linear)
     for place in sorted(crowded):
         for pair in itertools.combinations([v for v in VARIABLES if v in known], 2):
-            over = surface(linear, place, pair, included, project)
+            over = smooth_surface(linear, place, pair, included, project)
             tried.append((over.evidence, CurveOver(place, pair)))
     return tried
 
 
-def _over(place: str, variable: str) -> CurveOver:
+def _curve_over(place: str, variable: str) -> CurveOver:
     return CurveOver(place, (variable,))
 
 
@@ -199,25 +199,25 @@ Proposed = tuple[Candidate, Diagnosis]
 
 
 def _equation(space: CandidateSpace, effect: str) -> str:
-    return equation(space.library[effect].channel or space.library[effect].balance)
+    return equation_of_place(space.library[effect].channel or space.library[effect].balance)
 
 
 def _one_curve(
     space: CandidateSpace, best: Candidate, left: Diagnosis, bases: Bases, settings: Settings, beside: CurveBeside
 ) -> NameSupport:
     """Test whether a single curve is adequate where the names of a candidate are not."""
-    names = bases_room.names(bases)
+    names = bases_room.family_names(bases)
     for k in _strongest(left, names):
-        found, _ = beside_columns(left.linear, bases, family_columns(left.linear, bases, k), [names[k][0]])
+        found, _ = statistics_with_columns(left.linear, bases, family_columns(left.linear, bases, k), [names[k][0]])
         if not AdequacyTest(found, left.test.null, settings).rejected_with_margin:
-            return NameSupport(False, "curve alone", curves=(_over(*names[k]),))
+            return NameSupport(False, "curve alone", curves=(_curve_over(*names[k]),))
     where = beside.where
-    if equation(where.place) in {_equation(space, e) for e in best.effects}:
+    if equation_of_place(where.place) in {_equation(space, e) for e in best.effects}:
         # A strong curve distorts the base fit, and names then absorb its residuals in the same equation.
         # If the result is highly significant, no closer look is compiled.
         adequate = not left.test.beyond_doubt("chi2", beside.curve.chi2[1])
         if adequate and not beside.diagnosis.test.rejected_with_margin:
-            return NameSupport(False, "curve alone", curves=(_over(where.place, where.variable),))
+            return NameSupport(False, "curve alone", curves=(_curve_over(where.place, where.variable),))
     return NameSupport(True)
 
 
@@ -238,14 +238,14 @@ def _curves_beside(
     Args:
         seen: diagnosis of the fit; without: equations without curves; most: largest number of curves.
     """
-    places = [n[0] for n in bases_room.names(bases)]
-    barred = np.isin([equation(p) for p in places], list(without))
+    places = [n[0] for n in bases_room.family_names(bases)]
+    barred = np.isin([equation_of_place(p) for p in places], list(without))
     chosen, columns = list[int](), np.zeros((linear.readings, 0))
     deviate, test = np.array(seen.scores.curve), seen.test
     while test.rejected_with_margin and len(chosen) < most:
         chosen.append(int(np.argmax(np.where(barred, -np.inf, deviate))))
         columns = np.concatenate([columns, family_columns(linear, bases, chosen[-1])], 1)
-        found, deviate = beside_columns(linear, bases, columns, [places[k] for k in chosen])
+        found, deviate = statistics_with_columns(linear, bases, columns, [places[k] for k in chosen])
         test = AdequacyTest(found, seen.test.null, settings)
     return chosen, test
 
@@ -272,25 +272,25 @@ def name_tests(
     search, because otherwise a curve would represent other effects of that set in the same equation.
 
     Args:
-        after: diagnosis of the fit with all of them; blocks: as in `standing`.
+        after: diagnosis of the fit with all of them; blocks: as in `judge_names`.
         better: candidates that are the better explanation but not of a plausible size.
     """
-    names, largest, tests = bases_room.names(bases), searched.best or best, []
+    names, largest, tests = bases_room.family_names(bases), searched.best or best, []
     most = searched.diagnosis or after
-    lacks = _lacks(space, most, bases)
+    lacks = _deficient_equations(space, most, bases)
     fewer = dict(zip(largest.effects, without_each(space, largest, settings, searched.ladder), strict=True))
     each = without_each(space, best, settings, searched.ladder)
     fits = {c.active: c for c in (*each, *(c for e, c in fewer.items() if e in best.effects))}
-    seen = {at: diagnose(space, c, bases, after.test.null, settings).linear for at, c in fits.items()}
+    seen = {at: diagnose_candidate(space, c, bases, after.test.null, settings).linear for at, c in fits.items()}
     for effect, without in zip(best.effects, each, strict=True):
         own = _equation(space, effect)
         linear = seen[without.active]
         chosen, _ = _curves_beside(after.linear, after, bases, {own}, CURVES, settings)
-        beside = _beside(space, linear, bases, chosen, effect)
+        beside = _with_curves(space, linear, bases, chosen, effect)
         promised = _root(np.asarray(linear.jacobian), np.asarray(linear.residual), beside[2]) ** 2
         judged, signatures = beside, linear.signatures
         if promised < PROMISED * 2 * (without.cost - best.cost):
-            judged = _put_back(space, best, effect, _beside(space, after.linear, bases, chosen, effect))
+            judged = _put_back(space, best, effect, _with_curves(space, after.linear, bases, chosen, effect))
             signatures = after.linear.signatures
         run, root_without = _weakest_run(space, linear.runs(), *beside, differ=space.bare.observe.long)
         whole, others = (largest, fewer[effect]) if effect in fewer else (best, without)
@@ -300,7 +300,7 @@ def name_tests(
                 effect,
                 _root(*beside),
                 after.test.threshold("single"),
-                tuple(_over(*names[k]) for k in chosen),
+                tuple(_curve_over(*names[k]) for k in chosen),
                 _evidence_over_curves(space, whole, others, effect, seen[others.active], bases, settings),
                 run,
                 root_without,
@@ -316,12 +316,12 @@ def name_tests(
     return tuple(tests)
 
 
-def _lacks(space: CandidateSpace, seen: Diagnosis, bases: Bases) -> set[str]:
+def _deficient_equations(space: CandidateSpace, seen: Diagnosis, bases: Bases) -> set[str]:
     """Equations with a significant discrepancy of a fit: those of the most significant curve and of the strongest
     effect."""
     if not seen.test.rejected_with_margin:
         return set()
-    lacks = {equation(locate(seen, bases, space.included).place)}
+    lacks = {equation_of_place(locate_discrepancy(seen, bases, space.included).place)}
     if seen.test.beyond_doubt("single"):
         strongest = space.library.of[int(np.argmax(np.abs(np.asarray(seen.scores.single))))]
         lacks.add(_equation(space, space.library.names[strongest]))
@@ -352,9 +352,9 @@ def _varies_most(
     variables = [v for v in (*VARIABLES, "speed") if _varies(linear, v, space.included)]
     for variable in variables:
         at = linear.in_travel(bases_room.SHAFTS, variable)[0].reshape(-1, linear.rows).mean(0)
-        x = bases_room.scaled(np.nan_to_num(at), space.included.astype(float))
+        x = bases_room.scale_to_unit_range(np.nan_to_num(at), space.included.astype(float))
         changed = np.stack([(of_row * shape[:, None]).ravel() for shape in (x, 2 * x**2 - 1)], 1)
-        left, told = _left_of(jacobian, residual, changed)
+        left, told = _projected_columns(jacobian, residual, changed)
         for k, root in enumerate(_roots(jacobian, residual, changed)):
             spread = abs(told[k] / max(left[k], 1e-300) / best.z[slot]) if best.z[slot] else math.inf
             most = max(most, (float(root), variable, float(spread)))
@@ -381,7 +381,7 @@ def _evidence_over_curves(
     own = _equation(space, effect)
     offered = sum(_equation(space, name) == own for name in space.library.names)
     cost = _cost_of(space, best, best.active.index(effect), settings) + 2 * math.log(offered)
-    tried = [e for e, over in _curves(space, linear, bases, set()) if equation(over.place) == own]
+    tried = [e for e, over in _curves(space, linear, bases, set()) if equation_of_place(over.place) == own]
     return 2 * (without.cost - best.cost) - cost - max(tried, default=-math.inf) + 2 * math.log(max(len(tried), 1))
 
 
@@ -392,19 +392,21 @@ def _root(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) ->
 
 def _roots(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> np.ndarray:
     """Root of the score of each column; 0 for columns that the fit imitates."""
-    left, told = _left_of(jacobian, residual, signatures)
+    left, told = _projected_columns(jacobian, residual, signatures)
     root = np.abs(told) / np.sqrt(np.maximum(left, 1e-12))
     return np.where(left > ABSORBED**2 * np.sum(signatures**2, 0), root, 0.0)
 
 
-def _left_of(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _projected_columns(
+    jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Squared norm of columns over the readings after projection, and their product with the residual."""
     half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
     left, inside = residual - half.T @ (half @ residual), half[:, : len(signatures)] @ signatures
     return np.sum(signatures**2, 0) - np.sum(inside**2, 0), signatures.T @ left[: len(signatures)]
 
 
-def _beside(
+def _with_curves(
     space: CandidateSpace, linear: Linearization, bases: Bases, curves: Sequence[int], effect: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Jacobian and residual of a fit with additional families of curves, and an effect's signatures."""
@@ -445,10 +447,10 @@ def chosen_again(
         left: diagnosis of the base.
     """
     effect, linear = best.effects[0], left.linear
-    judged = _beside(space, linear, bases, (), effect)
+    judged = _with_curves(space, linear, bases, (), effect)
     if _root(*judged) ** 2 < PROMISED * 2 * (base.cost - best.cost):
-        linear = diagnose(space, best, bases, left.test.null, settings).linear
-        judged = _put_back(space, best, effect, _beside(space, linear, bases, (), effect))
+        linear = diagnose_candidate(space, best, bases, left.test.null, settings).linear
+        judged = _put_back(space, best, effect, _with_curves(space, linear, bases, (), effect))
     return _chosen_again(space, families, judged, np.asarray(linear.signatures), blocks, settings)
 
 
@@ -470,12 +472,12 @@ def _chosen_again(
     """
     library, again = space.library, []
     akin = np.array([library[name].family() in families for name in library.names])[library.of]
-    whole = _left_of(*beside)[0].max()
+    whole = _projected_columns(*beside)[0].max()
     for out in blocks:
-        kept = _kept(space, out, len(signatures))
+        kept = _kept_readings(space, out, len(signatures))
         every = signatures[kept]
-        j, e, own = _rest(kept, *beside)
-        if _left_of(j, e, own)[0].max() < 0.5 * whole:
+        j, e, own = _restrict_readings(kept, *beside)
+        if _projected_columns(j, e, own)[0].max() < 0.5 * whole:
             continue
         roots = _roots(j, e, every)
         most = np.max(roots) ** 2
@@ -498,25 +500,25 @@ def _weakest_run(
             to the information of all runs.
     """
     least: tuple[int | None, float] = None, math.inf
-    known = np.max(_left_of(jacobian, residual, signatures)[0]) if differ else 1.0
+    known = np.max(_projected_columns(jacobian, residual, signatures)[0]) if differ else 1.0
     counting = [(k, rows) for k, rows in enumerate(runs) if space.included[rows].any()]
     for k, rows in counting if len(counting) > 2 else ():
         out = np.zeros(len(space.included), bool)
         out[rows] = True
-        rest = _rest(_kept(space, out, len(signatures)), jacobian, residual, signatures)
-        told = math.sqrt(np.max(_left_of(*rest)[0]) / known) if differ else 1.0
+        rest = _restrict_readings(_kept_readings(space, out, len(signatures)), jacobian, residual, signatures)
+        told = math.sqrt(np.max(_projected_columns(*rest)[0]) / known) if differ else 1.0
         root = _root(*rest) / max(told, 1e-9)
         least = (k + 1, root) if root < least[1] else least
     return least
 
 
-def _kept(space: CandidateSpace, out: np.ndarray, readings: int) -> np.ndarray:
+def _kept_readings(space: CandidateSpace, out: np.ndarray, readings: int) -> np.ndarray:
     """True for readings that remain without some rows, which are padded; shape (readings,)."""
     rows = np.concatenate([out, np.zeros(len(space.included) - len(out), bool)])
     return np.repeat(~rows, readings // len(rows))
 
 
-def _rest(
+def _restrict_readings(
     kept: np.ndarray, jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Jacobian, residual and signatures of the remaining readings, and of all further residuals."""

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.discovery.active_set import CandidateSpace
-from calibration.discovery.candidates import Candidate, candidate
+from calibration.discovery.candidates import Candidate, candidate_of_fit
 from calibration.discovery.settings import Settings
 from calibration.inference.held_out import search_each
 from calibration.inference.linearization import Linearization
@@ -36,7 +36,7 @@ class Shift:
     fit: Candidate
 
 
-def scores(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def prior_shift_scores(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Score of a shift of the mean of each coordinate's prior [σ²], and the linear estimate of each coordinate
     without its prior [prior sds].
 
@@ -52,7 +52,7 @@ def scores(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.n
     return np.where(seen, left**2 / free, 0.0), np.where(seen, residual[at] / free, 0.0)
 
 
-def shifts(
+def find_prior_shifts(
     space: CandidateSpace, at: Candidate, needed: float, settings: Settings, linear: Linearization | None = None
 ) -> list[Shift]:
     """Base parameters that, without their prior, would explain at least `needed` σ² of a fit's discrepancy.
@@ -65,7 +65,7 @@ def shifts(
         residual, jacobian, _ = problem.observe.at(problem, at.z, active)
     else:
         residual, jacobian = linear.residual, linear.jacobian
-    explained, values = scores(np.asarray(jacobian), np.asarray(residual))
+    explained, values = prior_shift_scores(np.asarray(jacobian), np.asarray(residual))
     found = []
     for k in np.argsort(-explained[: space.free]):
         if explained[k] < needed:
@@ -101,4 +101,4 @@ def _without_prior(
         mean, start = float(z[k]), z.copy()
     if space.coordinates.base.beyond(z[:p])[k]:
         return None
-    return candidate(space, at.active, best, settings)
+    return candidate_of_fit(space, at.active, best, settings)

@@ -114,7 +114,7 @@ class Basis(eqx.Module):
 
         Families are computed one at a time, because each takes a copy of a balance's defects for histories.
         """
-        of_channels = in_readings(self.places[0])
+        of_channels = is_channel_place(self.places[0])
         known, change = (linear.channels, linear.shown) if of_channels else (linear.probed, linear.columns)
         places = jnp.asarray([known.index(place) for place in self.places])
         return jax.lax.map(lambda family: change(*family), (places, self.columns))
@@ -123,29 +123,29 @@ class Basis(eqx.Module):
 Bases = tuple[Basis, ...]
 
 
-def in_readings(place: str) -> bool:
+def is_channel_place(place: str) -> bool:
     """True if a place is a channel, whose readings have an error; False if it is a balance."""
     return place not in (*BALANCES, *OF_TURNS) and place in channels.names(channels.EVERY)
 
 
 def balance_of(place: str) -> str:
     """The balance of a place; `sensor` for a channel."""
-    return "sensor" if in_readings(place) else place
+    return "sensor" if is_channel_place(place) else place
 
 
-def in_words(place: str) -> str:
+def place_in_words(place: str) -> str:
     """Name of a place in words: `slip balance`, `reading of motor speed`."""
-    return f"reading of {place}".replace("_", " ") if in_readings(place) else f"{place} balance"
+    return f"reading of {place}".replace("_", " ") if is_channel_place(place) else f"{place} balance"
 
 
-def signature(linear: Linearization, place: str, shapes: np.ndarray) -> np.ndarray:
+def place_signature(linear: Linearization, place: str, shapes: np.ndarray) -> np.ndarray:
     """Change of the readings, shape (readings, terms), by defects of one place with shapes (rows, terms)."""
-    if in_readings(place):
+    if is_channel_place(place):
         return np.asarray(linear.shown(linear.channels.index(place), shapes))
     return np.asarray(linear.columns(linear.probed.index(place), shapes))
 
 
-def scaled(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def scale_to_unit_range(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """x mapped linearly so that rows of positive weight span -1 to 1; zeros if x does not vary."""
     counting = x[weight > 0]
     low, high = counting.min(), counting.max()
@@ -192,12 +192,12 @@ Ways = Mapping[str, np.ndarray]
 SHAFTS = "electrical"
 
 
-def forward(points: int) -> Ways:
+def forward_ways(points: int) -> Ways:
     """Ways of travel that is always forward."""
     return dict.fromkeys(WAYS, np.ones(points))
 
 
-def families(
+def curve_families(
     columns: Mapping[str, np.ndarray],
     weight: np.ndarray,
     robot: Robot | None = None,
@@ -217,13 +217,13 @@ def families(
     """
     scope = (Scope.of(robot) if scope is None else scope).over(columns)
     balances = scope.balances
-    ways = forward(len(weight)) if ways is None else ways
+    ways = forward_ways(len(weight)) if ways is None else ways
     unsigned = robot.rig.magnitudes if robot else ()
     over: dict[str, str] = {}  # a variable, and the one that takes its place
     for variable, column in VARIABLES.items():
         if column not in columns or (column in EVERY_AXIS and column not in scope.axes):
             continue
-        drift = variable == "order" and collinearity(columns, weight, scope.axes) > COLLINEAR
+        drift = variable == "order" and order_collinearity(columns, weight, scope.axes) > COLLINEAR
         if drift and not over:
             continue
         # A skipped variable is replaced by another, so that tables of one size share compiled programs.
@@ -231,7 +231,11 @@ def families(
 
     def curve(place: str, variable: str) -> np.ndarray:
         x, way = in_travel(place, variable, np.asarray(columns[VARIABLES[variable]]), ways.__getitem__, unsigned)
-        return way[:, None] * legendre.legvander(scaled(x, weight), TERMS - 1) * np.exp(-0.35 * np.arange(TERMS))
+        return (
+            way[:, None]
+            * legendre.legvander(scale_to_unit_range(x, weight), TERMS - 1)
+            * np.exp(-0.35 * np.arange(TERMS))
+        )
 
     names = [(balance, variable) for variable in over.values() for balance in balances]
     shown = [(c.name, v) for c in channels_of(robot) for v in over if v in AXES or v == READ_BY.get(c.name)]
@@ -240,20 +244,23 @@ def families(
     read = [n if n in new else next((m for m in new if m[0] == n[0]), new[0]) for n in shown] if new else []
     groups = [
         (names, [curve(*n) for n in names]),
-        ([(b, CONDITIONS) for b in balances], [surface(columns, weight, scope, ways, b) for b in balances]),
+        (
+            [(b, CONDITIONS) for b in balances],
+            [condition_polynomials(columns, weight, scope, ways, b) for b in balances],
+        ),
         (read, [curve(*n) for n in read]),
     ]
     return tuple(Basis.of(np.stack(b), ns) for ns, b in groups if ns)
 
 
-def surface(
+def condition_polynomials(
     columns: Mapping[str, np.ndarray], weight: np.ndarray, scope: Scope, ways: Ways, place: str
 ) -> Float[np.ndarray, "points terms"]:
-    """Polynomials in all conditions for each configuration; arguments as in `families`."""
+    """Polynomials in all conditions for each configuration; arguments as in `curve_families`."""
     of_column = {column: variable for variable, column in VARIABLES.items()}
     of_column |= {CURRENT: "current", LOAD: "current"}  # its sign is also that of the torque that drives the shafts
     along = (in_travel(place, of_column[c], np.asarray(columns[c]), ways.__getitem__)[0] for c in scope.axes)
-    spans = [scaled(x, weight) for x in along]
+    spans = [scale_to_unit_range(x, weight) for x in along]
     powers = [p for p in itertools.product(range(DEGREE + 1), repeat=len(spans)) if sum(p) <= DEGREE]
     terms = [
         np.prod([a**k for a, k in zip(spans, p, strict=True)], 0) * (columns["configuration"] == name)
@@ -286,13 +293,13 @@ class Window:
         return f"{self.low / factor:.4g} {unit} of {self.axis}"
 
 
-def window(variable: str) -> Window | None:
+def window_from_name(variable: str) -> Window | None:
     """Window that a variable's name describes; None if the name is no window's."""
     found = re.fullmatch(rf"({'|'.join((*AXES, *LEVELS))}) (\S+) to (\S+)", variable)
     return None if found is None else Window(found[1], float(found[2]), float(found[3]))
 
 
-def windows(
+def window_families(
     columns: Mapping[str, np.ndarray],
     weight: np.ndarray,
     robot: Robot | None = None,
@@ -306,11 +313,11 @@ def windows(
 
     Args:
         columns: of the table; weight: 0 for excluded rows, shape (rows,).
-        robot, scope, ways: as in `families`.
+        robot, scope, ways: as in `curve_families`.
     """
     counts = weight > 0
     scope = (Scope.of(robot) if scope is None else scope).over(columns)
-    ways = forward(len(weight)) if ways is None else ways
+    ways = forward_ways(len(weight)) if ways is None else ways
     facing = {name: np.where(way < 0, -1.0, 1.0) for name, way in ways.items()}  # also for starts from rest
     offered: list[tuple[str, np.ndarray, np.ndarray]] = []  # axis, its values, which rows are inside
     axis = next((a for a in AXES if VARIABLES[a] in columns), None)
@@ -318,7 +325,7 @@ def windows(
         x = np.asarray(columns[VARIABLES[axis]], float)
         low, high = x[counts].min(), x[counts].max()
         # Consecutive runs then have similar conditions, and conditions have windows of their own.
-        sorted_runs = axis == "order" and collinearity(columns, weight, scope.axes) > COLLINEAR
+        sorted_runs = axis == "order" and order_collinearity(columns, weight, scope.axes) > COLLINEAR
         for share in WINDOWS:
             size = share * (high - low)
             for k in range(round(2 / share) - 1):
@@ -357,7 +364,9 @@ def windows(
     )
 
 
-def collinearity(columns: Mapping[str, np.ndarray], weight: np.ndarray, axes: Sequence[str] | None = None) -> float:
+def order_collinearity(
+    columns: Mapping[str, np.ndarray], weight: np.ndarray, axes: Sequence[str] | None = None
+) -> float:
     """Share of the variance of the order of runs that their conditions explain (R²).
 
     At 1, drift from run to run cannot be separated from effects of the conditions. Conditions enter as a polynomial
@@ -366,7 +375,7 @@ def collinearity(columns: Mapping[str, np.ndarray], weight: np.ndarray, axes: Se
     and polynomials of the others.
 
     Args:
-        columns, weight: as in `families`; axes: columns of the conditions, None: of the packaged robot's.
+        columns, weight: as in `curve_families`; axes: columns of the conditions, None: of the packaged robot's.
     """
     counts = weight > 0
     x = np.asarray(columns["order"], float)[counts]
@@ -382,7 +391,7 @@ def collinearity(columns: Mapping[str, np.ndarray], weight: np.ndarray, axes: Se
     smooth = [VARIABLES["slope"]] * (VARIABLES["slope"] in conditions) if few else conditions
     terms = list(np.eye(len(x))[cell.ravel() if few else which.ravel()].T)
     for column in smooth:
-        terms += list(legendre.legvander(scaled(columns[column], weight)[counts], DEGREE)[:, 1:].T)
+        terms += list(legendre.legvander(scale_to_unit_range(columns[column], weight)[counts], DEGREE)[:, 1:].T)
     matrix = np.stack(terms, 1).astype(float)
     left = x - matrix @ np.linalg.lstsq(matrix, x, rcond=None)[0]
     rank = int(np.linalg.matrix_rank(matrix))
@@ -390,7 +399,7 @@ def collinearity(columns: Mapping[str, np.ndarray], weight: np.ndarray, axes: Se
     return float(1 - freedom * np.sum(left**2) / np.sum((x - x.mean()) ** 2))
 
 
-def waves(
+def wave_families(
     on_tracks: np.ndarray, angle: np.ndarray, rows: np.ndarray, knots: np.ndarray, robot: Robot | None = None
 ) -> Bases:
     """Waves of the orders that the samples of histories resolve, in each balance.
@@ -433,6 +442,6 @@ def waves(
     return (Basis.of(np.stack(bases * len(balances_of(robot))), every),)
 
 
-def names(bases: Bases) -> tuple[tuple[str, str], ...]:
+def family_names(bases: Bases) -> tuple[tuple[str, str], ...]:
     """(place, variable) of every family, in order."""
     return tuple(n for basis in bases for n in basis.names)

@@ -30,7 +30,7 @@ BLOCKS: dict[str, tuple[str, ...]] = {
 TURN = "turn"
 
 
-def in_words(by: str, joint: str = " and ") -> str:
+def kind_in_words(by: str, joint: str = " and ") -> str:
     """Name of a kind of blocks in words; `joint` joins two conditions."""
     for one in ("motor_speed", "load_torque"):
         by = by.replace(one, one.replace("_", " "))
@@ -46,7 +46,7 @@ GRADED = (SPEED, CURRENT, LOAD, "duty")
 APART, PARTS = 0.1, 4
 
 
-def levels(x: np.ndarray) -> np.ndarray:
+def group_into_levels(x: np.ndarray) -> np.ndarray:
     """Level of each number: the median of those of similar size, to four digits.
 
     Numbers that vary continuously are split into `PARTS` parts of about the same number of values.
@@ -62,7 +62,7 @@ def levels(x: np.ndarray) -> np.ndarray:
     return found
 
 
-def sharpness(runs: Runs) -> dict[str, np.ndarray]:
+def blocks_by_sharpness(runs: Runs) -> dict[str, np.ndarray]:
     """Label → mask of its rows, for `PARTS` groups of turns from turning on the spot to straight travel.
 
     Turns are sorted by the drive of the slower side over that of the faster side, -1 to 1.
@@ -74,19 +74,19 @@ def sharpness(runs: Runs) -> dict[str, np.ndarray]:
     return {f"{share[mine].min():.2g} to {share[mine].max():.2g}": mine for mine in rows} if len(rows) > 1 else {}
 
 
-def blocks(runs: Runs, by: str) -> dict[str, np.ndarray]:
+def blocks_of_kind(runs: Runs, by: str) -> dict[str, np.ndarray]:
     """Label → mask of its rows, for each block of `by`; empty if the data do not vary in it.
 
     A run of a history in which the quantity changes is a block of its own; empty if it changes in all runs.
     """
     if by == TURN:
-        return sharpness(runs) if runs.turns else {}
+        return blocks_by_sharpness(runs) if runs.turns else {}
     columns = [c for c in BLOCKS[by] if runs.has(c) and (c in NO_CONDITIONS or c in runs.axes)]
     if len(columns) < len(BLOCKS[by]):
         return {}
     if by == "voltage_configuration" and not runs.layout.complete and len(np.unique(runs["configuration"])) == 1:
         return {}  # the same blocks as `voltage`
-    values = {c: levels(runs[c]) if c in GRADED else runs[c] for c in columns}
+    values = {c: group_into_levels(runs[c]) if c in GRADED else runs[c] for c in columns}
     labels = np.array([" ".join(str(values[c][k]) for c in columns) for k in range(len(runs))])
     changes = varies(runs, BLOCKS[by])
     if changes.all() and by != "run":
@@ -97,12 +97,12 @@ def blocks(runs: Runs, by: str) -> dict[str, np.ndarray]:
     return {name: labels == name for name in names} if len(names) > 1 and not single else {}
 
 
-def distinct(runs: Runs, kinds: Sequence[str]) -> dict[str, dict[str, np.ndarray]]:
+def distinct_blocks(runs: Runs, kinds: Sequence[str]) -> dict[str, dict[str, np.ndarray]]:
     """Kind → blocks, for kinds that the data have, without kinds that divide the rows as an earlier one does."""
     found: dict[str, dict[str, np.ndarray]] = {}
     divided = []
     for kind in kinds:
-        by = blocks(runs, kind)
+        by = blocks_of_kind(runs, kind)
         parts = {m.tobytes() for m in by.values()}
         if parts not in divided:
             divided.append(parts)
@@ -110,31 +110,31 @@ def distinct(runs: Runs, kinds: Sequence[str]) -> dict[str, dict[str, np.ndarray
     return {kind: by for kind, by in found.items() if by}
 
 
-def predictable(runs: Runs, problem: Problem) -> dict[str, dict[str, np.ndarray]]:
-    """Kind → blocks as from `distinct`, of the kinds of a problem's observer, that the other rows can predict.
+def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, dict[str, np.ndarray]]:
+    """Kind → blocks as from `distinct_blocks`, of the kinds of a problem's observer, that the other rows can predict.
 
     A block is omitted if it holds all rows of a configuration with free parameters of its own.
     """
     names = runs.configurations_named(problem.base)
     coordinates = problem.coordinates
-    informs = [{_owner(name, names)} for name in coordinates.names]
+    informs = [{_configuration_of_parameter(name, names)} for name in coordinates.names]
     for follower, k, _ in coordinates.tied:
-        informs[k].add(_owner(follower, names))
+        informs[k].add(_configuration_of_parameter(follower, names))
     owned = [np.isin(names, list(owners)) for owners in informs if "" not in owners]
     kinds = {
         kind: {label: m for label, m in by.items() if not any(m[mine].all() for mine in owned)}
-        for kind, by in distinct(runs, problem.observe.blocks).items()
+        for kind, by in distinct_blocks(runs, problem.observe.blocks).items()
     }
     return {kind: by for kind, by in kinds.items() if by}
 
 
-def unpredictable(runs: Runs, problem: Problem) -> tuple[str, ...]:
+def unpredictable_kinds(runs: Runs, problem: Problem) -> tuple[str, ...]:
     """Kinds with at least one block that the other rows cannot predict."""
-    every, told = distinct(runs, problem.observe.blocks), predictable(runs, problem)
+    every, told = distinct_blocks(runs, problem.observe.blocks), predictable_blocks(runs, problem)
     return tuple(kind for kind, by in every.items() if len(told.get(kind, {})) < len(by))
 
 
-def _owner(parameter: str, configurations: np.ndarray) -> str:
+def _configuration_of_parameter(parameter: str, configurations: np.ndarray) -> str:
     """Configuration that a parameter belongs to, among those of a table's rows; empty for none."""
     first = parameter.partition(".")[0]
     return first if first in configurations else ""
@@ -161,18 +161,20 @@ class HeldOut:
     converged: np.ndarray
 
 
-def held_out(problem: Problem, start: np.ndarray, masks: dict[str, dict[str, np.ndarray]]) -> dict[str, HeldOut]:
+def hold_out_by_kind(
+    problem: Problem, start: np.ndarray, masks: dict[str, dict[str, np.ndarray]]
+) -> dict[str, HeldOut]:
     """Refit without each block of each kind in turn (with the given sds), and predict the omitted rows.
 
     Args:
         problem: as fitted to all rows; start: its optimum.
-        masks: kind → label → mask, from `blocks`; kinds without blocks are omitted from the result.
+        masks: kind → label → mask, from `blocks_of_kind`; kinds without blocks are omitted from the result.
     """
     answers = {}
     fits: dict[tuple[bytes, ...], refits.HeldOutFits] = {}  # shared by kinds that divide the rows in the same way
     for kind, by in masks.items():
         if by:
             parts = tuple(m.tobytes() for m in by.values())
-            seen = fits[parts] = fits.get(parts) or refits.held_out(problem, start, list(by.values()))
+            seen = fits[parts] = fits.get(parts) or refits.hold_out_blocks(problem, start, list(by.values()))
             answers[kind] = HeldOut(tuple(by), seen.block, seen.reading, seen.status, seen.z, seen.converged)
     return answers

@@ -18,10 +18,10 @@ from mmrjax.model.robot import Robot
 SLOW, SLIDING = 0.7, 0.7
 
 
-def conduct(runs: Runs, robot: Robot) -> list[Note]:
+def conduct_notes(runs: Runs, robot: Robot) -> list[Note]:
     """Notes on runs that end before they reach steady travel, and on runs that never grip."""
     runs = runs.of(robot)
-    kind = observers.kind(runs)
+    kind = observers.observer_kind(runs)
     ends, shown, lasts = kind.settled(runs)
     if not kind.axis or not len(ends) or not robot.has_ground or "speed" not in robot.rig.channels:
         return []
@@ -45,14 +45,14 @@ def conduct(runs: Runs, robot: Robot) -> list[Note]:
     if early.any():
         seen = slow & early
         share = float(np.nanmedian(speed[seen] / steady[seen])) if seen.any() else float("nan")
-        said.append(EndsEarly(_names(names, early), float(lasts[early].max()), share))
+        said.append(EndsEarly(_run_names(names, early), float(lasts[early].max()), share))
     if slides.any():
         share = max(float(np.median(speed[slides] / movers[slides])), 0.0)
-        said.append(NeverGrips(_names(names, slides), share))
+        said.append(NeverGrips(_run_names(names, slides), share))
     if slides.any() and (slides | early).all():
         said.append(Fact("no grip"))
     return said
 
 
-def _names(names: np.ndarray, which: np.ndarray) -> tuple[str, ...]:
+def _run_names(names: np.ndarray, which: np.ndarray) -> tuple[str, ...]:
     return tuple(str(n) for n in names[which])

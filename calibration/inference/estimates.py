@@ -15,7 +15,6 @@ from calibration.inference.noise import Noise
 from calibration.inference.observers import Observer
 from calibration.inference.problem import Problem
 from calibration.inference.result import (
-    Beside,
     Block,
     ChannelErrors,
     ChannelNoise,
@@ -26,6 +25,7 @@ from calibration.inference.result import (
     HeldOut,
     Prior,
     ProfileCurve,
+    SteadyEstimate,
     Tie,
 )
 from calibration.inference.scans import Scan
@@ -40,7 +40,7 @@ SENSITIVE = 1e-6
 _SIDE = {-1: "lower", 0: None, 1: "upper"}
 
 
-def parameters(
+def parameter_estimates(
     posed: Problem,
     base: Robot,
     z: np.ndarray,
@@ -66,7 +66,7 @@ def parameters(
     median = coordinates.value(np.zeros_like(at))
     wide = np.stack([coordinates.value(np.full_like(at, side * Z95)) for side in (-1, 1)], 1)
     other = None if beside is None else coordinates.value(np.asarray(beside))
-    bound, fields = coordinates.beyond(z), priors.known(base)
+    bound, fields = coordinates.beyond(z), priors.parameters_by_name(base)
     found = {}
     for k, name in enumerate(coordinates.names):
         interval, shift, is_open = linear[k], z[k] + Z95 * about.sd[k] * np.array([-1.0, 1.0]), (False, False)
@@ -101,7 +101,7 @@ def parameters(
             profile=None if profile is None else ProfileCurve(profile.value[k], profile.rise[k]),
             with_steady=None
             if beside is None or other is None
-            else Beside(float(other[k]), float((z[k] - beside[k]) / about.sd[k])),
+            else SteadyEstimate(float(other[k]), float((z[k] - beside[k]) / about.sd[k])),
         )
     return found
 
@@ -110,13 +110,13 @@ def _pair(ends: np.ndarray) -> tuple[float, float]:
     return float(ends[0]), float(ends[1])
 
 
-def tied(posed: Problem) -> dict[str, Tie]:
+def tied_parameters(posed: Problem) -> dict[str, Tie]:
     """Parameters tied to a free one, by name."""
     names = posed.coordinates.names
     return {follower: Tie(names[k], ratio) for follower, k, ratio in posed.coordinates.tied}
 
 
-def noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np.ndarray) -> dict[str, ChannelNoise]:
+def channel_noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np.ndarray) -> dict[str, ChannelNoise]:
     """Source and size of each channel's sd, by channel."""
     share = np.where(np.isfinite(measured), np.asarray(posed.data.sd) / np.maximum(np.abs(measured), 1e-12), np.nan)
     return {
@@ -129,7 +129,9 @@ def noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np.ndarray
     }
 
 
-def errors(shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray) -> Errors:
+def errors_by_channel(
+    shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray
+) -> Errors:
     """Errors by channel; arrays of shape (rows, channels)."""
     return _errors(shown, simulated, measured, sd, sized_error(simulated, measured))
 
@@ -146,7 +148,7 @@ def _errors(
     }
 
 
-def held_out(posed: Problem, held: holdout.HeldOut, measured: np.ndarray, sd: np.ndarray) -> HeldOut:
+def hold_out_errors(posed: Problem, held: holdout.HeldOut, measured: np.ndarray, sd: np.ndarray) -> HeldOut:
     """Hold-out errors, overall and for each block."""
     percent, lost = sized_error(held.reading, measured), posed.observe.unreachable(held.status)
     blocks = {}
@@ -155,19 +157,19 @@ def held_out(posed: Problem, held: holdout.HeldOut, measured: np.ndarray, sd: np
         alone = [np.where(inside[:, None], x, np.nan) for x in (held.reading, percent)]
         blocks[label] = Block(
             _errors(posed.channels, alone[0], measured, sd, alone[1]),
-            _counted(inside & lost),
+            _row_numbers(inside & lost),
             bool(held.converged[k]),
         )
     reading = dict(zip(channels.names(posed.channels), held.reading.T, strict=True))
-    return HeldOut(_errors(posed.channels, held.reading, measured, sd, percent), _counted(lost), blocks, reading)
+    return HeldOut(_errors(posed.channels, held.reading, measured, sd, percent), _row_numbers(lost), blocks, reading)
 
 
-def _counted(rows: np.ndarray) -> tuple[int, ...]:
+def _row_numbers(rows: np.ndarray) -> tuple[int, ...]:
     """Row numbers of a mask, from 1."""
     return tuple((np.flatnonzero(rows) + 1).tolist())
 
 
-def readings(
+def readings_by_channel(
     shown: Sequence[Channel],
     measured: np.ndarray,
     sd: np.ndarray,
@@ -192,7 +194,7 @@ def chi_square(
     return ChiSquare(float(np.sum(misfit**2)), freedom, not bool(known.estimated.any()))
 
 
-def conditions(observe: type[Observer], runs: Runs) -> dict[str, np.ndarray]:
+def condition_columns(observe: type[Observer], runs: Runs) -> dict[str, np.ndarray]:
     """Columns that identify the rows."""
     others = (axis for axis in observe.axes_of(runs) if axis not in runs.axes)
     columns = ("run_id", *others, "configuration", *runs.axes, *DRIVING, "surface")

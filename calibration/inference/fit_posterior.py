@@ -16,7 +16,7 @@ TOGETHER = 0.95
 EVEN = 1.25
 
 
-def of_coordinates(coordinates: Coordinates, z: np.ndarray, covariance: np.ndarray) -> Posterior:
+def posterior_of_coordinates(coordinates: Coordinates, z: np.ndarray, covariance: np.ndarray) -> Posterior:
     """Posterior of a fit with optimum z and this covariance."""
     size = len(coordinates)
     return Posterior(
@@ -59,7 +59,7 @@ def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tup
     return tuple(sorted(found, key=lambda pair: -abs(pair.correlation)))
 
 
-def undetermined(held: Collection[str], pairs: Collection[Pair]) -> tuple[str, ...]:
+def undetermined_names(held: Collection[str], pairs: Collection[Pair]) -> tuple[str, ...]:
     """Names held by priors, without names in a pair with a determined combination."""
     paired = {name for pair in pairs for name in (pair.one, pair.other)}
     return tuple(name for name in held if name not in paired)

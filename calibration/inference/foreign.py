@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from calibration.inference.fit_notes import InheritedPriors
-from calibration.inference.priors import FRICTION, GUIDE_FRICTION, GUIDE_SHARE, known
+from calibration.inference.priors import FRICTION, GUIDE_FRICTION, GUIDE_SHARE, parameters_by_name
 from mmrjax.model import paper_robots
 from mmrjax.model.robot import Robot
 
@@ -29,7 +29,9 @@ def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[Inherit
     """
     if not robot.rig.inherits:
         return []
-    mine, nominal = ({name: float(p.value) for name, p in known(r).items()} for r in (robot, paper_robots.nominal()))
+    mine, nominal = (
+        {name: float(p.value) for name, p in parameters_by_name(r).items()} for r in (robot, paper_robots.nominal())
+    )
     pairs = [(part, part, *DRIVE[part]) for part in DRIVE]
     pairs += [(c, other, *CHASSIS) for c in robot.configurations for other in paper_robots.nominal().configurations]
     found: dict[str, InheritedPriors] = {}

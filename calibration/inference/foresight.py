@@ -27,7 +27,7 @@ from calibration.inference.fit_notes import (
     Turned,
     Unused,
 )
-from calibration.inference.fit_posterior import determined_together, of_coordinates
+from calibration.inference.fit_posterior import determined_together, posterior_of_coordinates
 from calibration.inference.preparation import prepare
 from mmrjax import fidelities
 from mmrjax.model.robot import Robot
@@ -79,13 +79,13 @@ class Foresight:
     doubts: Notes = ()
 
 
-def foresee(runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS) -> Foresight:
+def predict_identifiability(runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS) -> Foresight:
     """Returns which parameters of `robot` `runs` can determine, from the linear analysis at the robot's own values.
 
     Rows that the robot does not reach with these values are ignored.
 
     Args:
-        noise: as `noise.parse`; None takes the file's sd columns, or shares of the readings.
+        noise: as `noise.parse_noise`; None takes the file's sd columns, or shares of the readings.
         rows: number of rows of a log over time above which readings are thinned.
 
     Raises:
@@ -101,15 +101,15 @@ def foresee(runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS
         names = tuple(n for n in names if n not in fidelities.unread("steady", names, runs.turns))
     if not names:
         raise BadConfiguration("nothing to determine: every loss is zero, so it is held; state yours with a ±")
-    coordinates = priors.coordinates(robot, names, any_surface=robot.rig.inherits)
-    posed = observers.pose(runs, robot, coordinates, known.sd)
+    coordinates = priors.parameter_coordinates(robot, names, any_surface=robot.rig.inherits)
+    posed = observers.pose_problem(runs, robot, coordinates, known.sd)
     z = jnp.zeros(len(names))
-    seen = fit.observation(posed, z)
+    seen = fit.observe_at(posed, z)
     reached = np.isfinite(np.asarray(seen.reading)).all(1) & ~posed.observe.unreachable(np.asarray(seen.status))
     data = dataclasses.replace(posed.data, weight=posed.data.weight * jnp.asarray(reached, float)[:, None])
-    about = identifiability.analyse(posed, z, data)
+    about = identifiability.analyse_identifiability(posed, z, data)
     held = identifiability.held_by_prior(about.sd)
-    fields = priors.known(robot)
+    fields = priors.parameters_by_name(robot)
     width = coordinates.prior_sd
     found = tuple(
         Determined(n, fields[n].spec.unit, float(fields[n].value), float(width[k]), float(about.sd[k]), bool(held[k]))
@@ -118,5 +118,7 @@ def foresee(runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS
     statuses = tuple(STATUSES[int(s)] for s in np.asarray(seen.status))
     doubts = tuple(note for note in ready.checked if isinstance(note, DOUBTS))
     priors_hold = [p.name for p in found if p.held]
-    together = determined_together(of_coordinates(coordinates, np.asarray(z), about.covariance), priors_hold)
+    together = determined_together(
+        posterior_of_coordinates(coordinates, np.asarray(z), about.covariance), priors_hold
+    )
     return Foresight(found, statuses, known.source, tuple(about.correlated()), together, robot, doubts)

@@ -51,7 +51,7 @@ class HeldOutFits:
     converged: np.ndarray
 
 
-def held_out(
+def hold_out_blocks(
     problem: Problem, start: np.ndarray, masks: Sequence[np.ndarray], active: Sequence[int] | None = None
 ) -> HeldOutFits:
     """Refit without each block in turn, and predict the omitted rows.
@@ -73,15 +73,15 @@ def held_out(
     return HeldOutFits(reading, status, block, np.asarray(found.z), np.asarray(found.converged))
 
 
-def unseen(
+def predict_unseen(
     problem: Problem, start: np.ndarray, masks: Sequence[np.ndarray], active: Sequence[int] | None = None
 ) -> HeldOutFits:
-    """Hold-out fits as `held_out`; for long runs each refit is one Gauss-Newton step from the fit to all rows.
+    """Hold-out fits as `hold_out_blocks`; for long runs each refit is one Gauss-Newton step from the fit to all rows.
 
     A log has hundreds of readings a parameter, and without one block a fit stays within the linear range.
     """
     if not problem.observe.long:
-        return held_out(problem, start, masks, active)
+        return hold_out_blocks(problem, start, masks, active)
     rows, at = len(masks[0]), np.asarray(start)
     out = [np.concatenate([m, np.zeros(len(problem.data.weight) - rows, bool)]) for m in masks]
     data = problem.data

@@ -43,7 +43,7 @@ class Identifiability:
         sd: posterior sd of z, thus the square root of the posterior over the prior variance.
         singular_values: of the whitened Jacobian of the readings without priors: prior sd over data sd along each
             direction, largest first; above 1 the data are more informative than the prior.
-        directions: right singular vectors, one a row; those beyond the rank as `told_apart` returns them.
+        directions: right singular vectors, one a row; those beyond the rank as `separate_directions` returns them.
         rank: number of singular values above 1e-8 of the largest.
         sensitivity: norm of each column of that Jacobian: change of the readings by one prior sd, in data sds;
             0 for a parameter that nothing measures.
@@ -89,7 +89,7 @@ class Identifiability:
         return weak
 
 
-def told_apart(directions: np.ndarray) -> np.ndarray:
+def separate_directions(directions: np.ndarray) -> np.ndarray:
     """Orthonormal basis of a subspace with each direction as close to one parameter as possible.
 
     The parameter with the largest component in the subspace comes first. The result does not depend on the basis
@@ -112,7 +112,9 @@ def _jacobians(problem: Problem, z: Array, data: Data) -> tuple[Array, Array]:
     return jnp.concatenate([readings, jnp.eye(z.size)]), readings
 
 
-def analyse(problem: Problem, z: Array, data: Data | None = None, slope: np.ndarray | None = None) -> Identifiability:
+def analyse_identifiability(
+    problem: Problem, z: Array, data: Data | None = None, slope: np.ndarray | None = None
+) -> Identifiability:
     """Linear analysis of `problem` at coordinates z, from readings and priors only.
 
     `slope`, if given, replaces the Jacobian of the whitened readings, (rows · channels, parameters). The limit of
@@ -122,15 +124,15 @@ def analyse(problem: Problem, z: Array, data: Data | None = None, slope: np.ndar
     if slope is not None:
         whole, readings = np.concatenate([slope, np.eye(len(z))]), slope
     elif problem.observe.long:
-        jacobian = np.asarray(fit.linearised(problem, z, data)[1])
-        whole, readings = jacobian[fit.informing(data)], jacobian[: data.measured.size]
+        jacobian = np.asarray(fit.linearise(problem, z, data)[1])
+        whole, readings = jacobian[fit.informative_residuals(data)], jacobian[: data.measured.size]
     else:
-        whole, readings = (np.asarray(j) for j in _jacobians(fit.rooted(problem, z), z, data))
+        whole, readings = (np.asarray(j) for j in _jacobians(fit.with_roots(problem, z), z, data))
     _, s, v = np.linalg.svd(whole, full_matrices=False)
     covariance = (v.T / s**2) @ v
     _, singular, directions = np.linalg.svd(readings, full_matrices=False)
     rank = int(np.sum(singular > 1e-8 * singular.max()))
-    directions[rank:] = told_apart(directions[rank:])
+    directions[rank:] = separate_directions(directions[rank:])
     leverage = np.einsum("ij,jk,ik->i", readings, covariance, readings)
     return Identifiability(
         names=problem.coordinates.names,
@@ -172,7 +174,9 @@ def _profiles(problem: Problem, data: Data, starts: Array, pins: Pin) -> fit.Opt
     return jax.vmap(lambda z, pin: fit.levenberg_marquardt(problem, z, data, pin)[0])(starts, pins)
 
 
-def profile(problem: Problem, z: Array, cost: float, about: Identifiability, data: Data | None = None) -> Profile:
+def profile_likelihoods(
+    problem: Problem, z: Array, cost: float, about: Identifiability, data: Data | None = None
+) -> Profile:
     """Profiles of all parameters; all points of all profiles are one vmapped batch of refits.
 
     Each refit starts on the line along which the linear analysis moves the other parameters. The end of an
@@ -192,14 +196,14 @@ def profile(problem: Problem, z: Array, cost: float, about: Identifiability, dat
     middle = len(PROFILE_STEPS)
     at_all = np.insert(at, middle, centre, axis=1)
     root_all = np.insert(root, middle, 0.0, axis=1)
-    ends = np.array([_ends(a, r) for a, r in zip(at_all, root_all, strict=True)])
+    ends = np.array([_interval_ends(a, r) for a, r in zip(at_all, root_all, strict=True)])
     value = np.asarray(jax.vmap(problem.coordinates.value)(jnp.asarray(at_all.T))).T
     low, high = np.asarray(jax.vmap(problem.coordinates.value)(jnp.asarray(ends.T)))
     is_open = np.stack([root_all[:, 0] > -Z95, root_all[:, -1] < Z95], 1)
     return Profile(at_all, value, root_all**2, low, high, is_open, float(max(0.0, -rise.min() / 2)))
 
 
-def _ends(at: np.ndarray, root: np.ndarray) -> tuple[float, float]:
+def _interval_ends(at: np.ndarray, root: np.ndarray) -> tuple[float, float]:
     """Coordinates where a profile's signed root reaches ∓Z95; its end points if it does not reach them."""
     rising = np.maximum.accumulate(root)
     return float(np.interp(-Z95, rising, at)), float(np.interp(Z95, rising, at))

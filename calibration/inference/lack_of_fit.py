@@ -153,7 +153,7 @@ class Residuals:
         return dataclasses.replace(self, whitened=whitened, jacobian=jacobian)
 
 
-def judged(
+def judge_adequacy(
     fit: Residuals, as_stated: np.ndarray, sd: np.ndarray, *, estimated: np.ndarray, converged: bool
 ) -> Adequacy:
     """Adequacy of a fit, with the obstacles that make tests of its residuals meaningless.
@@ -167,7 +167,7 @@ def judged(
         converged: True if the search converged.
     """
     misses = fit.misses(as_stated, ~estimated)
-    found = adequacy(fit, known=not estimated.any())
+    found = adequacy_of_residuals(fit, known=not estimated.any())
     both = fit.counts & np.isfinite(as_stated)
     before = np.sum(((as_stated - fit.runs.measured()) / sd) ** 2, where=both)
     obstacle = (
@@ -180,14 +180,14 @@ def judged(
     return dataclasses.replace(found, adequate=adequate, obstacle=obstacle, misses=misses)
 
 
-def adequacy(fit: Residuals, *, known: bool) -> Adequacy:
+def adequacy_of_residuals(fit: Residuals, *, known: bool) -> Adequacy:
     """Tests of a fit's residuals.
 
     Args:
         known: True if the noise of every channel is known, not estimated from the misfit.
     """
     chi2, freedom = float(fit.chi2.sum()), float(fit.freedom.sum())
-    found = structure(fit, known=known)
+    found = structure_tests(fit, known=known)
     if known and freedom > 0:
         found.append((float(chdtrc(freedom, chi2)), Shown(what="stated")))
     if not found:
@@ -197,15 +197,15 @@ def adequacy(fit: Residuals, *, known: bool) -> Adequacy:
     return Adequacy(p > LEVEL, chi2, freedom, p, shown, known)
 
 
-def structure(fit: Residuals, *, known: bool) -> list[tuple[float, Shown]]:
+def structure_tests(fit: Residuals, *, known: bool) -> list[tuple[float, Shown]]:
     """Tests of structure: p-value and finding of curves over the conditions, memory and replicates."""
-    families = {shown: _p_value(fit, columns, known) for shown, columns in _families(fit).items()}
+    families = {shown: _p_value(fit, columns, known) for shown, columns in _curve_columns(fit).items()}
     tested = [(p, shown) for shown, p in families.items() if p is not None]
     found = []
     if tested:
         p, shown = min(tested)
         found.append((min(1.0, p * len(tested)), shown))
-    return [*found, *(made for made in (_memory(fit), _replicates(fit)) if made is not None)]
+    return [*found, *(made for made in (_autocorrelation_test(fit), _replicate_test(fit)) if made is not None)]
 
 
 def _p_value(fit: Residuals, columns: np.ndarray, known: bool) -> float | None:
@@ -227,7 +227,7 @@ def _p_value(fit: Residuals, columns: np.ndarray, known: bool) -> float | None:
     return float(fdtrc(terms, freedom - terms, explained / terms / rest))
 
 
-def _families(fit: Residuals) -> dict[Shown, np.ndarray]:
+def _curve_columns(fit: Residuals) -> dict[Shown, np.ndarray]:
     """Columns over the readings, by finding: for each channel, curves over each variable, by configuration."""
     observe, runs, simulated, counts = fit.observe, fit.runs, fit.simulated, fit.counts
     variables = {c: (runs[c], TERMS) for c in (*runs.axes, *DUTY) if runs.has(c)}
@@ -256,7 +256,7 @@ def _families(fit: Residuals) -> dict[Shown, np.ndarray]:
     return families
 
 
-def _memory(fit: Residuals) -> tuple[float, Shown] | None:
+def _autocorrelation_test(fit: Residuals) -> tuple[float, Shown] | None:
     """Test of autocorrelation at lag 1 within runs; None if the rows of a run have no order."""
     observe, runs, residual, counts = fit.observe, fit.runs, fit.whitened, fit.counts
     if not observe.axis:
@@ -278,7 +278,7 @@ def _memory(fit: Residuals) -> tuple[float, Shown] | None:
     return min(1.0, p * len(found)), shown
 
 
-def _replicates(fit: Residuals) -> tuple[float, Shown] | None:
+def _replicate_test(fit: Residuals) -> tuple[float, Shown] | None:
     """Test of the residuals against the scatter of rows under the same conditions; None with too few replicates."""
     observe, runs, residual, counts = fit.observe, fit.runs, fit.whitened, fit.counts
     freedom, chi2 = float(fit.freedom.sum()), float(fit.chi2.sum())

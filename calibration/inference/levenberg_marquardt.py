@@ -51,12 +51,12 @@ def _slope(primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Ar
     return primals[1], primals[2] @ tangents[0]
 
 
-def at_known(value: Array, slope: Array, aux: Any = None) -> Function:
+def linear_residual_function(value: Array, slope: Array, aux: Any = None) -> Function:
     """Returns a residual function with a known value and slope at the single point where it will be called."""
     return lambda y, args: (with_slope(y, value, slope), aux)
 
 
-def counted(r: Array, jacobian: Array, one_sided: slice) -> tuple[Array, Array]:
+def zero_inactive_residuals(r: Array, jacobian: Array, one_sided: slice) -> tuple[Array, Array]:
     """Returns residuals and Jacobian with zeros for the one-sided residuals that are not positive."""
     counts = jnp.ones(r.shape, bool).at[one_sided].set(r[one_sided] > 0)
     return jnp.where(counts, r, 0.0), jnp.where(counts[:, None], jacobian, 0.0)
@@ -67,7 +67,7 @@ def half_squares(r: Array, one_sided: slice) -> Float[Array, ""]:
     return 0.5 * jnp.sum(r.at[one_sided].set(jnp.maximum(r[one_sided], 0.0)) ** 2)
 
 
-def stride_of(r: Array, jacobian: Array, one_sided: slice, damping: Array | float) -> Z:
+def one_sided_step(r: Array, jacobian: Array, one_sided: slice, damping: Array | float) -> Z:
     """Step to the optimum of a linearisation whose one-sided residuals count where they are positive.
 
     min_d ½ Σ (r + J d)² + ½ damping |d|², over the two-sided residuals and the one-sided ones that are positive at
@@ -145,7 +145,7 @@ class OneSidedDescent(optx.AbstractDescent[Z, Linearisation, Linearisation]):
     def step(self, step_size: Array, state: Linearisation) -> tuple[Z, optx.RESULTS]:
         tiny = jnp.finfo(step_size.dtype)
         damping = jnp.where(step_size > tiny.eps, 1 / jnp.maximum(step_size, tiny.eps), tiny.max)
-        return stride_of(state.residual, state.jacobian, state.one_sided, damping), optx.RESULTS.successful  # type: ignore[return-value]  # an enumeration of equinox's
+        return one_sided_step(state.residual, state.jacobian, state.one_sided, damping), optx.RESULTS.successful  # type: ignore[return-value]  # an enumeration of equinox's
 
 
 class OneSidedTrustRegion(optx.ClassicalTrustRegion):

@@ -29,7 +29,7 @@ from mmrjax.numerics.one_sided import clip
 PROBED = ("mass", "supply", "electrical", "motor", "gearbox", "track", "ground", "slip")
 
 
-def probe(whose: str) -> Effect:
+def balance_probe(whose: str) -> Effect:
     """Effect that adds its amplitude to a balance: one number for all sides, or shape (2,): left, right."""
 
     class Probe(Effect):
@@ -50,7 +50,7 @@ def probe(whose: str) -> Effect:
 # --- effects as they are scored -------------------------------------------------------------------------
 
 
-def _phase(p: Parameter) -> bool:
+def _is_phase(p: Parameter) -> bool:
     return p.name == "phase"
 
 
@@ -60,17 +60,17 @@ Scales = tuple[Scalar, Scalar, Scalar, Scalar, Scalar]
 def shape_scales(shape: Parameter | None) -> tuple[float, float, float, float, float]:
     """(value, spread, sd, low, high) of a shape parameter, value · exp(spread · z) + sd · z at coordinate z.
 
-    A phase is shifted, a scale multiplied; `shaped` applies the bounds.
+    A phase is shifted, a scale multiplied; `shape_at` applies the bounds.
     """
     if shape is None:
         return 1.0, 0.0, 0.0, -math.inf, math.inf
     low, high = shape.spec.bounds
-    if _phase(shape):
+    if _is_phase(shape):
         return float(shape.value), 0.0, shape.spec.prior_sd(0.0), low, high
     return float(shape.value), math.sqrt(math.log1p((shape.spec.relative_sd or 0.0) ** 2)), 0.0, low, high
 
 
-def shaped(scales: Scales, z: Array) -> Array:
+def shape_at(scales: Scales, z: Array) -> Array:
     """Shape parameter at coordinate z, with `scales` from `shape_scales`, within the bounds of a robot file.
 
     A phase is wrapped by whole turns, a scale clipped.
@@ -113,21 +113,21 @@ class ScoredEffect(eqx.Module):
         return jax.vmap(lambda v: function(params.replace(self.effect, {self.shape: v})))(self.values)
 
 
-def scored(effect: Effect, grid: Sequence[float] = GRID) -> ScoredEffect:
+def with_shape_grid(effect: Effect, grid: Sequence[float] = GRID) -> ScoredEffect:
     """Effect with the grid of its shape parameter, clipped at the bounds."""
     shape, amplitude = shape_of(effect), amplitude_of(effect)
     unit = params.replace(effect, {amplitude.name: jnp.asarray(amplitude.spec.prior_sd(0.0))})
     if shape is None:
         return ScoredEffect(unit, "", (0.0,), jnp.zeros(0))
-    grid = TURN if _phase(shape) else grid
+    grid = TURN if _is_phase(shape) else grid
     scales = [np.asarray(x) for x in shape_scales(shape)]
-    return ScoredEffect(unit, shape.name, tuple(grid), _shaped(tuple(scales), np.asarray(grid)))
+    return ScoredEffect(unit, shape.name, tuple(grid), _shape_at(tuple(scales), np.asarray(grid)))
 
 
-_shaped: Callable[..., Array] = compiled(shaped)
+_shape_at: Callable[..., Array] = compiled(shape_at)
 
 
-def shaped_as_in(robot: Robot, scored: ScoredEffect) -> ScoredEffect:
+def with_shape_of_robot(robot: Robot, scored: ScoredEffect) -> ScoredEffect:
     """Effect with its grid, or with the shape that it has in `robot` if it is present there."""
     own = next((e for e in robot.effects if e.name == scored.effect.name), None)
     if own is None or not scored.shape:
@@ -136,7 +136,7 @@ def shaped_as_in(robot: Robot, scored: ScoredEffect) -> ScoredEffect:
     return dataclasses.replace(scored, values=jnp.where(jnp.asarray(own.amplitude) == 0, scored.values, shape))
 
 
-def each_shape(scored: ScoredEffect, function: Callable[[Effect, Array], Array], given: Array) -> Array:
+def map_over_shapes(scored: ScoredEffect, function: Callable[[Effect, Array], Array], given: Array) -> Array:
     """A function of an effect and of the value in `given`, shape (grid,), at each point of its shape's grid."""
     if not scored.shape:
         return function(scored.effect, given[0])[None]
@@ -144,7 +144,7 @@ def each_shape(scored: ScoredEffect, function: Callable[[Effect, Array], Array],
     return jax.vmap(at)(scored.values, given)
 
 
-def terms_of(robot: Robot, signals: Signals, effects: tuple[ScoredEffect, ...], memory: list[Array]) -> Array:
+def effect_terms(robot: Robot, signals: Signals, effects: tuple[ScoredEffect, ...], memory: list[Array]) -> Array:
     """Terms of effects in their balances at an instant, shape (instances,).
 
     Args:
@@ -156,7 +156,7 @@ def terms_of(robot: Robot, signals: Signals, effects: tuple[ScoredEffect, ...], 
         with_memory = dataclasses.replace(signals, memory={**signals.memory, effect.name: remembered})
         return jnp.asarray(balances.added(alone, with_memory, effect.balance, effect.channel), float)
 
-    found = [each_shape(e, term, m) for e, m in zip(effects, memory, strict=True)]
+    found = [map_over_shapes(e, term, m) for e, m in zip(effects, memory, strict=True)]
     return jnp.concatenate(found) if found else jnp.zeros(0)
 
 
@@ -270,6 +270,6 @@ class Linearization(eqx.Module):
         return jnp.asarray(-jnp.inf)
 
 
-def finite(x: Array) -> Array:
+def finite_or_zero(x: Array) -> Array:
     """x with 0 for non-finite values."""
     return jnp.where(jnp.isfinite(x), x, 0.0)

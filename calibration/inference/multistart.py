@@ -17,7 +17,7 @@ from calibration.inference import noise as noise_room
 from calibration.inference import optimizers as fit
 from calibration.inference.fit_notes import Agreement, Step
 from calibration.inference.noise import Noise
-from calibration.inference.population import Population, Searched, most_probable
+from calibration.inference.population import Population, Searched, most_probable_noise
 from calibration.inference.problem import Data, Observation, Problem
 from calibration.words import fit_words
 from mmrjax.model.robot import Robot
@@ -71,7 +71,7 @@ class Starts:
 
 
 @dataclasses.dataclass(frozen=True)
-class Found:
+class SearchResult:
     """Result of the searches.
 
     Attributes:
@@ -88,12 +88,14 @@ class Found:
     searched: Searched | None = None
 
 
-def unreachable(posed: Problem, status: np.ndarray) -> np.ndarray:
+def unreachable_rows(posed: Problem, status: np.ndarray) -> np.ndarray:
     """True for rows with readings for which the model has no operating point; shape of `status`, (..., rows)."""
     return posed.observe.unreachable(np.asarray(status)) & (np.asarray(posed.data.weight).max(1) > 0)
 
 
-def search(posed: Problem, noise: Noise, points: np.ndarray, solver: fit.Solver | None = None) -> Found:
+def search_from_starts(
+    posed: Problem, noise: Noise, points: np.ndarray, solver: fit.Solver | None = None
+) -> SearchResult:
     """Search from all points in one batch; if the noise is unknown, estimate it and repeat until it settles.
 
     The best optimum so far is one more start, so that every round runs the same compiled batch.
@@ -101,19 +103,21 @@ def search(posed: Problem, noise: Noise, points: np.ndarray, solver: fit.Solver 
     Args:
         solver: of optimistix; None for ours.
     """
-    by = functools.partial(fit.searches, solver=solver)
+    by = functools.partial(fit.search_starts, solver=solver)
     z = points[0]
-    shares = first_shares(noise)
+    shares = initial_noise_shares(noise)
     for _ in range(ROUNDS):
-        posed, found, feasible = _tighten(posed, np.concatenate([points, z[None]]), by)
-        best = _member(found, int(np.nanargmin(found.cost)))
+        posed, found, feasible = _search_until_feasible(posed, np.concatenate([points, z[None]]), by)
+        best = _pick_member(found, int(np.nanargmin(found.cost)))
         z = np.asarray(best.z)
-        new = _settling(posed, noise, z, shares)
+        new = _reestimate_shares(posed, noise, z, shares)
         if new is None:
             break
         shares = new
-        posed = _noisier(posed, noise, shares)
-    return Found(posed, best, _ended(jax.tree.map(lambda x: x[:-1], found), feasible[:-1]), shares)
+        posed = _with_noise_shares(posed, noise, shares)
+    return SearchResult(
+        posed, best, _outcome_of_searches(jax.tree.map(lambda x: x[:-1], found), feasible[:-1]), shares
+    )
 
 
 def search_one_by_one(
@@ -123,8 +127,8 @@ def search_one_by_one(
     shares: np.ndarray,
     tell: Callable[[Step], None],
     solver: fit.Solver | None = None,
-) -> Found:
-    """Search as `search`, but with one search at a time.
+) -> SearchResult:
+    """Search as `search_from_starts`, but with one search at a time.
 
     The noise settles on the first point's optimum, then each other point starts one search. If one of these ends
     lower, it takes the first one's place and the noise settles again.
@@ -141,13 +145,13 @@ def search_one_by_one(
     def step(posed: Problem, points: np.ndarray, data: Data) -> tuple[fit.Optimum, np.ndarray, np.ndarray]:
         def one(z: np.ndarray) -> tuple[fit.Optimum, Observation, Observation]:
             if solver is not None:
-                return _member(fit.searches_by(posed, jnp.asarray(z)[None], data, solver), 0)
-            return fit.search_long(
+                return _pick_member(fit.search_with_solver(posed, jnp.asarray(z)[None], data, solver), 0)
+            return fit.search_rollout(
                 posed, jnp.asarray(z), data, tell=lambda *done: tell(Step("search", (*done, minutes())))
             )
 
         found, start, end = one(points[0])
-        found, end = scans.searched_on(posed, (found, end), data, lambda z: one(z)[::2], tell)
+        found, end = scans.search_lower_basins(posed, (found, end), data, lambda z: one(z)[::2], tell)
         found, start, end = jax.tree.map(lambda x: jnp.asarray(x)[None], (found, start, end))
         return found, start.status, end.status
 
@@ -155,19 +159,19 @@ def search_one_by_one(
     for _ in range(len(points)):
         z = first
         for round_ in range(1, ROUNDS + 1):
-            posed, found, feasible = _tighten(posed, z[None], step)
+            posed, found, feasible = _search_until_feasible(posed, z[None], step)
             z = np.asarray(found.z[0])
             tell(Step("round", (round_, found.cost[0], found.steps[0], minutes())))
-            new = _settling(posed, noise, z, shares)
+            new = _reestimate_shares(posed, noise, z, shares)
             if new is None:
                 break
             shares = new
-            posed = _noisier(posed, noise, shares)
+            posed = _with_noise_shares(posed, noise, shares)
         ends, feasibles = [found], [feasible]
         for k, point in enumerate(points[1:], 2):
             end, status, _ = step(posed, point[None], posed.data)
             ends.append(end)
-            feasibles.append(~np.any(unreachable(posed, status), axis=1))
+            feasibles.append(~np.any(unreachable_rows(posed, status), axis=1))
             tell(Step("start", (k, len(points), end.cost[0], end.steps[0], minutes())))
         found = jax.tree.map(lambda *x: jnp.concatenate(x), *ends)
         k = int(np.nanargmin(found.cost))
@@ -175,17 +179,17 @@ def search_one_by_one(
             k = 0
             break
         first = np.asarray(found.z[k])
-    return Found(posed, _member(found, k), _ended(found, np.concatenate(feasibles)), shares)
+    return SearchResult(posed, _pick_member(found, k), _outcome_of_searches(found, np.concatenate(feasibles)), shares)
 
 
-def nearby(easy: Problem, z: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
+def starts_from_posterior(easy: Problem, z: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
     """Starts of a rollout's searches, drawn from the posterior of `steady` at its optimum z.
 
     Draws are kept if no row slides and no friction law is steeper at rest than the base's, or else if they are the
     nearest to that. Draws from the prior would need hundreds of rollouts along the limit of adhesion to recover. The
     starts of `steady` show whether the problem has several optima.
     """
-    spread = np.linalg.cholesky(identifiability.analyse(easy, jnp.asarray(z)).covariance)
+    spread = np.linalg.cholesky(identifiability.analyse_identifiability(easy, jnp.asarray(z)).covariance)
     draws = z + rng.standard_normal((DRAWS, len(z))) @ spread.T
 
     def steepness(robot: Robot) -> jax.Array:
@@ -196,18 +200,18 @@ def nearby(easy: Problem, z: np.ndarray, rng: np.random.Generator, count: int) -
         return easy.observation(z).status, steepness(easy.robot(z)) > 1.001 * steepness(easy.base)
 
     status, steep = jax.jit(jax.vmap(seen))(jnp.asarray(draws))
-    lost = unreachable(easy, status).sum(1) + np.asarray(steep).sum(1)
+    lost = unreachable_rows(easy, status).sum(1) + np.asarray(steep).sum(1)
     return draws[np.argsort(lost, kind="stable")[:count]]
 
 
-def at_best(
+def optimum_of_population(
     posed: Problem,
     noise: Noise,
     shares: np.ndarray,
     searched: Searched,
     tell: Callable[[Step], None],
     solver: fit.Solver | None = None,
-) -> Found:
+) -> SearchResult:
     """Optimum of a population: its best member, improved by gradients if these are reliable."""
     z = searched.found.z[searched.at]
     if searched.slope is None:
@@ -218,47 +222,47 @@ def at_best(
     )))  # fmt: skip
     error = np.concatenate([np.asarray(posed.whitened(seen, posed.data)), z - np.asarray(posed.data.centre)])
     rows = np.zeros((posed.data.measured.shape[0], len(z)))  # of the penalty on adhesion
-    best = fit.optimum(np.concatenate([searched.slope, rows, np.eye(len(z))]), error, z, posed.data)
+    best = fit.optimum_at_point(np.concatenate([searched.slope, rows, np.eye(len(z))]), error, z, posed.data)
     settled = np.array([searched.found.settled])
     best = dataclasses.replace(best, converged=jnp.asarray(searched.found.settled))
     ended = Starts(np.array([float(best.cost)]), settled, sum(g.failed for g in searched.found.generations))
-    return Found(posed, best, ended, shares, searched)
+    return SearchResult(posed, best, ended, shares, searched)
 
 
 def reestimate_noise_at(posed: Problem, noise: Noise, searched: Population, at: int) -> tuple[Problem, np.ndarray]:
     """Problem with the noise that is most probable for a member, and that noise as shares of the readings."""
-    shares = most_probable(posed, noise, searched.reading[at])
-    return _noisier(posed, noise, shares), shares
+    shares = most_probable_noise(posed, noise, searched.reading[at])
+    return _with_noise_shares(posed, noise, shares), shares
 
 
-def first_shares(noise: Noise) -> np.ndarray:
+def initial_noise_shares(noise: Noise) -> np.ndarray:
     """Initial estimated shares, NaN if the sd is known; shape (channels,)."""
     return np.where(noise.estimated, noise_room.START, np.nan)
 
 
-def _member(found: T, k: int) -> T:
+def _pick_member(found: T, k: int) -> T:
     return jax.tree.map(lambda x: x[k], found)
 
 
-def _ended(found: fit.Optimum, feasible: np.ndarray) -> Starts:
+def _outcome_of_searches(found: fit.Optimum, feasible: np.ndarray) -> Starts:
     cost = np.where(np.isfinite(found.cost), found.cost, np.inf)
     return Starts(cost, np.asarray(found.converged), int(np.sum(~feasible)), np.asarray(found.z))
 
 
-def _settling(posed: Problem, noise: Noise, z: np.ndarray, shares: np.ndarray) -> np.ndarray | None:
+def _reestimate_shares(posed: Problem, noise: Noise, z: np.ndarray, shares: np.ndarray) -> np.ndarray | None:
     """New estimates of the shares at z; None without unknown noise, or if the shares have settled."""
     if not noise.estimated.any():
         return None
-    new = _shares(posed, noise, z)
+    new = _estimate_shares(posed, noise, z)
     return None if np.nanmax(np.abs(new / shares - 1)) < SETTLED_SHARE else new
 
 
-def _noisier(posed: Problem, noise: Noise, shares: np.ndarray) -> Problem:
+def _with_noise_shares(posed: Problem, noise: Noise, shares: np.ndarray) -> Problem:
     sd = np.where(noise.estimated, noise.sd / noise_room.START * shares, noise.sd)
     return dataclasses.replace(posed, data=dataclasses.replace(posed.data, sd=jnp.asarray(sd)))
 
 
-def _tighten(
+def _search_until_feasible(
     posed: Problem, points: np.ndarray, search: Callable[..., Any]
 ) -> tuple[Problem, fit.Optimum, np.ndarray]:
     """Search from all points; the penalty on adhesion is increased until no row slides at the best optimum.
@@ -269,14 +273,14 @@ def _tighten(
     for _ in range(TIGHTENINGS + 1):
         found, status_start, status_end = search(posed, jnp.asarray(points), posed.data)
         k = int(np.nanargmin(found.cost))
-        if not unreachable(posed, status_end)[k].any():
+        if not unreachable_rows(posed, status_end)[k].any():
             break
         data = dataclasses.replace(posed.data, stiffness=posed.data.stiffness / 10)
         posed = dataclasses.replace(posed, data=data)
-    return posed, found, ~np.any(unreachable(posed, status_start), axis=1)
+    return posed, found, ~np.any(unreachable_rows(posed, status_start), axis=1)
 
 
-def _shares(posed: Problem, noise: Noise, z: np.ndarray) -> np.ndarray:
+def _estimate_shares(posed: Problem, noise: Noise, z: np.ndarray) -> np.ndarray:
     """Sd over size of each channel from the misfit, corrected for degrees of freedom; NaN if known.
 
     s² = Σ (error / size)² / (readings - Σ leverage). It contains model error as well as noise, so a fit with it can't
@@ -285,9 +289,9 @@ def _shares(posed: Problem, noise: Noise, z: np.ndarray) -> np.ndarray:
     data = posed.data
     size = noise.sd / noise_room.START  # the reference of an estimated share
     weight = np.asarray(data.weight)
-    error = np.asarray(fit.observation(posed, jnp.asarray(z)).reading - data.measured) / size
+    error = np.asarray(fit.observe_at(posed, jnp.asarray(z)).reading - data.measured) / size
     error = np.where(weight > 0, error, 0.0)
-    leverage = identifiability.analyse(posed, jnp.asarray(z)).leverage
+    leverage = identifiability.analyse_identifiability(posed, jnp.asarray(z)).leverage
     left = np.maximum(weight.sum(0) - leverage.sum(0), 1.0)
     shares = np.maximum(np.sqrt(np.sum(error**2, 0) / left), series_noise.FLOOR)
     return np.where(noise.estimated, shares, np.nan)

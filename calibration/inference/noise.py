@@ -63,7 +63,7 @@ class Noise:
         return dataclasses.replace(self, sd=self.sd * factor)
 
 
-def parse(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float, bool]]:
+def parse_noise(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float, bool]]:
     """Reads `current=2%,motor_speed=0.5%,speed=1%` (or `current=0.05A,motor_speed=30rpm,speed=5mm/s`).
 
     Args:
@@ -102,20 +102,20 @@ def parse(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float, bool]
     return found
 
 
-def from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
+def noise_from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
     """Noise of a table: as stated, else from the file's sd columns, else to be estimated.
 
     Known sds include the quantisation error of the instrument, `Instrument.variance`.
 
     Args:
         sizes: reference size of each reading [SI] for shares, see `Observer.sizes`; shape (rows, channels).
-        stated: as `parse`.
+        stated: as `parse_noise`.
 
     Raises:
-        BadConfiguration: as `parse`.
+        BadConfiguration: as `parse_noise`.
         BadData: a channel that reads zero everywhere and has no stated sd.
     """
-    shares = parse(stated, runs.channels) if stated else {}
+    shares = parse_noise(stated, runs.channels) if stated else {}
     measured, columns = runs.measured(), runs.deviations()
     sd, source = np.ones_like(measured), []
     for k, channel in enumerate(runs.channels):
@@ -141,7 +141,7 @@ def from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Nois
     return Noise(runs.channels, sd, np.array([s == "estimated" for s in source]), tuple(source))
 
 
-def default(shown: Iterable[Channel]) -> str:
+def default_noise(shown: Iterable[Channel]) -> str:
     """Default sds of the loop if neither the file nor the user states them.
 
     They are for averages of at least three repeats, printed to 0.05 A, 10 rpm and 10 mm/s, as in Tables A1 and A2.
@@ -149,21 +149,21 @@ def default(shown: Iterable[Channel]) -> str:
     return ",".join(f"{c.word}={100 * c.sd_share:g}%" for c in shown)
 
 
-def inferred(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
-    """Noise as `from_table`, but known before any fit.
+def infer_noise(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
+    """Noise as `noise_from_table`, but known before any fit.
 
-    Instead of an estimate from the misfit it takes the scatter along series (`series_noise`), or `default` if the
-    table has none.
+    Instead of an estimate from the misfit it takes the scatter along series (`series_noise`), or `default_noise` if
+    the table has none.
 
     Raises:
-        BadConfiguration, BadData: as `from_table`.
+        BadConfiguration, BadData: as `noise_from_table`.
     """
-    known = from_table(runs, sizes, stated)
+    known = noise_from_table(runs, sizes, stated)
     if not known.estimated.any():
         return known
     sd, words, series = known.sd.copy(), list(known.source), []
-    guess = from_table(runs, sizes, default(runs.channels))
-    shown = (None,) * len(words) if runs.sampled else series_noise.estimate(runs, sizes)
+    guess = noise_from_table(runs, sizes, default_noise(runs.channels))
+    shown = (None,) * len(words) if runs.sampled else series_noise.estimate_noise(runs, sizes)
     for k in np.flatnonzero(known.estimated):
         found = shown[k]
         if found is None:

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import chdtr, chdtrc
 
 from calibration.inference.fit_notes import NoiseOff
-from calibration.inference.lack_of_fit import LEVEL, Residuals, structure
+from calibration.inference.lack_of_fit import LEVEL, Residuals, structure_tests
 
 #: Factor on the sds, in either direction, above which a note reports it; p-value under correct sds below which it
 #: does.
@@ -27,7 +27,7 @@ def noise_factors(fit: Residuals, level: float = LEVEL) -> dict[str, float]:
     Args:
         level: family-wise significance of that test.
     """
-    tests = structure(fit.rescaled(), known=False)
+    tests = structure_tests(fit.rescaled(), known=False)
     if tests and min(p for p, _ in tests) * len(tests) < level:
         return {}
     found = {}
@@ -49,10 +49,10 @@ def common_factors(fit: Residuals) -> dict[str, float]:
     """
     factors = noise_factors(fit, BEYOND_DOUBT)
     enough = bool(np.all(fit.freedom[fit.counts.any(0)] >= FEWEST))
-    return factors if enough and _everywhere(fit, factors) else {}
+    return factors if enough and _is_common_factor(fit, factors) else {}
 
 
-def _everywhere(fit: Residuals, factors: dict[str, float]) -> bool:
+def _is_common_factor(fit: Residuals, factors: dict[str, float]) -> bool:
     """True if every measured channel has a factor, and the factors are the same."""
     count = int(fit.counts.any(0).sum())
     return len(factors) == count > 1 and max(factors.values()) < ALIKE**2 * min(factors.values())
@@ -61,6 +61,6 @@ def _everywhere(fit: Residuals, factors: dict[str, float]) -> bool:
 def noise_remarks(fit: Residuals, source: str = "stated") -> list[NoiseOff]:
     """Notes on sds that are wrong by a factor; `source` is the origin of the sds."""
     factors = noise_factors(fit)
-    if _everywhere(fit, factors):
+    if _is_common_factor(fit, factors):
         return [NoiseOff("", float(np.exp(np.mean(np.log(list(factors.values()))))), source)]
     return [NoiseOff(name, factor, source) for name, factor in factors.items()]

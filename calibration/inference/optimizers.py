@@ -22,11 +22,11 @@ from calibration.inference.levenberg_marquardt import (
     Function,
     OneSidedLevenbergMarquardt,
     Searching,
-    at_known,
-    counted,
     half_squares,
-    stride_of,
+    linear_residual_function,
+    one_sided_step,
     with_slope,
+    zero_inactive_residuals,
 )
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax.compile.compiling import OVER_TIME, SELDOM, SMALL, compiled
@@ -92,14 +92,14 @@ class Optimum(eqx.Module):
     steps: Int[Array, ""]
 
 
-def penalties(data: Data) -> slice:
+def penalty_slice(data: Data) -> slice:
     """Slice of the residuals that are penalties on adhesion, one a row, between readings and priors."""
     return slice(data.measured.size, data.measured.size + data.measured.shape[0])
 
 
-def informing(data: Data) -> np.ndarray:
+def informative_residuals(data: Data) -> np.ndarray:
     """Indices of the residuals that carry information: readings and priors, not the penalty on adhesion."""
-    held = penalties(data)
+    held = penalty_slice(data)
     return np.r_[: held.start, held.stop : held.stop + data.centre.size]
 
 
@@ -119,7 +119,7 @@ def _evaluated(problem: Problem, data: Data, pin: Pin, z: Z) -> tuple[Array, Arr
     return jnp.concatenate([r, prior]), jnp.concatenate([jacobian, jnp.eye(z.size)]), seen
 
 
-def residuals(problem: Problem, data: Data, pin: Pin) -> Function:
+def residual_function(problem: Problem, data: Data, pin: Pin) -> Function:
     """Residual function of optimistix with the residuals of `_evaluated`, and the observation as auxiliary output."""
 
     def function(z: Z, args: Any) -> tuple[Array, Observation]:
@@ -131,27 +131,27 @@ def residuals(problem: Problem, data: Data, pin: Pin) -> Function:
 
 def _solver(data: Data, long: bool) -> OneSidedLevenbergMarquardt:
     """Solver of fits to such data; of rollouts if `long`."""
-    held, tolerance = penalties(data), TOLERANCE_LONG if long else TOLERANCE
+    held, tolerance = penalty_slice(data), TOLERANCE_LONG if long else TOLERANCE
     return OneSidedLevenbergMarquardt(tolerance, tolerance, held.start, held.stop)
 
 
 def _optimum(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array) -> Optimum:
-    held_rows = penalties(data)
-    informed = jacobian[informing(data)]
+    held_rows = penalty_slice(data)
+    informed = jacobian[informative_residuals(data)]
     half = half_solved(informed.T @ informed, jnp.eye(z.shape[0]))
     sd = jnp.linalg.norm(half, axis=0)
-    ahead = r + jacobian @ stride_of(r, jacobian, held_rows, 0.0)
+    ahead = r + jacobian @ one_sided_step(r, jacobian, held_rows, 0.0)
     decrement = half_squares(r, held_rows) - half_squares(ahead, held_rows)
     held = jnp.where(pin.held, pin.at - data.centre, 0.0)
     cost = half_squares(r, held_rows) + 0.5 * jnp.sum(held**2)
-    return Optimum(pin.apply(z), sd, half.T @ half, cost, decrement, _small(decrement, cost), steps)
+    return Optimum(pin.apply(z), sd, half.T @ half, cost, decrement, _is_converged(decrement, cost), steps)
 
 
-def _small(decrement: Any, cost: Array) -> Array:
+def _is_converged(decrement: Any, cost: Array) -> Array:
     return jnp.asarray(decrement < DECREMENT + DECREMENT_SHARE * cost)
 
 
-def optimum(jacobian: np.ndarray, residual: np.ndarray, z: np.ndarray, data: Data) -> Optimum:
+def optimum_at_point(jacobian: np.ndarray, residual: np.ndarray, z: np.ndarray, data: Data) -> Optimum:
     """A point as an optimum, from its residuals (misfit, then prior) and their Jacobian, of any origin."""
     j, r, at = (jnp.asarray(x, float) for x in (jacobian, residual, z))
     return _optimum(j, r, at, data, no_pin(len(z)), jnp.asarray(0))
@@ -186,7 +186,7 @@ def _step(solver: OneSidedLevenbergMarquardt, function: Function, at: Progress) 
 
 def _begun(problem: Problem, start: Z, data: Data) -> Progress:
     """State of a problem's search before its first evaluation."""
-    size = penalties(data).stop + start.shape[0]
+    size = penalty_slice(data).stop + start.shape[0]
     return _begin(_solver(data, problem.observe.long), start, size, _of_every_row(data))
 
 
@@ -196,7 +196,7 @@ def _advance(problem: Problem, at: Progress, data: Data, max_steps: int | Number
     The program evaluates the model in one place, at the start of a step. The point accepted there is the search's
     result, with its residuals, Jacobian and observation.
     """
-    solver, function = _solver(data, problem.observe.long), residuals(problem, data, no_pin(at[0].shape[0]))
+    solver, function = _solver(data, problem.observe.long), residual_function(problem, data, no_pin(at[0].shape[0]))
     y, state = _step(solver, function, at)
     done, _ = solver.terminate(function, y, None, {}, state, frozenset())
     over = done | (state.steps >= max_steps) | ~jnp.all(jnp.isfinite(y))
@@ -215,7 +215,7 @@ def levenberg_marquardt(
 ) -> tuple[Optimum, Observation]:
     """Optimum of one search, and the observation there; for `vmap` over starts, data and pins."""
     pin = no_pin(start.shape[0]) if pin is None else pin
-    function: Any = residuals(problem, data, pin)
+    function: Any = residual_function(problem, data, pin)
     found: optx.Solution = optx.least_squares(
         function,
         _solver(data, problem.observe.long),
@@ -251,7 +251,7 @@ class Member(eqx.Module):
 
 
 @functools.partial(compiled, options=SELDOM)
-def _vacant(problem: Problem, members: Member) -> Progress:
+def _placeholder_searches(problem: Problem, members: Member) -> Progress:
     """States of searches that are over before they begin, as placeholders."""
 
     def one(member: Member) -> Progress:
@@ -330,7 +330,7 @@ def _go_on_apart(
             return at, found
 
 
-def rooted(problem: Problem, z: Z) -> Problem:
+def with_roots(problem: Problem, z: Z) -> Problem:
     """Problem with its roots at z, found by the program of searches; unchanged if its observer is not `apart`."""
     if not problem.observe.apart:
         return problem
@@ -341,7 +341,7 @@ def rooted(problem: Problem, z: Z) -> Problem:
     return dataclasses.replace(problem, roots=jax.tree.map(lambda x: x[0], _roots(problem, *many)))
 
 
-def roots_of(problem: Problem, zs: Numbers) -> tuple[np.ndarray, np.ndarray]:
+def solve_roots(problem: Problem, zs: Numbers) -> tuple[np.ndarray, np.ndarray]:
     """Roots at several z, by the program of searches, of a problem without slots; the leading axis is z."""
     places = problem.observe.places(problem)
     filled = np.resize(zs, (-(-len(zs) // places) * places, zs.shape[1]))
@@ -396,7 +396,7 @@ class Places:
             self.holds[place] = -1
 
 
-def searches_refilled(problem: Problem, members: Member, max_steps: int, places: int) -> tuple[Optimum, Observation]:
+def search_refilling(problem: Problem, members: Member, max_steps: int, places: int) -> tuple[Optimum, Observation]:
     """`levenberg_marquardt` for any number of members, with a fixed number in parallel.
 
     Finished members are replaced by queued ones, whereas a batch would wait for its slowest member. One program
@@ -414,11 +414,11 @@ def searches_refilled(problem: Problem, members: Member, max_steps: int, places:
 
 
 def _refilled(problem: Problem, members: Member, max_steps: int, places: int) -> tuple[Optimum, Searching]:
-    """Results as of `searches_refilled`, with the solver's state at the end of each search."""
+    """Results as of `search_refilling`, with the solver's state at the end of each search."""
     count, most = len(members.start), np.asarray(max_steps)
     cores = min(CORES, -(-count // places))
     first = jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members)
-    idle = _vacant(problem, first)
+    idle = _placeholder_searches(problem, first)
     go_on = _go_on_seldom if getattr(problem.coordinates, "fitted_once", False) else _go_on_often
     go_on = _go_on_apart if problem.observe.apart else go_on
 
@@ -440,14 +440,14 @@ def _refilled(problem: Problem, members: Member, max_steps: int, places: int) ->
     return jax.tree.map(lambda *x: np.stack(x), *(ended[k] for k in range(count)))
 
 
-def linearised(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
+def linearise(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
     """Residuals (misfit, then prior) at z, their Jacobian, and the observation."""
-    r, jacobian, seen = (linearised_signed if problem.observe.long else _first_step)(problem, z, data)
-    return *_counting(r, jacobian, data), seen
+    r, jacobian, seen = (linearise_rollout if problem.observe.long else _first_step)(problem, z, data)
+    return *_clip_penalties(r, jacobian, data), seen
 
 
 def _first_step(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
-    """Result of `linearised` with the signs of penalties, by the compiled program of the searches."""
+    """Result of `linearise` with the signs of penalties, by the compiled program of the searches."""
     active = getattr(problem.coordinates, "active", None)
     own = [np.asarray(x)[None] for x in (z, data.weight, data.measured, data.centre)]
     members = Member(own[0], own[1], own[2], own[3], None if active is None else np.asarray(active)[None])
@@ -456,18 +456,18 @@ def _first_step(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Obser
     return state.found.residual, state.found.jacobian, state.aux
 
 
-def counting(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
+def clip_penalties(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
     """Residuals and Jacobian with penalties cut off at 0, for solvers without one-sided residuals.
 
     Readings with a non-finite slope count as not computed.
     """
-    return counted(*computed(r, jacobian, data), penalties(data))
+    return zero_inactive_residuals(*mask_uncomputed(r, jacobian, data), penalty_slice(data))
 
 
-_counting = compiled(counting, options=SELDOM)
+_clip_penalties = compiled(clip_penalties, options=SELDOM)
 
 
-def computed(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
+def mask_uncomputed(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
     """Residuals and Jacobian; a reading with a non-finite row of the Jacobian counts as not computed."""
     counts = jnp.concatenate([data.weight.ravel() > 0, jnp.ones(data.measured.shape[0] + jacobian.shape[1], bool)])
     known = jnp.all(jnp.isfinite(jacobian), axis=1)
@@ -475,29 +475,29 @@ def computed(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
 
 
 @functools.partial(compiled, options=OVER_TIME)
-def linearised_signed(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
-    """`linearised` of a rollout with the signs of penalties, and with the slopes of negative ones.
+def linearise_rollout(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
+    """`linearise` of a rollout with the signs of penalties, and with the slopes of negative ones.
 
     If a rollout's step is too long for its friction law (V_s small compared with μ_s), the run oscillates and its
     derivative grows without limit. Such a reading counts as not computed if it has a weight.
     """
 
     r, jacobian, seen = _evaluated(problem, data, no_pin(z.size), z)
-    return *computed(r, jacobian, data), seen
+    return *mask_uncomputed(r, jacobian, data), seen
 
 
-def evaluated(problem: Problem, z: Z, data: Data) -> Array:
-    """Residuals of `linearised` without the Jacobian, by the program of `read`, which saves compiling a rollout."""
-    seen = read(problem, problem.robot(z))
+def evaluate_residuals(problem: Problem, z: Z, data: Data) -> Array:
+    """Residuals of `linearise` without the Jacobian, by the program of `observe_robot`, which saves a compilation."""
+    seen = observe_robot(problem, problem.robot(z))
     return jnp.concatenate([problem.whitened(seen, data), z - data.centre])
 
 
 @eqx.filter_jit
 def _stepped(solver: OneSidedLevenbergMarquardt, at: Progress, r: Array, jacobian: Array) -> Progress:
-    return _step(solver, at_known(r, jacobian), at)
+    return _step(solver, linear_residual_function(r, jacobian), at)
 
 
-def search_long(
+def search_rollout(
     problem: Problem,
     start: Z,
     data: Data,
@@ -512,15 +512,15 @@ def search_long(
         The optimum, and the observations at the start and at the end.
     """
     pin, solver = no_pin(start.shape[0]), _solver(data, long=True)
-    size = penalties(data).stop + start.shape[0]
+    size = penalty_slice(data).stop + start.shape[0]
     at, first, last = _begin(solver, start, size, None), None, None
     best: Optimum | None = None
     for steps in range(1, max_steps + 1):
         ahead = at[1].ahead
         # A step after a rejected one is often rejected too; that needs no Jacobian, so the previous one remains.
-        r = evaluated(problem, ahead, data) if at[1].rejected > 0 else None
+        r = evaluate_residuals(problem, ahead, data) if at[1].rejected > 0 else None
         if r is None or best is None or 0.5 * jnp.sum(r**2) < best.cost:
-            r, jacobian, seen = linearised_signed(problem, ahead, data)
+            r, jacobian, seen = linearise_rollout(problem, ahead, data)
         first = seen if first is None else first
         at = _stepped(solver, at, r, jacobian)
         done = bool(at[1].over)
@@ -547,13 +547,13 @@ def _steps(at: Progress, found: tuple[Array, Array, Any], data: Data, weights: A
     solver, pin = _solver(data, long=True), no_pin(at[0].shape[-1])
 
     def one(at: Progress, found: tuple[Array, Array, Any], weight: Array) -> tuple[Progress, Optimum]:
-        new = _step(solver, at_known(*found), at)
+        new = _step(solver, linear_residual_function(*found), at)
         return new, _ended(new, dataclasses.replace(data, weight=weight), pin)
 
     return jax.vmap(one)(at, found, weights)
 
 
-def searches_long(
+def search_rollouts(
     evaluate: Evaluate,
     starts: Numbers,
     data: Data,
@@ -585,14 +585,18 @@ def searches_long(
     while mine:
         fresh, going = mine.fill(), np.flatnonzero(mine.taken)
         # A step accepts or rejects the point to which the last one led; an accepted point becomes y.
-        ahead = _put(ahead, fresh, starts[mine.holds[fresh]])
+        ahead = _with_values(ahead, fresh, starts[mine.holds[fresh]])
         evaluated = evaluate(ahead[going], mine.holds[going])
-        found = jax.tree.map(lambda x: _put(np.zeros((len(ahead), *x.shape[1:]), x.dtype), going, x), evaluated)  # noqa: B023
+        found = jax.tree.map(
+            lambda x: _with_values(np.zeros((len(ahead), *x.shape[1:]), x.dtype), going, x),  # noqa: B023
+            evaluated,
+        )
         if len(fresh):
             aux = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), found[2])
             begin = functools.partial(_begin, solver, size=found[0].shape[1], aux=aux)
             begun = jax.device_get(jax.vmap(begin)(jnp.asarray(ahead)))
-            at = begun if at is None else jax.tree.map(lambda old, new: _put(old, fresh, new[fresh]), at, begun)  # noqa: B023
+            put = lambda old, new: _with_values(old, fresh, new[fresh])  # noqa: B023, E731
+            at = begun if at is None else jax.tree.map(put, at, begun)
         assert at is not None  # the first searches are fresh
         at, ends = jax.device_get(_steps(at, found, data, weights[mine.member]))
         state = at[1]
@@ -614,13 +618,13 @@ def searches_long(
     return jax.tree.map(lambda *x: np.stack(x), *(mine.ended[k] for k in range(len(starts))))
 
 
-def _put(x: np.ndarray, places: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _with_values(x: np.ndarray, places: np.ndarray, values: np.ndarray) -> np.ndarray:
     x = np.array(x)
     x[places] = values
     return x
 
 
-def searches(
+def search_starts(
     problem: Problem, starts: Float[Array, "starts parameters"], data: Data, solver: Solver | None = None
 ) -> tuple[Optimum, Int[Array, "starts rows"], Int[Array, "starts rows"]]:
     """A search from each start: in one vmapped batch by our solver, one after another by any other `solver`.
@@ -629,20 +633,20 @@ def searches(
         The end of each search, and the status of each row at its start and at its end.
     """
     if solver is not None:
-        found, start, end = searches_by(problem, starts, data, solver)
+        found, start, end = search_with_solver(problem, starts, data, solver)
         return found, start.status, end.status
     if not problem.observe.apart:
-        return _searches(problem, starts, data)
+        return _search_starts(problem, starts, data)
     own = (np.repeat(np.asarray(x)[None], len(starts), 0) for x in (data.weight, data.measured, data.centre))
     members = Member(np.asarray(starts), *own)
     problem = dataclasses.replace(problem, data=data)
     # A search of one step evaluates its start.
-    begun, ended = (searches_refilled(problem, members, steps, problem.observe.places(problem)) for steps in (1, 100))
+    begun, ended = (search_refilling(problem, members, steps, problem.observe.places(problem)) for steps in (1, 100))
     return ended[0], begun[1].status, ended[1].status
 
 
 @compiled
-def _searches(problem: Problem, starts: Array, data: Data) -> tuple[Optimum, Array, Array]:
+def _search_starts(problem: Problem, starts: Array, data: Data) -> tuple[Optimum, Array, Array]:
     def search(z: Z) -> tuple[Optimum, Array, Array]:
         found, seen = levenberg_marquardt(problem, z, data)
         return found, problem.observation(z).status, seen.status
@@ -651,7 +655,7 @@ def _searches(problem: Problem, starts: Array, data: Data) -> tuple[Optimum, Arr
 
 
 @eqx.filter_jit
-def searches_by(
+def search_with_solver(
     problem: Problem, starts: Float[Array, "starts parameters"], data: Data, solver: Solver
 ) -> tuple[Optimum, Observation, Observation]:
     """Searches by a solver of optimistix, one after another.
@@ -665,29 +669,31 @@ def searches_by(
 
     def residual(z: Z, args: Any) -> Array:
         r, jacobian, _ = _evaluated(problem, data, no_pin(z.size), jax.lax.stop_gradient(z))
-        return with_slope(z, *counting(r, jacobian, data))
+        return with_slope(z, *clip_penalties(r, jacobian, data))
 
     def search(start: Z) -> tuple[Optimum, Observation, Observation]:
         solved: optx.Solution = optx.least_squares(residual, solver, start, max_steps=most, throw=False)
         z, pin = solved.value, no_pin(start.size)
         r, jacobian, seen = _evaluated(problem, data, pin, z)
-        r, jacobian = computed(r, jacobian, data)
+        r, jacobian = mask_uncomputed(r, jacobian, data)
         found = _optimum(jacobian, r, z, data, pin, solved.stats["num_steps"])
         return found, problem.observation(start), seen
 
     return jax.lax.map(search, starts)
 
 
-def read(problem: Problem, robot: Robot) -> Observation:
+def observe_robot(problem: Problem, robot: Robot) -> Observation:
     """Observation of any robot in each row of the problem, compiled."""
-    return problem.observe.read(robot) if problem.observe.apart else _read(problem, robot)
+    return problem.observe.read(robot) if problem.observe.apart else _observe_robot(problem, robot)
 
 
 @functools.partial(compiled, options=OVER_TIME)
-def _read(problem: Problem, robot: Robot) -> Observation:
+def _observe_robot(problem: Problem, robot: Robot) -> Observation:
     return problem.observe(robot)
 
 
-def observation(problem: Problem, z: Z) -> Observation:
+def observe_at(problem: Problem, z: Z) -> Observation:
     """Observation at z, by a program that the search has already compiled if it is long."""
-    return linearised(problem, z, problem.data)[2] if problem.observe.long else read(problem, problem.robot(z))
+    return (
+        linearise(problem, z, problem.data)[2] if problem.observe.long else observe_robot(problem, problem.robot(z))
+    )

@@ -121,7 +121,7 @@ KEPT = ("z", *Rows._fields)
 Objective = Callable[[np.ndarray, Rows], Float[np.ndarray, " members"]]
 
 
-def identity(posed: Problem) -> str:
+def problem_hash(posed: Problem) -> str:
     """Hash of a problem's data, base robot, coordinates and model."""
     arrays, rest = eqx.partition(posed, eqx.is_array_like)
     digest = hashlib.sha256(str(rest).encode())
@@ -163,7 +163,7 @@ class Members:
         self._together = together or TOGETHER[jax.default_backend() != "cpu"]
         # The noise is excluded, because it may be estimated again during the search.
         bare = dataclasses.replace(posed.data, sd=jnp.ones_like(posed.data.sd), stiffness=jnp.zeros(()))
-        self._posed, self._file, self._own = posed, file, identity(dataclasses.replace(posed, data=bare))
+        self._posed, self._file, self._own = posed, file, problem_hash(dataclasses.replace(posed, data=bare))
         self._kept: dict[bytes, tuple[np.ndarray, ...]] = {}
         if file is not None and file.exists():
             self._load(file)
@@ -220,7 +220,7 @@ def _observed(posed: Problem, points: Float[Array, "points parameters"]) -> Obse
     return jax.vmap(posed.observation)(points)
 
 
-def most_probable(
+def most_probable_noise(
     posed: Problem, noise: Noise, reading: Float[np.ndarray, "... rows channels"]
 ) -> Float[np.ndarray, "... channels"]:
     """Most probable sd of each channel for given readings, as a share of its size; NaN if it is known."""
@@ -230,7 +230,7 @@ def most_probable(
     return np.where(noise.estimated, np.hypot(share, series_noise.FLOOR), np.nan)
 
 
-def objective(posed: Problem, noise: Noise) -> Objective:
+def member_objective(posed: Problem, noise: Noise) -> Objective:
     """Objective of members: half the sum of squares of misfit and prior.
 
     If the sd of a channel is unknown, the most probable one for each member is used: n ln s replaces the squares,
@@ -243,7 +243,7 @@ def objective(posed: Problem, noise: Noise) -> Objective:
     def of(z: np.ndarray, seen: Rows) -> Float[np.ndarray, " members"]:
         error = np.where(weight > 0, seen.reading - measured, 0.0)
         squares = np.sum((z - np.asarray(data.centre)) ** 2, -1)
-        shares = most_probable(posed, noise, seen.reading)
+        shares = most_probable_noise(posed, noise, seen.reading)
         for k, estimated in enumerate(noise.estimated):
             count = weight[:, k].sum()
             if estimated and count:
@@ -306,7 +306,9 @@ def evolve(
     return found
 
 
-def regression(posed: Problem, found: Population, at: int) -> tuple[Float[np.ndarray, "readings parameters"], float]:
+def local_regression(
+    posed: Problem, found: Population, at: int
+) -> tuple[Float[np.ndarray, "readings parameters"], float]:
     """Slope of the whitened readings by z near a member, by least squares over the nearest members.
 
     If contacts open and close, the derivative of a run excludes these events. The regression includes them, over the
@@ -331,7 +333,7 @@ def regression(posed: Problem, found: Population, at: int) -> tuple[Float[np.nda
     return slope[1:].T, float(np.sqrt(np.mean(left**2)))
 
 
-def apart(
+def unreliable_derivatives(
     posed: Problem, members: Members, z: np.ndarray, jacobian: np.ndarray, sd: np.ndarray
 ) -> Bool[np.ndarray, " parameters"]:
     """True for parameters with derivatives of a run that disagree with finite differences, shape (parameters,).
@@ -350,7 +352,7 @@ def apart(
     return ~np.isfinite(off) | ((off > APART * size) & (off > 1.0))
 
 
-def edges(coordinates: Coordinates, z: np.ndarray) -> dict[str, Edge]:
+def parameters_at_edge(coordinates: Coordinates, z: np.ndarray) -> dict[str, Edge]:
     """Parameters at a bound, or further than `EDGE` from the middle of their prior, with that distance, by name."""
     bound = coordinates.beyond(z)
     found = {}
@@ -371,7 +373,7 @@ class Searched:
         apart: names of parameters with derivatives of a run that disagree with finite differences.
         slope: of the whitened readings, from the members, if derivatives are unreliable; else None.
         left: rms residual of the regression that gives the slope [σ], NaN without one.
-        edge: of the best member, see `edges`.
+        edge: of the best member, see `parameters_at_edge`.
     """
 
     found: Population

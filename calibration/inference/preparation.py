@@ -60,15 +60,15 @@ def prepare(
     """A table and a robot, prepared for any fit.
 
     Args:
-        noise: as `noise.parse`; stated: parameter → (mean, sd) [SI], by the names that the user knows.
+        noise: as `noise.parse_noise`; stated: parameter → (mean, sd) [SI], by the names that the user knows.
         assume: True to take a usual sd for a channel without one, False to let the fit estimate it.
         choose: function from the preparation to the names of the free parameters.
 
     Raises:
-        BadData: a table that contradicts itself, its robot or its model, see `checks.check`.
+        BadData: a table that contradicts itself, its robot or its model, see `checks.check_data`.
         BadConfiguration: an invalid noise or prior, or any raised by `choose`.
     """
-    observe = observers.kind(runs)
+    observe = observers.observer_kind(runs)
     robot = surfaces.with_surface_configurations(instruments.with_inferred_instruments(robot, runs), runs)
     former: list[str] = []
     priors = surfaces.of_surfaces(stated or {}, robot, runs)
@@ -76,13 +76,13 @@ def prepare(
     own_mass.check_priors(priors, robot, runs)
     as_stated, weighed = robot, own_mass.remarks(robot, runs)
     robot = own_mass.with_table_mass(robot, runs)
-    known = (noise_room.inferred if assume else noise_room.from_table)(runs, observe.sizes(runs), noise)
-    known, larger = repeats.enlarged(known, runs)
+    known = (noise_room.infer_noise if assume else noise_room.noise_from_table)(runs, observe.sizes(runs), noise)
+    known, larger = repeats.enlarge_noise(known, runs)
     robot = observe.with_initial_states(robot, runs, known)
     found = Prepared(robot, observe, known, priors, (), tuple(former), (), (), (), tuple(weighed))
     names = tuple(choose(found))
     # The table's masses are compared with those of the file, which are not yet replaced there.
-    checked = checks.check(runs, as_stated, names, known)
+    checked = checks.check_data(runs, as_stated, names, known)
     begins = observe.check_start(runs, known, robot)
     return dataclasses.replace(
         found,

@@ -70,7 +70,7 @@ DELAY = "rig.delay"
 SOFTNESS = 0.05  # of a prior sd: the width over which a bound is rounded
 
 
-def held_within(u: Array, low: Array | np.ndarray, high: Array | np.ndarray, width: Array | np.ndarray) -> Array:
+def clip_softly(u: Array, low: Array | np.ndarray, high: Array | np.ndarray, width: Array | np.ndarray) -> Array:
     """u + w S((low - u)/w) - w S((u - high)/w), S softplus, within low and high; clipped there for w = 0."""
     xp = np if isinstance(u, np.ndarray) else jnp
     w = xp.where(xp.asarray(width) > 0, width, 1.0)
@@ -119,7 +119,7 @@ class Coordinates(eqx.Module):
     def value(self, z: Float[Array | np.ndarray, "... parameters"]) -> Any:
         """Parameters θ [SI] at coordinates z; NumPy in, NumPy out."""
         xp, own = (np, jax.tree.map(np.asarray, self)) if isinstance(z, np.ndarray) else (jnp, self)
-        u = held_within(own.location + own.spread * z, own.low, own.high, SOFTNESS * own.spread)
+        u = clip_softly(own.location + own.spread * z, own.low, own.high, SOFTNESS * own.spread)
         return xp.where(xp.asarray(self.scale), xp.exp(u), u)
 
     @property
@@ -161,12 +161,12 @@ def _numbers(coordinates: Coordinates, z: Float[Array, " parameters"]) -> tuple[
     return (*params.one_by_one(theta), *params.one_by_one(tied))
 
 
-def known(robot: Robot) -> dict[str, Parameter]:
+def parameters_by_name(robot: Robot) -> dict[str, Parameter]:
     """Parameters of the robot by dotted name."""
     return {p.name: p for p in params.walk(robot)}
 
 
-def friction(robot: Robot, configuration: str) -> tuple[str, ...]:
+def friction_names(robot: Robot, configuration: str) -> tuple[str, ...]:
     """Friction parameters of a configuration that are free by default.
 
     Parameters that are zero, or that no channel can show, are fixed. The ground's friction shows in the speed, as
@@ -186,7 +186,7 @@ def _uncertain(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
     A zero is uncertain if the file states its sd. The delay of a rig is uncertain unless it is exact, because a log
     may be late without its author's knowledge.
     """
-    fields, exact = known(robot), robot.rig.exact
+    fields, exact = parameters_by_name(robot), robot.rig.exact
     stated = robot.rig.stated if robot.rig.inherits else {*robot.rig.stated, DELAY}
     mine = (n for n in names if n in fields and n not in exact)
     return tuple(n for n in mine if float(fields[n].value) != 0.0 or n in stated)
@@ -205,7 +205,7 @@ def stated_names(robot: Robot, configurations: Iterable[str], idle: tuple[str, .
     return _drive(robot, (n for n in mine if _leader(robot, n) is None and not n.endswith(idle)))
 
 
-def delays(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
+def delay_names(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
     """The delay among `names`, for a rig with a file that states its sd."""
     return tuple(n for n in names if n == DELAY and n in robot.rig.stated - robot.rig.exact)
 
@@ -221,16 +221,16 @@ def default_names(
         turns: True for data of turns.
     """
     present = set(configurations)
-    names = [n for c in robot.configurations if c in present for n in friction(robot, c)]
+    names = [n for c in robot.configurations if c in present for n in friction_names(robot, c)]
     if turns:
         names += _uncertain(robot, (f"{c}.{n}" for c in robot.configurations if c in present for n in OF_TURNS))
     names = [n for n in names if _leader(robot, n) is None]
     if GUIDE_SHARE in computed:
         names = [n.replace(GUIDE_SHARE, GUIDE_FRICTION) for n in names]
-    return (*names, *(f"effects.{e.name}.amplitude" for e in robot.effects), *begins(robot))
+    return (*names, *(f"effects.{e.name}.amplitude" for e in robot.effects), *initial_state_names(robot))
 
 
-def begins(robot: Robot) -> tuple[str, ...]:
+def initial_state_names(robot: Robot) -> tuple[str, ...]:
     """Initial speeds and angles of histories, if a rig leaves them free."""
     if robot.rig.begins is None or robot.rig.start != "free":
         return ()
@@ -263,10 +263,14 @@ def free_names(
         name
         for c in robot.configurations
         if c in present
-        for name in (*friction(robot, c), *_radius(robot, c), *(f"{c}.{n}" for n in chassis if _has(robot, c, n)))
+        for name in (
+            *friction_names(robot, c),
+            *_radius(robot, c),
+            *(f"{c}.{n}" for n in chassis if _has_nonzero(robot, c, n)),
+        )
     ]
     own = [n for n in own if _leader(robot, n) is None]
-    return (*_uncertain(robot, (*_drive(robot, (*BENCH, *drive)), *own)), *begins(robot))
+    return (*_uncertain(robot, (*_drive(robot, (*BENCH, *drive)), *own)), *initial_state_names(robot))
 
 
 def _leader(robot: Robot, name: str) -> str | None:
@@ -276,9 +280,9 @@ def _leader(robot: Robot, name: str) -> str | None:
     return None if leader is None or rest.startswith(GROUND) else f"{leader}.{rest}"
 
 
-def _has(robot: Robot, configuration: str, name: str) -> bool:
+def _has_nonzero(robot: Robot, configuration: str, name: str) -> bool:
     """True if a load has a parameter that is not zero."""
-    field = known(robot).get(f"{configuration}.{name}")
+    field = parameters_by_name(robot).get(f"{configuration}.{name}")
     return field is not None and float(field.value) != 0.0
 
 
@@ -298,7 +302,7 @@ def _drive(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
     return tuple(n for n in names if n not in ELECTRICAL)
 
 
-def guided(robot: Robot, configuration: str) -> tuple[Robot, dict[str, tuple[float, float]]]:
+def with_guide_share(robot: Robot, configuration: str) -> tuple[Robot, dict[str, tuple[float, float]]]:
     """`robot` with the track model's guide share, and the resulting prior of its guide friction.
 
     The prior is that of the product of friction and share, because all fidelities agree on the product. Table 4
@@ -310,14 +314,14 @@ def guided(robot: Robot, configuration: str) -> tuple[Robot, dict[str, tuple[flo
     Returns:
         The robot, and (mean, sd) of the guide friction by its name.
     """
-    field = known(robot)
+    field = parameters_by_name(robot)
     of_share, of_friction = f"{configuration}.{GUIDE_SHARE}", f"{configuration}.{GUIDE_FRICTION}"
     size, share = float(field[of_friction].value), float(field[of_share].value)
     sd = size * field[of_share].spec.prior_sd(share) / GUIDED
     return params.replace(robot, {of_share: jnp.asarray(GUIDED)}), {of_friction: (size * share / GUIDED, sd)}
 
 
-def choose(
+def choose_free_names(
     robot: Robot, default: Sequence[str], free: Sequence[str] = (), fix: Sequence[str] = ()
 ) -> tuple[str, ...]:
     """Names of the free parameters: `free` if it has any, else the default set; less `fix`.
@@ -328,11 +332,11 @@ def choose(
         BadConfiguration: an unknown name (with the choices), a name that is both freed and fixed by name,
             or nothing left to fit.
     """
-    everything = list(known(robot))
+    everything = list(parameters_by_name(robot))
     chosen: list[str] = []
     for word in free:
-        chosen += default if word == "default" else expand(word, everything, "--free")
-    fixed = [n for word in fix for n in expand(word, everything, "--fix")]
+        chosen += default if word == "default" else expand_name(word, everything, "--free")
+    fixed = [n for word in fix for n in expand_name(word, everything, "--fix")]
     both = [word for word in free if word in fix]
     if both:
         raise BadConfiguration(f"--free and --fix both name {both[0]}; name it once")
@@ -347,7 +351,7 @@ def choose(
     return tuple(names)
 
 
-def expand(word: str, everything: list[str], option: str) -> list[str]:
+def expand_name(word: str, everything: list[str], option: str) -> list[str]:
     """Parameters that a word names: one, or with `.*` at its end all below it.
 
     Raises:
@@ -360,11 +364,13 @@ def expand(word: str, everything: list[str], option: str) -> list[str]:
         groups = sorted({n.rsplit(".", 1)[0] + ".*" for n in everything})
         raise BadConfiguration(f"{option} {word}: no parameters below it; {choices(word, groups)}")
     if word not in everything:
-        raise BadConfiguration(f"{option} {word}: no such parameter; {choices(word, _near(word, everything))}")
+        raise BadConfiguration(
+            f"{option} {word}: no such parameter; {choices(word, _similar_names(word, everything))}"
+        )
     return [word]
 
 
-def _near(word: str, everything: list[str]) -> list[str]:
+def _similar_names(word: str, everything: list[str]) -> list[str]:
     """The names to list for an unknown one: those that share its last part or its group, else all."""
     last = word.rsplit(".", 1)[-1]
     near = [n for n in everything if last and (n.endswith(f".{last}") or last in n)]
@@ -410,7 +416,7 @@ def parse_priors(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
     return stated
 
 
-def coordinates(
+def parameter_coordinates(
     robot: Robot,
     names: Sequence[str],
     stated: dict[str, tuple[float, float]] | None = None,
@@ -421,7 +427,7 @@ def coordinates(
 
     Args:
         robot: its values are the prior means (medians for scales).
-        names: of the free parameters, from `choose`.
+        names: of the free parameters, from `choose_free_names`.
         stated: name → (mean, sd) [SI]; these take precedence over the file's (`Rig.priors`), and those over the
             fields'.
         any_surface: True for the priors of `SURFACE` on ground friction without a stated prior.
@@ -431,7 +437,7 @@ def coordinates(
             parameter with a prior of zero width (nominal value 0 with a relative sd, or stated as exact).
     """
     stated = stated or {}
-    fields = known(robot)
+    fields = parameters_by_name(robot)
     for name in names:
         if name in robot.rig.exact and name not in stated:
             raise BadConfiguration(
@@ -439,7 +445,9 @@ def coordinates(
             )
     for name in stated:
         if name not in fields:
-            raise BadConfiguration(f"--prior {name}: no such parameter; {choices(name, _near(name, list(fields)))}")
+            raise BadConfiguration(
+                f"--prior {name}: no such parameter; {choices(name, _similar_names(name, list(fields)))}"
+            )
         if name not in names:
             raise BadConfiguration(f"--prior {name}: it is not free; add --free {name} (with --free default)")
     wide = {n: SURFACE[n.split(".", 1)[-1]] for n in names if any_surface and n.split(".", 1)[-1] in SURFACE}
@@ -450,7 +458,7 @@ def coordinates(
         wide = {n: RELATIVE_OF_RIGS for n in names if n.endswith(FRICTION_OF_RIGS)} | wide
     known_sds = {n: (float(fields[n].value), float(fields[n].value) * share) for n, share in wide.items()}
     known_sds |= {n: (mean, sd) for n, mean, sd in robot.rig.priors if n in names} | stated
-    rows = [_row(fields[name], known_sds.get(name)) for name in names]
+    rows = [_coordinate_of_parameter(fields[name], known_sds.get(name)) for name in names]
     location, spread, low, high, scale = zip(*rows, strict=True)
     tied = tuple(
         (follower, names.index(leader), float(fields[follower].value / fields[leader].value))
@@ -476,7 +484,9 @@ def coordinates(
     )
 
 
-def _row(parameter: Parameter, stated: tuple[float, float] | None) -> tuple[float, float, float, float, bool]:
+def _coordinate_of_parameter(
+    parameter: Parameter, stated: tuple[float, float] | None
+) -> tuple[float, float, float, float, bool]:
     """Location, spread, low and high [θ or log θ] of a parameter, and True for a scale."""
     spec = parameter.spec
     low, high = spec.bounds

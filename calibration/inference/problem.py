@@ -60,7 +60,7 @@ class Data(eqx.Module):
     stiffness: Float[Array, ""]
 
 
-def data_of(measured: np.ndarray, sd: np.ndarray, parameters: int) -> Data:
+def data_from_readings(measured: np.ndarray, sd: np.ndarray, parameters: int) -> Data:
     """Data of a table in which every reading that is present has full weight.
 
     Args:

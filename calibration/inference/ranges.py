@@ -52,7 +52,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
             confusion of units explains it.
     """
     runs = runs.of(robot)
-    kind = observers.kind(runs)
+    kind = observers.observer_kind(runs)
     runs, measured, lasts = kind.settled(runs, steady=True)
     if not len(runs):
         return []
@@ -63,7 +63,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
     if not robot.rig.inherits:
         _check_gear(runs, measured, robot)
     conditions = runs.conditions(robot)
-    possible = np.stack([operating_readings(_rubbing(robot, f), conditions) for f in FRICTION])
+    possible = np.stack([operating_readings(_with_friction_factor(robot, f), conditions) for f in FRICTION])
     # A robot that moves with less friction but not with more may stand still: any speed between is possible.
     slow = np.array([c.zero_at_rest for c in robot.channels])
     possible = np.where(slow & np.isnan(possible) & np.isfinite(possible[0]), 0.0, possible)
@@ -87,7 +87,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
             channel.unit,
             typical if units else factor,
             tuple(units),
-            tuple(_others(channel, factors)),
+            tuple(_columns_with_same_factor(channel, factors)),
             runs.layout.imposed_column,
         )
         if off > REFUSED:
@@ -106,7 +106,9 @@ def turned_signs(runs: Runs, robot: Robot) -> list[Turned]:
         return []
     conditions = runs.conditions(robot)
     return _turned(
-        runs, runs.measured(), np.stack([operating_readings(_rubbing(robot, f), conditions) for f in FRICTION])
+        runs,
+        runs.measured(),
+        np.stack([operating_readings(_with_friction_factor(robot, f), conditions) for f in FRICTION]),
     )
 
 
@@ -128,7 +130,7 @@ def _rms(off: np.ndarray) -> float:
     return min((float(np.sqrt(np.nanmean(x**2))) for x in off if np.isfinite(x).any()), default=math.inf)
 
 
-def _rubbing(robot: Robot, factor: float) -> Robot:
+def _with_friction_factor(robot: Robot, factor: float) -> Robot:
     """Robot with its friction torques and its ground's rolling resistance multiplied by a factor."""
     torques = [
         p
@@ -166,7 +168,7 @@ def _units(channel: Channel, measured: np.ndarray, possible: np.ndarray, robot: 
     return sorted((u for u, x in left.items() if x < math.log(ALIKE)), key=left.__getitem__)
 
 
-def _others(channel: Channel, factors: dict[Channel, float]) -> list[str]:
+def _columns_with_same_factor(channel: Channel, factors: dict[Channel, float]) -> list[str]:
     """Columns of the other channels with the same factor."""
     mine = factors[channel]
     return [c.column for c, f in factors.items() if c is not channel and abs(math.log(f / mine)) < math.log(ALIKE)]

@@ -32,7 +32,7 @@ from mmrjax.model.signals import DONE, STATUSES
 FAR = 3.0
 
 
-def remarks(found: CalibrationResult) -> list[Note]:
+def calibration_remarks(found: CalibrationResult) -> list[Note]:
     """All remarks."""
     return [
         *_noise(found),
@@ -67,7 +67,7 @@ def _search(found: CalibrationResult) -> Iterator[Note]:
 def _statuses(found: CalibrationResult) -> Iterator[Note]:
     for k, word in enumerate(STATUSES):
         if k not in DONE and np.any(found.status == word):
-            yield OfRows(numbers(found.status == word), word)
+            yield OfRows(row_numbers(found.status == word), word)
 
 
 def _parameters(found: CalibrationResult) -> Iterator[Note]:
@@ -90,7 +90,7 @@ def _parameters(found: CalibrationResult) -> Iterator[Note]:
 def _limits(found: CalibrationResult) -> Iterator[Note]:
     limited = found.adhesion_used > 1 - MARGIN
     if limited.any():
-        yield OfRows(numbers(limited), "limited", MARGIN)
+        yield OfRows(row_numbers(limited), "limited", MARGIN)
     for configuration in found.robot.configurations:
         friction = f"{configuration}.{priors.GUIDE_FRICTION}"
         share = f"{configuration}.{priors.GUIDE_SHARE}"
@@ -110,6 +110,6 @@ def _blocks(found: CalibrationResult) -> Iterator[Note]:
             yield BlockNotConverged(kind)
 
 
-def numbers(which: np.ndarray) -> tuple[int, ...]:
+def row_numbers(which: np.ndarray) -> tuple[int, ...]:
     """Row numbers of a mask, from 1."""
     return tuple(int(k) + 1 for k in np.flatnonzero(which))

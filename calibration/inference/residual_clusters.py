@@ -143,7 +143,7 @@ def residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, .
                 taken.append((p, test, []))
             else:
                 explains[2].append(test.column)
-        answer += [_reported(whole, k, test, p, tuple(names)) for p, test, names in taken]
+        answer += [_report_cluster(whole, k, test, p, tuple(names)) for p, test, names in taken]
     return tuple(sorted(answer, key=lambda c: c.p))
 
 
@@ -152,7 +152,7 @@ def _coarse_first(
 ) -> list[tuple[float, _Comparison]]:
     """Findings in the order of their p-values, but with a column before any finer division of its levels."""
     words = {test.column: _words(columns[test.column]) for _, test in found}
-    levels = {name for name in words if not _numbers(columns[name])}
+    levels = {name for name in words if not _is_numeric(columns[name])}
     ordered: list[tuple[float, _Comparison]] = []
     waiting = list(found)
     while waiting:
@@ -241,7 +241,9 @@ def _without_role(whole: _Units) -> dict[str, np.ndarray]:
         levels = np.unique(words[words != ""])
         if len(levels) < 2 or _is_time(name, cells) or _is_id(cells, len(levels)):
             continue
-        if any(_same(words, alias) for alias in _known(runs)) or _steps(cells, words, conditions):
+        if any(_are_equivalent(words, alias) for alias in _columns_with_role(runs)) or _are_steps_of_condition(
+            cells, words, conditions
+        ):
             continue
         kept[name] = cells
     return kept
@@ -254,7 +256,7 @@ def _words(cells: np.ndarray) -> np.ndarray:
     return cells.astype(str)
 
 
-def _known(runs: Runs) -> Iterator[np.ndarray]:
+def _columns_with_role(runs: Runs) -> Iterator[np.ndarray]:
     """Columns with a role, except readings and their sds, and the combinations of the labels."""
     readings = {name for c in runs.channels for name in (c.column, c.sd_column)}
     known = {name: v.astype(str) for name, v in runs.columns.items() if name not in readings}
@@ -272,13 +274,13 @@ def _labels(runs: Runs) -> list[str]:
     ]  # fmt: skip
 
 
-def _same(one: np.ndarray, other: np.ndarray) -> bool:
+def _are_equivalent(one: np.ndarray, other: np.ndarray) -> bool:
     """True if each level of one column determines that of the other, and the reverse."""
     pairs = len(set(zip(one.tolist(), other.tolist(), strict=True)))
     return pairs == len(np.unique(one)) == len(np.unique(other))
 
 
-def _steps(cells: np.ndarray, words: np.ndarray, conditions: Sequence[np.ndarray]) -> bool:
+def _are_steps_of_condition(cells: np.ndarray, words: np.ndarray, conditions: Sequence[np.ndarray]) -> bool:
     """True if a column's levels divide the values of a condition into intervals that do not overlap."""
     if cells.dtype.kind != "f" or len(np.unique(words)) > LEVELS:
         return False
@@ -341,7 +343,7 @@ class _Channel:
     def p_values(self, residuals: np.ndarray) -> list[tuple[_Comparison, np.ndarray]]:
         """p-values of each test for columns of residuals, shape (units, tables)."""
         total = np.sum(residuals**2, 0)
-        return [(test, _ratio(test.basis, residuals, total, self.freedom)) for test in self.tests]
+        return [(test, _variance_ratio_test(test.basis, residuals, total, self.freedom)) for test in self.tests]
 
     def cleared(self, residuals: np.ndarray) -> np.ndarray:
         """Residuals after conditions and parameters are projected out."""
@@ -354,10 +356,10 @@ class _Channel:
         freedom = self.freedom - other.basis.shape[1]
         if own.shape[1] == 0 or freedom - own.shape[1] < LEAST:
             return 1.0
-        return float(_ratio(own, left[:, None], np.array([left @ left]), freedom)[0])
+        return float(_variance_ratio_test(own, left[:, None], np.array([left @ left]), freedom)[0])
 
 
-def _ratio(basis: np.ndarray, residuals: np.ndarray, total: np.ndarray, freedom: int) -> np.ndarray:
+def _variance_ratio_test(basis: np.ndarray, residuals: np.ndarray, total: np.ndarray, freedom: int) -> np.ndarray:
     """p-value of the part of residuals that an orthonormal basis explains, by the variance ratio."""
     terms = basis.shape[1]
     explained = np.sum((basis.T @ residuals) ** 2, 0)
@@ -393,8 +395,8 @@ def _channel(whole: _Units, k: int, columns: dict[str, np.ndarray]) -> _Channel 
 
     travel = np.sign(whole.simulated[counts, k])
     both = min(np.sum(travel > 0), np.sum(travel < 0)) >= 2
-    smooth = _smooth(runs, whole.simulated[counts], travel if both else None)
-    taken = _orthonormal(np.concatenate([directions[:, ~open_], _unit(scaled(smooth, forth))], 1))
+    smooth = _condition_columns(runs, whole.simulated[counts], travel if both else None)
+    taken = _orthonormal(np.concatenate([directions[:, ~open_], _unit_columns(scaled(smooth, forth))], 1))
     whitened = scaled(whole.whitened[counts, k][:, None], back)[:, 0]
     left = whitened - taken @ (taken.T @ whitened)
     freedom = len(left) - taken.shape[1]
@@ -402,22 +404,22 @@ def _channel(whole: _Units, k: int, columns: dict[str, np.ndarray]) -> _Channel 
     for name, cells in columns.items():
         for within in ("", *_labels(runs)):
             for reversing in (False, True)[: 1 + both]:
-                shape = _shape(cells[counts], runs[within] if within else None)
+                shape = _comparison_columns(cells[counts], runs[within] if within else None)
                 basis = scaled(shape * travel[:, None] if reversing else shape, forth)
-                basis = _orthonormal(_unit(basis))
+                basis = _orthonormal(_unit_columns(basis))
                 basis = _orthonormal(basis - taken @ (taken.T @ basis), OWN)
                 if basis.shape[1] and freedom - basis.shape[1] >= LEAST:
                     tests.append(_Comparison(name, within, reversing, basis))
     return _Channel(left, freedom, taken, tuple(tests)) if tests else None
 
 
-def _unit(columns: np.ndarray) -> np.ndarray:
+def _unit_columns(columns: np.ndarray) -> np.ndarray:
     """Columns normalised to length 1, without zero ones."""
     size = np.linalg.norm(columns, axis=0)
     return columns[:, size > 1e-9] / size[size > 1e-9]
 
 
-def _numbers(cells: np.ndarray) -> bool:
+def _is_numeric(cells: np.ndarray) -> bool:
     """True if a column is compared by ranks."""
     return cells.dtype.kind == "f" and len(np.unique(cells[np.isfinite(cells)])) > LEVELS
 
@@ -433,10 +435,10 @@ def _ranks(cells: np.ndarray) -> np.ndarray:
     return ranks
 
 
-def _shape(cells: np.ndarray, within: np.ndarray | None) -> np.ndarray:
+def _comparison_columns(cells: np.ndarray, within: np.ndarray | None) -> np.ndarray:
     """Functions of a column: a mean of each level, or a slope over ranks, at each level of `within`."""
     cell = np.zeros(len(cells), str) if within is None else within
-    if _numbers(cells):
+    if _is_numeric(cells):
         return np.stack(
             [np.where(cell == c, _ranks(np.where(cell == c, cells, np.nan)), 0.0) for c in np.unique(cell)], 1
         )
@@ -445,7 +447,7 @@ def _shape(cells: np.ndarray, within: np.ndarray | None) -> np.ndarray:
     return np.stack([b for b in both if b.any()], 1).astype(float)
 
 
-def _smooth(runs: Runs, simulated: np.ndarray, travel: np.ndarray | None) -> np.ndarray:
+def _condition_columns(runs: Runs, simulated: np.ndarray, travel: np.ndarray | None) -> np.ndarray:
     """Functions of the conditions, shape (units, columns).
 
     A mean of each set of labels and direction, then smooth curves over conditions and readings, as many as the number
@@ -485,7 +487,7 @@ def _permuted(made: Sequence[tuple[int, _Channel]], seed: int) -> np.ndarray:
     return strongest
 
 
-def _reported(whole: _Units, k: int, test: _Comparison, p: float, alike: tuple[str, ...]) -> ResidualCluster:
+def _report_cluster(whole: _Units, k: int, test: _Comparison, p: float, alike: tuple[str, ...]) -> ResidualCluster:
     """A finding in the units of its channel."""
     channel, counts = whole.runs.channels[k], whole.counts[:, k]
     cells, residual = whole.runs.extras[test.column][counts], whole.residual[counts, k] / channel.factor
@@ -494,14 +496,16 @@ def _reported(whole: _Units, k: int, test: _Comparison, p: float, alike: tuple[s
     words, correlation, at = _words(cells), None, cells
     words = np.where(words == "", "not stated", words)
     levels: tuple[LevelMean, ...] = ()
-    if _numbers(cells):
+    if _is_numeric(cells):
         from scipy.stats import spearmanr
 
         fine = np.isfinite(cells)
         correlation = float(spearmanr(cells[fine], signed[fine]).statistic)
     else:
         at = np.array([f"{w} at {c}" if c else w for w, c in zip(words, within, strict=True)])
-        keys = sorted(set(zip(within.tolist(), words.tolist(), strict=True)), key=lambda x: (x[0], _place(x[1])))
+        keys = sorted(
+            set(zip(within.tolist(), words.tolist(), strict=True)), key=lambda x: (x[0], _level_order(x[1]))
+        )
         levels = tuple(
             LevelMean(w, c, float(signed[mine].mean()), int(mine.sum()))
             for c, w in keys if (mine := (within == c) & (words == w)).any()
@@ -516,7 +520,7 @@ def _reported(whole: _Units, k: int, test: _Comparison, p: float, alike: tuple[s
         correlation,
         p,
         alike,
-        () if _numbers(cells) else _coarser(whole, k, test.column, words, within, signed),
+        () if _is_numeric(cells) else _coarser(whole, k, test.column, words, within, signed),
         at,
         signed,
     )
@@ -539,7 +543,7 @@ def _coarser(
 
     found, all_of_it, counts = [], between(words), whole.counts[:, k]
     for name, cells in whole.runs.extras.items():
-        if name == column or _numbers(cells[counts]):
+        if name == column or _is_numeric(cells[counts]):
             continue
         coarse = _words(cells[counts])
         if len(np.unique(coarse)) > 1 and _divides(words, coarse) and all_of_it > 0:
@@ -548,7 +552,7 @@ def _coarser(
     return tuple(sorted(found, key=lambda one: -one[1]))
 
 
-def _place(word: str) -> tuple[float, str]:
+def _level_order(word: str) -> tuple[float, str]:
     """Sort key of levels: numbers by size, then words."""
     try:
         return float(word), ""

@@ -13,7 +13,7 @@ from calibration.data import posterior_file as posterior
 from calibration.data import writing
 from calibration.data.posterior_file import Posterior
 from calibration.inference.fit_notes import HeldByPrior, Notes, Pair
-from calibration.inference.fit_posterior import determined_together, undetermined
+from calibration.inference.fit_posterior import determined_together, undetermined_names
 from calibration.inference.identifiability import Identifiability
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.multistart import Starts
@@ -66,7 +66,7 @@ class ProfileCurve:
 
 
 @dataclasses.dataclass(frozen=True)
-class Beside:
+class SteadyEstimate:
     """A parameter at the optimum of the same problem with `steady`.
 
     Attributes:
@@ -111,7 +111,7 @@ class Estimate:
     at_bound: str | None
     measured_by_data: bool
     profile: ProfileCurve | None = None
-    with_steady: Beside | None = None
+    with_steady: SteadyEstimate | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Entry of `parameters` in result.json."""
@@ -339,7 +339,7 @@ class CalibrationResult:
     @property
     def undetermined(self) -> tuple[str, ...]:
         """Names of the parameters that only their priors determine, without those of a pair in `together`."""
-        return undetermined(self.held_by_prior, self.together)
+        return undetermined_names(self.held_by_prior, self.together)
 
     def determined(self, name: str) -> str:
         """`yes`, `no`, or the parameters with which the data determine this one only together."""

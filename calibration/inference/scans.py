@@ -18,8 +18,8 @@ from jaxtyping import Float
 
 from calibration.inference.fit_notes import InPieces, Step
 from calibration.inference.identifiability import Z95, Identifiability
-from calibration.inference.optimizers import Optimum, evaluated
-from calibration.inference.priors import known
+from calibration.inference.optimizers import Optimum, evaluate_residuals
+from calibration.inference.priors import parameters_by_name
 from calibration.inference.problem import Data, Observation, Problem
 
 #: Half of the range of a scan [prior sd].
@@ -80,52 +80,56 @@ class Scan:
         return float(np.sqrt(np.sum(mass * (self.at - middle) ** 2) / np.sum(mass)))
 
 
-def scanned(problem: Problem) -> tuple[int, ...]:
+def scanned_coordinates(problem: Problem) -> tuple[int, ...]:
     """Coordinates that are scanned: their fields request it, and the data are histories."""
     return problem.observe.scanned(problem)
 
 
-def beyond_a_basin(problem: Problem) -> tuple[int, ...]:
+def coordinates_beyond_a_basin(problem: Problem) -> tuple[int, ...]:
     """Coordinates with a prior wider than one basin of the misfit, according to their fields (`Spec.scanned`)."""
-    fields, c = known(problem.base), problem.coordinates
+    fields, c = parameters_by_name(problem.base), problem.coordinates
     values = [c.value(np.full(len(c), side * RANGE)) for side in (-1.0, 1.0)]
     half = 0.5 * (values[1] - values[0])
     widths = [fields[n].spec.scanned if n in fields else None for n in c.names]
     return tuple(k for k, width in enumerate(widths) if width is not None and half[k] > width)
 
 
-def scan(problem: Problem, z: np.ndarray, data: Data, k: int) -> Scan:
+def scan_coordinate(problem: Problem, z: np.ndarray, data: Data, k: int) -> Scan:
     """Misfit over coordinate k near z: evenly over the prior's range, and more closely near minima."""
     count = problem.observe.scan_points(problem, k)
-    seen = _seen(problem, z, data, k, np.linspace(-RANGE, RANGE, count))
+    seen = _scan_values(problem, z, data, k, np.linspace(-RANGE, RANGE, count))
     around, few = np.array([z[k], *seen.at[seen.basins()]])[:CLOSER], count // CLOSER
     close = (around[:, None] + 2 * RANGE / (count - 1) * np.linspace(-1, 1, few)).ravel()
     if few > 2:
-        seen = _with(seen, _seen(problem, z, data, k, np.resize(close, count)))
+        seen = _join_scans(seen, _scan_values(problem, z, data, k, np.resize(close, count)))
     low, high = seen.interval()
-    return _with(seen, _seen(problem, z, data, k, np.linspace(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, count)))
+    return _join_scans(
+        seen, _scan_values(problem, z, data, k, np.linspace(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, count))
+    )
 
 
-def _seen(problem: Problem, z: np.ndarray, data: Data, k: int, at: np.ndarray) -> Scan:
+def _scan_values(problem: Problem, z: np.ndarray, data: Data, k: int, at: np.ndarray) -> Scan:
     at = np.clip(at, -RANGE, RANGE)
     cost, others = problem.observe.scan(problem, jnp.asarray(z), data, k, jnp.asarray(at))
-    return _sorted(at, np.asarray(cost), np.asarray(others))
+    return _sorted_scan(at, np.asarray(cost), np.asarray(others))
 
 
-def _with(one: Scan, two: Scan) -> Scan:
-    return _sorted(*(np.concatenate(x) for x in ((one.at, two.at), (one.cost, two.cost), (one.others, two.others))))
+def _join_scans(one: Scan, two: Scan) -> Scan:
+    return _sorted_scan(
+        *(np.concatenate(x) for x in ((one.at, two.at), (one.cost, two.cost), (one.others, two.others)))
+    )
 
 
-def _sorted(at: np.ndarray, cost: np.ndarray, others: np.ndarray) -> Scan:
+def _sorted_scan(at: np.ndarray, cost: np.ndarray, others: np.ndarray) -> Scan:
     order = np.unique(at, return_index=True)[1]
     return Scan(at[order], np.where(np.isfinite(cost), cost, np.inf)[order], others[order])
 
 
-def placed(problem: Problem, starts: Float[np.ndarray, "starts z"]) -> Float[np.ndarray, "starts z"]:
+def place_at_minimum(problem: Problem, starts: Float[np.ndarray, "starts z"]) -> Float[np.ndarray, "starts z"]:
     """Starts with the scanned coordinates at the lowest misfit near the first start; others are unchanged."""
     starts = np.array(starts, float)
-    for k in scanned(problem):
-        seen = scan(problem, starts[0], problem.data, k)
+    for k in scanned_coordinates(problem):
+        seen = scan_coordinate(problem, starts[0], problem.data, k)
         starts[:, k] = seen.at[np.argmin(seen.cost)]
     return starts
 
@@ -133,7 +137,7 @@ def placed(problem: Problem, starts: Float[np.ndarray, "starts z"]) -> Float[np.
 Found = tuple[Optimum, Observation]
 
 
-def searched_on(
+def search_lower_basins(
     problem: Problem, found: Found, data: Data, search: Callable[[np.ndarray], Found], tell: Callable[[Step], None]
 ) -> Found:
     """Optimum of a search that is scanned afterwards, and repeated from lower basins.
@@ -143,17 +147,17 @@ def searched_on(
     Args:
         found: optimum of a search, and the observation there; search: function that searches from a start.
     """
-    every = scanned(problem)
+    every = scanned_coordinates(problem)
     if not every:
         return found
 
     def objective(z: np.ndarray) -> float:
-        cost = 0.5 * float(jnp.sum(evaluated(problem, jnp.asarray(z), data) ** 2))
+        cost = 0.5 * float(jnp.sum(evaluate_residuals(problem, jnp.asarray(z), data) ** 2))
         return cost if np.isfinite(cost) else np.inf
 
     for _ in range(AGAIN):
         here, z = float(found[0].cost), np.asarray(found[0].z)
-        looked = {k: scan(problem, z, data, k) for k in every}
+        looked = {k: scan_coordinate(problem, z, data, k) for k in every}
         lower = found
         for k, seen in looked.items():
             for j in [j for j in seen.basins() if seen.cost[j] < here - WORTH][:TRIED]:
@@ -176,9 +180,9 @@ def searched_on(
     return dataclasses.replace(found[0], converged=jnp.asarray(settled), sd=jnp.asarray(sd)), found[1]
 
 
-def profiles(problem: Problem, z: np.ndarray) -> dict[int, Scan]:
+def scan_all(problem: Problem, z: np.ndarray) -> dict[int, Scan]:
     """Scans at an optimum, by coordinate."""
-    return {k: scan(problem, z, problem.data, k) for k in scanned(problem)}
+    return {k: scan_coordinate(problem, z, problem.data, k) for k in scanned_coordinates(problem)}
 
 
 def with_scanned_sds(about: Identifiability, scans: dict[int, Scan]) -> Identifiability:
@@ -190,7 +194,7 @@ def with_scanned_sds(about: Identifiability, scans: dict[int, Scan]) -> Identifi
     return dataclasses.replace(about, sd=sd, covariance=about.covariance * np.outer(wider, wider))
 
 
-def apart(scans: dict[int, Scan], z: np.ndarray | None, converged: np.ndarray) -> int:
+def count_outside(scans: dict[int, Scan], z: np.ndarray | None, converged: np.ndarray) -> int:
     """Number of converged searches that ended outside the profiles at the best optimum.
 
     Args:
@@ -203,6 +207,6 @@ def apart(scans: dict[int, Scan], z: np.ndarray | None, converged: np.ndarray) -
     return int(np.sum(np.any(outside, 0) & converged)) if outside else 0
 
 
-def remarks(problem: Problem, scans: dict[int, Scan]) -> list[InPieces]:
+def scan_remarks(problem: Problem, scans: dict[int, Scan]) -> list[InPieces]:
     """Notes on parameters with a 95 % region in several pieces."""
     return [InPieces(problem.coordinates.names[k], parts) for k, seen in scans.items() if (parts := seen.parts()) > 1]

@@ -56,24 +56,24 @@ class SeriesNoise:
         return np.maximum(np.hypot(self.floor, self.share * sizes), np.maximum(self.least, FLOOR * sizes))
 
 
-def estimate(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tuple[SeriesNoise | None, ...]:
+def estimate_noise(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tuple[SeriesNoise | None, ...]:
     """Noise of each channel; None if too few rows are along series.
 
     Args:
         sizes: reference size of each reading for shares [SI].
     """
     measured = runs.measured()
-    by_axis = {axis: series_of(runs, axis) for axis in sorted(runs.axes, key=lambda axis: axis != FIRST)}
+    by_axis = {axis: series_along(runs, axis) for axis in sorted(runs.axes, key=lambda axis: axis != FIRST)}
     found: list[SeriesNoise | None] = []
     for k, channel in enumerate(runs.channels):
-        each = [_of_channel(channel, measured[:, k], sizes[:, k], runs[a], a, s) for a, s in by_axis.items()]
+        each = [_noise_of_channel(channel, measured[:, k], sizes[:, k], runs[a], a, s) for a, s in by_axis.items()]
         enough = [e for e in each if e is not None and e.freedom >= FEWEST]
         first = next((e for e in enough if e.axis == FIRST), None)
         found.append(first or max(enough, key=lambda e: e.freedom, default=None))
     return tuple(found)
 
 
-def series_of(runs: Runs, axis: str) -> list[np.ndarray]:
+def series_along(runs: Runs, axis: str) -> list[np.ndarray]:
     """Rows of each series along an axis, three or more; backward travel is a separate series."""
     others = [c for c in (*LABELS, *runs.axes) if runs.has(c) and c != axis]
     driving = [c for c in (*runs.layout.axes[:1], "supply_voltage_V", "duty") if runs.has(c)]
@@ -89,7 +89,7 @@ def series_of(runs: Runs, axis: str) -> list[np.ndarray]:
     return [np.array(rows) for rows in together.values() if len(rows) > 2]
 
 
-def _of_channel(
+def _noise_of_channel(
     channel: Channel, measured: np.ndarray, sizes: np.ndarray, x: np.ndarray, axis: str, series: list[np.ndarray]
 ) -> SeriesNoise | None:
     """Noise as a mixture of two forms, a constant sd and a share of the reading, by their likelihood.
@@ -108,7 +108,7 @@ def _of_channel(
         scale = weights * (sizes if in_share else 1.0)
         spread = np.sqrt(np.sum(scale**2, 1))
         unit, scale = difference / spread, scale / spread[:, None]
-        sound = _sound(unit)
+        sound = _without_wrong_readings(unit)
         unit, scale = unit[sound], scale[sound]
         count = len(unit)
         size = float(np.sqrt(np.mean(unit**2)))
@@ -140,7 +140,7 @@ def _differences(measured: np.ndarray, x: np.ndarray, series: list[np.ndarray]) 
     return np.concatenate(found) if found else np.zeros((0, len(measured))), used
 
 
-def _sound(unit: np.ndarray) -> np.ndarray:
+def _without_wrong_readings(unit: np.ndarray) -> np.ndarray:
     """True for differences without a wrong reading; all True if too many would be wrong."""
     sound = np.abs(unit) <= WRONG * 1.4826 * np.median(np.abs(unit))
     return sound if np.mean(~sound) <= MOST else np.ones(len(unit), bool)

@@ -126,7 +126,7 @@ class Windows:
     bend: np.ndarray
 
 
-def window(share: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def window_function(share: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """w = sin⁴ π s, w' and w'' of a window at shares s of its length [s]; 0 outside.
 
     The first three derivatives are 0 at its ends.
@@ -138,7 +138,7 @@ def window(share: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np
     return tuple(np.where(inside, x, 0.0) for x in found)  # type: ignore[return-value]
 
 
-def windows_in(time: np.ndarray, usable: np.ndarray, broken: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def windows_of_run(time: np.ndarray, usable: np.ndarray, broken: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Returns the windows of one run, each as (indices of its rows, their positions as shares of its length).
 
     Args:
@@ -166,14 +166,14 @@ def windows_in(time: np.ndarray, usable: np.ndarray, broken: np.ndarray) -> list
     return found
 
 
-def windows_of(problem: Problem, plan: Plan, rate: np.ndarray) -> list[Windows]:
+def windows_of_log(problem: Problem, plan: Plan, rate: np.ndarray) -> list[Windows]:
     """Returns the windows of each run."""
     observe: Any = problem.observe
     time, weight = np.asarray(observe.time), np.asarray(problem.data.weight)
     measured, sd = np.asarray(problem.data.measured), np.asarray(problem.data.sd)
     states = [k for k in (plan.current, plan.motion if plan.mechanical else -1, *plan.others) if k >= 0]
-    moves = ways_of(problem, plan, measured, sd, rate)
-    late = _late(problem)
+    moves = travel_directions(problem, plan, measured, sd, rate)
+    late = _longest_delay(problem)
     found = []
     for r, every in enumerate(np.asarray(observe.rows_of)):
         rows = every[every >= 0]
@@ -188,18 +188,18 @@ def windows_of(problem: Problem, plan: Plan, rate: np.ndarray) -> list[Windows]:
             # A reading at the instant of a jump still shows the state before it.
             usable &= ~((at > jump + 1e-9) & (at <= jump + late + 1e-9))
             broken |= np.r_[False, (at[:-1] <= jump + 1e-9) & (at[1:] > jump + 1e-9)]
-        made = windows_in(at, usable, broken)
+        made = windows_of_run(at, usable, broken)
         step = np.gradient(at)
         whole = np.zeros((3, len(made), len(rows)))
         for k, (inside, share) in enumerate(made):
             length = (at[inside[-1]] - at[inside[0]]) / max(share[-1] - share[0], 1e-12)
-            whole[:, k, inside] = np.array(window(share, length)) * step[inside]
+            whole[:, k, inside] = np.array(window_function(share, length)) * step[inside]
         if made:
             found.append(Windows(rows, *whole))
     return found
 
 
-def _late(problem: Problem) -> float:
+def _longest_delay(problem: Problem) -> float:
     """Longest delay between a jump and its effect [s]."""
     names, delay = problem.coordinates.names, abs(float(np.max(np.asarray(problem.base.rig.delay))))
     if DELAY not in names:
@@ -220,7 +220,9 @@ def _jumps(observe: Any, run: int) -> np.ndarray:
     return times[1:][jumps]
 
 
-def ways_of(problem: Problem, plan: Plan, measured: np.ndarray, sd: np.ndarray, rate: np.ndarray) -> np.ndarray:
+def travel_directions(
+    problem: Problem, plan: Plan, measured: np.ndarray, sd: np.ndarray, rate: np.ndarray
+) -> np.ndarray:
     """Direction of travel at each row, 0 if the robot may be at rest."""
     if plan.imposed == "motor_speed":
         speed = np.asarray(problem.observe.of_rows.motor_speed)  # type: ignore[attr-defined]
@@ -231,7 +233,7 @@ def ways_of(problem: Problem, plan: Plan, measured: np.ndarray, sd: np.ndarray, 
     return np.where(np.abs(speed) > limit, np.sign(speed), 0.0)
 
 
-def rates_of(problem: Problem, plan: Plan) -> np.ndarray:
+def motion_rates(problem: Problem, plan: Plan) -> np.ndarray:
     """Rate of the channel of the motion at each row: the slope of a cubic over a window [unit / s]."""
     observe: Any = problem.observe
     time, measured = np.asarray(observe.time), np.asarray(problem.data.measured)
@@ -249,7 +251,7 @@ def rates_of(problem: Problem, plan: Plan) -> np.ndarray:
     return out
 
 
-def rows_of(problem: Problem, plan: Plan, rate: np.ndarray) -> Rows:
+def states_by_row(problem: Problem, plan: Plan, rate: np.ndarray) -> Rows:
     """Returns conditions, readings and states of each row."""
     observe: Any = problem.observe
     time, measured = np.asarray(observe.time), np.asarray(problem.data.measured)
@@ -266,7 +268,9 @@ def rows_of(problem: Problem, plan: Plan, rate: np.ndarray) -> Rows:
             wheel = (rate if plan.angle else measured[:, plan.motion])[rows] * _wheel_per_unit(problem, plan)
         steps = 0.5 * (wheel[1:] + wheel[:-1]) * np.diff(time[rows])
         angle[rows[1:]] = np.cumsum(steps)
-    arrays = [jnp.asarray(x) for x in (measured, rate, ways_of(problem, plan, measured, sd, rate), angle, since)]
+    arrays = [
+        jnp.asarray(x) for x in (measured, rate, travel_directions(problem, plan, measured, sd, rate), angle, since)
+    ]
     return Rows(jax.tree.map(jnp.asarray, conditions), *arrays)
 
 

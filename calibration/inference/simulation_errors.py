@@ -56,7 +56,7 @@ def root_mean_square(errors: np.ndarray) -> float:
     return float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")
 
 
-def summary(errors: np.ndarray) -> dict[str, float | int]:
+def error_summary(errors: np.ndarray) -> dict[str, float | int]:
     """Root mean square and largest magnitude of finite errors (35) [%], and their count."""
     finite = errors[np.isfinite(errors)]
     if finite.size == 0:
@@ -68,7 +68,7 @@ def summary(errors: np.ndarray) -> dict[str, float | int]:
     }
 
 
-def certainty(measured: np.ndarray, approximated: np.ndarray) -> float:
+def r_squared(measured: np.ndarray, approximated: np.ndarray) -> float:
     """R² of eq. (A1) [-]: 1 - Σ(y - Y)² / (ΣY² - (ΣY)²/n), Y measured, y the approximation.
 
     NaN if the measured values do not vary, or if fewer than two rows have both.
@@ -101,7 +101,7 @@ def channel_errors(
     answer = {}
     for k, channel in enumerate(shown):
         answer[channel.name] = {
-            **summary(percent[:, k]),
+            **error_summary(percent[:, k]),
             "rms_sigma": root_mean_square(off[:, k] / sd[:, k]),
             "rms": root_mean_square(off[:, k]) / channel.factor,
         }

@@ -28,7 +28,7 @@ TOLERANCE = 1e-6
 RATE = 0.02
 
 
-def solver(name: str) -> optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser:
+def solver_by_name(name: str) -> optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser:
     """Returns the solver of a name, one of `NAMES`.
 
     Raises:

@@ -41,7 +41,7 @@ def nothing_varies(runs: Runs, robot: Robot, noise: Noise) -> NothingVaries | No
     return NothingVaries(runs.source, len(runs), runs.layout.imposed_column, unused_columns(runs))
 
 
-def copied(runs: Runs, robot: Robot) -> list[Copied]:
+def copied_channels(runs: Runs, robot: Robot) -> list[Copied]:
     """Channels that are a linear function of another channel in all rows, to the digits of the file."""
     found, copies = list[Copied](), set[str]()
     names = [c for c in runs.channels if runs.has(c.column)]

@@ -19,7 +19,7 @@ BRAKED, VARIES = 0.5, 0.2
 TORQUE = channels.find("output_torque")
 
 
-def unused(runs: Runs) -> tuple[Unused, ...]:
+def unused_notes(runs: Runs) -> tuple[Unused, ...]:
     """A note on the columns of numbers that vary and have no role, without row numbers and times."""
     columns = tuple((name, runs.layout.nearest(name, runs.columns)) for name in unused_columns(runs))
     return (Unused(runs.source, columns),) if columns else ()
@@ -39,7 +39,7 @@ def _varies(name: str, cells: np.ndarray) -> bool:
     return len(levels) > 1 and not counts
 
 
-def no_load_gives(runs: Runs) -> tuple[NoLoadGives, ...]:
+def unexplained_torque_notes(runs: Runs) -> tuple[NoLoadGives, ...]:
     """A note on a measured output torque with a variation that no load on a shaft causes.
 
     A load takes M_0 sign ω + K ω + M_c with M_0 and K of at least 0. If the best such load in each configuration
@@ -58,14 +58,14 @@ def no_load_gives(runs: Runs) -> tuple[NoLoadGives, ...]:
         mine = read & (runs["configuration"] == name)
         if mine.sum() >= 4:
             y, w, d = torque[mine], np.abs(speed[mine]), way[mine]  # a meter may show only magnitudes
-            left += min(_left(y, w, d), _left(np.abs(y), w, np.abs(d)))
+            left += min(_unexplained_torque(y, w, d), _unexplained_torque(np.abs(y), w, np.abs(d)))
             total += float(np.sum((y - y.mean()) ** 2))
     if left <= BRAKED * total or total < VARIES**2 * float(np.sum(torque[read] ** 2)):
         return ()
     return (NoLoadGives(runs.source, column, runs.headings.get(column, column), left / total),)
 
 
-def _left(torque: np.ndarray, speed: np.ndarray, way: np.ndarray) -> float:
+def _unexplained_torque(torque: np.ndarray, speed: np.ndarray, way: np.ndarray) -> float:
     """Sum of squared residuals of a torque after the best load, for magnitudes of a speed and its directions."""
     w, ones = speed / max(float(speed.max()), 1e-12), np.ones(len(speed))
     return float(nnls(np.stack([way, way * w, ones, -ones], 1), torque)[1] ** 2)

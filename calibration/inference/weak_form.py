@@ -25,9 +25,17 @@ from jaxtyping import Array
 from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 
-from calibration.inference.linearization import ScoredEffect, each_shape, probe, terms_of
+from calibration.inference.linearization import ScoredEffect, balance_probe, effect_terms, map_over_shapes
 from calibration.inference.problem import Problem
-from calibration.inference.shown_states import Plan, Rows, Windows, plan_of, rates_of, rows_of, windows_of
+from calibration.inference.shown_states import (
+    Plan,
+    Rows,
+    Windows,
+    motion_rates,
+    plan_of,
+    states_by_row,
+    windows_of_log,
+)
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.effects import Effect
 from mmrjax.model import balances, channels
@@ -143,7 +151,7 @@ def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str
 def _terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[ScoredEffect, ...]) -> Terms:
     """Returns the terms of each row at coordinates z, with derivatives by base parameters, readings and effects."""
     entering = tuple(dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor"))
-    probes = tuple(probe(b) for b in entering)
+    probes = tuple(balance_probe(b) for b in entering)
     size, names = z.size, channels.names(problem.channels)
 
     def one(row: Rows) -> tuple[Any, tuple[Any, Signals]]:
@@ -160,7 +168,7 @@ def _terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[Sc
     slopes, (values, signals) = jax.vmap(one)(rows)
     base = problem.coordinates.robot(problem.base, z)
     memory = _remembered(base, rows, signals, effects)
-    entered = jax.vmap(lambda s, m: terms_of(base, s, effects, m))(signals, memory)
+    entered = jax.vmap(lambda s, m: effect_terms(base, s, effects, m))(signals, memory)
     # An effect changes an equation like a defect of its balance. An effect of an instrument changes it like a
     # negative reading, or like a defect of that equation if the reading follows from the states.
     counts = np.array([len(e.at) for e in effects], int)
@@ -201,13 +209,13 @@ def _remembered(robot: Robot, rows: Rows, signals: Signals, effects: tuple[Score
             return jnp.asarray(effect.rate(robot, known), float)
 
         def begun(angle: Array) -> Array:
-            return each_shape(
+            return map_over_shapes(
                 scored, lambda e, _: jnp.asarray(e.initial(robot, angle), float), jnp.zeros(len(scored.at))
             )
 
         def after(memory: Array, row: tuple[Array, Array, Signals]) -> tuple[Array, Array]:
             since, angle, signals = row
-            law = lambda m: each_shape(scored, lambda e, x: rate(e, x, signals), m)  # noqa: E731
+            law = lambda m: map_over_shapes(scored, lambda e, x: rate(e, x, signals), m)  # noqa: E731
             speed, slope = jax.jvp(law, (memory,), (jnp.ones_like(memory),))
             memory = jnp.where(since > 0, memory + since * speed / (1 - since * slope), begun(angle))
             return memory, memory
@@ -249,12 +257,12 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
     plan = plan_of(problem)
     if plan is None:
         return None
-    rate = rates_of(problem, plan)
-    cut = windows_of(problem, plan, rate)
+    rate = motion_rates(problem, plan)
+    cut = windows_of_log(problem, plan, rate)
     equations = plan.electrical + plan.mechanical + len(plan.others)
     if equations * sum(len(w.weight) for w in cut) < ENOUGH * len(problem.coordinates):
         return None
-    rows = rows_of(problem, plan, rate)
+    rows = states_by_row(problem, plan, rate)
 
     def terms_at(z: np.ndarray, effects: tuple[ScoredEffect, ...] = ()) -> Terms:
         return jax.device_get(_terms(problem, plan, rows, jnp.asarray(z), effects))

@@ -9,10 +9,10 @@ import numpy as np
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference.fit_notes import Note, Step
 from calibration.inference.identifiability import Z95
-from calibration.sensitivity.local import Local, directions, inert, local
+from calibration.sensitivity.local import Local, correlated_directions, inert_inputs, local_derivatives
 from calibration.sensitivity.methods import (
     Part,
-    correlated,
+    correlated_inputs,
     derivative_bounds,
     morris_screening,
     shapley_effects,
@@ -39,7 +39,7 @@ def default_evaluations(outputs: tuple[OutputRow, ...], model: str, method: str)
     return EVALUATIONS_LONG if long else EVALUATIONS_SHAPLEY if method == "shapley" else EVALUATIONS
 
 
-def analyse(
+def analyse_sensitivity(
     study: Study, method: str, evaluations: int | None = None, seed: int = 0, candidates: Candidates | None = None
 ) -> SensitivityResult:
     """Result of a whole study.
@@ -67,10 +67,10 @@ def analyse(
     if evaluations < LEAST:
         raise BadConfiguration(f"--evaluations: got {evaluations}; expected {LEAST} or more")
     study.tell(Step("points"))
-    found = local(study)
+    found = local_derivatives(study)
     if not any(np.isfinite(x).any() for x in found.value.values()):
         raise BadConfiguration(_none_converges(study, found.statuses))
-    idle = inert(study, found, seed)
+    idle = inert_inputs(study, found, seed)
     if idle.all():
         raise BadConfiguration(
             "--parameters: the derivative of every output by every input is zero; choose others, or change --outputs"
@@ -121,7 +121,7 @@ def _described(inputs: Inputs, idle: np.ndarray) -> dict[str, Input]:
     slope = inputs.slope[inputs.places]
     uniform = np.arange(len(inputs)) >= len(inputs.parameters)
     sd = np.where(uniform, np.abs(slope).sum(1) / np.sqrt(12), np.sqrt(np.sum(slope**2, 1)))
-    along = directions(inputs)
+    along = correlated_directions(inputs)
     p = len(inputs.parameters)
     rows = {q: np.tile(inputs.centre, (len(inputs), 1)) for q in (-1, 0, 1)}
     for side in (-1, 1):
@@ -150,7 +150,7 @@ def _study_of(row: OutputRow, study: Study, found: Local, part: Part | None) -> 
     elasticity = np.where(np.isfinite(elasticity), elasticity, np.nan)
     # A condition's score is uniform in 0..1, of variance 1/12.
     weight = np.where(np.arange(len(study.inputs)) < len(study.inputs.parameters), 1.0, 1 / 12)
-    along = directions(study.inputs)
+    along = correlated_directions(study.inputs)
     moved = (scores @ along.T) ** 2 * weight if study.inputs.is_posterior else scores**2 * weight
     variance = np.sum(scores**2 * weight, 1)
     linear = moved / np.where(variance > 0, variance, 1.0)[:, None]
@@ -225,7 +225,7 @@ def _remarks(study: Study, method: str, outputs: dict[str, OutputStudy], idle: n
         some = o.studied & (o.lost >= 1e-3)
         if some.any():
             said.append(SampleLeftOut(int(some.sum()), float(o.lost[some].max()), names))
-    drawn = correlated(study.inputs, np.flatnonzero(~idle)) if method == "shapley" else ()
+    drawn = correlated_inputs(study.inputs, np.flatnonzero(~idle)) if method == "shapley" else ()
     for followed in (False, True):
         names = tuple(n for k, n in enumerate(study.inputs.names) if idle[k] and (k in drawn) == followed)
         if names:

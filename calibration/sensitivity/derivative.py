@@ -15,7 +15,7 @@ import dataclasses
 import numpy as np
 from scipy.stats import qmc
 
-from calibration.sensitivity.replicates import REPLICATES, Estimate, ratio
+from calibration.sensitivity.replicates import REPLICATES, Estimate, ratio_estimate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Bounds:
     variance: float
 
 
-def design(inputs: int, size: int, seed: int, replicates: int = REPLICATES) -> np.ndarray:
+def derivative_design(inputs: int, size: int, seed: int, replicates: int = REPLICATES) -> np.ndarray:
     """Points of the unit cube, shape (replicates · size, inputs), each replicate with an independent scrambling.
 
     Args:
@@ -62,7 +62,7 @@ def design(inputs: int, size: int, seed: int, replicates: int = REPLICATES) -> n
     return np.concatenate([qmc.Sobol(inputs, scramble=True, rng=rng).random(size) for rng in generators])
 
 
-def terms(
+def derivative_terms(
     scores: np.ndarray, values: np.ndarray, gradients: np.ndarray, normal: np.ndarray, replicates: int = REPLICATES
 ) -> Terms | None:
     """Parts of an output's variance and of its bounds.
@@ -96,7 +96,7 @@ def terms(
     )
 
 
-def bounds(terms: Terms) -> Bounds:
+def index_bounds(terms: Terms) -> Bounds:
     """Bounds from parts of the variance."""
-    lower, upper = ratio(terms.lower, terms.variance), ratio(terms.upper, terms.variance)
+    lower, upper = ratio_estimate(terms.lower, terms.variance), ratio_estimate(terms.upper, terms.variance)
     return Bounds(lower, upper, float(terms.variance.mean()))

@@ -27,7 +27,7 @@ class Choice:
     covariance: np.ndarray
 
 
-def fisher(jacobian: np.ndarray, sd: np.ndarray) -> np.ndarray:
+def fisher_information(jacobian: np.ndarray, sd: np.ndarray) -> np.ndarray:
     """Information of each run on the scores, shape (runs, inputs, inputs).
 
     Args:
@@ -40,11 +40,11 @@ def fisher(jacobian: np.ndarray, sd: np.ndarray) -> np.ndarray:
     return np.einsum("rci,rcj->rij", whitened, whitened)
 
 
-def choose(information: np.ndarray, count: int) -> Choice:
+def choose_runs(information: np.ndarray, count: int) -> Choice:
     """Runs that together are most informative, each candidate at most once.
 
     Args:
-        information: of each candidate, from `fisher`; count: number of runs.
+        information: of each candidate, from `fisher_information`; count: number of runs.
     """
     candidates, size, _ = information.shape
     count = min(count, candidates)

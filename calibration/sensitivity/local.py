@@ -32,7 +32,7 @@ class Local:
     statuses: dict[str, dict[str, int]]
 
 
-def directions(inputs: Inputs) -> np.ndarray:
+def correlated_directions(inputs: Inputs) -> np.ndarray:
     """Directions in scores along which each input moves by one sd and the others follow by their correlation.
 
     Each row has length 1; a condition moves along its own score.
@@ -45,7 +45,7 @@ def directions(inputs: Inputs) -> np.ndarray:
     return whole
 
 
-def local(study: Study) -> Local:
+def local_derivatives(study: Study) -> Local:
     """Values, exact derivatives and swings at each point."""
     inputs, points = study.inputs, len(study.points)
     d, centre = len(inputs), np.tile(study.inputs.centre, (points, 1))
@@ -57,7 +57,7 @@ def local(study: Study) -> Local:
         finite = np.isfinite(answer.values[name])[:, None]
         derivative[name] = np.where(finite, _by_inputs(inputs, moved), np.nan)
         by_score[name] = np.where(finite, moved @ inputs.slope, np.nan)
-    along = directions(inputs)
+    along = correlated_directions(inputs)
     p = len(inputs.parameters)
     ends = []
     for side in (-1, 1):
@@ -85,9 +85,9 @@ def _in_words(counts: dict[str, dict[str, int]]) -> dict[str, dict[str, int]]:
     return {source_words(source): by for source, by in counts.items()}
 
 
-def inert(study: Study, found: Local, seed: int) -> np.ndarray:
+def inert_inputs(study: Study, found: Local, seed: int) -> np.ndarray:
     """True for inputs with exactly zero derivatives of all outputs at all tested points, shape (inputs,)."""
-    scores = study.inputs.scores(derivative.design(len(study.inputs), 1, seed, LOOKS))
+    scores = study.inputs.scores(derivative.derivative_design(len(study.inputs), 1, seed, LOOKS))
     moving = np.zeros(len(study.inputs), bool)
     for g in found.derivative.values():  # not by scores, because those of a posterior mix its parameters
         moving |= (np.nan_to_num(g) != 0).any(0)

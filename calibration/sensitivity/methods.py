@@ -44,7 +44,7 @@ def _sampled(study: Study, unit: np.ndarray, which: np.ndarray) -> np.ndarray:
     return study.inputs.scores(whole)
 
 
-def groups(study: Study, moving: np.ndarray) -> dict[tuple[int, ...], list[int]]:
+def group_points(study: Study, moving: np.ndarray) -> dict[tuple[int, ...], list[int]]:
     """Points grouped by the inputs that act there."""
     found: dict[tuple[int, ...], list[int]] = {}
     for k in range(len(study.points)):
@@ -54,7 +54,7 @@ def groups(study: Study, moving: np.ndarray) -> dict[tuple[int, ...], list[int]]
     return found
 
 
-def correlated(inputs: Inputs, which: Sequence[int] | np.ndarray) -> tuple[int, ...]:
+def correlated_inputs(inputs: Inputs, which: Sequence[int] | np.ndarray) -> tuple[int, ...]:
     """These inputs and all that are correlated with one of them, directly or through others.
 
     An inert input that is correlated with these has, by definition, a Shapley effect, because its value is
@@ -88,14 +88,14 @@ def sobol_indices(
     terms: dict[str, dict[int, sobol.Terms]] = {name: {} for name in names}
     lost = {name: np.zeros(points) for name in names}
     spent = {}
-    for which, group in groups(study, moving).items():
-        size = sobol.size_of(evaluations / points, len(which), second)
-        design = sobol.design(len(which), size, seed, second)
+    for which, group in group_points(study, moving).items():
+        size = sobol.base_points(evaluations / points, len(which), second)
+        design = sobol.sobol_design(len(which), size, seed, second)
         scores = _sampled(study, design.points, np.array(which))
         for k, made in study.sample(study.values_at(scores), group):
             spent[k] = len(design.points)
             for name in names:
-                found = sobol.terms(design, made[name])
+                found = sobol.sobol_terms(design, made[name])
                 rows = design.size * design.replicates
                 lost[name][k] = 1.0 if found is None else found.lost / rows
                 if found is not None and lost[name][k] <= MOST_LOST:
@@ -105,7 +105,7 @@ def sobol_indices(
         first, total, sd = _blank(points, d), _blank(points, d), np.full(points, np.nan)
         whole: sobol.Terms | None = None
         for k, found in terms[name].items():
-            at = sobol.indices(found)
+            at = sobol.indices_of_terms(found)
             _put(first, k, at.first)
             _put(total, k, at.total)
             sd[k] = np.sqrt(at.variance)
@@ -114,8 +114,8 @@ def sobol_indices(
         if whole is None:
             answer[name] = Part({}, {}, None, None, None, (), lost[name], studied)
             continue
-        overall = sobol.indices(whole)
-        stages = [(r, sobol.indices(whole, r).total) for r in sobol.STAGES]
+        overall = sobol.indices_of_terms(whole)
+        stages = [(r, sobol.indices_of_terms(whole, r).total) for r in sobol.STAGES]
         count = sum(spent[k] for k in terms[name])
         answer[name] = Part(
             {"first": overall.first, "total": overall.total},
@@ -136,9 +136,9 @@ def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: i
     names = [o.name for o in study.model.outputs]
     found: dict[str, dict[int, tuple[morris.Effects, tuple[int, ...]]]] = {name: {} for name in names}
     lost = {name: np.zeros(points) for name in names}
-    for which, group in groups(study, moving).items():
+    for which, group in group_points(study, moving).items():
         count = max(int(np.ceil(evaluations / points / (len(which) + 1))), 10)
-        unit = morris.design(len(which), count, seed)
+        unit = morris.morris_design(len(which), count, seed)
         scores = np.array(_sampled(study, 0.025 + 0.95 * unit, np.array(which)))
         # Trajectories have equal steps in the scores, between the ends of the 95 % interval.
         normal = np.arange(d) < len(study.inputs.parameters)
@@ -147,7 +147,7 @@ def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: i
                 scores[:, i] = Z95 * (2 * unit[:, j] - 1)
         for k, made in study.sample(study.values_at(scores), group):
             for name in names:
-                effects = morris.effects(unit, made[name])
+                effects = morris.elementary_effects(unit, made[name])
                 lost[name][k] = 1.0 if effects is None else effects.lost / count
                 if effects is not None and lost[name][k] <= MOST_LOST:
                     found[name][k] = effects, which
@@ -192,7 +192,7 @@ def derivative_bounds(study: Study, moving: np.ndarray, seed: int) -> dict[str, 
     names = [o.name for o in study.model.outputs]
     normal = np.arange(d) < len(study.inputs.parameters)
     replicates, size = GRADIENTS
-    unit = derivative.design(d, size, seed, replicates)
+    unit = derivative.derivative_design(d, size, seed, replicates)
     scores = study.inputs.scores(unit)
     rows = np.tile(scores, (points, 1))
     conditions = jax.tree.map(lambda x: np.repeat(np.asarray(x), len(scores)), study.conditions)
@@ -205,10 +205,10 @@ def derivative_bounds(study: Study, moving: np.ndarray, seed: int) -> dict[str, 
         whole: derivative.Terms | None = None
         studied = np.zeros(points, bool)
         for k in map(int, np.flatnonzero(lost <= MOST_LOST)):
-            found = derivative.terms(scores, y[k], g[k], normal, replicates)
+            found = derivative.derivative_terms(scores, y[k], g[k], normal, replicates)
             if found is None:
                 continue
-            at = derivative.bounds(found)
+            at = derivative.index_bounds(found)
             _put(lower, k, at.lower)
             _put(upper, k, at.upper)
             sd[k] = np.sqrt(at.variance)
@@ -217,7 +217,7 @@ def derivative_bounds(study: Study, moving: np.ndarray, seed: int) -> dict[str, 
         if whole is None:
             answer[name] = Part({}, {}, None, None, None, (), lost, studied)
             continue
-        overall = derivative.bounds(whole)
+        overall = derivative.index_bounds(whole)
         share = np.where(np.isfinite(upper.value), np.clip(upper.value, 0.0, 1.0), np.nan)
         answer[name] = Part(
             {"lower": overall.lower, "upper": overall.upper},
@@ -240,17 +240,17 @@ def shapley_effects(study: Study, moving: np.ndarray, evaluations: int, seed: in
     mean = np.concatenate([study.inputs.parameters.mean, np.zeros(d - p)])
     terms: dict[str, dict[int, tuple[shapley.Terms, tuple[int, ...]]]] = {name: {} for name in names}
     lost = {name: np.zeros(points) for name in names}
-    for acting, group in groups(study, moving).items():
-        which = correlated(study.inputs, acting)
+    for acting, group in group_points(study, moving).items():
+        which = correlated_inputs(study.inputs, acting)
         places = np.array(which)
-        pairs = shapley.pairs_of(evaluations / points, len(which))
-        design = shapley.design(mean[places], covariance[np.ix_(places, places)], pairs, seed)
+        pairs = shapley.pairs_of_orders(evaluations / points, len(which))
+        design = shapley.shapley_design(mean[places], covariance[np.ix_(places, places)], pairs, seed)
         z = np.tile(mean, (len(design.points), 1))
         z[:, places] = design.points
         values = _at_coordinates(study.inputs, z)
         for k, made in study.sample(values, group):
             for name in names:
-                found = shapley.terms(design, made[name])
+                found = shapley.shapley_terms(design, made[name])
                 lost[name][k] = 1.0 if found is None else found.lost
                 if found is not None and lost[name][k] <= MOST_LOST:
                     terms[name][k] = found, which
@@ -263,12 +263,12 @@ def shapley_effects(study: Study, moving: np.ndarray, evaluations: int, seed: in
             wide = np.zeros((len(found.parts), d))
             wide[:, list(which)] = found.parts
             widened.append(dataclasses.replace(found, parts=wide))
-            _put(shown, k, shapley.effects(widened[-1]))
+            _put(shown, k, shapley.effects_of_terms(widened[-1]))
             sd[k], studied[k] = np.sqrt(found.variance), True
         if not studied.any():
             answer[name] = Part({}, {}, None, None, None, (), lost[name], studied)
             continue
-        overall = shapley.effects(shapley.of_vector(widened))
+        overall = shapley.effects_of_terms(shapley.terms_of_vector(widened))
         answer[name] = Part(
             {"shapley": overall},
             {"shapley": shown},

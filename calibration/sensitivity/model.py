@@ -47,10 +47,10 @@ class Answer:
 
     def counts(self) -> dict[str, dict[str, int]]:
         """Source → status → number of points."""
-        return {source: counted(codes) for source, codes in self.statuses.items()}
+        return {source: count_statuses(codes) for source, codes in self.statuses.items()}
 
 
-def counted(codes: np.ndarray) -> dict[str, int]:
+def count_statuses(codes: np.ndarray) -> dict[str, int]:
     """Status → number, without zeros."""
     each = np.bincount(codes, minlength=len(STATUSES))
     return {STATUSES[k]: int(n) for k, n in enumerate(each) if n}
@@ -203,15 +203,15 @@ class Model:
             count = min(size, points - first)
             part, rows = values[first : first + count], spread
             if not alike:
-                rows = jax.tree.map(lambda x, f=first, n=count: _filled(x[f : f + n], size), spread)
-            part = function(jnp.asarray(_filled(part, size)), rows)
+                rows = jax.tree.map(lambda x, f=first, n=count: _padded(x[f : f + n], size), spread)
+            part = function(jnp.asarray(_padded(part, size)), rows)
             parts.append({name: np.asarray(x)[:count] for name, x in part.items()})
         if len(parts) == 1:
             return parts[0]
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def _filled(rows: np.ndarray, size: int) -> np.ndarray:
+def _padded(rows: np.ndarray, size: int) -> np.ndarray:
     """Rows padded by repeats of the last to a given size."""
     if len(rows) == size:
         return rows

@@ -34,7 +34,7 @@ class Effects:
     lost: int
 
 
-def design(inputs: int, trajectories: int, seed: int) -> np.ndarray:
+def morris_design(inputs: int, trajectories: int, seed: int) -> np.ndarray:
     """Points of the unit cube, shape (trajectories · (inputs + 1), inputs)."""
     from SALib.sample import morris as sampling
 
@@ -46,11 +46,11 @@ def design(inputs: int, trajectories: int, seed: int) -> np.ndarray:
         np.random.set_state(state)  # noqa: NPY002
 
 
-def effects(points: np.ndarray, values: np.ndarray) -> Effects | None:
+def elementary_effects(points: np.ndarray, values: np.ndarray) -> Effects | None:
     """Elementary effects of an output.
 
     Args:
-        points: from `design`; values: of the output there.
+        points: from `morris_design`; values: of the output there.
 
     Returns:
         None if fewer than two trajectories have values at all points.

@@ -78,8 +78,8 @@ def next_runs(study: Study, found: Local, candidates: Candidates) -> NextRuns | 
     finite = np.isfinite(reading).all(1)
     if not finite.any():
         return None
-    information_of = information.fisher(jacobian[finite], candidates.deviations(reading)[finite])
-    choice = information.choose(information_of, candidates.count)
+    information_of = information.fisher_information(jacobian[finite], candidates.deviations(reading)[finite])
+    choice = information.choose_runs(information_of, candidates.count)
     picked = np.flatnonzero(finite)[list(choice.rows)]
     slope = study.inputs.slope[study.inputs.places][:, :p]
     after = np.sqrt(np.einsum("ij,kjl,il->ki", slope, choice.covariance, slope))

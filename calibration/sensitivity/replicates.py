@@ -36,7 +36,7 @@ class Estimate:
         return Estimate(self.value[k], self.low[k], self.high[k])
 
 
-def ratio(numerator: np.ndarray, denominator: np.ndarray) -> Estimate:
+def ratio_estimate(numerator: np.ndarray, denominator: np.ndarray) -> Estimate:
     """Ratio of the means of two quantities over replicates, and its interval.
 
     Its variance is that of the linearised ratio, e = (numerator - ratio · denominator) / mean denominator (Cochran,

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import ndtri
 from scipy.stats import qmc
 
-from calibration.sensitivity.replicates import Estimate, ratio
+from calibration.sensitivity.replicates import Estimate, ratio_estimate
 
 #: Draws of unknown inputs for each draw of known ones.
 INNER = 3
@@ -50,12 +50,12 @@ class Terms:
     lost: float
 
 
-def pairs_of(evaluations: float, inputs: int) -> int:
+def pairs_of_orders(evaluations: float, inputs: int) -> int:
     """Number of pairs of orders for at least so many evaluations."""
     return max(int(np.ceil((evaluations - DRAWS) / (2 * INNER * max(inputs - 1, 1)))), 50)
 
 
-def design(mean: np.ndarray, covariance: np.ndarray, pairs: int, seed: int) -> Design:
+def shapley_design(mean: np.ndarray, covariance: np.ndarray, pairs: int, seed: int) -> Design:
     """Design for jointly normal inputs.
 
     Args:
@@ -99,7 +99,7 @@ def _conditional(covariance: np.ndarray, drawn: np.ndarray) -> tuple[np.ndarray,
     return pull, vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-def terms(design: Design, values: np.ndarray) -> Terms | None:
+def shapley_terms(design: Design, values: np.ndarray) -> Terms | None:
     """Parts of an output's variance from its values at the design's points.
 
     A pair of orders is omitted if the output is not finite at one of its points.
@@ -123,7 +123,7 @@ def terms(design: Design, values: np.ndarray) -> Terms | None:
     return Terms(variance, parts, float(1 - np.isfinite(values).mean()))
 
 
-def of_vector(found: Sequence[Terms]) -> Terms:
+def terms_of_vector(found: Sequence[Terms]) -> Terms:
     """Terms of several outputs as of a vector (Gamboa et al., Electron. J. Stat. 8 (2014)), with the same pairs of
     orders, row by row.
 
@@ -141,7 +141,7 @@ def of_vector(found: Sequence[Terms]) -> Terms:
     return Terms(sum(t.variance for t in found), whole, max(t.lost for t in found))
 
 
-def effects(terms: Terms) -> Estimate:
+def effects_of_terms(terms: Terms) -> Estimate:
     """Shapley effects [-], shape (inputs,)."""
     kept = terms.parts[np.isfinite(terms.parts).all(1)]
-    return ratio(kept, np.full(len(kept), terms.variance))
+    return ratio_estimate(kept, np.full(len(kept), terms.variance))

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.sensitivity.replicates import REPLICATES, Estimate, ratio
+from calibration.sensitivity.replicates import REPLICATES, Estimate, ratio_estimate
 
 #: Fewest points of a replicate.
 FEWEST = 4
@@ -51,13 +51,13 @@ class Design:
         return (2 * self.inputs if self.second else self.inputs) + 2
 
 
-def size_of(evaluations: float, inputs: int, second: bool, replicates: int = REPLICATES) -> int:
+def base_points(evaluations: float, inputs: int, second: bool, replicates: int = REPLICATES) -> int:
     """Base points of a replicate for at least so many evaluations in all: the next power of 2."""
     blocks = (2 * inputs if second else inputs) + 2
     return 2 ** max(math.ceil(math.log2(max(evaluations / (replicates * blocks), FEWEST))), 0)
 
 
-def design(inputs: int, size: int, seed: int, second: bool = True, replicates: int = REPLICATES) -> Design:
+def sobol_design(inputs: int, size: int, seed: int, second: bool = True, replicates: int = REPLICATES) -> Design:
     """Design of independent replicates, each a Sobol sequence with its own scrambling.
 
     Args:
@@ -118,7 +118,7 @@ class Terms:
         return dataclasses.replace(self, first=first, total=total, second=second)
 
 
-def terms(design: Design, values: np.ndarray) -> Terms | None:
+def sobol_terms(design: Design, values: np.ndarray) -> Terms | None:
     """Parts of an output's variance.
 
     A base point is omitted if the output is not finite in one of its blocks. If that depends on one
@@ -172,12 +172,14 @@ class Indices:
     variance: float
 
 
-def indices(terms: Terms, replicates: int | None = None) -> Indices:
+def indices_of_terms(terms: Terms, replicates: int | None = None) -> Indices:
     """Indices from parts of the variance, or from a first number of replicates."""
     kept = slice(replicates)
     variance, first = terms.variance[kept], terms.first[kept]
     second = None
     if terms.second is not None:
         beyond = terms.second[kept] - first[:, :, None] - first[:, None, :]
-        second = ratio(beyond, variance)
-    return Indices(ratio(first, variance), ratio(terms.total[kept], variance), second, float(variance.mean()))
+        second = ratio_estimate(beyond, variance)
+    return Indices(
+        ratio_estimate(first, variance), ratio_estimate(terms.total[kept], variance), second, float(variance.mean())
+    )

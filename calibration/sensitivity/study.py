@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.inference.fit_notes import Note, Step
-from calibration.sensitivity.model import Answer, Model, OutputRow, counted
+from calibration.sensitivity.model import Answer, Model, OutputRow, count_statuses
 from calibration.sensitivity.result import Points
 from calibration.sensitivity.uncertain_inputs import Inputs
 from mmrjax import fidelities
@@ -116,7 +116,7 @@ class Study:
     def statuses(self) -> dict[str, dict[str, int]]:
         """Source → status → number in the sample."""
         return {
-            source_words(source): counted(np.repeat(np.arange(len(whole)), whole))
+            source_words(source): count_statuses(np.repeat(np.arange(len(whole)), whole))
             for source, whole in self.sampled.items()
         }
 

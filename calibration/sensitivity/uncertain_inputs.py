@@ -17,7 +17,7 @@ from scipy.special import ndtri
 from calibration.data.input_errors import BadConfiguration, choices
 from calibration.data.posterior_file import Posterior
 from calibration.inference import priors
-from calibration.inference.fit_posterior import of_coordinates
+from calibration.inference.fit_posterior import posterior_of_coordinates
 from mmrjax import fidelities
 from mmrjax.errors import UsageError
 from mmrjax.fidelities.variation import CONDITIONS, Axis, Variation
@@ -119,7 +119,7 @@ class Inputs:
 _OTHERS = ("driver.", "rig.", "motor.resistance_thermal_", "motor.time_constant_", "motor.temperature_ambient")
 
 
-def default_names(
+def default_input_names(
     robot: Robot, configurations: Sequence[str], battery: bool, model: str = "steady", turns: bool = False
 ) -> tuple[str, ...]:
     """Parameters of the robot with a prior of nonzero width, for these configurations and those common to all.
@@ -131,7 +131,7 @@ def default_names(
     wheels = [name for name in configurations if float(robot.configurations[name].on_tracks) < 0.5]
     out = tuple(f"{name}." for name in absent) + (() if battery else ("battery.",))
     guides = {f"{name}.{g}" for name in wheels for g in (priors.GUIDE_SHARE, priors.GUIDE_FRICTION)}
-    known = priors.known(robot)
+    known = priors.parameters_by_name(robot)
     left_out = {*guides, *fidelities.unread(model, known, turns), *robot.rig.exact}
     if not robot.rig.inherits:  # parameters of another robot are not its own
         stated = {name for name, _, _ in robot.rig.priors}
@@ -143,7 +143,7 @@ def default_names(
     )
 
 
-def of_priors(robot: Robot, words: Sequence[str], ranges: Mapping[str, tuple[float, float]]) -> Inputs:
+def inputs_from_priors(robot: Robot, words: Sequence[str], ranges: Mapping[str, tuple[float, float]]) -> Inputs:
     """Inputs from the priors of the parameters' fields, around the robot's values, and from stated ranges.
 
     Args:
@@ -152,9 +152,11 @@ def of_priors(robot: Robot, words: Sequence[str], ranges: Mapping[str, tuple[flo
     Raises:
         BadConfiguration: an unknown name, with the choices; one with a prior of zero width; or an invalid range.
     """
-    everything = list(priors.known(robot))
-    names = list(dict.fromkeys(name for word in words for name in priors.expand(word, everything, "--parameters")))
-    known = priors.known(robot)
+    everything = list(priors.parameters_by_name(robot))
+    names = list(
+        dict.fromkeys(name for word in words for name in priors.expand_name(word, everything, "--parameters"))
+    )
+    known = priors.parameters_by_name(robot)
     for name in names:
         if not known[name].spec.prior_sd(float(known[name].value)) > 0:
             raise BadConfiguration(
@@ -162,15 +164,15 @@ def of_priors(robot: Robot, words: Sequence[str], ranges: Mapping[str, tuple[flo
                 "depends on it; give it a value with --set, or leave it out"
             )
     try:
-        coordinates = priors.coordinates(robot, names) if names else None
+        coordinates = priors.parameter_coordinates(robot, names) if names else None
     except BadConfiguration as error:
         raise BadConfiguration(str(error).replace("--prior", "--parameters")) from None
     size = len(names)
-    parameters = of_coordinates(coordinates, np.zeros(size), np.eye(size)) if coordinates else NOTHING
+    parameters = posterior_of_coordinates(coordinates, np.zeros(size), np.eye(size)) if coordinates else NOTHING
     return _inputs(robot, parameters, ranges, posterior=False)
 
 
-def of_posterior(robot: Robot, posterior: Posterior, ranges: Mapping[str, tuple[float, float]]) -> Inputs:
+def inputs_from_posterior(robot: Robot, posterior: Posterior, ranges: Mapping[str, tuple[float, float]]) -> Inputs:
     """Inputs from the posterior of a calibrated robot, and from stated ranges of conditions."""
     return _inputs(robot, posterior, ranges, posterior=True)
 

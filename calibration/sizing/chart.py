@@ -46,7 +46,7 @@ class Chart:
 
 
 @compiled
-def _left(robot: Robot, rated: Ratings, points: Point, speeds: Array, wanted: Array) -> Array:
+def _margins(robot: Robot, rated: Ratings, points: Point, speeds: Array, wanted: Array) -> Array:
     """Margins by limit, shape (points, limits)."""
 
     def one(point: Point, wanted: Array) -> Array:
@@ -66,7 +66,7 @@ def _left(robot: Robot, rated: Ratings, points: Point, speeds: Array, wanted: Ar
     return jax.vmap(one)(points, wanted)
 
 
-def chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -> Chart:
+def margin_chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -> Chart:
     """Chart of a robot, at the worse end of charge, in the warmest ambient of the envelope.
 
     A required speed applies only within its own payloads and slopes.
@@ -76,7 +76,7 @@ def chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -> Chart
     """
     payload, slope = np.linspace(0, most[0], POINTS), np.linspace(0, most[1], POINTS)
     e = asked.envelope
-    base = sheet.points(robot, Requirement("speed_m_s", 0.0, True, e))
+    base = sheet.envelope_points(robot, Requirement("speed_m_s", 0.0, True, e))
     first = jax.tree.map(lambda x: np.asarray(x)[-1], base)
     s, p = (x.ravel() for x in np.meshgrid(slope, payload, indexing="ij"))
     speeds = [r for r in asked.each if r.quantity.group == "travel" and r.name.startswith("speed") and r.least]
@@ -93,7 +93,7 @@ def chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -> Chart
         points = dataclasses.replace(
             points, payload=jnp.asarray(p), slope_deg=jnp.asarray(s), charge=jnp.full(len(p), charge)
         )
-        left = np.asarray(_left(robot, ratings(robot), points, permitted, jnp.asarray(wanted)))
+        left = np.asarray(_margins(robot, ratings(robot), points, permitted, jnp.asarray(wanted)))
         margins = left if margins is None else np.minimum(margins, left)
     assert margins is not None
     margins = np.where(np.isfinite(margins), margins, -1.0)
@@ -101,7 +101,7 @@ def chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -> Chart
     return Chart(payload, slope, np.argmin(margins, 1).reshape(shape), margins.min(1).reshape(shape))
 
 
-def extent(asked: Requirements) -> tuple[float, float]:
+def chart_extent(asked: Requirements) -> tuple[float, float]:
     """Largest payload [kg] and slope [deg] of a chart of these requirements."""
     payloads = [asked.envelope.payload_kg[1], *(r.limit or 0.0 for r in asked.each if r.name == "payload_kg")]
     slopes = [asked.envelope.slope_deg[1], *(r.limit or 0.0 for r in asked.each if r.name == "slope_deg")]

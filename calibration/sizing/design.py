@@ -52,7 +52,7 @@ class Design(eqx.Module):
     cells: Array
 
 
-def build(robot: Robot, base_mass: float, configuration: str, design: Design) -> tuple[Robot, Ratings]:
+def build_robot(robot: Robot, base_mass: float, configuration: str, design: Design) -> tuple[Robot, Ratings]:
     """Robot of a design, from an initial robot, with its ratings; traceable.
 
     Motors, gearboxes and cells replace the robot's own in its mass. The cell's voltage depends on the used share
@@ -109,11 +109,11 @@ class Task(eqx.Module):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Label of each margin of `evaluate`."""
+        """Label of each margin of `evaluate_design`."""
         return tuple(d.label for d in self.demands)
 
 
-def task(robot: Robot, asked: Requirements, options: Options) -> Task:
+def sizing_task(robot: Robot, asked: Requirements, options: Options) -> Task:
     """Points of requirements: corners of each envelope, each point once.
 
     A required slope or payload is a condition in which the robot has to travel. Ratings of the parts apply to
@@ -132,9 +132,9 @@ def task(robot: Robot, asked: Requirements, options: Options) -> Task:
 
     demands = []
     for r in asked.each:
-        at = sheet.points(robot, r)
+        at = sheet.envelope_points(robot, r)
         rows = [tuple(row(p) for p in corner) for corner in _corners(robot, r, at)]
-        demands.append(Demand(r, label(r), tuple(k for corner in dict.fromkeys(rows) for k in corner)))
+        demands.append(Demand(r, requirement_label(r), tuple(k for corner in dict.fromkeys(rows) for k in corner)))
     middle = row(_middle(robot, asked.envelope))
     travelling = sorted({k for d in demands if d.requirement and d.requirement.name in LASTING for k in d.rows})
     demands += [Demand(None, words, tuple(travelling) or (middle,)) for words in RATED.values()]
@@ -143,7 +143,7 @@ def task(robot: Robot, asked: Requirements, options: Options) -> Task:
     return Task(one_cell, name, options.base_mass, points, middle, tuple(demands))
 
 
-def label(r: Requirement) -> str:
+def requirement_label(r: Requirement) -> str:
     extra = ""
     if r.name == "endurance_min":
         extra = f" driving {100 * r.share:g} % of the time" if r.share else " standing still"
@@ -183,15 +183,15 @@ def _middle(robot: Robot, e: Envelope) -> Point:
         state_of_charge=(sum(e.state_of_charge) / 2,) * 2,
         supply_voltage_V=None if e.supply_voltage_V is None else (sum(e.supply_voltage_V) / 2,) * 2,
     ))  # fmt: skip
-    return jax.tree.map(lambda x: x[0], sheet.points(robot, middle))
+    return jax.tree.map(lambda x: x[0], sheet.envelope_points(robot, middle))
 
 
-def evaluate(asked: Task, design: Design) -> tuple[Array, Array]:
+def evaluate_design(asked: Task, design: Design) -> tuple[Array, Array]:
     """Objectives (as `OBJECTIVES`) and margins (as `Task.labels`) of one design; traceable.
 
     Margins are shares of the required or permitted value; a requirement is met if its margin is not negative.
     """
-    robot, ratings = build(asked.robot, asked.base_mass, asked.configuration, design)
+    robot, ratings = build_robot(asked.robot, asked.base_mass, asked.configuration, design)
     found = jax.vmap(lambda p: travel(robot, p, ratings)[0])(asked.points)
     mass = jnp.asarray(robot.configurations[asked.configuration].mass)
     energy = found["energy_per_metre_Wh"][asked.middle] / 3600.0

@@ -19,8 +19,8 @@ from calibration.data.input_errors import BadConfiguration, choices
 from calibration.data.parts import CellSheet
 from calibration.data.requirements_file import Requirements
 from calibration.sizing import sheet
-from calibration.sizing.design import CONTINUOUS, OBJECTIVES, Design, Task, build, evaluate, task
-from calibration.sizing.part_options import Drive, Options, options
+from calibration.sizing.design import CONTINUOUS, OBJECTIVES, Design, Task, build_robot, evaluate_design, sizing_task
+from calibration.sizing.part_options import Drive, Options, options_for_robot
 from mmrjax.compile.compiling import compiled
 from mmrjax.model.robot import Robot
 
@@ -30,7 +30,7 @@ CELLS, PARALLEL, RADIUS = (3, 14), (1.0, 12.0), (0.6, 1.3)
 #: Random designs of each enumerated choice, from which the starts are taken; least number of starts for each motor;
 #: largest number for one choice.
 TRIES, OF_MOTOR, OF_CHOICE = 6, 6, 3
-#: Rows of one call of `_measured`.
+#: Rows of one call of `_evaluate_designs`.
 ROWS = 8192
 #: Steps of each start; steps between updates of the multipliers; first and last step length in the logarithms.
 STEPS, EVERY, RATE = 120, 12, (0.06, 0.003)
@@ -46,7 +46,7 @@ BINDS = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
-class Found:
+class SizedDesign:
     """One design.
 
     Attributes:
@@ -106,23 +106,23 @@ class Sizing:
     options: Options
     objective: str
     unmeetable: tuple[str, ...]
-    ideal: Found | None
-    best: Found | None
-    alternatives: tuple[Found, ...]
-    motors: dict[str, Found]
-    front: tuple[Found, ...]
+    ideal: SizedDesign | None
+    best: SizedDesign | None
+    alternatives: tuple[SizedDesign, ...]
+    motors: dict[str, SizedDesign]
+    front: tuple[SizedDesign, ...]
     starts: int
     evaluated: int
 
 
 @compiled
-def _measured(problem: Task, designs: Design) -> tuple[Array, Array]:
+def _evaluate_designs(problem: Task, designs: Design) -> tuple[Array, Array]:
     """Objectives and margins of designs, shapes (designs, objectives), (designs, margins)."""
-    return jax.vmap(lambda d: evaluate(problem, d))(designs)
+    return jax.vmap(lambda d: evaluate_design(problem, d))(designs)
 
 
 @compiled
-def _descended(
+def _descend(
     problem: Task,
     designs: Design,
     low: Float[Array, "designs 3"],
@@ -142,7 +142,7 @@ def _descended(
     adam = optax.adam(rate, b1=0.8, b2=0.95)
 
     def value(x: Array, d: Design, w: Array, multipliers: Array, weight: Array) -> tuple[Array, tuple[Array, Array]]:
-        objectives, margins = evaluate(problem, dataclasses.replace(d, continuous=x))
+        objectives, margins = evaluate_design(problem, dataclasses.replace(d, continuous=x))
         f = jnp.sum(jnp.where(w > 0, w * jnp.log(jnp.where(w > 0, objectives, 1.0)), 0.0))
         g = jnp.where(kept > 0, jnp.clip(margins, -5.0, 5.0), 1.0)
         short = jnp.maximum(multipliers - weight * (g - 1e-3), 0.0)
@@ -195,7 +195,7 @@ class Space:
         )
 
 
-def space(robot: Robot, problem: Task, options: Options) -> Space:
+def choice_space(robot: Robot, problem: Task, options: Options) -> Space:
     """Choices for a robot."""
     n_drives, n_cells = len(options.drives), len(options.cells)
     every = list(itertools.product(range(n_drives), range(n_cells), range(CELLS[0], CELLS[1] + 1)))
@@ -217,19 +217,19 @@ def space(robot: Robot, problem: Task, options: Options) -> Space:
     return Space(options, drive, cell, series, bounds(0, "ratio_least"), bounds(1, "ratio_most"))
 
 
-def measured(problem: Task, choice: Space, rows: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def evaluate_designs(problem: Task, choice: Space, rows: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Objectives and margins of many designs, in calls of one size."""
     parts = []
     for first in range(0, len(rows), ROWS):
         some = np.minimum(np.arange(first, first + ROWS), len(rows) - 1)
-        f, g = jax.device_get(_measured(problem, choice.designs(rows[some], x[some])))
+        f, g = jax.device_get(_evaluate_designs(problem, choice.designs(rows[some], x[some])))
         parts.append((f[: len(rows) - first], g[: len(rows) - first]))
     f, g = (np.concatenate(p) for p in zip(*parts, strict=True))
     f = np.where(f > 0, f, np.inf)  # no motion, or no price: worse than any
     return f, np.where(np.isfinite(g), g, -5.0)
 
 
-def size(
+def size_robot(
     robot: Robot,
     asked: Requirements,
     objectives: tuple[str, ...] = ("mass",),
@@ -245,17 +245,17 @@ def size(
         starts: number of searches in the batch; motors: names of the choices, empty: all; seed: of the starts.
 
     Raises:
-        BadConfiguration: any raised by `sheet.refuse`; an unknown objective or motor.
+        BadConfiguration: any raised by `sheet.refuse_impossible`; an unknown objective or motor.
     """
     for name in objectives:
         if name not in OBJECTIVES:
             raise BadConfiguration(f"objective: got {name}; {choices(name, OBJECTIVES)}")
-    sheet.refuse(robot, asked)
-    chosen = options(robot, motors)
-    problem = task(robot, asked, chosen)
-    choice = space(robot, problem, chosen)
+    sheet.refuse_impossible(robot, asked)
+    chosen = options_for_robot(robot, motors)
+    problem = sizing_task(robot, asked, chosen)
+    choice = choice_space(robot, problem, chosen)
     columns = [list(OBJECTIVES).index(name) for name in objectives]
-    drawn = _drawn(problem, choice, "cost" in objectives, np.random.default_rng(seed))
+    drawn = _random_designs(problem, choice, "cost" in objectives, np.random.default_rng(seed))
     kept = drawn.g.max(axis=0) >= 0
     unmeetable = tuple(label for label, k in zip(problem.labels, kept, strict=True) if not k)
     search = _Search(problem, choice, kept, columns)
@@ -267,11 +267,11 @@ def size(
     free = free + search.refined(real.rows[top], real.x[top], search.first(len(top)), np.ones(3))
     evaluated = len(drawn.rows) + starts * STEPS + search.evaluated
 
-    def found(designs: _Designs, k: int) -> Found:
+    def found(designs: _Designs, k: int) -> SizedDesign:
         margins = np.where(kept, designs.g[k], np.nan)
-        return _found(robot, problem, choice, designs.rows[k], designs.x[k], designs.f[k], margins)
+        return _sized_design(robot, problem, choice, designs.rows[k], designs.x[k], designs.f[k], margins)
 
-    everything, by_motor = free + real, dict[str, Found]()
+    everything, by_motor = free + real, dict[str, SizedDesign]()
     for k in np.argsort(search.cost(everything)):
         name = chosen.drives[choice.drive[everything.rows[k]]].motor.name
         if name not in by_motor:  # building a robot takes time, and there are a thousand designs
@@ -312,7 +312,7 @@ class _Designs:
         return iter((self.rows, self.x, self.f, self.g))
 
 
-def _drawn(problem: Task, choice: Space, costed: bool, rng: np.random.Generator) -> _Designs:
+def _random_designs(problem: Task, choice: Space, costed: bool, rng: np.random.Generator) -> _Designs:
     """Random designs of every choice of parts: they show which limits can be met, and give the starts.
 
     Args:
@@ -323,7 +323,7 @@ def _drawn(problem: Task, choice: Space, costed: bool, rng: np.random.Generator)
         rows = rows[np.isfinite(choice.options.drive["cost"][choice.drive[rows]])]
     low, high = choice.low[rows], choice.high[rows]
     x = low + (high - low) * rng.random((len(rows), 3)) ** np.array([1.0, 1.0, 2.0])
-    return _Designs(rows, x, *measured(problem, choice, rows, x))
+    return _Designs(rows, x, *evaluate_designs(problem, choice, rows, x))
 
 
 @dataclasses.dataclass
@@ -342,7 +342,7 @@ class _Search:
 
     def designs(self, rows: np.ndarray, x: np.ndarray) -> _Designs:
         """Designs with their objectives and margins."""
-        return _Designs(rows, x, *measured(self.problem, self.choice, rows, x))
+        return _Designs(rows, x, *evaluate_designs(self.problem, self.choice, rows, x))
 
     def first(self, count: int) -> np.ndarray:
         """Weights of only the first objective, shape (count, objectives)."""
@@ -380,7 +380,7 @@ class _Search:
             for c, n in zip(self.columns, shares, strict=True)
         ]
         rows, x = drawn.rows[np.concatenate(picked)], drawn.x[np.concatenate(picked)]
-        x = np.array(_descended(
+        x = np.array(_descend(
             self.problem, choice.designs(rows, x), jnp.asarray(choice.low[rows]), jnp.asarray(choice.high[rows]),
             jnp.asarray(weights), jnp.asarray(self.kept, float),
         ))  # fmt: skip
@@ -391,13 +391,13 @@ class _Search:
 
     def real(self, drawn: _Designs, free: _Designs, weights: np.ndarray) -> _Designs:
         """Designs with ratios of the sheets and whole cells: those near `free`, and the best of every choice."""
-        rows, x, w = _real(self.choice, free.rows, free.x, weights, np.argsort(self.cost(free)))
+        rows, x, w = _nearest_buildable(self.choice, free.rows, free.x, weights, np.argsort(self.cost(free)))
         misses = self.misses(drawn)
         for c in self.columns:
             merit = np.where(np.isfinite(drawn.f[:, c]), np.log(drawn.f[:, c]) + misses, np.inf)
             ranked = np.array(list(dict.fromkeys(drawn.rows[np.argsort(merit)]))[:WHOLE])
             own = np.eye(len(OBJECTIVES))[c]
-            more_rows, more_x, count = _enumerated(self.problem, self.choice, ranked, self.kept, own)
+            more_rows, more_x, count = _best_buildable(self.problem, self.choice, ranked, self.kept, own)
             self.evaluated += count
             rows, x = np.concatenate([rows, more_rows]), np.concatenate([x, more_x])
             w = np.concatenate([w, np.tile(own, (len(more_rows), 1))])
@@ -451,14 +451,14 @@ def _refine(
     for _ in range(ROUNDS):
         tried = np.clip(x[:, None] + width * box, choice.low[rows][:, None], choice.high[rows][:, None])
         n = tried.shape[1]
-        f, g = measured(problem, choice, np.repeat(rows, n), tried.reshape(-1, 3))
+        f, g = evaluate_designs(problem, choice, np.repeat(rows, n), tried.reshape(-1, 3))
         cost = _cost(f, g, kept, np.repeat(weights, n, axis=0)).reshape(-1, n)
         x = tried[np.arange(len(rows)), np.argmin(cost, axis=1)]
         width, count = width * SHRINK, count + len(f)
     return x, count
 
 
-def _real(
+def _nearest_buildable(
     choice: Space, rows: np.ndarray, x: np.ndarray, weights: np.ndarray, order: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Designs near the given ones with ratios of the sheets and whole cells: the two nearest of each."""
@@ -476,7 +476,7 @@ def _real(
     return np.array(chosen), np.array(points), np.array(w)
 
 
-def _enumerated(
+def _best_buildable(
     problem: Task, choice: Space, rows: np.ndarray, kept: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Best designs of choices with every ratio of their sheets, few whole cells in parallel and three radii, and
@@ -489,7 +489,7 @@ def _enumerated(
             of_row.append(row)
             points.append([math.log(ratio), low + share * (high - low), math.log(p)])
     every, x = np.array(of_row), np.array(points)
-    f, g = measured(problem, choice, every, x)
+    f, g = evaluate_designs(problem, choice, every, x)
     best = np.argsort(_cost(f, g, kept, np.tile(weights, (len(every), 1))))[:KEPT_WHOLE]
     return every[best], x[best], len(every)
 
@@ -504,14 +504,14 @@ def _undominated(f: np.ndarray, among: list[int]) -> list[int]:
     return front
 
 
-def _found(
+def _sized_design(
     robot: Robot, problem: Task, choice: Space, row: int, x: np.ndarray, f: np.ndarray, g: np.ndarray
-) -> Found:
+) -> SizedDesign:
     drive, cell = choice.options.drives[choice.drive[row]], choice.options.cells[choice.cell[row]]
     series = int(choice.in_series[row])
     ratio, radius, parallel = (float(v) for v in np.exp(x))
     design = jax.tree.map(lambda v: v[0], choice.designs(np.array([row]), x[None]))
-    made, _ = build(problem.robot, problem.base_mass, problem.configuration, design)
+    made, _ = build_robot(problem.robot, problem.base_mass, problem.configuration, design)
     made = jax.tree.map(lambda v: np.asarray(v) if eqx.is_array(v) else v, made)
 
     def rated(key: str) -> float:
@@ -538,4 +538,4 @@ def _found(
         if abs(v - b) < 1e-6 and (word, name) != ("least", "parallel")
     )
     values = {name: float(v) for name, v in zip(OBJECTIVES, f, strict=True) if np.isfinite(v)}
-    return Found(drive, cell, ratio, radius, series, parallel, values, margins, at_bound, made)
+    return SizedDesign(drive, cell, ratio, radius, series, parallel, values, margins, at_bound, made)

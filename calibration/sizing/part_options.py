@@ -43,7 +43,7 @@ class Drive(NamedTuple):
         return f"{self.motor.name}, {self.family}, {self.stages} stage{'s' if self.stages > 1 else ''}"
 
 
-def drives(names: tuple[str, ...] = ()) -> tuple[Drive, ...]:
+def drive_options(names: tuple[str, ...] = ()) -> tuple[Drive, ...]:
     """All motors of the sheets (or those named) with all sizes of gearbox that their source combines them with."""
     found = []
     for motor in motors():
@@ -59,7 +59,7 @@ def drives(names: tuple[str, ...] = ()) -> tuple[Drive, ...]:
     return tuple(found)
 
 
-def packable() -> tuple[CellSheet, ...]:
+def packable_cells() -> tuple[CellSheet, ...]:
     """Cells with all data for a pack: capacity, full voltage and cut-off are stated, or are the paper's."""
     return tuple(c for c in cells() if c.cells == 1 and (c.name == CELL or not math.isnan(c.voltage_cut_off)))
 
@@ -92,13 +92,13 @@ def _stated(value: float, otherwise: float) -> float:
     return otherwise if math.isnan(value) else value
 
 
-def options(robot: Robot, names: tuple[str, ...] = ()) -> Options:
+def options_for_robot(robot: Robot, names: tuple[str, ...] = ()) -> Options:
     """Options for a robot.
 
     Args:
         robot: source of friction, efficiencies and cells missing in sheets; names: of motors, empty: all.
     """
-    chosen, packs = drives(names), packable()
+    chosen, packs = drive_options(names), packable_cells()
     paper_motor = next(m for m in motors() if m.name == MOTOR)
     paper_gear = next(g for g in gearboxes() if g.name == GEARBOX)
     paper_cell = next(c for c in cells() if c.name == CELL)

@@ -102,7 +102,7 @@ class Outcome:
         }  # fmt: skip
 
 
-def rated(robot: Robot, asked: Requirements) -> Requirements:
+def with_ratings(robot: Robot, asked: Requirements) -> Requirements:
     """Requirements with the robot's own ratings for those without a number.
 
     Raises:
@@ -124,7 +124,7 @@ def rated(robot: Robot, asked: Requirements) -> Requirements:
     return dataclasses.replace(asked, each=tuple(each))
 
 
-def refuse(robot: Robot, asked: Requirements) -> None:
+def refuse_impossible(robot: Robot, asked: Requirements) -> None:
     """Refuse requirements that cannot be evaluated for a robot of these configurations.
 
     Raises:
@@ -160,7 +160,7 @@ def _configuration(robot: Robot, envelope: Envelope) -> str:
     return envelope.configuration or robot.configurations.names[0]
 
 
-def points(robot: Robot, requirement: Requirement) -> Point:
+def envelope_points(robot: Robot, requirement: Requirement) -> Point:
     """Points of a requirement's envelope: ends of each range and values between, shape (points,).
 
     An axis without influence on the quantity has one value. The number of points depends only on the quantity.
@@ -215,7 +215,7 @@ def _unrated(robot: Robot) -> Robot:
 
 
 @compiled
-def _over(
+def _quantity_over(
     robot: Robot,
     rated: Ratings,
     names: tuple[str, ...],
@@ -245,7 +245,7 @@ def _gradient(robot: Robot, rated: Ratings, names: tuple[str, ...], theta: Array
 
 
 @dataclasses.dataclass(frozen=True)
-class _Held:
+class _QuantityOfRobot:
     """A requirement's quantity over its envelope, as a function of the designer's parameters."""
 
     robot: Robot
@@ -254,7 +254,7 @@ class _Held:
 
     @property
     def at(self) -> Point:
-        return points(self.robot, self.requirement)
+        return envelope_points(self.robot, self.requirement)
 
     def over(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Values in the unit of the name, outcomes, and margins (-inf without a value), shape (rows, points)."""
@@ -262,12 +262,14 @@ class _Held:
         robot, rated = _unrated(self.robot), ratings(self.robot)
         for first in range(0, len(rows), ROWS):
             chosen = rows[np.minimum(np.arange(first, first + ROWS), len(rows) - 1)]
-            found = jax.device_get(_over(robot, rated, self.names, jnp.asarray(chosen), at, _computed(r)))
+            found = jax.device_get(
+                _quantity_over(robot, rated, self.names, jnp.asarray(chosen), at, _computed_name(r))
+            )
             parts.append([x[: len(rows) - first] for x in found])
         value, outcome = (np.concatenate(x) for x in zip(*parts, strict=True))
         value = value / r.quantity.factor
         counts = (outcome == CONVERGED) & np.isfinite(value)
-        assert r.limit is not None  # see `rated`
+        assert r.limit is not None  # see `with_ratings`
         margin = (value - r.limit) * (1 if r.least else -1)
         return value, outcome, np.where(counts, margin, -np.inf)
 
@@ -276,48 +278,48 @@ class _Held:
         return self.over(rows)[2].min(axis=1)
 
 
-def _computed(requirement: Requirement) -> str:
+def _computed_name(requirement: Requirement) -> str:
     """Common name of a quantity with several names, so that these share one program."""
     return "speed_m_s" if requirement.name == "speed_end_of_charge_m_s" else requirement.name
 
 
-def parameters(robot: Robot, configuration: str) -> dict[str, params.Parameter]:
+def changeable_parameters(robot: Robot, configuration: str) -> dict[str, params.Parameter]:
     """Parameters of a robot that a designer can change, by name, without cells."""
     known = {p.name: p for p in params.walk(robot)}
     names = (*CHANGEABLE, *(f"{configuration}.{n}" for n in OF_CONFIGURATION))
     return {name: known[name] for name in names if name in known}
 
 
-def check(robot: Robot, asked: Requirements, *, changes: bool = True) -> tuple[Outcome, ...]:
+def check_requirements(robot: Robot, asked: Requirements, *, changes: bool = True) -> tuple[Outcome, ...]:
     """Evaluate requirements for a robot.
 
     Args:
         changes: True to search for changes that would meet the missed ones.
 
     Raises:
-        BadConfiguration: see `refuse` and `rated`.
+        BadConfiguration: see `refuse_impossible` and `with_ratings`.
     """
-    refuse(robot, asked)
-    asked = rated(robot, asked)
+    refuse_impossible(robot, asked)
+    asked = with_ratings(robot, asked)
     held = []
     for r in asked.each:
         configuration = _configuration(robot, r.envelope)
         of_levers = OF_LEVERS if r.quantity.group == "posture" else ()
-        held.append(_Held(robot, r, (*parameters(robot, configuration), *of_levers, CELLS)))
+        held.append(_QuantityOfRobot(robot, r, (*changeable_parameters(robot, configuration), *of_levers, CELLS)))
     found = [_outcome(h) for h in held]
     if changes:
         found = [o if o.met else _with_changes(h, o, held, found) for h, o in zip(held, found, strict=True)]
     return tuple(found)
 
 
-def _now(held: _Held) -> np.ndarray:
+def _present_values(held: _QuantityOfRobot) -> np.ndarray:
     known = {p.name: float(p.value) for p in params.walk(held.robot)}
     return np.array([held.robot.battery.cells if n == CELLS else known[n] for n in held.names], float)
 
 
-def _outcome(held: _Held) -> Outcome:
+def _outcome(held: _QuantityOfRobot) -> Outcome:
     r = held.requirement
-    value, outcome, margin = (x[0] for x in held.over(_now(held)[None]))
+    value, outcome, margin = (x[0] for x in held.over(_present_values(held)[None]))
     # A point without a value is worse than any; the largest of those with the same outcome is at its worst corner.
     k = int(np.argmin(margin))
     status = STATUSES[outcome[k]]
@@ -329,7 +331,7 @@ def _outcome(held: _Held) -> Outcome:
     )
 
 
-def _corner(held: _Held, k: int) -> dict[str, Any]:
+def _corner(held: _QuantityOfRobot, k: int) -> dict[str, Any]:
     """A point in the names of a file."""
     r, at = held.requirement, held.at
     e = r.envelope
@@ -350,17 +352,19 @@ def _corner(held: _Held, k: int) -> dict[str, Any]:
     return {"configuration": _configuration(held.robot, e), "surface": e.surface, **found}
 
 
-def _with_changes(held: _Held, outcome: Outcome, every: Sequence[_Held], now: Sequence[Outcome]) -> Outcome:
+def _with_changes(
+    held: _QuantityOfRobot, outcome: Outcome, every: Sequence[_QuantityOfRobot], now: Sequence[Outcome]
+) -> Outcome:
     found = _changes(held, outcome)
     if not found:
         return outcome
-    rows = np.stack([_with(held, c.parameter, c.after) for c in found])
+    rows = np.stack([_with_value(held, c.parameter, c.after) for c in found])
     broken: list[list[str]] = [[] for _ in found]
     for other, before in zip(every, now, strict=True):
         if other is held or not before.met:
             continue
         # Another configuration has other names; names in common are changed.
-        own = np.tile(_now(other), (len(rows), 1))
+        own = np.tile(_present_values(other), (len(rows), 1))
         for k, name in enumerate(held.names):
             if name in other.names:
                 own[:, other.names.index(name)] = rows[:, k]
@@ -371,24 +375,29 @@ def _with_changes(held: _Held, outcome: Outcome, every: Sequence[_Held], now: Se
     return dataclasses.replace(outcome, change=tuple(order))
 
 
-def _with(held: _Held, name: str, value: float) -> np.ndarray:
-    row = _now(held)
+def _with_value(held: _QuantityOfRobot, name: str, value: float) -> np.ndarray:
+    row = _present_values(held)
     row[held.names.index(name)] = value
     return row
 
 
-def _changes(held: _Held, outcome: Outcome) -> list[Change]:
+def _changes(held: _QuantityOfRobot, outcome: Outcome) -> list[Change]:
     """Single changes that meet a requirement.
 
     The direction is that of the derivative at the worst corner. The nearest value that meets the requirement at every
     corner is found on a ladder and by division of its interval. Each stated value is verified.
     """
-    now, names = _now(held), held.names
+    now, names = _present_values(held), held.names
     worst = int(np.argmin(held.over(now[None])[2][0]))
     point = jax.tree.map(lambda x: x[worst], held.at)
     slopes = np.asarray(
         _gradient(
-            _unrated(held.robot), ratings(held.robot), names, jnp.asarray(now), point, _computed(held.requirement)
+            _unrated(held.robot),
+            ratings(held.robot),
+            names,
+            jnp.asarray(now),
+            point,
+            _computed_name(held.requirement),
         )
     )
     slopes = slopes / held.requirement.quantity.factor * (1 if held.requirement.least else -1)
@@ -415,13 +424,13 @@ def _changes(held: _Held, outcome: Outcome) -> list[Change]:
     return found
 
 
-def _nearest(held: _Held, name: str, begin: float, end: float) -> float | None:
+def _nearest(held: _QuantityOfRobot, name: str, begin: float, end: float) -> float | None:
     """Value of a parameter nearest to `begin` towards `end` that meets the requirement; None without one."""
     if begin == end:
         return None
 
     def meets(values: np.ndarray) -> np.ndarray:
-        return held.worst(np.stack([_with(held, name, v) for v in values])) >= 0
+        return held.worst(np.stack([_with_value(held, name, v) for v in values])) >= 0
 
     def steps(a: float, b: float, count: int) -> np.ndarray:
         if name == CELLS:
@@ -455,7 +464,7 @@ def _rounded(value: float, digits: int, up: bool) -> float:
     return float(f"{(math.ceil if up else math.floor)(value / step - (1e-9 if up else -1e-9)) * step:.{digits}g}")
 
 
-def counts(outcomes: Sequence[Outcome]) -> Mapping[str, int]:
+def count_outcomes(outcomes: Sequence[Outcome]) -> Mapping[str, int]:
     """Number of met and of missed requirements."""
     met = sum(o.met for o in outcomes)
     return {"met": met, "missed": len(outcomes) - met}

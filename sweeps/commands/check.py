@@ -38,15 +38,15 @@ def check(config: configuration.Check, out: Path | None, force: bool) -> int:
     file = load_robot(config)
     robot = file.robot
     imposed.check_on_ground(robot, "check")
-    sheet.refuse(robot, asked)
+    sheet.refuse_impossible(robot, asked)
     _check_charge(robot, asked)
     _check_heat(robot, asked)
     with open_folder("check", config, robot, out, force) as folder:
-        outcomes = sheet.check(robot, asked, changes=config.changes)
+        outcomes = sheet.check_requirements(robot, asked, changes=config.changes)
         found = CheckResult(asked, robot, outcomes, posture_results.of_requirements(robot, outcomes))
         _write(folder, config, found)
         print_check(found, changes=config.changes)
-        manifest = {"seed": None, **sheet.counts(found.outcomes)}
+        manifest = {"seed": None, **sheet.count_outcomes(found.outcomes)}
         return leave(
             folder,
             config,

@@ -12,7 +12,7 @@ from calibration.data.input_errors import BadConfiguration, choices
 from calibration.data.parts import motors
 from calibration.sizing import sheet
 from calibration.sizing.design import OBJECTIVES
-from calibration.sizing.design_search import size as search
+from calibration.sizing.design_search import size_robot as search
 from mmrjax.errors import counted
 from sweeps import config as configuration
 from sweeps.console import say
@@ -45,10 +45,10 @@ def size(config: configuration.Size, out: Path | None, force: bool) -> int:
     for name in config.motors:
         if name not in known:
             raise BadConfiguration(f"--motors: got {name}; {choices(name, known)}")
-    sheet.refuse(robot, asked)
+    sheet.refuse_impossible(robot, asked)
     with open_folder("size", config, robot, out, force) as folder:
         sizing = search(robot, asked, objectives, starts=config.starts, motors=config.motors, seed=config.seed)
-        outcomes = () if sizing.best is None else sheet.check(sizing.best.robot, asked, changes=False)
+        outcomes = () if sizing.best is None else sheet.check_requirements(sizing.best.robot, asked, changes=False)
         found = SizeResult(asked, robot, sizing, objectives, outcomes)
         _write(folder, config, found)
         print_size(found)

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from calibration.data.robot_file import RobotFile
-from calibration.sizing.chart import chart, extent
+from calibration.sizing.chart import chart_extent, margin_chart
 from calibration.sizing.design import OBJECTIVES
-from calibration.sizing.design_search import Found
+from calibration.sizing.design_search import SizedDesign
 from sweeps.pages import size_figures
 from sweeps.pages.page import Album, named, render, words_shown
 from sweeps.results.check_results import label, reached, wanted
@@ -20,11 +20,11 @@ from sweeps.results.size_results import SizeResult, missed, verdict
 def write(folder: Path, found: SizeResult, file: RobotFile) -> Path:
     """Write `report.html` and `figures/` of a sizing; returns the path of the page."""
     album, best, left_out = Album(folder), found.sizing.best, found.sizing.unmeetable
-    most = extent(found.asked)
-    charts = {f"as it is: {words_shown(file.name)}": chart(found.robot, found.asked, most)}
+    most = chart_extent(found.asked)
+    charts = {f"as it is: {words_shown(file.name)}": margin_chart(found.robot, found.asked, most)}
     if best is not None:
         charts = {
-            f"best: {best.drive.motor.name}, ratio {best.ratio:.4g}": chart(best.robot, found.asked, most),
+            f"best: {best.drive.motor.name}, ratio {best.ratio:.4g}": margin_chart(best.robot, found.asked, most),
             **charts,
         }
     album.add("limits", partial(size_figures.limits, found, charts))
@@ -57,7 +57,7 @@ def write(folder: Path, found: SizeResult, file: RobotFile) -> Path:
     )
 
 
-def _row(f: Found, unmeetable: tuple[str, ...]) -> dict[str, Any]:
+def _row(f: SizedDesign, unmeetable: tuple[str, ...]) -> dict[str, Any]:
     return {
         "feasible": f.feasible and not unmeetable,
         "verdict": verdict(f, unmeetable),

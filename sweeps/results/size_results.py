@@ -7,7 +7,7 @@ from typing import Any
 
 from calibration.data.requirements_file import Requirements
 from calibration.sizing.design import OBJECTIVES
-from calibration.sizing.design_search import Found, Sizing
+from calibration.sizing.design_search import SizedDesign, Sizing
 from calibration.sizing.sheet import Outcome
 from mmrjax.model.robot import Robot
 
@@ -58,22 +58,22 @@ class SizeResult:
         }
 
 
-def verdict(found: Found, unmeetable: tuple[str, ...]) -> str:
+def verdict(found: SizedDesign, unmeetable: tuple[str, ...]) -> str:
     """Whether a design meets the requirements; `unmeetable`: those that no choice of parts meets, left out of it."""
     return "misses" if not found.feasible else "meets the others" if unmeetable else "meets"
 
 
-def short(found: Found) -> float:
+def short(found: SizedDesign) -> float:
     """By how much a design misses, all margins together [-]."""
     return sum(max(-m, 0.0) for m in found.margins.values())
 
 
-def missed(found: Found) -> list[str]:
+def missed(found: SizedDesign) -> list[str]:
     """What a design misses, by how much."""
     return [f"{label} ({100 * m:+.1f} %)" for label, m in sorted(found.margins.items(), key=lambda x: x[1]) if m < 0]
 
 
-def described(found: Found) -> str:
+def described(found: SizedDesign) -> str:
     """A design in words."""
     stages = f"{found.drive.stages} stage{'s' if found.drive.stages > 1 else ''}"
     return (
@@ -82,7 +82,7 @@ def described(found: Found) -> str:
     )
 
 
-def objective(found: Found, name: str) -> str:
+def objective(found: SizedDesign, name: str) -> str:
     """An objective with its unit; what no sheet states is said."""
     unit, words = OBJECTIVES[name]
     return f"{words} {found.objectives[name]:.4g} {unit}" if name in found.objectives else f"{words} not stated"

@@ -14,7 +14,7 @@ from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.observers.time_histories import Histories
 from calibration.inference.observers.turns import SettledTurns
 from calibration.inference.priors import Coordinates
-from calibration.inference.problem import Problem, data_of
+from calibration.inference.problem import Problem, data_from_readings
 from mmrjax import fidelities
 from mmrjax.fidelities import Facts
 from mmrjax.model import params
@@ -26,12 +26,12 @@ __all__ = ["Histories", "Observer", "SettledRuns", "SettledTurns", "facts", "kin
 KINDS: tuple[type[Observer], ...] = (Histories, SettledTurns, SettledRuns)
 
 
-def kind(runs: Runs) -> type[Observer]:
+def observer_kind(runs: Runs) -> type[Observer]:
     """The observer of a table: time histories where it has `time_s`, else settled turns or straight runs."""
     return next(k for k in KINDS if k.observes(runs))
 
 
-def facts(model: str) -> Facts:
+def fidelity_facts(model: str) -> Facts:
     """Facts about a fidelity, by its name.
 
     Raises:
@@ -42,7 +42,9 @@ def facts(model: str) -> Facts:
     return fidelities.facts(model)
 
 
-def pose(runs: Runs, base: Robot, coordinates: Coordinates, sd: np.ndarray, model: str | None = None) -> Problem:
+def pose_problem(
+    runs: Runs, base: Robot, coordinates: Coordinates, sd: np.ndarray, model: str | None = None
+) -> Problem:
     """Inverse problem of these runs.
 
     Args:
@@ -54,6 +56,8 @@ def pose(runs: Runs, base: Robot, coordinates: Coordinates, sd: np.ndarray, mode
         BadData: a configuration that `base` does not have.
     """
     if model is not None:
-        facts(model)
-    observe = kind(runs).of(runs, base, model)
-    return Problem(params.strong(base), coordinates, observe, data_of(runs.measured(), sd, len(coordinates)))
+        fidelity_facts(model)
+    observe = observer_kind(runs).of(runs, base, model)
+    return Problem(
+        params.strong(base), coordinates, observe, data_from_readings(runs.measured(), sd, len(coordinates))
+    )

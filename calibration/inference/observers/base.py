@@ -18,7 +18,7 @@ from calibration.inference.details import Detail
 from calibration.inference.fit_notes import Note
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.noise import Noise
-from calibration.inference.optimizers import Numbers, Optimum, linearised, read
+from calibration.inference.optimizers import Numbers, Optimum, linearise, observe_robot
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax.effects import Effect
 from mmrjax.model.conditions import Conditions
@@ -133,7 +133,7 @@ class Observer(eqx.Module):
     @classmethod
     @abc.abstractmethod
     def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> Observer:
-        """Observer of a table; see `observers.pose`."""
+        """Observer of a table; see `observers.pose_problem`."""
 
     @classmethod
     @abc.abstractmethod
@@ -348,11 +348,11 @@ class Observer(eqx.Module):
         if not self.long:
             return self.at(problem, z, active)[2]
         problem = _with_effects(problem, active)
-        return read(problem, problem.robot(jnp.asarray(z)))
+        return observe_robot(problem, problem.robot(jnp.asarray(z)))
 
     def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
         """Residuals, their Jacobian and the observation at z; arguments as in `observed`."""
-        return linearised(_with_effects(problem, active), jnp.asarray(z), problem.data)
+        return linearise(_with_effects(problem, active), jnp.asarray(z), problem.data)
 
     @abc.abstractmethod
     def bases(self, columns: Mapping[str, np.ndarray], included: Bool[np.ndarray, " rows"], robot: Robot) -> Bases:

@@ -21,12 +21,19 @@ from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.details import EquationDefects
 from calibration.inference.fit_notes import Note, Repeats
-from calibration.inference.linearization import Linearization, ScoredEffect, finite, probe
+from calibration.inference.linearization import Linearization, ScoredEffect, balance_probe, finite_or_zero
 from calibration.inference.noise import Noise
 from calibration.inference.observers.base import Diagnosis, Observer, SearchPolicy
-from calibration.inference.optimizers import Member, Numbers, Optimum, counted, penalties, searches_refilled
+from calibration.inference.optimizers import (
+    Member,
+    Numbers,
+    Optimum,
+    penalty_slice,
+    search_refilling,
+    zero_inactive_residuals,
+)
 from calibration.inference.problem import Data, Observation, Problem
-from calibration.inference.repeats import same_conditions
+from calibration.inference.repeats import rows_of_same_conditions
 from calibration.inference.simulation_errors import root_mean_square
 from calibration.words import table_words
 from mmrjax import fidelities
@@ -96,7 +103,7 @@ class SettledLinearization(Linearization):
         return np.arange(self.rows)
 
 
-def shares(channel: str, sides: int) -> np.ndarray:
+def side_shares(channel: str, sides: int) -> np.ndarray:
     """Weights of the sides in a channel's reading [-]: one side, or the mean of all."""
     side = channels.find(channel).side
     return np.full(sides, 1 / sides) if side is None or sides == 1 else np.eye(sides)[side]
@@ -154,7 +161,7 @@ class SettledRuns(Observer):
     @classmethod
     def check(cls, runs: Runs, noise: Noise) -> list[Note | str]:
         """Refuses a table of one condition with readings that differ; notes the repeats that differ most."""
-        measured, alike = runs.measured(), same_conditions(runs)
+        measured, alike = runs.measured(), rows_of_same_conditions(runs)
         least, found = cls.least(runs), list[Repeats]()
         shared = np.array([source == "series" for source in noise.source])
         usual = np.array([c.sd_share for c in runs.channels])
@@ -256,7 +263,7 @@ class SettledRuns(Observer):
         This is exact, because an effect enters one balance and is linear in its amplitude.
         """
         kind = self.linearization
-        probes = tuple(probe(b) for b in kind.probed)
+        probes = tuple(balance_probe(b) for b in kind.probed)
         robot, size, shown = problem.robot(z), z.size, channels.names(problem.channels)
 
         def probed(x: Array) -> Robot:
@@ -267,7 +274,7 @@ class SettledRuns(Observer):
 
         wide = jnp.concatenate([z, jnp.zeros(len(probes) * math.prod(self.shape_sides))])
         r, slopes, _, signals = problem.linearised(probed, wide, data)
-        r, slopes = counted(r, slopes, penalties(data))
+        r, slopes = zero_inactive_residuals(r, slopes, penalty_slice(data))
         jacobian = jnp.concatenate([slopes, jnp.eye(size, wide.size)])
         residual = jnp.concatenate([r, z - data.centre])
         rows, count = data.measured.shape
@@ -282,7 +289,7 @@ class SettledRuns(Observer):
             term = jax.vmap(lambda s: balances.added(alone, s, effect.balance, effect.channel))(each)
             term = jnp.broadcast_to(term, each.speed.shape).reshape(rows, -1)
             if effect.balance == "sensor":
-                term = term @ shares(effect.channel, term.shape[1])
+                term = term @ side_shares(effect.channel, term.shape[1])
                 moved = term[:, None] * (jnp.arange(count) == shown.index(effect.channel)) * scale
             elif effect.balance in kind.probed:
                 moved = (term.T[:, :, None] * defects[kind.probed.index(effect.balance)]).sum(0)
@@ -293,7 +300,7 @@ class SettledRuns(Observer):
         signatures = jnp.concatenate([e.each(signature) for e in effects]).T
         defects = defects.reshape(len(probes), *self.shape_sides, rows, count)
         return kind(
-            residual, jacobian[:, :size], finite(signatures), defects, scale, signals, channels=shown,
+            residual, jacobian[:, :size], finite_or_zero(signatures), defects, scale, signals, channels=shown,
             magnitudes=robot.rig.magnitudes,
         )  # fmt: skip
 
@@ -307,10 +314,10 @@ class SettledRuns(Observer):
         """
         data, count = problem.data, len(keys)
         clean = data.measured + data.sd * linear.by_row()  # for included readings
-        measured, centre = jax.device_get(_drawn(clean, data.sd, z, keys, jnp.asarray(factors)))
+        measured, centre = jax.device_get(_draw_tables(clean, data.sd, z, keys, jnp.asarray(factors)))
         start, weight = (np.repeat(np.asarray(x)[None], count, 0) for x in (z, data.weight))
         members = Member(start, weight, measured, centre)
-        refits, _ = searches_refilled(problem, members, self.policy.steps, self.places(problem))
+        refits, _ = search_refilling(problem, members, self.policy.steps, self.places(problem))
         return measured, centre, refits.z
 
     def replicate(
@@ -340,7 +347,7 @@ class SettledRuns(Observer):
         own = np.asarray(starts), np.asarray(weights), measured, centre
         members = Member(*own, active=None if active is None else np.asarray(active))
         steps = self.policy.steps if most is None else most
-        return searches_refilled(problem, members, steps, self.places(problem))
+        return search_refilling(problem, members, steps, self.places(problem))
 
     def places(self, problem: Problem) -> int:
         """Number of searches that run together on a core.
@@ -358,7 +365,7 @@ class SettledRuns(Observer):
         columns = {**_unmeasured(self, robot, columns), **columns}
         ways = dict.fromkeys(WAYS, np.asarray(_directions(self, robot)))
         told = columns, weight, robot, None, ways
-        return (*bases_room.families(*told), *bases_room.windows(*told))
+        return (*bases_room.curve_families(*told), *bases_room.window_families(*told))
 
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> EquationDefects:
         """Defects of `electrical`, `track` and `slip` that together make each row's residual.
@@ -430,7 +437,7 @@ def _directions(observe: SettledRuns, robot: Robot) -> Float[Array, " rows"]:
 
 
 @functools.partial(compiled, options=SELDOM)
-def _drawn(clean: Array, sd: Array, z: Array, keys: Array, factors: Array) -> tuple[Array, Array]:
+def _draw_tables(clean: Array, sd: Array, z: Array, keys: Array, factors: Array) -> tuple[Array, Array]:
     """Readings and bench values of a table for each key, with its sds times its factors."""
 
     def one(key: Array, factors: Array) -> tuple[Array, Array]:

@@ -23,7 +23,7 @@ from scipy.special import ndtr
 from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.optimizers import CORES, Optimum, Pin, levenberg_marquardt
 from calibration.inference.priors import TIED
-from calibration.inference.problem import Problem, data_of
+from calibration.inference.problem import Problem, data_from_readings
 from mmrjax.compile.compiling import compiled
 from mmrjax.compile.precision import Threads
 from mmrjax.model import channels
@@ -116,7 +116,7 @@ def settled_ends(problem: Problem) -> Ends:
     return Ends(conditions, mean, np.where(np.isfinite(error), np.maximum(error, 1e-12), np.nan), shown)
 
 
-def starts(
+def starts_from_settled_ends(
     problem: Problem, draws: Float[np.ndarray, "draws parameters"], search: Callable[..., Optimum]
 ) -> Float[np.ndarray, "starts parameters"]:
     """Initial coordinates for searches of a base, the most promising first.
@@ -126,17 +126,19 @@ def starts(
         draws: of the prior, tried in addition to the settled ends.
         search: (problem, starts, most steps) → optima of a batch of searches.
     """
-    ends = _at_ends(problem)
+    ends = _fit_settled_ends(problem)
     friction = np.array(["ground.friction." in n for n in problem.coordinates.names])
-    points = np.concatenate([ends, np.where(friction, _spread(problem, draws), ends[0]), 0 * ends[:1], draws])
-    blunt = _blunt(problem)
+    points = np.concatenate(
+        [ends, np.where(friction, _spread_over_surfaces(problem, draws), ends[0]), 0 * ends[:1], draws]
+    )
+    blunt = _with_blunt_instruments(problem)
     found = search(blunt, _recombined(blunt, points)[:SEARCHES], STEPS_BLUNT)
     ended = np.asarray(found.z)[np.argsort(np.asarray(found.cost))]
     best = _recombined(blunt, ended)[:1]
-    return _apart(np.concatenate([best, _peaked(problem, best[0]), ended]))
+    return _distinct_points(np.concatenate([best, _with_peaked_friction(problem, best[0]), ended]))
 
 
-def _peaked(problem: Problem, z: np.ndarray) -> np.ndarray:
+def _with_peaked_friction(problem: Problem, z: np.ndarray) -> np.ndarray:
     """Copies of z with a friction that falls from a peak, with the same creep and sliding friction.
 
     Their μ_s, V_s and V_d have the nominal ratios to μ_d and to each other, in one configuration or in all;
@@ -158,7 +160,7 @@ def _peaked(problem: Problem, z: np.ndarray) -> np.ndarray:
     return np.stack([*out, every])
 
 
-def _apart(points: np.ndarray) -> np.ndarray:
+def _distinct_points(points: np.ndarray) -> np.ndarray:
     """Points without those too close to an earlier one."""
     kept: list[np.ndarray] = []
     for z in points:
@@ -183,7 +185,7 @@ def _recombined(problem: Problem, points: np.ndarray) -> np.ndarray:
     return mixed
 
 
-def _spread(problem: Problem, draws: np.ndarray) -> np.ndarray:
+def _spread_over_surfaces(problem: Problem, draws: np.ndarray) -> np.ndarray:
     """Draws with adhesion and V_s spread evenly (in logarithms) over the ranges of surfaces, and with dynamic values
     in their nominal ratio to static ones."""
     out = []
@@ -205,7 +207,7 @@ def _coordinate(problem: Problem, k: int, value: float) -> float:
     return float(((np.log(value) if scale else value) - location) / spread)
 
 
-def _blunt(problem: Problem) -> Problem:
+def _with_blunt_instruments(problem: Problem) -> Problem:
     """Problem with the enlarged sds of blunt instruments."""
     data = problem.data
     count = np.maximum(np.sum(np.asarray(data.weight) > 0, 0), 1)
@@ -213,25 +215,25 @@ def _blunt(problem: Problem) -> Problem:
     return dataclasses.replace(problem, data=dataclasses.replace(data, sd=jnp.hypot(data.sd, BLUNT * rms)))
 
 
-def _at_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"]:
+def _fit_settled_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"]:
     """Fits to the settled ends: with each adhesion of the grid, and with a free adhesion."""
     names = problem.coordinates.names
     statics = [k for k, n in enumerate(names) if n.endswith(STATIC)]
     ends = settled_ends(problem)
-    mean = np.where(_sliding(problem, ends)[:, None], np.nan, ends.mean)
+    mean = np.where(_slides_at_end(problem, ends)[:, None], np.nan, ends.mean)
     observe = SettledRuns(ends.conditions, "steady")
-    here = Problem(problem.base, problem.coordinates, observe, data_of(mean, ends.sd, len(names)))
+    here = Problem(problem.base, problem.coordinates, observe, data_from_readings(mean, ends.sd, len(names)))
     pinned = np.stack([_with_adhesion(problem, np.zeros(len(names)), a) for a in ADHESIONS])
     held = np.zeros(pinned.shape, bool)
     held[:, statics] = True
-    fitted = jax.device_get(_pinned(here, jnp.asarray(pinned), jnp.asarray(held)))
-    free = jax.device_get(_pinned(here, jnp.asarray(fitted.z), jnp.zeros(held.shape, bool)))
+    fitted = jax.device_get(_fit_pinned(here, jnp.asarray(pinned), jnp.asarray(held)))
+    free = jax.device_get(_fit_pinned(here, jnp.asarray(fitted.z), jnp.zeros(held.shape, bool)))
     best = free.z[int(np.argmin(np.where(np.isfinite(free.cost), free.cost, np.inf)))]
     wanted = [z for z in (best, *fitted.z) if np.all(np.isfinite(z))]
     return np.stack([_with_sliding(problem, z, share) for z in wanted for share in FINER])
 
 
-def _sliding(problem: Problem, ends: Ends) -> np.ndarray:
+def _slides_at_end(problem: Problem, ends: Ends) -> np.ndarray:
     """True if a run's movers spin at its end, also while it still gains speed, forwards or back; shape (runs,)."""
     if not {"motor_speed", "speed"} <= set(problem.base.rig.channels):
         return np.zeros(len(ends.mean), bool)
@@ -272,7 +274,7 @@ def _with_sliding(problem: Problem, z: np.ndarray, share: float) -> np.ndarray:
 
 
 @compiled
-def _pinned(problem: Problem, starts: Array, held: Array) -> Optimum:
+def _fit_pinned(problem: Problem, starts: Array, held: Array) -> Optimum:
     def one(z: Array, held: Array) -> Optimum:
         return levenberg_marquardt(problem, z, problem.data, Pin(held, z), max_steps=STEPS)[0]
 

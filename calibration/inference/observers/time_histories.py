@@ -34,11 +34,11 @@ from calibration.inference.linearization import (
     PROBED,
     Linearization,
     ScoredEffect,
-    each_shape,
-    finite,
-    probe,
-    shaped_as_in,
-    terms_of,
+    balance_probe,
+    effect_terms,
+    finite_or_zero,
+    map_over_shapes,
+    with_shape_of_robot,
 )
 from calibration.inference.noise import Noise
 from calibration.inference.observers import settled_ends
@@ -48,11 +48,11 @@ from calibration.inference.optimizers import (
     Evaluate,
     Numbers,
     Optimum,
-    counted,
-    linearised,
-    linearised_signed,
-    penalties,
-    searches_long,
+    linearise,
+    linearise_rollout,
+    penalty_slice,
+    search_rollouts,
+    zero_inactive_residuals,
 )
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import MISSING, Data, Observation, Problem
@@ -252,27 +252,30 @@ class Histories(Observer):
         given = [runs["time_s"][m] for m in mine]
         # Rows of the log without a reading here are kept if the imposed quantity changes there.
         noted = [
-            np.isin(whole["time_s"][rows], t) | exact | linear | _changed(whole, rows)
+            np.isin(whole["time_s"][rows], t) | exact | linear | _drive_changes(whole, rows)
             for rows, t in zip(every, given, strict=True)
         ]
         steps = [
-            np.minimum.reduceat(h, np.flatnonzero(n)[:-1]) for h, n in zip(_longest(runs, robot), noted, strict=True)
+            np.minimum.reduceat(h, np.flatnonzero(n)[:-1])
+            for h, n in zip(_longest_steps(runs, robot), noted, strict=True)
         ]
         change = LOOSE if robot.loose else CHANGE
         grids = [
             grid(whole["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change)
-            for rows, n, c, h in zip(every, noted, _changes(whole, every, robot.rig), steps, strict=True)
+            for rows, n, c, h in zip(every, noted, _drive_jumps(whole, every, robot.rig), steps, strict=True)
         ]
         # The last instant begins a step too, of length zero.
-        longest, samples = _common(max(map(len, grids)) + 1), max(map(len, mine))
+        longest, samples = _common_length(max(map(len, grids)) + 1), max(map(len, mine))
         times = np.stack([np.concatenate([g, np.repeat(g[-1], longest - len(g))]) for g in grids])
         instant = np.array([np.searchsorted(grids[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
         rows = np.stack([np.concatenate([m, np.full(samples - len(m), -1)]) for m in mine])
         most = min(samples, KNOTS, max(8, int(KNOT_STEPS / times.size)))
-        knots = np.stack([_knots(m, most) for m in mine])
-        conditions = _in_time(whole.conditions(robot), every, whole["time_s"], times, ON_LINES if linear else ())
+        knots = np.stack([_choose_knots(m, most) for m in mine])
+        conditions = _conditions_over_time(
+            whole.conditions(robot), every, whole["time_s"], times, ON_LINES if linear else ()
+        )
         if robot.rig.begins is not None:
-            order = [robot.rig.begins.names.index(begin_name(str(n))) for n in names]
+            order = [robot.rig.begins.names.index(initial_state_name(str(n))) for n in names]
             conditions = eqx.tree_at(lambda c: c.begin, conditions, jnp.asarray(order), is_leaf=lambda x: x is None)
         index = [jnp.asarray(x) for x in (run, instant, rows, knots)]
         rig = robot.rig
@@ -308,11 +311,11 @@ class Histories(Observer):
         thinned: list[Note | str] = []
         if runs.log is not None:
             thinned.append(Thinned(runs.source, len(runs.log), len(runs)))
-        return [*thinned, *_stops(runs)]
+        return [*thinned, *_stop_notes(runs)]
 
     @classmethod
     def with_initial_states(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
-        return with_begins(robot, runs, noise)
+        return measure_initial_states(robot, runs, noise)
 
     @classmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Note | str]:
@@ -350,7 +353,7 @@ class Histories(Observer):
         said: list[Note | str] = []
         step = runs["time_s"].max() / STEPS
         if robot.rig.imposed != "motor_speed":
-            step = max(step, *(h.max(initial=0.0) for h in _longest(runs, robot)))
+            step = max(step, *(h.max(initial=0.0) for h in _longest_steps(runs, robot)))
         if step > FAST * LONGEST:
             said.append(CoarseSteps(float(runs["time_s"].max()), float(step)))
         return said
@@ -398,7 +401,7 @@ class Histories(Observer):
     def defective(
         self, robot: Robot, probes: tuple[Effect, ...]
     ) -> Float[Array, "probes runs knots samples channels"]:
-        """Change of the readings by a defect of each probe's balance [its unit]; an effect `probe` has amplitude 1.
+        """Change of the readings by a defect of each probe's balance [its unit]; a probe has amplitude 1.
 
         The defect is 1 at a knot of a run and falls linearly to 0 at the neighbouring knots.
         """
@@ -481,33 +484,33 @@ class Histories(Observer):
         if not self.varying:
             return self.conditions
         rows = self.of_rows
-        braked = np.zeros(len(rows.voltage)) if rows.load_torque is None else _few(rows.load_torque)
+        braked = np.zeros(len(rows.voltage)) if rows.load_torque is None else _merge_levels(rows.load_torque)
         if rows.voltage_follows:
             own = "motor_current" if rows.motor_speed is None else "motor_speed"
-            levels = _few(getattr(rows, own))
+            levels = _merge_levels(getattr(rows, own))
             which = np.stack([rows.configuration, levels, rows.slope_deg, rows.payload, braked], 1)
             cases = np.unique(which[levels != 0], axis=0, return_index=True)[1]
             cases = np.flatnonzero(levels != 0)[cases] if len(cases) else np.arange(1)
             held = {} if rows.motor_speed is None else {"motor_acceleration": np.zeros_like(levels)}
             held |= {} if rows.load_torque is None else {"load_torque": braked}
             steady = dataclasses.replace(rows, **{own: levels}, **held)
-            return _some(steady, cases)
+            return _conditions_of_rows(steady, cases)
         applied = np.where(rows.open > 0.5, 0.0, rows.voltage * rows.duty)
         some = np.flatnonzero(applied != 0) if (applied != 0).any() else np.arange(1)
         way = np.where(applied < 0, -1.0, 1.0)
         braked = way * braked
         turned = dataclasses.replace(
             rows,
-            voltage=_few(np.abs(applied)),
-            slope_deg=_few(way * rows.slope_deg),
-            payload=_few(rows.payload),
+            voltage=_merge_levels(np.abs(applied)),
+            slope_deg=_merge_levels(way * rows.slope_deg),
+            payload=_merge_levels(rows.payload),
             load_torque=None if rows.load_torque is None else braked,
             duty=np.ones_like(rows.duty),
             open=np.zeros_like(rows.open),
         )
         which = np.stack([turned.configuration, turned.voltage, turned.slope_deg, turned.payload, braked], 1)[some]
         cases = some[np.unique(which, axis=0, return_index=True)[1]]
-        return _some(turned, cases)
+        return _conditions_of_rows(turned, cases)
 
     def late(self, every: tuple[Array, ...], rig: Rig) -> Float[Array, "rows ..."]:
         """Values within a step at the time of each row less the rig's delay.
@@ -532,7 +535,7 @@ class Histories(Observer):
             if not self.delayed:
                 return _readings(robot, histories(robot, conditions, times, known, instants))
             step, share = robot.rig.before(times, time)
-            return Within.read(_of_steps(robot, within(robot, conditions, times, known, step)), share)
+            return Within.read(_readings_within_steps(robot, within(robot, conditions, times, known, step)), share)
 
         places = self.instant[self.rows_of], self.time[self.rows_of]
         of_runs = jax.vmap(of_run)(self.conditions, self.times, self.known, *places)
@@ -583,7 +586,7 @@ class Histories(Observer):
         twice = lambda x: jnp.stack([jnp.asarray(x)] * TOGETHER)  # noqa: E731
         members = twice(z), twice(data.weight), None if which is None else twice(which)
         r, jacobian, _, known = jax.tree.map(lambda x: x[0], _evaluate(problem, *members))
-        residual, jacobian = counted(r, jacobian, penalties(data))
+        residual, jacobian = zero_inactive_residuals(r, jacobian, penalty_slice(data))
         robot, observe = problem.robot(jnp.asarray(z)), dataclasses.replace(self, known=known)
         signatures, defects, signals, angle = _responses(observe, robot, effects, data.weight / data.sd)
         return HistoriesLinearization(
@@ -626,18 +629,20 @@ class Histories(Observer):
         def search(blunt: Problem, starts: np.ndarray, steps: int) -> Optimum:
             weights = np.repeat(np.asarray(blunt.data.weight)[None], len(starts), 0)
             evaluate = _evaluator(blunt, weights, None)
-            return searches_long(evaluate, starts, blunt.data, weights, steps, self.policy.batch)[0]
+            return search_rollouts(evaluate, starts, blunt.data, weights, steps, self.policy.batch)[0]
 
         if not problem.base.has_ground or problem.base.rig.imposed != "voltage":  # no grip, so no local minima by it
             shown = weak_form(problem)
             if shown is not None:
-                return scans.placed(problem, np.stack([shown.z, np.zeros(len(problem.coordinates))])[:count])
-            return scans.placed(problem, super().starts(problem, random, count))
+                return scans.place_at_minimum(
+                    problem, np.stack([shown.z, np.zeros(len(problem.coordinates))])[:count]
+                )
+            return scans.place_at_minimum(problem, super().starts(problem, random, count))
         draws = random.standard_normal((settled_ends.DRAWS, len(problem.coordinates)))
-        return scans.placed(problem, settled_ends.starts(problem, draws, search)[:count])
+        return scans.place_at_minimum(problem, settled_ends.starts_from_settled_ends(problem, draws, search)[:count])
 
     def scanned(self, problem: Problem) -> tuple[int, ...]:
-        return scans.beyond_a_basin(problem)
+        return scans.coordinates_beyond_a_basin(problem)
 
     def scan_points(self, problem: Problem, k: int) -> int:
         """Number of values of a scan.
@@ -657,7 +662,9 @@ class Histories(Observer):
         if problem.coordinates.names[k] == DELAY:
             return _over_delays(problem, z, data, jnp.arange(len(z)) == k, values)
         found = [
-            _moved(*linearised(problem, z.at[k].set(v), data)[:2], z.at[k].set(v), jnp.arange(len(z)) == k)
+            _minimum_with_one_held(
+                *linearise(problem, z.at[k].set(v), data)[:2], z.at[k].set(v), jnp.arange(len(z)) == k
+            )
             for v in values
         ]
         return jnp.stack([cost for cost, _ in found]), jnp.stack([at for _, at in found])
@@ -677,18 +684,18 @@ class Histories(Observer):
 
         def searched(starts: Numbers) -> tuple[Optimum, Observation]:
             evaluate = _evaluator(problem, weights, active)
-            return searches_long(evaluate, starts, data, weights, steps, self.policy.batch, rivals=rivals)
+            return search_rollouts(evaluate, starts, data, weights, steps, self.policy.batch, rivals=rivals)
 
         found = searched(starts)
         near = np.asarray(found[0].cost) < np.nanmin(found[0].cost) + NEAR
         if most is None and np.any(near & ~np.asarray(found[0].converged)):  # a proposal has to be an optimum
             found = searched(np.asarray(found[0].z))
-        if not rivals or not scans.scanned(problem):
+        if not rivals or not scans.scanned_coordinates(problem):
             return found
         k = int(np.nanargmin(found[0].cost))
         one = lambda x: jax.tree.map(lambda leaf: leaf[k], x)  # noqa: E731
         data = dataclasses.replace(problem.data, weight=weights[k])
-        best = scans.searched_on(
+        best = scans.search_lower_basins(
             problem,
             one(found),
             data,
@@ -705,7 +712,7 @@ class Histories(Observer):
         which = None if active is None else np.asarray(active)[None]
         evaluate = _evaluator(problem, np.asarray(problem.data.weight)[None], which)
         r, jacobian, seen = jax.tree.map(lambda x: x[0], evaluate(np.asarray(z)[None], np.zeros(1, int)))
-        return *counted(jnp.asarray(r), jnp.asarray(jacobian), penalties(problem.data)), seen
+        return *zero_inactive_residuals(jnp.asarray(r), jnp.asarray(jacobian), penalty_slice(problem.data)), seen
 
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
         """Curves and windows as for settled runs, also over time, and waves over the angle of a shaft.
@@ -719,13 +726,15 @@ class Histories(Observer):
             columns = {**columns, "supply_voltage_V": at_motors}
         which = self.conditions.configuration
         on_tracks = np.broadcast_to(jax.vmap(robot.chassis)(which).on_tracks > 0.5, np.shape(which))
-        waves = bases_room.waves(on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots), robot)
+        waves = bases_room.wave_families(
+            on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots), robot
+        )
         weight = included.astype(float)
         told = columns, weight, robot, None, ways
-        return (*bases_room.families(*told), *bases_room.windows(*told), *waves)
+        return (*bases_room.curve_families(*told), *bases_room.window_families(*told), *waves)
 
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> TimeStatistics:
-        names = bases_room.names(bases)
+        names = bases_room.family_names(bases)
         orders = [w for w in bases_room.ORDERS if any(n[1] == w for n in names)]
 
         def strongest(diagnosis: Diagnosis, variable: str) -> Strongest:
@@ -759,7 +768,7 @@ def _autocorrelation(linear: Linearization, lags: int) -> dict[str, list[float]]
     return {name: [float(lag[k]) for lag in by_lag] for k, name in enumerate(linear.channels)}
 
 
-def _changes(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[tuple[np.ndarray, np.ndarray]]:
+def _drive_jumps(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[tuple[np.ndarray, np.ndarray]]:
     """Times of jumps of the drive of each run's motors [s], and the jumps as shares of its largest value."""
     driven, time = applied(runs), runs["time_s"]
     # An imposed speed determines the current; a linear drive does not jump; an unknown drive is refused later.
@@ -767,12 +776,12 @@ def _changes(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[tuple[np.ndar
     coasts = runs["mode"] == "coast" if runs.has("mode") else np.zeros(len(runs), bool)
     driven, found = driven if known else np.zeros(len(runs)), []
     for rows in each:
-        sizes = np.maximum(_jumps(driven[rows]), coasts[rows][1:] != coasts[rows][:-1])
+        sizes = np.maximum(_relative_jumps(driven[rows]), coasts[rows][1:] != coasts[rows][:-1])
         found.append((time[rows[1:]][sizes > 0], sizes[sizes > 0]))
     return found
 
 
-def _in_time(
+def _conditions_over_time(
     of_rows: Conditions,
     each: list[np.ndarray],
     time: np.ndarray,
@@ -793,15 +802,15 @@ def _in_time(
             for rows, t in zip(each, times, strict=True)
         ]
     )
-    conditions = _some(of_rows, np.array([rows[0] for rows in each]))
+    conditions = _conditions_of_rows(of_rows, np.array([rows[0] for rows in each]))
     for name in CHANGING:
         x = None if getattr(of_rows, name) is None else np.asarray(getattr(of_rows, name))
         if x is not None and any(np.ptp(x[rows]) > 0 for rows in each):
-            values = x[at] if name not in on_lines else _on_lines(x, each, time, middle)
+            values = x[at] if name not in on_lines else _interpolate_at_instants(x, each, time, middle)
             conditions = eqx.tree_at(operator.attrgetter(name), conditions, jnp.asarray(values))
     if of_rows.motor_speed is None:
         return conditions
-    speed = _on_lines(np.asarray(of_rows.motor_speed), each, time, times)
+    speed = _interpolate_at_instants(np.asarray(of_rows.motor_speed), each, time, times)
     step = np.diff(times, axis=1)
     slope = np.where(step > 0, np.diff(speed, axis=1) / np.where(step > 0, step, 1.0), 0.0)
     # An instant has the acceleration of the step that it begins; the last begins none, and has that of the last step.
@@ -816,17 +825,17 @@ def _in_time(
     )
 
 
-def _some(conditions: Conditions, rows: np.ndarray) -> Conditions:
+def _conditions_of_rows(conditions: Conditions, rows: np.ndarray) -> Conditions:
     """Conditions of some rows, selected by NumPy so that nothing is compiled."""
     return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), conditions)
 
 
-def _on_lines(x: np.ndarray, each: list[np.ndarray], time: np.ndarray, at: np.ndarray) -> np.ndarray:
+def _interpolate_at_instants(x: np.ndarray, each: list[np.ndarray], time: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Values at instants of each run, by linear interpolation between its rows; shape (runs, instants)."""
     return np.stack([np.interp(t, time[rows], x[rows]) for rows, t in zip(each, at, strict=True)])
 
 
-def begin_name(run: str) -> str:
+def initial_state_name(run: str) -> str:
     """Name of a run's initial state among the parameters of a rig."""
     return f"begin_{re.sub(r'[^A-Za-z0-9_-]', '_', run)}"
 
@@ -835,7 +844,7 @@ def begin_name(run: str) -> str:
 FIRST_SAMPLES = 5
 
 
-def with_begins(robot: Robot, runs: Runs, noise: Noise) -> Robot:
+def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
     """`robot` with the initial states of a table's runs, if its rig says that they do not begin at rest.
 
     Speed and angle of the first samples are extrapolated to the first; the error of that is the prior of free ones.
@@ -847,7 +856,7 @@ def with_begins(robot: Robot, runs: Runs, noise: Noise) -> Robot:
     rows = runs.configurations(robot)
     for name in np.unique(runs.run_names):
         mine = runs.in_order(name)
-        key = begin_name(str(name))
+        key = initial_state_name(str(name))
         at: dict[str, tuple[float, float]] = {}
         for k, channel in enumerate(runs.channels):
             field = "motor_speed" if channel.settled else "angle"
@@ -882,7 +891,7 @@ def _extrapolated(time: np.ndarray, shown: np.ndarray) -> tuple[float, float]:
     return float(line[0]), float(np.sqrt(scatter * np.linalg.inv(matrix.T @ matrix)[0, 0]))
 
 
-def _few(x: np.ndarray) -> np.ndarray:
+def _merge_levels(x: np.ndarray) -> np.ndarray:
     """Numbers, moved to the nearest of `LEVELS` levels if they have more distinct values."""
     if len(np.unique(x)) <= LEVELS:
         return x
@@ -914,7 +923,7 @@ def _check_signs(runs: Runs) -> None:
                     )
 
 
-def _stops(runs: Runs) -> list[Note | str]:
+def _stop_notes(runs: Runs) -> list[Note | str]:
     """Note on runs with motors that are not driven on a slope."""
     still = (applied(runs) == 0) & (runs["slope_deg"] != 0)
     if not still.any():
@@ -922,7 +931,7 @@ def _stops(runs: Runs) -> list[Note | str]:
     return [StopsOnSlope(tuple(dict.fromkeys(str(n) or "(no run_id)" for n in runs.run_names[still])))]
 
 
-def _knots(rows: np.ndarray, most: int) -> np.ndarray:
+def _choose_knots(rows: np.ndarray, most: int) -> np.ndarray:
     """At most `most` of a run's rows, evenly spaced, with its first and last; the last is repeated as padding."""
     chosen = rows[np.unique(np.round(np.linspace(0, len(rows) - 1, most)).astype(int))]
     return np.concatenate([chosen, np.repeat(chosen[-1], most - len(chosen))])
@@ -940,25 +949,25 @@ def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) ->
     return bool(np.any(np.abs(after - before) > STILL * np.abs(before + after) / 2))
 
 
-def _changed(runs: Runs, rows: np.ndarray, share: float = 0.0) -> np.ndarray:
+def _drive_changes(runs: Runs, rows: np.ndarray, share: float = 0.0) -> np.ndarray:
     """True for rows of a run with a change of its drive (of the motors' supply: above a share of its largest)."""
     supplied = (runs.layout.imposed_column, SUPPLY, "duty")
     found = differs(rows, (runs[column] for column in changing(runs) if column not in supplied))
-    found[1:] |= _jumps(applied(runs)[rows]) > share
+    found[1:] |= _relative_jumps(applied(runs)[rows]) > share
     return found
 
 
-def _jumps(driven: np.ndarray) -> np.ndarray:
+def _relative_jumps(driven: np.ndarray) -> np.ndarray:
     """Change of a run's drive from row to row, as a share of its largest value."""
     return np.abs(np.diff(driven)) / max(float(np.abs(driven).max(initial=0.0)), 1e-300)
 
 
-def _usual(apart: np.ndarray) -> float:
+def _usual_interval(apart: np.ndarray) -> float:
     """Median of the times between a run's rows; infinite for a single row."""
     return float(np.median(apart)) if len(apart) else np.inf
 
 
-def _longest(runs: Runs, robot: Robot) -> list[np.ndarray]:
+def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
     """Longest step after each row of a run's log except the last, for each run in the order of their names [s].
 
     With an imposed speed only the memory of effects is simulated. If the drive of a run changes its sign and shafts
@@ -975,27 +984,27 @@ def _longest(runs: Runs, robot: Robot) -> list[np.ndarray]:
     for name in np.unique(runs.run_names):
         rows = whole.in_order(name)
         time = whole["time_s"][rows]
-        apart, wait = np.diff(time), _usual(np.diff(runs["time_s"][runs.in_order(name)]))
+        apart, wait = np.diff(time), _usual_interval(np.diff(runs["time_s"][runs.in_order(name)]))
         both_ways = driven is not None and driven[rows].min() < 0 < driven[rows].max()
         longest = np.full(len(apart), (FAST if both_ways else 1) * LONGEST)
         if driven is None:
             longest[:] = min(SLOWLY * LONGEST, wait / COARSELY)
         elif runs.log is not None:
-            begins = np.where(_changed(whole, rows, SMALL), np.arange(len(rows)), 0)
+            begins = np.where(_drive_changes(whole, rows, SMALL), np.arange(len(rows)), 0)
             since = time - time[np.maximum.accumulate(begins)]
             longest = np.maximum(longest, np.minimum(LATER * since[:-1], wait / BETWEEN))
         if both_ways and not robot.moves_as_one:
             speeds = measured[rows]
             speeds[:, rates] = np.gradient(speeds[:, rates], time, axis=0)
-            slow = _slow(speeds, SLOW[rig.imposed])
-            before = int(np.ceil(early / _usual(apart)))
+            slow = _may_pass_rest(speeds, SLOW[rig.imposed])
+            before = int(np.ceil(early / _usual_interval(apart)))
             slow = np.convolve(slow, np.ones(before + 1))[before:] > 0
             longest[slow] = min(LONGEST, wait / FINE)
         found.append(longest)
     return found
 
 
-def _slow(speeds: np.ndarray, share: float) -> np.ndarray:
+def _may_pass_rest(speeds: np.ndarray, share: float) -> np.ndarray:
     """True between rows where a run may pass through rest; all True if no reading shows it.
 
     Args:
@@ -1009,7 +1018,7 @@ def _slow(speeds: np.ndarray, share: float) -> np.ndarray:
     return ~np.any((ways[1:] == ways[:-1]) & (ways[1:] != 0), 1)
 
 
-def _common(instants: int) -> int:
+def _common_length(instants: int) -> int:
     """The next common length of grids, at eighths of powers of two.
 
     Logs of similar length then share compiled programs, at the cost of at most an eighth more steps, of length zero.
@@ -1027,7 +1036,7 @@ def _readings(robot: Robot, signals: Signals) -> Float[Array, "instants channels
     return jax.vmap(lambda s: _reading(robot, s))(signals)
 
 
-def _of_steps(robot: Robot, steps: Within) -> tuple[Array, ...]:
+def _readings_within_steps(robot: Robot, steps: Within) -> tuple[Array, ...]:
     """Readings as arguments of `Within.read`."""
     return *(_readings(robot, s) for s in (steps.first, steps.begin, steps.end)), steps.decays
 
@@ -1047,7 +1056,7 @@ def _over_delays(problem: Problem, z: Array, data: Data, scanned: Array, values:
 
     def shown(z: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         robot = problem.robot(z)
-        of_run = lambda c, t, k: _of_steps(robot, within(robot, c, t, k))  # noqa: E731
+        of_run = lambda c, t, k: _readings_within_steps(robot, within(robot, c, t, k))  # noqa: E731
         *every, decays = jax.vmap(of_run)(observe.conditions, observe.times, observe.known)
         return tuple(every), (*every, decays)
 
@@ -1063,13 +1072,13 @@ def _over_delays(problem: Problem, z: Array, data: Data, scanned: Array, values:
         jacobian = jnp.where(finite[..., None], (data.weight / data.sd)[..., None] * late[..., 1:], 0.0)
         residual = jnp.concatenate([error.ravel(), at - data.centre])
         whole = jnp.concatenate([jacobian.reshape(-1, z.size), jnp.eye(z.size)])
-        return _moved(residual, whole, at, scanned)
+        return _minimum_with_one_held(residual, whole, at, scanned)
 
     return jax.lax.map(one, values, batch_size=16)
 
 
 @compiled
-def _moved(residual: Array, jacobian: Array, z: Array, held: Array) -> tuple[Array, Array]:
+def _minimum_with_one_held(residual: Array, jacobian: Array, z: Array, held: Array) -> tuple[Array, Array]:
     """Objective at the minimum of a linearisation with one coordinate held, and the coordinates there."""
     free = jnp.where(held, 0.0, jacobian)
     step = -solved(free.T @ free + jnp.diag(held.astype(float)), free.T @ residual)
@@ -1104,7 +1113,7 @@ def _evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Ev
 def _evaluate(
     problem: Problem, z: Numbers, weights: Numbers, active: Numbers | None
 ) -> tuple[Array, Array, Observation, Followed]:
-    """Result of `linearised_signed` for members of a search, and their runs."""
+    """Result of `linearise_rollout` for members of a search, and their runs."""
 
     def one(z: Array, weight: Array, which: Array | None) -> tuple[Array, Array, Observation, Followed]:
         here = problem
@@ -1113,7 +1122,7 @@ def _evaluate(
         observe: Histories = problem.observe.following(here.robot(z))  # type: ignore[attr-defined]
         here = dataclasses.replace(here, observe=observe)
         assert observe.known is not None
-        return *linearised_signed(here, z, dataclasses.replace(problem.data, weight=weight)), observe.known
+        return *linearise_rollout(here, z, dataclasses.replace(problem.data, weight=weight)), observe.known
 
     return jax.vmap(one)(z, weights, active)
 
@@ -1127,13 +1136,13 @@ def _responses(
     Args:
         observe: with known runs; scale: of readings [1/SI], shape (rows, channels).
     """
-    defects, by_effects = observe.changes(robot, tuple(probe(b) for b in PROBED), effects)
+    defects, by_effects = observe.changes(robot, tuple(balance_probe(b) for b in PROBED), effects)
     rows_of, rows = observe.rows_of, len(scale)
     defects = jnp.where(rows_of[:, None, :, None] < 0, 0.0, defects * scale[rows_of][:, None])
     signatures = _by_row(by_effects, rows_of, rows) * scale[..., None]
     runs = observe.whole(robot)
     by_reading = signatures.reshape(scale.size, -1)
-    return finite(by_reading), finite(defects), observe.at_rows(runs), observe.angle(runs)
+    return finite_or_zero(by_reading), finite_or_zero(defects), observe.at_rows(runs), observe.angle(runs)
 
 
 class _Probed(NamedTuple):
@@ -1158,9 +1167,9 @@ class _Probed(NamedTuple):
     def of(cls, robot: Robot, probes: tuple[Effect, ...], effects: tuple[ScoredEffect, ...]) -> _Probed:
         """Probes, with further ones for the balances that the effects enter."""
         others = dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor")
-        entered = tuple(probe(b) for b in others if b not in {p.balance for p in probes})
+        entered = tuple(balance_probe(b) for b in others if b not in {p.balance for p in probes})
         every, size = (*probes, *entered), len(probes)
-        effects = tuple(shaped_as_in(robot, e) for e in effects)
+        effects = tuple(with_shape_of_robot(robot, e) for e in effects)
         counts, places = np.array([len(e.at) for e in effects], int), [p.balance for p in every]
         entering = np.array([places.index(b) if (b := e.effect.balance) in places else 0 for e in effects], int)
         entering = np.repeat(entering, counts)
@@ -1197,7 +1206,7 @@ class _Probed(NamedTuple):
 
         def terms(t: Array, y: Array, held: Conditions, way: Array | None = None) -> Array:
             signals = moving(robot, held, state_of(robot, y), way)
-            return terms_of(robot, signals, self.effects, remembered(t))
+            return effect_terms(robot, signals, self.effects, remembered(t))
 
         def both(by_probes: Array, t: Array, term: Array) -> Array:
             """Changes by defects at all knots and by each instance, from the change by each probe."""
@@ -1273,7 +1282,7 @@ def _remembered(
             known = dataclasses.replace(signals, memory={**signals.memory, effect.name: remembered})
             return jnp.asarray(effect.rate(robot, known), float)
 
-        return jnp.concatenate([each_shape(e, rate, m) for e, m in zip(mine, split(memory), strict=True)])
+        return jnp.concatenate([map_over_shapes(e, rate, m) for e, m in zip(mine, split(memory), strict=True)])
 
     times = jnp.append(along.clock[:, 0], along.clock[-1, 2])
     steps, constant = steps_of(conditions, times)
@@ -1297,7 +1306,9 @@ def _remembered(
     angle = state_of(robot, begin).distance / robot.chassis(conditions.configuration).radius
     begun = jnp.concatenate(
         [
-            each_shape(e, lambda effect, _: jnp.asarray(effect.initial(robot, angle), float), jnp.zeros(len(e.at)))
+            map_over_shapes(
+                e, lambda effect, _: jnp.asarray(effect.initial(robot, angle), float), jnp.zeros(len(e.at))
+            )
             for e in mine
         ]
     )

@@ -18,9 +18,9 @@ from calibration.inference.bases import Bases
 from calibration.inference.blocks import TURN
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect
 from calibration.inference.observers.base import SearchPolicy
-from calibration.inference.observers.settled import SettledLinearization, SettledRuns, shares
+from calibration.inference.observers.settled import SettledLinearization, SettledRuns, side_shares
 from calibration.inference.observers.time_histories import Histories
-from calibration.inference.optimizers import roots_of
+from calibration.inference.optimizers import solve_roots
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax import effects, fidelities
 from mmrjax.effects import Effect
@@ -35,7 +35,7 @@ from mmrjax.model.signals import NOT_SETTLED, Result, Signals
 VARIABLES = (*(v for v in IN_TURNS if v != "order"), *VARIABLES_ROUND)
 
 
-def by_point(signals: Signals, name: str) -> Float[Array, " points"]:
+def signal_by_point(signals: Signals, name: str) -> Float[Array, " points"]:
     """A signal at each point [SI].
 
     Args:
@@ -60,11 +60,11 @@ class TurnLinearization(SettledLinearization):
         return np.any(points.reshape(-1, self.rows), axis=0)
 
     def variable(self, name: str) -> np.ndarray:
-        return np.asarray(by_point(self.signals, name), float)
+        return np.asarray(signal_by_point(self.signals, name), float)
 
     def shown(self, channel: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         of_sides = shapes.reshape(-1, self.rows, shapes.shape[1])
-        each = np.stack([shares(name, len(of_sides)) for name in self.channels])
+        each = np.stack([side_shares(name, len(of_sides)) for name in self.channels])
         return super().shown(channel, jnp.tensordot(jnp.asarray(each)[channel], of_sides, 1))
 
 
@@ -127,7 +127,7 @@ class SettledTurns(SettledRuns):
     ) -> tuple[Any, ...]:
         """Draws as in the protocol, with the roots at each refit."""
         drawn = super().draws(problem, z, linear, keys, factors)
-        return *drawn, roots_of(problem, drawn[2])
+        return *drawn, solve_roots(problem, drawn[2])
 
     def replicate(
         self,
@@ -150,11 +150,11 @@ class SettledTurns(SettledRuns):
         """
         names = [v for v in VARIABLES if v != "voltage" or robot.rig.shows_voltage]
         signals = shown_batch(robot, self.conditions)[1]
-        seen = {n: np.asarray(by_point(signals, n)) for n in (*names, *WAYS)}
+        seen = {n: np.asarray(signal_by_point(signals, n)) for n in (*names, *WAYS)}
         points = {bases_room.VARIABLES[v]: seen[v] for v in names}
         points |= {c: np.tile(columns[c], 2) for c in ("configuration", "order") if c in columns}
         weight = np.tile(included.astype(float), 2)
         lacking = bases_room.balances_of(robot, (*bases_room.BALANCES, *bases_room.OF_TURNS))
         axes = (bases_room.axes_of(robot)[0], bases_room.VARIABLES["payload"], "yaw_rate", "side")  # what is imposed
         told = points, weight, robot, bases_room.Scope(lacking, axes), {way: seen[way] for way in WAYS}
-        return (*bases_room.families(*told), *bases_room.windows(*told))
+        return (*bases_room.curve_families(*told), *bases_room.window_families(*told))
