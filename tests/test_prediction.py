@@ -90,7 +90,7 @@ def test_what_candidates_predict_is_kept_and_not_fitted_again(monkeypatch, runs)
     shown = {c.effects: {kind: np.full((12, 2), len(c.effects)) for kind in ("slope", "voltage")} for c in candidates}
     monkeypatch.setattr(
         prediction,
-        "score_of",
+        "score_candidate",
         lambda space, runs, c: dataclasses.replace(score(np.zeros(12), np.arange(12)), reading=shown[c.effects]),
     )
     space = SimpleNamespace(

@@ -94,7 +94,7 @@ def test_nothing_to_fit_is_not_put_down_to_an_option_that_nobody_gave(tmp_path):
         tmp_path, lambda text: text.replace('"1.2 ± 5 %"', "1.2").replace("loss_coulomb = 0.1", "loss_coulomb = 0.0")
     )
     with pytest.raises(
-        BadConfiguration, match=r"^no parameter to fit: every loss .* state what is not known"
+        BadConfiguration, match=r"^no parameter to fit: every loss .* give unknown values one"
     ) as error:
         priors.choose_free_names(robot, ())
     assert "--fix" not in str(error.value)
