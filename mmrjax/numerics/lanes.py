@@ -1,4 +1,4 @@
-"""A loop whose turns differ much in number over a batch: a member that has ended makes room for the next."""
+"""A loop for batches with very different numbers of turns: finished members are replaced by queued ones."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool
 
 T = TypeVar("T")
 
-#: Members of a batch that are at work at once: enough to fill vectors and caches, few enough that seldom many have
-#: ended at its end.
+#: Number of members that are computed at a time: enough to fill vectors and caches, few enough that most are still
+#: running at the end.
 LANES = 256
 
 
@@ -26,17 +26,17 @@ def until(
     kept: Callable[[T], Any] = lambda state: state,
     most: int | None = None,
 ) -> Any:
-    """The state at which `ended`, by `turn` from `begun`, without derivatives.
+    """The first state with `ended`, by repeated `turn` from `begun`; without derivatives.
 
-    A batch of `jax.lax.while_loop` takes for each of its members as many turns as the longest of them. Here it takes
-    the mean, beside what the last `most` members take; those that have ended when they begin take none.
+    A batch of `jax.lax.while_loop` takes the turns of its longest member for every member. This loop takes their
+    mean, plus those of the last `most` members; members that have ended at the start take none.
 
     Args:
-        begun: state of arrays, of `own`; turn: the next state, of `own` and a state; ended: of a state. They close
-            over no traced number.
-        own: what a member has of its own; numbers in it may be batched.
-        kept: what of the last state is returned; most: members that are at work at once, `LANES` if
-            none are stated.
+        begun: state of arrays, from `own`; turn: the next state, from `own` and a state; ended: of a state. They
+            close over no traced number.
+        own: data of one member; its numbers may be batched.
+        kept: the part of the last state to return; most: number of members computed at a time, `LANES` if
+            None.
     """
     numbers, rest = eqx.partition(jax.lax.stop_gradient(own), eqx.is_array)
 
@@ -44,7 +44,7 @@ def until(
         return eqx.combine(numbers, rest)
 
     def many(numbers: Any, batched: Any, size: int) -> T:
-        """The end of each of `size` members; where these are a batch again, all members go through the same lanes."""
+        """The end of each of `size` members; if these are batched again, all members share the same lanes."""
 
         @custom_vmap
         def each(numbers: Any) -> T:
