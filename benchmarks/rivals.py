@@ -1,7 +1,8 @@
 """Methods that predict unseen runs, all with the same folds: our fits, SciPy, MuJoCo, PySINDy, regressions.
 
 Each method gets the same problem (`Posed`): a table, a robot whose constants have the tolerances of its file, and the
-folds, which are the blocks of `blocks.predictable_blocks`. It returns readings of every fold by a fit without its rows.
+folds, which are the blocks of `blocks.predictable_blocks`. It returns readings of every fold by a fit without its
+rows.
 """
 
 from __future__ import annotations

@@ -268,8 +268,8 @@ def name_tests(
 
     The test uses a score instead of an amplitude over its sd. With a free shape that ratio stays small, however
     much an effect explains (Hauck and Donner, J. Am. Stat. Assoc. 72 (1977); Davies, Biometrika 64 (1977)). Curves in
-    the effect's own equation would absorb it. They are compared with it in addition to the largest set of the
-    search, because otherwise a curve would represent other effects of that set in the same equation.
+    the effect's own equation would absorb it. So they are compared with it in addition to the largest set of
+    the search. Without that set, a curve would represent its other effects in the same equation.
 
     Args:
         after: diagnosis of the fit with all of them; blocks: as in `judge_names`.
@@ -333,8 +333,8 @@ def _varies_most(
 ) -> tuple[float, str, float, float]:
     """Largest change of an effect's amplitude over a variable, as a line or a parabola.
 
-    Returns the root of its score after a refit [σ], the variable, the critical value for all these tests, and the
-    change at an end of the variable over the amplitude [-]. The critical value is Bonferroni's (1936).
+    Returns the root of its score after a refit [σ], the variable, the critical value and the relative change of the
+    amplitude at an end of the variable [-]. The critical value holds for all these tests (Bonferroni 1936).
 
     To first order, the residual of a law of another form is the name's own term with an amplitude that varies. So
     a few columns can test what a whole family of curves, with many more, cannot. For settled runs, where each row

@@ -127,8 +127,8 @@ def terms_of_vector(found: Sequence[Terms]) -> Terms:
     """Terms of several outputs as of a vector (Gamboa et al., Electron. J. Stat. 8 (2014)), with the same pairs of
     orders, row by row.
 
-    A pair missing in one output is replaced by the mean of that output's other pairs. Those get a larger weight, so
-    that the mean over all rows and its variance are the output's own.
+    A pair missing in one output is replaced by the mean of that output's other pairs. The other pairs get a larger
+    weight, so that the mean over all rows and its variance are the output's own.
     """
     rows = max(len(terms.parts) for terms in found)
     whole = np.zeros((rows, found[0].parts.shape[1]))
