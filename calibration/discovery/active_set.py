@@ -119,8 +119,8 @@ class ScoredLibrary:
 
     def indices(self, names: Sequence[str]) -> tuple[int, ...]:
         """Index of each effect, -1 for an empty slot ("")."""
-        known = {n: k for k, n in enumerate(self.names)} | {"": -1}
-        return tuple(known[n] for n in names)
+        index_of_name = {n: k for k, n in enumerate(self.names)} | {"": -1}
+        return tuple(index_of_name[n] for n in names)
 
     def largest(self, instances: np.ndarray) -> np.ndarray:
         """Maximum of a non-negative number over each effect's instances, shape (effects,)."""

@@ -142,14 +142,14 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candid
     unusable = tuple(map(int, np.flatnonzero(lost)))
     space = space.without(lost) if unusable else space
     while True:
-        found, seen = _base_searches(space, settings, near)
+        optima, seen = _base_searches(space, settings, near)
         # The first of those that end in one place, because rounding decides which of them is the lowest.
-        cost = np.where(np.isfinite(found.cost), found.cost, np.inf)
+        cost = np.where(np.isfinite(optima.cost), optima.cost, np.inf)
         k = int(np.argmax(cost <= np.min(cost) + ALIKE))
         lost = space.bare.observe.unreachable(np.asarray(seen.status[k])) & space.included
         if not lost.any():
             slots = np.zeros(2 * settings.slots)
-            best = jax.tree.map(lambda x: x[k], found)  # noqa: B023
+            best = jax.tree.map(lambda x: x[k], optima)  # noqa: B023
             z, sd = np.concatenate([best.z[: space.free], slots]), np.concatenate([best.sd[: space.free], slots + 1])
             best = dataclasses.replace(best, z=z, sd=sd)
             return BaseFit(
@@ -209,9 +209,9 @@ def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], setting
         if not mine:
             continue
         starts = [space.near.get(*proposals[k]) for k in mine]
-        found, _ = search_each(problem, starts, [space.weight] * len(mine), [active[k] for k in mine], most)
+        optima, _ = search_each(problem, starts, [space.weight] * len(mine), [active[k] for k in mine], most)
         for j, k in enumerate(mine):
-            one = jax.tree.map(lambda x: x[j], found)  # noqa: B023
+            one = jax.tree.map(lambda x: x[j], optima)  # noqa: B023
             made[k] = candidate_of_fit(space, proposals[k][0], one, settings)
     return [made[k] for k in range(len(proposals))]
 

@@ -81,25 +81,25 @@ def find_classes(
             if cosine[k, j] > settings.alike and names[j] not in best.effects:
                 active = tuple(names[j] if s == slot else n for s, n in enumerate(best.active))
                 wanted.append((slot, names[j], active))
-    known = {c.key: c for c in ladder if c.simulated}
-    new = [active for _, _, active in wanted if frozenset(n for n in active if n) not in known]
+    simulated = {c.key: c for c in ladder if c.simulated}
+    new = [active for _, _, active in wanted if frozenset(n for n in active if n) not in simulated]
     fitted = []
     if space.bare.observe.long:
         fitted = fit_by_regression(space, [(w, best, after) for w in new], settings)
-        known |= {c.key: c for c in fitted}
+        simulated |= {c.key: c for c in fitted}
         # Possible members of the class are simulated if the program of the fits includes them.
         new = [c.active for c in fitted if 2 * (c.cost - best.cost) < max(NEAR, FAR * max(gains))]
         new = [active for active in new if {n for n in active if n} <= {*space.room, *best.effects}]
     wanted_fits = [(w, start_of_fit(space, best, w, settings, left.scores)) for w in new]
     fitted += fit_candidates(space, wanted_fits, settings)
-    known |= {c.key: c for c in fitted if c.simulated}
+    simulated |= {c.key: c for c in fitted if c.simulated}
     members, stated = [], []
     for slot, (name, gain) in enumerate(zip(best.effects, gains, strict=True)):
         same = [name]
         within = {f: max(settings.same, f**2 * gain) for f in (settings.form, settings.form_family)}
         family = space.library[name].family()
         for s, other, active in wanted:
-            rival = known[frozenset(n for n in active if n)]
+            rival = simulated[frozenset(n for n in active if n)]
             parallel = cosine[names.index(name), names.index(other)] > settings.parallel
             akin = space.library[other].family() == family
             limit = within[settings.form_family if akin else settings.form]
@@ -108,10 +108,10 @@ def find_classes(
                 same.append(other)
         members.append(tuple(same))
         linear = left.linear if len(best.effects) == 1 else None
-        found = find_prior_shifts(space, fewer[slot], SURE * gain, settings, linear)
-        stated.append(tuple(s for s in found if 2 * (s.fit.cost - best.cost) <= within[settings.form]))
-    by_regression = [c for c in (*ladder, *fitted) if not c.simulated and c.key not in known]
-    latest = {c.key: c for c in by_regression} | {k: c for k, c in known.items() if not c.simulated}
+        shifts = find_prior_shifts(space, fewer[slot], SURE * gain, settings, linear)
+        stated.append(tuple(s for s in shifts if 2 * (s.fit.cost - best.cost) <= within[settings.form]))
+    by_regression = [c for c in (*ladder, *fitted) if not c.simulated and c.key not in simulated]
+    latest = {c.key: c for c in by_regression} | {k: c for k, c in simulated.items() if not c.simulated}
     whole = (*latest.values(), *(c for c in (*ladder, *fitted) if c.simulated))
     return Classes(tuple(members), tuple(stated), tuple(families_of_members(space, same) for same in members), whole)
 

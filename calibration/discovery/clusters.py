@@ -59,11 +59,11 @@ def find_cluster(
     mine = np.flatnonzero(outliers)
     if len(mine) < FEWEST:
         return None
-    found = [_cluster_along_axis(name, np.asarray(x, float), mine, pool, seed) for name, x in axes.items()]
-    found += [c for name, x in levels.items() for c in _at_levels(name, np.asarray(x), mine, pool)]
-    if not found:
+    clusters = [_cluster_along_axis(name, np.asarray(x, float), mine, pool, seed) for name, x in axes.items()]
+    clusters += [c for name, x in levels.items() for c in _at_levels(name, np.asarray(x), mine, pool)]
+    if not clusters:
         return None
-    best = min(found, key=lambda c: c.p)
+    best = min(clusters, key=lambda c: c.p)
     p = min(1.0, best.p * (len(axes) + len(levels)))
     return dataclasses.replace(best, p=p) if p < error else None
 
@@ -73,7 +73,7 @@ def _cluster_along_axis(name: str, x: np.ndarray, mine: np.ndarray, pool: np.nda
     low, high = x[pool].min(), x[pool].max()
     random = np.random.default_rng(seed)
     drawn = np.stack([random.choice(pool, len(mine), replace=False) for _ in range(PERMUTATIONS)])
-    found: list[Cluster] = []
+    clusters: list[Cluster] = []
     for share in WINDOWS:
         width = share * (high - low)
         count, first = _fullest_window(x[mine][None], width)
@@ -82,8 +82,8 @@ def _cluster_along_axis(name: str, x: np.ndarray, mine: np.ndarray, pool: np.nda
         if p == 1 / (1 + PERMUTATIONS):  # beyond the resolution of permutations: a normal approximation
             p = min(p, float(ndtr((null.mean() - count[0]) / max(null.std(), 0.3))))
         inside = x[mine][(x[mine] >= first[0]) & (x[mine] <= first[0] + width)]
-        found.append(Cluster(name, float(inside.min()), float(inside.max()), "", int(count[0]), len(mine), p))
-    best = min(found, key=lambda c: c.p)
+        clusters.append(Cluster(name, float(inside.min()), float(inside.max()), "", int(count[0]), len(mine), p))
+    best = min(clusters, key=lambda c: c.p)
     return dataclasses.replace(best, p=min(1.0, best.p * len(WINDOWS)))
 
 

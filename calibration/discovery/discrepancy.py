@@ -97,11 +97,11 @@ def similar_variables(
     """Other variables with curves of similar significance in a place, the most significant first."""
     by_variable = {names[j][1]: deviate[j] for j in np.argsort(-deviate) if names[j][0] == place}
     by_variable.pop(bases_room.CONDITIONS, None)
-    found: dict[str, str] = {_axis(variable): variable}
+    variable_of_axis: dict[str, str] = {_axis(variable): variable}
     for other, d in by_variable.items():
         if d > max(by_variable.values()) - ALIKE:
-            found.setdefault(_axis(other), other)
-    return tuple(other for other in found.values() if other != variable)
+            variable_of_axis.setdefault(_axis(other), other)
+    return tuple(other for other in variable_of_axis.values() if other != variable)
 
 
 def _axis(variable: str) -> str:
@@ -121,16 +121,16 @@ def refine_window(
         included: True for included rows, shape (rows,).
     """
     (x, way), included = linear.in_travel(place, axis), linear.at_points(included)
-    at, counts = np.unique(x[included], return_counts=True)
-    merged = -(-len(at) // INSTANTS)
-    edges = at[::merged]
+    levels, counts = np.unique(x[included], return_counts=True)
+    merged = -(-len(levels) // INSTANTS)
+    edges = levels[::merged]
     index = np.searchsorted(edges, x, side="right") - 1
     shapes = (index[:, None] == np.arange(len(edges))) & included[:, None]
     a, b = Projection(linear)(bases_room.place_signature(linear, place, way[:, None] * shapes))
     sums = np.zeros((len(edges) + 1,) * 2)
     sums[1:, 1:] = a.cumsum(0).cumsum(1)
     pull = np.append(0.0, b.cumsum())
-    rows = np.append(0, np.add.reduceat(counts, np.arange(0, len(at), merged)).cumsum())
+    rows = np.append(0, np.add.reduceat(counts, np.arange(0, len(levels), merged)).cumsum())
     first, last = np.triu_indices(len(edges) + 1, 1)
     norm2 = sums[last, last] - 2 * sums[first, last] + sums[first, first]
     held = rows[last] - rows[first]
@@ -226,10 +226,10 @@ def fit_discrepancy(
     starts = np.zeros((STARTS, len(problem.coordinates)))
     starts[:, :inner] = base.z[:inner]
     starts[:, inner:] = np.linspace(1.0, 0.0, STARTS)[:, None] * at_base.start
-    found, seen = search_each(problem, list(starts), [space.weight] * STARTS)
-    k = int(np.argmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))
-    z = np.asarray(found.z[k])
-    covariance = np.asarray(found.covariance[k])
+    optima, seen = search_each(problem, list(starts), [space.weight] * STARTS)
+    k = int(np.argmin(np.where(np.isfinite(optima.cost), optima.cost, np.inf)))
+    z = np.asarray(optima.z[k])
+    covariance = np.asarray(optima.covariance[k])
     grid = np.linspace(at_base.low, at_base.high, POINTS)
     shape = at_base.scale * at_base.basis(grid) @ at_base.root
     ordinates = covariance[inner:, inner:]
@@ -243,12 +243,12 @@ def fit_discrepancy(
         grid=grid,
         curve=shape @ z[inner:],
         sd=np.sqrt(np.einsum("ij,jk,ik->i", shape, ordinates, shape)),
-        chi2=(2 * base.cost, 2 * float(found.cost[k])),
+        chi2=(2 * base.cost, 2 * float(optima.cost[k])),
         z=z,
         covariance=covariance,
         problem=problem,
         reading=np.asarray(seen.reading[k]),
-        converged=bool(found.converged[k]),
+        converged=bool(optima.converged[k]),
         proposal=propose_formula(linear, balance, included, at_base, voltage=space.bare.base.rig.shows_voltage),
     )
 

@@ -59,5 +59,5 @@ def _dissipated_power(observe: Observer, robot: Robot) -> Float[Array, "balances
     signals = observe.operating(robot)
     if signals is None:
         return None
-    found = jax.vmap(lambda run, at: sinks(robot, run, at))(observe.conditions, signals)
-    return jnp.stack([jnp.asarray(found[name], float) for name in SINK.values()])
+    power = jax.vmap(lambda run, at: sinks(robot, run, at))(observe.conditions, signals)
+    return jnp.stack([jnp.asarray(power[name], float) for name in SINK.values()])

@@ -82,9 +82,9 @@ class PredictedReadings:
         """Expected separation of two alternatives by experiments, all carried out [σ]."""
         where = predicted.reading_spans(self.experiments)
         spans = [where[e] for e in experiments]
-        at = np.concatenate([np.flatnonzero(self.exists[k]) + k.start for k in spans])
-        d = self.value[a, at] - self.value[b, at]
-        squares = [d @ np.linalg.solve(_covariance(self.half[x, at], self.sd[at]), d) for x in (a, b)]
+        columns = np.concatenate([np.flatnonzero(self.exists[k]) + k.start for k in spans])
+        d = self.value[a, columns] - self.value[b, columns]
+        squares = [d @ np.linalg.solve(_covariance(self.half[x, columns], self.sd[columns]), d) for x in (a, b)]
         return float(np.sqrt(max(min(squares), 0.0)))
 
 
@@ -263,11 +263,11 @@ def _possible(
     for e in experiments:
         rows = np.ones(predicted.reading_count(e), bool)
         if isinstance(e, menu.Run):
-            at = slice(ends[e.name] - len(e.voltage), ends[e.name])
-            grips = np.abs(found.grip[:, at]) < np.where(np.asarray(e.slope) > e.beyond, menu.GRIP, np.inf)
-            done = menu.possible_runs(e, np.all(found.does[:, at] & grips, 0))
+            span = slice(ends[e.name] - len(e.voltage), ends[e.name])
+            grips = np.abs(found.grip[:, span]) < np.where(np.asarray(e.slope) > e.beyond, menu.GRIP, np.inf)
+            done = menu.possible_runs(e, np.all(found.does[:, span] & grips, 0))
             if done.any():
-                hot, fast = np.asarray(found.temperature)[0, at], np.asarray(found.speed)[0, at]
+                hot, fast = np.asarray(found.temperature)[0, span], np.asarray(found.speed)[0, span]
                 e = menu.restrict_run(e, done, hot, fast, within)
             rows = np.repeat(done, len(e.channels))
         if set(e.kinds) & set(settings.forbidden):

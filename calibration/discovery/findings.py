@@ -132,9 +132,9 @@ def _member(space: CandidateSpace, best: Candidate, found: Classes, slot: int, n
     """An effect of a class in place of the leader."""
     wanted = frozenset(name if s == slot else n for s, n in enumerate(best.active)) - {""}
     other = next(c for c in (best, *found.ladder) if c.key == wanted)
-    at = other.active.index(name)
-    amplitude = other.amplitude[at] * amplitude_unit(space.library[name])
-    return Member(float(amplitude), float(other.size[at]), float(2 * (other.cost - best.cost)))
+    position = other.active.index(name)
+    amplitude = other.amplitude[position] * amplitude_unit(space.library[name])
+    return Member(float(amplitude), float(other.size[position]), float(2 * (other.cost - best.cost)))
 
 
 def _stated(space: CandidateSpace, best: Candidate, shift: Shift) -> StatedValue:
@@ -410,9 +410,9 @@ def readings_of_rows(
     rows = len(runs)
 
     def seen(fitted: Fitted) -> np.ndarray:
-        found = fitted.observation()
-        lost = fitted.problem.observe.unreachable(np.asarray(found.status))[:rows, None]
-        return np.where(lost, np.nan, np.asarray(found.reading)[:rows])
+        observation = fitted.observation()
+        lost = fitted.problem.observe.unreachable(np.asarray(observation.status))[:rows, None]
+        return np.where(lost, np.nan, np.asarray(observation.reading)[:rows])
 
     def left_out(fitted: Fitted, masks: list[np.ndarray]) -> np.ndarray:
         return predict_unseen(fitted.problem, fitted.z, masks, fitted.active).reading

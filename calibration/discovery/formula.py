@@ -117,15 +117,15 @@ def monomial_dictionary(ratios: np.ndarray, kinds: tuple[Ratio, ...] = RATIOS) -
         for p, q in itertools.product(POWERS_PRODUCT, repeat=2)
         if safe(j, p) and safe(k, q)
     ]
-    found: dict[Monomial, np.ndarray] = {}
+    monomials: dict[Monomial, np.ndarray] = {}
     directions: list[np.ndarray] = []
     for factors in sorted(single + double, key=lambda f: Monomial(f).complexity):
         value = np.prod([ratios[:, k] ** p for k, p in factors], 0)
         norm = np.linalg.norm(value)
         if norm > 0 and not any(abs(value @ d) > (1 - 1e-9) * norm for d in directions):
-            found[Monomial(factors, kinds)] = value
+            monomials[Monomial(factors, kinds)] = value
             directions.append(value / norm)
-    return found
+    return monomials
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,13 +174,13 @@ def propose_formula(
     known_of = [r for r in RATIOS if voltage or r.of != "voltage"]
     scaled = tuple(r.scaled(r(linear, balance)[counts]) for r in known_of)
     ratios = np.stack([r(linear, balance) for r in scaled], 1)
-    known = monomial_dictionary(ratios[counts], scaled)
-    terms = list(known)
+    dictionary = monomial_dictionary(ratios[counts], scaled)
+    terms = list(dictionary)
     if not terms:  # all runs have the same conditions
         return Proposal("", (), (), (), (), 0.0, 0.0, 0)
     shapes = np.zeros((linear.points, len(terms)))
     _, way = linear.in_travel(balance, curve.variable)
-    for k, value in enumerate(known.values()):
+    for k, value in enumerate(dictionary.values()):
         shapes[counts, k] = way[counts] * value
     a, b = Projection(linear)(place_signature(linear, balance, shapes))
     scale = np.sqrt(np.maximum(np.diag(a), 0))

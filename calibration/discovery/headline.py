@@ -38,8 +38,12 @@ def _verdict_without_claim(said: Summary) -> str:
 
 def _mechanisms(said: Summary) -> list[tuple[str, ...]]:
     """Families of each established law or mechanism."""
-    found = [m.families for m in said.missing if m.established]
-    return [*found, said.mechanism.families] if said.verdict == "mechanism" and said.mechanism is not None else found
+    families = [m.families for m in said.missing if m.established]
+    return (
+        [*families, said.mechanism.families]
+        if said.verdict == "mechanism" and said.mechanism is not None
+        else families
+    )
 
 
 def _places(said: Summary) -> list[tuple[str, ...]]:
@@ -58,14 +62,14 @@ def _shared_claims(
     Members in all verdicts come first, then any that some noises cannot separate from them. A claim within another
     is omitted. The second result is the number of shared members of each claim.
     """
-    found: dict[tuple[str, ...], int] = {}
+    counts: dict[tuple[str, ...], int] = {}
     for claim in claims[0]:
         alike = [[other for other in those if set(other) & set(claim)] for those in claims[1:]]
         if all(alike):
             every = dict.fromkeys([*claim, *(n for those in alike for other in those for n in other)])
             shared = [n for n in claim if all(any(n in o for o in those) for those in alike)]
             whole = (*shared, *(n for n in every if n not in shared))
-            if not any(set(whole) <= set(other) for other in found):
-                found[whole] = len(shared)
-    kept = {c: n for c, n in found.items() if not any(set(c) < set(other) for other in found)}
+            if not any(set(whole) <= set(other) for other in counts):
+                counts[whole] = len(shared)
+    kept = {c: n for c, n in counts.items() if not any(set(c) < set(other) for other in counts)}
     return tuple(kept), tuple(kept.values())

@@ -72,7 +72,7 @@ def find_mechanism(
     over = [f for f in own if f not in alike and explained[alike[0]] == by_curve]
     by_name = [f for f in (*alike, *over) if f in best and (space.bare.observe.long or by_effects[f] >= HALF * most)]
     blocks = [mask for by in blocks_room.predictable_blocks(runs, space.bare).values() for mask in by.values()]
-    found: list[Mechanism] = []
+    mechanisms: list[Mechanism] = []
     excess = excess_misfit(space, base)
     curve = () if space.bare.observe.long or own[0] in by_name or own[0] not in alike else own[:1]
     for leader in (*by_name[:1], *curve, *by_name[1:]):
@@ -92,26 +92,26 @@ def find_mechanism(
             gain, effects = _gain_of_curve(space, runs, base, beside, predicted), ()
             again = _curve_again(space, left, bases, families, blocks, settings)
         share = share_of_excess(excess, explained.get(leader, 0.0))
-        found.append(Mechanism(families, effects, share, gain.mean, gain.se, again, gain.errors))
-        if not found[-1].fails:
-            return found[-1]
-    return found[0] if found else None
+        mechanisms.append(Mechanism(families, effects, share, gain.mean, gain.se, again, gain.errors))
+        if not mechanisms[-1].fails:
+            return mechanisms[-1]
+    return mechanisms[0] if mechanisms else None
 
 
 def simulate_leading_families(
     space: CandidateSpace, base: Candidate, ladder: Sequence[Candidate], settings: Settings
 ) -> list[Candidate]:
     """Candidates in which the best one of each family that may explain most is simulated, not a regression."""
-    found = list(ladder)
+    candidates = list(ladder)
     while True:
-        best = _of_one_family(space, found).values()
+        best = _of_one_family(space, candidates).values()
         lowest = min((c.cost for c in best), default=0.0)
         within = max(settings.same, settings.form**2 * 2 * (base.cost - lowest))
         near = [c for c in best if not c.simulated and 2 * (c.cost - lowest) <= within]
         if not near:
-            return found
+            return candidates
         made = fit_candidates(space, [(c.active, c.z) for c in near], settings)
-        found = [*(c for c in found if not any(c is x for x in near)), *made]
+        candidates = [*(c for c in candidates if not any(c is x for x in near)), *made]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -139,14 +139,14 @@ def _explained(
     space: CandidateSpace, base: Candidate, ladder: Sequence[Candidate], best: dict[str, Candidate]
 ) -> dict[str, Pair]:
     """For each family the fits with and without its effects that differ most: alone, or with those of others."""
-    known = {c.key: c for c in (base, *ladder) if np.isfinite(c.cost) and not c.supplying}
-    found = {family: Pair(alone, base) for family, alone in best.items()}
-    for effects, having in known.items():
-        for family in {space.library[name].family() for name in effects} & set(found):
+    simulated = {c.key: c for c in (base, *ladder) if np.isfinite(c.cost) and not c.supplying}
+    pairs = {family: Pair(alone, base) for family, alone in best.items()}
+    for effects, having in simulated.items():
+        for family in {space.library[name].family() for name in effects} & set(pairs):
             others = frozenset(n for n in effects if space.library[n].family() != family)
-            if others in known:
-                found[family] = max(found[family], Pair(having, known[others]), key=lambda pair: pair.explained)
-    return found
+            if others in simulated:
+                pairs[family] = max(pairs[family], Pair(having, simulated[others]), key=lambda pair: pair.explained)
+    return pairs
 
 
 def excess_misfit(space: CandidateSpace, base: Candidate) -> float:
@@ -170,14 +170,14 @@ def _of_one_family(space: CandidateSpace, ladder: Sequence[Candidate]) -> dict[s
 
     The size of a mechanism is not claimed.
     """
-    found: dict[str, Candidate] = {}
+    best: dict[str, Candidate] = {}
     for c in ladder:
         families = {space.library[name].family() for name in c.effects}
         once = len(set(c.effects)) == len(c.effects)
         if len(families) == 1 and once and np.isfinite(c.cost) and not c.supplying:
             (family,) = families
-            found[family] = min(found.get(family, c), c, key=lambda x: (not x.plausible, x.cost))
-    return found
+            best[family] = min(best.get(family, c), c, key=lambda x: (not x.plausible, x.cost))
+    return best
 
 
 def _in_equations_alike(family: str, where: DiscrepancyLocation) -> tuple[str, ...]:
@@ -262,9 +262,9 @@ def _within_seen_range(space: CandidateSpace, beside: CurveBeside, masks: Sequen
 
 
 def _held_out(space: CandidateSpace, runs: Runs, candidate: Candidate, predicted: Predicted) -> HeldOutScore:
-    known = predicted.get(prediction.candidate_key(candidate))
-    if known is not None:
-        return _scored(space, runs, known)
+    prediction_before = predicted.get(prediction.candidate_key(candidate))
+    if prediction_before is not None:
+        return _scored(space, runs, prediction_before)
     score = prediction.score_candidate(space, runs, candidate)
     predicted[prediction.candidate_key(candidate)] = score.reading
     return score

@@ -207,15 +207,15 @@ def calibration_acts(reach: Reach) -> tuple[Act, ...]:
     ]
     strobe = Act("strobe", ("strobe",), _strobed, _one_tuple_each(turning), 5 * RPM)
     timing = Act("timing", ("timing",), _timed, _one_tuple_each(paces), 3e-3)
-    found = [weighing] * reach.has_ground
-    found += ammeter * ("total_current" in reach.measured)
+    acts = [weighing] * reach.has_ground
+    acts += ammeter * ("total_current" in reach.measured)
     meters = [c for c in channels.rows(reach.measured) if c.misses_zero]
-    found += [
+    acts += [
         Act(f"zero of {c.label}", ("zero reading",), _Zero(c.name), ((0.0,),), None, channel=c.name) for c in meters
     ]
-    found += [strobe] * ("motor_speed" in reach.measured)
-    found += [timing] * ("speed" in reach.measured)
-    return tuple(found)
+    acts += [strobe] * ("motor_speed" in reach.measured)
+    acts += [timing] * ("speed" in reach.measured)
+    return tuple(acts)
 
 
 def _one_tuple_each(values: Sequence[float]) -> tuple[tuple[float, ...], ...]:
@@ -259,26 +259,26 @@ def _runs(
 
 def other_voltages(reach: Reach, used: tuple[float, ...]) -> tuple[float, ...]:
     """Four voltages missing in a table: below its lowest, in its widest gaps, above if the motors allow it."""
-    found = [round_significant(0.55 * used[0])]
+    voltages = [round_significant(0.55 * used[0])]
     if reach.voltage > used[-1]:
-        found.append(floor_significant(reach.voltage))
+        voltages.append(floor_significant(reach.voltage))
     levels = [0.55 * used[0], *used] if len(used) == 1 else list(used)
-    while len(found) < 4:
+    while len(voltages) < 4:
         low, high = max(itertools.pairwise(levels), key=lambda gap: gap[1] - gap[0])
         levels = sorted([*levels, 0.5 * (low + high)])
-        found.append(round_significant(0.5 * (low + high)))
-    return tuple(sorted(set(found)))
+        voltages.append(round_significant(0.5 * (low + high)))
+    return tuple(sorted(set(voltages)))
 
 
 def other_torques(used: Sequence[float]) -> tuple[float, ...]:
     """Three brake torques missing in a table, in its widest gaps from zero, and the largest that it used."""
     levels = sorted({0.0, *used})
-    found: list[float] = []
-    while len(found) < 3 and levels[-1] > 0:
+    torques: list[float] = []
+    while len(torques) < 3 and levels[-1] > 0:
         low, high = max(itertools.pairwise(levels), key=lambda gap: round_significant(gap[1] - gap[0], 6))
         levels = sorted([*levels, 0.5 * (low + high)])
-        found.append(round_significant(0.5 * (low + high)))
-    return tuple(sorted({*found, floor_significant(levels[-1]) if levels[-1] > 0 else 0.0}))
+        torques.append(round_significant(0.5 * (low + high)))
+    return tuple(sorted({*torques, floor_significant(levels[-1]) if levels[-1] > 0 else 0.0}))
 
 
 def _travel_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
@@ -290,7 +290,7 @@ def _travel_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
     some, more, most = inclines[(len(inclines) - 1) // 2], inclines[max(len(inclines) - 2, 0)], inclines[-1]
     air, payload = spaced_settings(0.2 * reach.geared, reach.geared, 5), round_significant(used.payload)
     runs = functools.partial(_runs, reach, at=used)
-    found = [
+    experiments = [
         runs("reverse", "backwards", setups.reversed_, voltages=ends, slopes=(0.0, -some)),
         runs("downhill", "about", voltages=ends, slopes=(-inclines[0], -some)),
         runs("lifted", "lifted", setups.lifted, voltages=air, read=TURNING),
@@ -306,7 +306,7 @@ def _travel_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
     lacks = {
         "downhill": most == 0, "steepest slope": most == 0, "payload": payload == 0, "one motor": reach.motors == 1,
     }  # fmt: skip
-    return tuple(r for r in found if not lacks.get(r.kinds[0], False))
+    return tuple(r for r in experiments if not lacks.get(r.kinds[0], False))
 
 
 def _motor_runs(reach: Reach) -> tuple[Run, ...]:
@@ -316,7 +316,7 @@ def _motor_runs(reach: Reach) -> tuple[Run, ...]:
         0.5 * reach.current * reach.resistance, min(reach.current * reach.resistance, reach.voltage), 2
     )
     brake = round_significant(0.6 * reach.torque_constant * reach.current, 1)
-    found = [
+    experiments = [
         _runs(reach, "bare motor", "alone", setups.bare, voltages=volts, read=TURNING),
         _runs(reach, "stall", "held", setups.blocked, voltages=stalling, read=STANDING),
         _runs(reach, "stall, one motor", "one held", setups.blocked, kinds=("stall", "one motor"), voltages=stalling,
@@ -324,7 +324,7 @@ def _motor_runs(reach: Reach) -> tuple[Run, ...]:
         _runs(reach, "braked motor", "braked", setups.braked,
               voltages=spaced_settings(0.4 * reach.alone, reach.alone, 3), read=TURNING, brake=brake),
     ]  # fmt: skip
-    return tuple(r for r in found if reach.motors > 1 or r.sides is None)
+    return tuple(r for r in experiments if reach.motors > 1 or r.sides is None)
 
 
 def experiment_menu(reach: Reach) -> tuple[Experiment, ...]:
@@ -356,7 +356,7 @@ def _shaft_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
     both = any(x < 0 for x in levels) and any(x > 0 for x in levels)
     torques = other_torques(reach.torques)
     way = -1.0 if levels[-1] > 0 else 1.0  # also of a brake, which acts against the rotation
-    found = [
+    experiments = [
         _runs(reach, others_of[reach.imposed], "run", kinds=("other voltages",), at=used,
               voltages=others),
         *([] if both else [
@@ -368,7 +368,7 @@ def _shaft_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
                   torques=[-way * x for x in torques])
         ] if max(reach.torques, default=0.0) > 0 else []),
     ]  # fmt: skip
-    return tuple(dataclasses.replace(r, imposed=reach.imposed) for r in found)
+    return tuple(dataclasses.replace(r, imposed=reach.imposed) for r in experiments)
 
 
 def check_forbidden(forbidden: Sequence[str], robot: Robot) -> None:
@@ -377,10 +377,10 @@ def check_forbidden(forbidden: Sequence[str], robot: Robot) -> None:
     Raises:
         BadConfiguration: such a name, with the choices.
     """
-    known = (*KINDS, *robot.configurations)
+    allowed = (*KINDS, *robot.configurations)
     for name in forbidden:
-        if name not in known:
-            raise BadConfiguration(f"--forbid {name}: no such experiment or configuration; {choices(name, known)}")
+        if name not in allowed:
+            raise BadConfiguration(f"--forbid {name}: no such experiment or configuration; {choices(name, allowed)}")
 
 
 # --- possible experiments -----------------------------------------------------------------------------

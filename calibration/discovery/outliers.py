@@ -216,8 +216,8 @@ def _set_gross_aside(base: BaseFit, settings: Settings, where: str) -> tuple[Bas
         return base, ()
     for _ in range(settings.reweightings):
         robust = space.weight / np.sqrt(1 + (far / settings.cauchy) ** 2)[:, None]
-        found, seen = search_each(space.bare, [start], [robust])
-        far, start = off(np.asarray(seen.reading[0])), np.asarray(found.z[0])
+        optima, seen = search_each(space.bare, [start], [robust])
+        far, start = off(np.asarray(seen.reading[0])), np.asarray(optima.z[0])
     gross = included & (far > settings.gross * max(1.0, float(np.median(far[included]))))
     if not gross.any() or gross.sum() > settings.outliers(int(included.sum())):
         return base, ()

@@ -172,12 +172,12 @@ def reading_sds(experiments: Sequence[Experiment], of_channels: Mapping[str, flo
     Args:
         of_channels: sds of its channels [SI], by name.
     """
-    found = [np.zeros(0)]
+    sds = [np.zeros(0)]
     for e in experiments:
         one = (
             [of_channels[e.channel] if e.sd is None else e.sd] * len(e.at)
             if isinstance(e, Act)
             else np.tile([of_channels[c] for c in e.channels], len(e.voltage))
         )
-        found.append(np.asarray(one, float) / math.sqrt(e.repeats))
-    return np.concatenate(found)
+        sds.append(np.asarray(one, float) / math.sqrt(e.repeats))
+    return np.concatenate(sds)

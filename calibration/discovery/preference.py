@@ -36,15 +36,15 @@ def worse_predictions(
         readings: kind of block → readings before and after [SI], NaN if a fit predicts none.
         errors: function of readings to their errors, by channel.
     """
-    found = []
+    worse = []
     for kind, (before, after) in readings.items():
         both = np.isfinite(before) & np.isfinite(after)
         was, now = (errors(np.where(both, x, np.nan)) for x in (before, after))
         for channel, e in now.items():
             old, new = float(was[channel]["rms_percent"]), float(e["rms_percent"])
             if new > (1 + TOLD) * old:
-                found.append(Worse(kind, channel, int(e["rows"]), old, new))
-    return tuple(found)
+                worse.append(Worse(kind, channel, int(e["rows"]), old, new))
+    return tuple(worse)
 
 
 # --- among alternatives ---------------------------------------------------------------------------------
@@ -148,13 +148,13 @@ def _classes_of_leader(
     members[new] = (new, *(n for n in members.pop(old) if n != new))
     stated = dict(zip(best.effects, alike.stated, strict=True))
     stated[new] = stated.pop(old)
-    known = {best.key, *(c.key for c in alike.ladder)}
+    keys = {best.key, *(c.key for c in alike.ladder)}
     wanted = [
         tuple(other if n == name else n for n in leader.active)
         for name in leader.effects
         for other in members[name][1:]
     ]
-    missing = [w for w in wanted if frozenset(n for n in w if n) not in known]
+    missing = [w for w in wanted if frozenset(n for n in w if n) not in keys]
     fitted = fit_candidates(space, [(w, start_of_fit(space, leader, w, settings)) for w in missing], settings)
     return Classes(
         tuple(members[name] for name in leader.effects),

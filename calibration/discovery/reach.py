@@ -111,13 +111,13 @@ def reach_of_table(robot: Robot, conditions: Conditions, measured: tuple[str, ..
         np.asarray(x)
         for x in (conditions.configuration, conditions.voltage, conditions.slope_deg, conditions.payload)
     )
-    own = np.asarray([float(c.mass) for c in robot.configurations.members])
+    masses = np.asarray([float(c.mass) for c in robot.configurations.members])
     stated = conditions.total_mass
-    mass = own[which] + payload if stated is None else np.asarray(stated)
+    mass = masses[which] + payload if stated is None else np.asarray(stated)
     used = tuple(
-        Used(name, k, _levels(volts[at]), _levels(slope[at]), _levels(payload[at]), float(mass[at].max()))
+        Used(name, k, _levels(volts[rows]), _levels(slope[rows]), _levels(payload[rows]), float(mass[rows].max()))
         for k, name in enumerate(robot.configurations)
-        if (at := which == k).any()
+        if (rows := which == k).any()
     )
     motor, highest = robot.motor, float(volts.max())
     constant, resistance = float(motor.torque_constant), float(motor.resistance)

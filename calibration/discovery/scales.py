@@ -122,8 +122,8 @@ def _at_position(signals: Signals, kind: type[Effect], turned: float | None = No
     """Signals of an effect that depends on position, at a given angle, or for None at its reference angle."""
     if kind.driver != "position" or kind.memory_size is None:
         return signals
-    at = jnp.full(jnp.shape(signals.speed_motor), kind.memory_size if turned is None else turned)
-    return dataclasses.replace(signals, memory={**signals.memory, kind.name: at})
+    positions = jnp.full(jnp.shape(signals.speed_motor), kind.memory_size if turned is None else turned)
+    return dataclasses.replace(signals, memory={**signals.memory, kind.name: positions})
 
 
 def effect_applies(kind: type[Effect], robot: Robot) -> bool:

@@ -110,8 +110,8 @@ def score_tests(linear: Linearization, bases: Bases) -> ScoreTable:
     leverage = jnp.sum(fit.half**2, 0)
     row = jnp.where(leverage < 1 - 1e-6, fit.left / jnp.sqrt(jnp.maximum(1 - leverage, 1e-12)), 0.0)
 
-    found = [jax.vmap(lambda c: _curve_score(fit, c))(basis.signatures(linear)) for basis in bases]
-    deviate, explained = (jnp.concatenate([f[k] for f in found] or [jnp.zeros(0)]) for k in (0, 1))
+    scores = [jax.vmap(lambda c: _curve_score(fit, c))(basis.signatures(linear)) for basis in bases]
+    deviate, explained = (jnp.concatenate([f[k] for f in scores] or [jnp.zeros(0)]) for k in (0, 1))
     amplitude = jnp.where(seen, -dots / norm**2, 0.0)
     row = row.reshape(linear.rows, -1)
     fall = 0.5 * jnp.sum(fit.step**2)
@@ -269,7 +269,7 @@ def statistics_with_columns(
     balances = np.array([n[0] for b in bases for n in b.names])
     deviate = np.where(np.isin(balances, list(names)), -np.inf, np.asarray(scores.curve))
     nothing = jnp.asarray(-jnp.inf)
-    found = Statistics(
+    statistics = Statistics(
         single=np.max(np.abs(np.asarray(scores.single))),
         pair=np.max(np.asarray(scores.pair)),
         curve=np.max(deviate, initial=-np.inf),
@@ -277,7 +277,7 @@ def statistics_with_columns(
         white=nothing,
         settled=jnp.asarray(True),
     )
-    return found, deviate
+    return statistics, deviate
 
 
 @functools.partial(compiled, options=SELDOM)

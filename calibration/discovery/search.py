@@ -119,12 +119,12 @@ def without_each(
         ladder: known fits, which are not repeated.
     """
     fewer = [tuple("" if s == slot else n for s, n in enumerate(best.active)) for slot in range(len(best.effects))]
-    known = {c.active: c for c in ladder if c.simulated}
+    simulated = {c.active: c for c in ladder if c.simulated}
     new = fit_candidates(
-        space, [(w, start_of_fit(space, best, w, settings)) for w in fewer if w not in known], settings
+        space, [(w, start_of_fit(space, best, w, settings)) for w in fewer if w not in simulated], settings
     )
-    known |= {c.active: c for c in new}
-    return [known[w] for w in fewer]
+    simulated |= {c.active: c for c in new}
+    return [simulated[w] for w in fewer]
 
 
 def _largest_set_size(space: CandidateSpace, settings: Settings) -> int:
@@ -184,14 +184,14 @@ def _pairs(space: CandidateSpace, scores: ScoreTable) -> list[tuple[str, str]]:
     """One batch of pairs of effects by their joint score, the strongest first."""
     effect, names = space.library.of, space.library.names
     pair = np.triu(np.asarray(scores.pair))
-    found: list[tuple[str, str]] = []
+    pairs: list[tuple[str, str]] = []
     for flat in np.argsort(-pair, axis=None)[:PAIRS]:
         i, j = sorted((int(effect[flat // len(effect)]), int(effect[flat % len(effect)])))
-        if i != j and (names[i], names[j]) not in found:
-            found.append((names[i], names[j]))
-        if len(found) == _batch(space):
+        if i != j and (names[i], names[j]) not in pairs:
+            pairs.append((names[i], names[j]))
+        if len(pairs) == _batch(space):
             break
-    return found
+    return pairs
 
 
 def _best(candidates: Sequence[Candidate]) -> Candidate | None:

@@ -160,8 +160,8 @@ def _curves(
     tried = []
     for place, variable in offered:
         if variable in known:
-            found = smooth_curve(linear, place, variable, included)
-            tried.append((found.evidence, CurveOver(place, (variable,))))
+            curve = smooth_curve(linear, place, variable, included)
+            tried.append((curve.evidence, CurveOver(place, (variable,))))
     project = Projection(linear)
     for place in sorted(crowded):
         for pair in itertools.combinations([v for v in VARIABLES if v in known], 2):
@@ -283,9 +283,9 @@ def name_tests(
     fits = {c.active: c for c in (*each, *(c for e, c in fewer.items() if e in best.effects))}
     seen = {at: diagnose_candidate(space, c, bases, after.test.null, settings).linear for at, c in fits.items()}
     for effect, without in zip(best.effects, each, strict=True):
-        own = _equation(space, effect)
+        equation = _equation(space, effect)
         linear = seen[without.active]
-        chosen, _ = _curves_beside(after.linear, after, bases, {own}, CURVES, settings)
+        chosen, _ = _curves_beside(after.linear, after, bases, {equation}, CURVES, settings)
         beside = _with_curves(space, linear, bases, chosen, effect)
         promised = _root(np.asarray(linear.jacobian), np.asarray(linear.residual), beside[2]) ** 2
         judged, signatures = beside, linear.signatures
@@ -308,7 +308,7 @@ def name_tests(
                     space, (space.library[effect].family(),), judged, np.asarray(signatures), blocks, settings
                 ),
                 next((c.effects for c in better if effect not in c.effects), ()),
-                own in lacks,
+                equation in lacks,
                 "run" if space.bare.observe.long else "row",
                 *_varies_most(space, whole, effect, beside_all, settings.shares["single"]),
             )
@@ -351,8 +351,8 @@ def _varies_most(
     of_row = jacobian[: linear.readings, slot].reshape(linear.rows, -1)
     variables = [v for v in (*VARIABLES, "speed") if _varies(linear, v, space.included)]
     for variable in variables:
-        at = linear.in_travel(bases_room.SHAFTS, variable)[0].reshape(-1, linear.rows).mean(0)
-        x = bases_room.scale_to_unit_range(np.nan_to_num(at), space.included.astype(float))
+        values = linear.in_travel(bases_room.SHAFTS, variable)[0].reshape(-1, linear.rows).mean(0)
+        x = bases_room.scale_to_unit_range(np.nan_to_num(values), space.included.astype(float))
         changed = np.stack([(of_row * shape[:, None]).ravel() for shape in (x, 2 * x**2 - 1)], 1)
         left, told = _projected_columns(jacobian, residual, changed)
         for k, root in enumerate(_roots(jacobian, residual, changed)):
@@ -378,10 +378,10 @@ def _evidence_over_curves(
     Args:
         without: the same fit without it; linear: linearization of that fit.
     """
-    own = _equation(space, effect)
-    offered = sum(_equation(space, name) == own for name in space.library.names)
+    equation = _equation(space, effect)
+    offered = sum(_equation(space, name) == equation for name in space.library.names)
     cost = _cost_of(space, best, best.active.index(effect), settings) + 2 * math.log(offered)
-    tried = [e for e, over in _curves(space, linear, bases, set()) if equation_of_place(over.place) == own]
+    tried = [e for e, over in _curves(space, linear, bases, set()) if equation_of_place(over.place) == equation]
     return 2 * (without.cost - best.cost) - cost - max(tried, default=-math.inf) + 2 * math.log(max(len(tried), 1))
 
 
@@ -411,8 +411,8 @@ def _with_curves(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Jacobian and residual of a fit with additional families of curves, and an effect's signatures."""
     columns = [np.zeros((linear.readings, 0)), *(family_columns(linear, bases, k) for k in curves)]
-    own = np.asarray(linear.signatures)[:, space.library.of == space.library.names.index(effect)]
-    return *augment_with_columns(linear, np.concatenate(columns, 1)), own
+    own_columns = np.asarray(linear.signatures)[:, space.library.of == space.library.names.index(effect)]
+    return *augment_with_columns(linear, np.concatenate(columns, 1)), own_columns
 
 
 def _put_back(

@@ -44,12 +44,12 @@ def prior_shift_scores(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.n
         jacobian, residual: of a fit, the priors' residuals last.
     """
     half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
-    at = np.arange(len(residual) - jacobian.shape[1], len(residual))
-    leverage = np.sum(half[:, at] ** 2, 0)
-    left = residual[at] - half[:, at].T @ (half @ residual)
+    prior_rows = np.arange(len(residual) - jacobian.shape[1], len(residual))
+    leverage = np.sum(half[:, prior_rows] ** 2, 0)
+    left = residual[prior_rows] - half[:, prior_rows].T @ (half @ residual)
     free = np.maximum(1 - leverage, 1e-9)
     seen = leverage < 1 - 1e-6
-    return np.where(seen, left**2 / free, 0.0), np.where(seen, residual[at] / free, 0.0)
+    return np.where(seen, left**2 / free, 0.0), np.where(seen, residual[prior_rows] / free, 0.0)
 
 
 def find_prior_shifts(
@@ -66,14 +66,14 @@ def find_prior_shifts(
     else:
         residual, jacobian = linear.residual, linear.jacobian
     explained, values = prior_shift_scores(np.asarray(jacobian), np.asarray(residual))
-    found = []
+    shifts = []
     for k in np.argsort(-explained[: space.free]):
         if explained[k] < needed:
             break
         fit = _without_prior(space, at, int(k), float(values[k]), settings)
         if fit is not None:
-            found.append(Shift(space.coordinates.base.names[k], int(k), fit))
-    return found
+            shifts.append(Shift(space.coordinates.base.names[k], int(k), fit))
+    return shifts
 
 
 def _without_prior(
@@ -91,8 +91,8 @@ def _without_prior(
         start[k] = mean
         data = dataclasses.replace(equipped.data, centre=jnp.asarray(centre))
         problem = dataclasses.replace(equipped, data=data)
-        found, _ = search_each(problem, [start], [space.weight], [indices])
-        best = jax.tree.map(lambda x: x[0], found)
+        optima, _ = search_each(problem, [start], [space.weight], [indices])
+        best = jax.tree.map(lambda x: x[0], optima)
         z = np.asarray(best.z)
         if not np.isfinite(best.cost):
             return None

@@ -295,8 +295,8 @@ class Window:
 
 def window_from_name(variable: str) -> Window | None:
     """Window that a variable's name describes; None if the name is no window's."""
-    found = re.fullmatch(rf"({'|'.join((*AXES, *LEVELS))}) (\S+) to (\S+)", variable)
-    return None if found is None else Window(found[1], float(found[2]), float(found[3]))
+    match = re.fullmatch(rf"({'|'.join((*AXES, *LEVELS))}) (\S+) to (\S+)", variable)
+    return None if match is None else Window(match[1], float(match[2]), float(match[3]))
 
 
 def window_families(

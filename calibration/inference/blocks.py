@@ -57,9 +57,9 @@ def group_into_levels(x: np.ndarray) -> np.ndarray:
     if group[-1] == 0 and np.ptp(x) > 2 * APART * PARTS * np.max(np.abs(x)):
         group = np.arange(len(x)) * PARTS // len(x)
     level = np.array([float(f"{np.median(x[order][group == g]):.4g}") for g in group])
-    found = np.empty(len(x))
-    found[order] = level
-    return found
+    level_of_row = np.empty(len(x))
+    level_of_row[order] = level
+    return level_of_row
 
 
 def blocks_by_sharpness(runs: Runs) -> dict[str, np.ndarray]:
@@ -99,15 +99,15 @@ def blocks_of_kind(runs: Runs, by: str) -> dict[str, np.ndarray]:
 
 def distinct_blocks(runs: Runs, kinds: Sequence[str]) -> dict[str, dict[str, np.ndarray]]:
     """Kind → blocks, for kinds that the data have, without kinds that divide the rows as an earlier one does."""
-    found: dict[str, dict[str, np.ndarray]] = {}
+    blocks: dict[str, dict[str, np.ndarray]] = {}
     divided = []
     for kind in kinds:
         by = blocks_of_kind(runs, kind)
         parts = {m.tobytes() for m in by.values()}
         if parts not in divided:
             divided.append(parts)
-            found[kind] = by
-    return {kind: by for kind, by in found.items() if by}
+            blocks[kind] = by
+    return {kind: by for kind, by in blocks.items() if by}
 
 
 def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, dict[str, np.ndarray]]:

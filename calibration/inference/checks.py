@@ -172,9 +172,9 @@ def infeasible_error(
         )
     sliding = sorted(set(runs.configurations_named(robot)[slides]), key=robot.configurations.index)
     parameter = {c: f"{c}.ground.friction.static" for c in sliding}
-    at = ", ".join(f"{float(robot.configurations[c].ground.friction.static):.3g}" for c in sliding)
+    frictions = ", ".join(f"{float(robot.configurations[c].ground.friction.static):.3g}" for c in sliding)
     cure = "free it, or raise it in --robot" if set(parameter.values()) - set(names) else "widen its prior"
     return BadConfiguration(
         f"no start is feasible: {runs.source} rows {rows(slides)} were measured in steady travel, but the model "
-        f"slides there ({' and '.join(parameter.values())} = {at} cannot carry the demand); {cure}"
+        f"slides there ({' and '.join(parameter.values())} = {frictions} cannot carry the demand); {cure}"
     )

@@ -36,10 +36,10 @@ def conduct_notes(runs: Runs, robot: Robot) -> list[Note]:
     steady = operating_readings(robot, conditions)[:, channels.index("speed", robot.channels)]
     radius = np.asarray([float(c.radius) for c in robot.configurations.members])[np.asarray(conditions.configuration)]
     movers = radius * turning / float(robot.gearbox.ratio)
-    known = np.isfinite(speed)
-    slow = known & np.isfinite(steady) & (speed < SLOW * steady)
-    early = (lasts < UNDER_WAY) & (slow | ~known)
-    slides = (lasts >= UNDER_WAY) & known & np.isfinite(movers) & (movers > 0) & (speed < SLIDING * movers)
+    measured = np.isfinite(speed)
+    slow = measured & np.isfinite(steady) & (speed < SLOW * steady)
+    early = (lasts < UNDER_WAY) & (slow | ~measured)
+    slides = (lasts >= UNDER_WAY) & measured & np.isfinite(movers) & (movers > 0) & (speed < SLIDING * movers)
     slides &= ~np.isin(names, runs.run_names[varies(runs)])  # their settled ends are only parts of them
     said: list[Note] = []
     if early.any():

@@ -67,7 +67,7 @@ def parameter_estimates(
     wide = np.stack([coordinates.value(np.full_like(at, side * Z95)) for side in (-1, 1)], 1)
     other = None if beside is None else coordinates.value(np.asarray(beside))
     bound, fields = coordinates.beyond(z), priors.parameters_by_name(base)
-    found = {}
+    estimates = {}
     for k, name in enumerate(coordinates.names):
         interval, shift, is_open = linear[k], z[k] + Z95 * about.sd[k] * np.array([-1.0, 1.0]), (False, False)
         if profile is not None:
@@ -78,7 +78,7 @@ def parameter_estimates(
             shift, is_open = np.array(scans[k].interval()), scans[k].open()
             ends = [np.where(np.arange(len(z)) == k, x, at) for x in shift]
             interval = np.array([coordinates.value(end)[k] for end in ends])
-        found[name] = Estimate(
+        estimates[name] = Estimate(
             value=float(value[k]),
             sd=float(about.sd[k] * slope[k]),
             interval=_pair(interval),
@@ -103,7 +103,7 @@ def parameter_estimates(
             if beside is None or other is None
             else SteadyEstimate(float(other[k]), float((z[k] - beside[k]) / about.sd[k])),
         )
-    return found
+    return estimates
 
 
 def _pair(ends: np.ndarray) -> tuple[float, float]:
@@ -139,12 +139,12 @@ def errors_by_channel(
 def _errors(
     shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray, percent: np.ndarray
 ) -> Errors:
-    found = channel_errors(shown, simulated, measured, sd, percent)
+    errors = channel_errors(shown, simulated, measured, sd, percent)
     return {
         name: ChannelErrors(
             int(e["rows"]), *(float(e[x]) for x in ("rms_percent", "max_percent", "rms_sigma", "rms"))
         )
-        for name, e in found.items()
+        for name, e in errors.items()
     }
 
 

@@ -45,7 +45,7 @@ def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tup
     value = posterior.at(posterior.mean)
     log = np.array([kind == LOG for kind in posterior.kinds])
     spread = posterior.spread * sd  # of the parameter, or of its logarithm
-    found = []
+    groups = []
     for i, j in zip(*np.triu_indices(len(sd), 1), strict=True):
         one, other = posterior.coordinates[i], posterior.coordinates[j]
         correlation = float(posterior.covariance[i, j] / max(sd[i] * sd[j], 1e-300))
@@ -55,8 +55,8 @@ def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tup
         weight = -np.sign(correlation) * abs(size[i] / size[j])
         even = log[i] and log[j] and 1 / EVEN < spread[i] / spread[j] < EVEN
         form = "linear" if not even else "ratio" if correlation > 0 else "product"
-        found.append(Pair(one, other, correlation, form, float(weight)))
-    return tuple(sorted(found, key=lambda pair: -abs(pair.correlation)))
+        groups.append(Pair(one, other, correlation, form, float(weight)))
+    return tuple(sorted(groups, key=lambda pair: -abs(pair.correlation)))
 
 
 def undetermined_names(held: Collection[str], pairs: Collection[Pair]) -> tuple[str, ...]:

@@ -34,7 +34,7 @@ def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[Inherit
     )
     pairs = [(part, part, *DRIVE[part]) for part in DRIVE]
     pairs += [(c, other, *CHASSIS) for c in robot.configurations for other in paper_robots.nominal().configurations]
-    found: dict[str, InheritedPriors] = {}
+    inherited: dict[str, InheritedPriors] = {}
     for part, other, sheet, friction in pairs:
         on_tracks = part in robot.configurations and float(robot.configurations[part].on_tracks) > 0.5
         guides = GUIDES if on_tracks else ()
@@ -48,6 +48,6 @@ def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[Inherit
             for name in sheet
             if abs(mine[f"{part}.{name}"] / nominal[f"{other}.{name}"] - 1) > DIFFERS
         )
-        if len(kept) > len(found[part].kept if part in found else ()):
-            found[part] = InheritedPriors(part, changed, kept)
-    return [note for note in found.values() if note.changed]
+        if len(kept) > len(inherited[part].kept if part in inherited else ()):
+            inherited[part] = InheritedPriors(part, changed, kept)
+    return [note for note in inherited.values() if note.changed]

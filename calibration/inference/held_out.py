@@ -63,14 +63,14 @@ def hold_out_blocks(
     rows, weight = len(masks[0]), np.asarray(problem.data.weight)
     out = [np.concatenate([m, np.zeros(len(weight) - rows, bool)]) for m in masks]
     which = None if active is None else [active] * len(masks)
-    found, seen = search_each(problem, [start] * len(masks), [weight * ~m[:, None] for m in out], which)
+    optima, seen = search_each(problem, [start] * len(masks), [weight * ~m[:, None] for m in out], which)
     reading, status = np.full((rows, weight.shape[1]), np.nan), np.full(rows, -1)
     block = np.full(rows, -1)
     for k, mask in enumerate(masks):
         lost = problem.observe.unreachable(np.asarray(seen.status[k]))[:rows, None]
         reading[mask] = np.where(lost, np.nan, seen.reading[k][:rows])[mask]
         status[mask], block[mask] = seen.status[k][:rows][mask], k
-    return HeldOutFits(reading, status, block, np.asarray(found.z), np.asarray(found.converged))
+    return HeldOutFits(reading, status, block, np.asarray(optima.z), np.asarray(optima.converged))
 
 
 def predict_unseen(
@@ -82,10 +82,10 @@ def predict_unseen(
     """
     if not problem.observe.long:
         return hold_out_blocks(problem, start, masks, active)
-    rows, at = len(masks[0]), np.asarray(start)
+    rows, start_values = len(masks[0]), np.asarray(start)
     out = [np.concatenate([m, np.zeros(len(problem.data.weight) - rows, bool)]) for m in masks]
     data = problem.data
-    residual, jacobian, seen = problem.observe.at(problem, at, active)
+    residual, jacobian, seen = problem.observe.at(problem, start_values, active)
     residual, jacobian, read = np.asarray(residual), np.asarray(jacobian), np.asarray(seen.reading)
     scale = np.asarray(data.weight / data.sd)
     count, size = scale.shape[1], scale.size
@@ -94,7 +94,7 @@ def predict_unseen(
         per_unit = np.where(scale[..., None] > 0, slopes / scale[..., None], 0.0)
     lost = problem.observe.unreachable(np.asarray(seen.status))
     reading, status = np.full((rows, count), np.nan), np.full(rows, -1)
-    block, z = np.full(rows, -1), np.tile(at, (len(out), 1))
+    block, z = np.full(rows, -1), np.tile(start_values, (len(out), 1))
     for k, mask in enumerate(out):
         kept = np.concatenate([np.repeat(~mask, count), ~mask, np.ones(len(residual) - size - len(mask), bool)])
         j = jacobian[kept]

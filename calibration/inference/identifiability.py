@@ -98,12 +98,12 @@ def separate_directions(directions: np.ndarray) -> np.ndarray:
     Args:
         directions: orthonormal, shape (directions, parameters), as the result.
     """
-    left, found = directions.T @ directions, np.zeros_like(directions)
-    for row in found:
+    left, separated = directions.T @ directions, np.zeros_like(directions)
+    for row in separated:
         k = int(np.argmax(np.round(np.diag(left), 6)))
         row[:] = left[k] / np.sqrt(left[k, k])
         left = left - np.outer(row, row)
-    return found
+    return separated
 
 
 @compiled
@@ -185,16 +185,16 @@ def profile_likelihoods(
     data = problem.data if data is None else data
     centre, size = np.asarray(z), len(about.names)
     steps = np.concatenate([-np.asarray(PROFILE_STEPS[::-1]), PROFILE_STEPS])
-    at = centre[:, None] + about.sd[:, None] * steps  # (parameters, points)
+    pinned = centre[:, None] + about.sd[:, None] * steps  # (parameters, points)
     along = about.covariance / np.diag(about.covariance)[:, None]  # row k: how all move with k
-    starts = centre + along[:, None, :] * (at - centre[:, None])[..., None]
+    starts = centre + along[:, None, :] * (pinned - centre[:, None])[..., None]
     held = np.broadcast_to(np.eye(size, dtype=bool)[:, None, :], starts.shape)
     pins = Pin(jnp.asarray(held.reshape(-1, size)), jnp.asarray(starts.reshape(-1, size)))
-    found = _profiles(problem, data, pins.at, pins)
-    rise = 2 * (np.asarray(found.cost).reshape(at.shape) - cost)
+    profiles = _profiles(problem, data, pins.at, pins)
+    rise = 2 * (np.asarray(profiles.cost).reshape(pinned.shape) - cost)
     root = np.sign(steps) * np.sqrt(np.maximum(rise, 0.0))
     middle = len(PROFILE_STEPS)
-    at_all = np.insert(at, middle, centre, axis=1)
+    at_all = np.insert(pinned, middle, centre, axis=1)
     root_all = np.insert(root, middle, 0.0, axis=1)
     ends = np.array([_interval_ends(a, r) for a, r in zip(at_all, root_all, strict=True)])
     value = np.asarray(jax.vmap(problem.coordinates.value)(jnp.asarray(at_all.T))).T

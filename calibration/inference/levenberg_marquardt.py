@@ -236,23 +236,23 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
         """Returns the state of a search that has evaluated nothing yet."""
         none, no, still = jnp.asarray(0), jnp.asarray(False), jnp.zeros_like(y)
         jacobian = jnp.zeros((f_struct.size, y.size), f_struct.dtype)
-        found = Linearisation(jnp.zeros(f_struct.shape, f_struct.dtype), jacobian, self.first, self.last)
+        unevaluated = Linearisation(jnp.zeros(f_struct.shape, f_struct.dtype), jacobian, self.first, self.last)
         aux = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), aux_struct)
-        return Searching(found, aux, still, y, no, self.search.init(y, found), none, none, no)
+        return Searching(unevaluated, aux, still, y, no, self.search.init(y, unevaluated), none, none, no)
 
     def step(
         self, fn: Function, y: Z, args: Any, options: dict[str, Any], state: Searching, tags: frozenset
     ) -> tuple[Z, Searching, Any]:
         """Evaluates the function at the end of the last step, accepts or rejects that step, and finds the next."""
-        found, aux = self._linearised(fn, state.ahead, args)
+        linearised, aux = self._linearised(fn, state.ahead, args)
         moved, first, before = state.ahead - y, state.steps == 0, state.found
-        _, accepted, _, region = self.search.step(first, y, state.ahead, before, found, state.region)
-        alike = jnp.all(found.positive == before.positive)
+        _, accepted, _, region = self.search.step(first, y, state.ahead, before, linearised, state.region)
+        alike = jnp.all(linearised.positive == before.positive)
         accepted &= first | alike | ~state.mixed
         region = _where(state.mixed & ~accepted, state.region, region)
-        ended = self._is_small(state.ahead, moved, found, before) & accepted
+        ended = self._is_small(state.ahead, moved, linearised, before) & accepted
 
-        y, best, aux = _where(accepted, (state.ahead, found, aux), (y, before, state.aux))
+        y, best, aux = _where(accepted, (state.ahead, linearised, aux), (y, before, state.aux))
         stride, _ = self.descent.step(region.step_size, self.descent.query(y, best, best))
         mixed = accepted & alike & (state.steps > 1) & (jnp.max(jnp.abs(stride)) < self.near)
         ahead = y + jnp.where(mixed, mixed_step(stride, moved, stride - state.stride), stride)

@@ -129,19 +129,21 @@ _shape_at: Callable[..., Array] = compiled(shape_at)
 
 def with_shape_of_robot(robot: Robot, scored: ScoredEffect) -> ScoredEffect:
     """Effect with its grid, or with the shape that it has in `robot` if it is present there."""
-    own = next((e for e in robot.effects if e.name == scored.effect.name), None)
-    if own is None or not scored.shape:
+    effect_of_robot = next((e for e in robot.effects if e.name == scored.effect.name), None)
+    if effect_of_robot is None or not scored.shape:
         return scored
-    shape = getattr(own, scored.shape)
-    return dataclasses.replace(scored, values=jnp.where(jnp.asarray(own.amplitude) == 0, scored.values, shape))
+    shape = getattr(effect_of_robot, scored.shape)
+    return dataclasses.replace(
+        scored, values=jnp.where(jnp.asarray(effect_of_robot.amplitude) == 0, scored.values, shape)
+    )
 
 
 def map_over_shapes(scored: ScoredEffect, function: Callable[[Effect, Array], Array], given: Array) -> Array:
     """A function of an effect and of the value in `given`, shape (grid,), at each point of its shape's grid."""
     if not scored.shape:
         return function(scored.effect, given[0])[None]
-    at = lambda v, x: function(params.replace(scored.effect, {scored.shape: v}), x)  # noqa: E731
-    return jax.vmap(at)(scored.values, given)
+    of_shape = lambda v, x: function(params.replace(scored.effect, {scored.shape: v}), x)  # noqa: E731
+    return jax.vmap(of_shape)(scored.values, given)
 
 
 def effect_terms(robot: Robot, signals: Signals, effects: tuple[ScoredEffect, ...], memory: list[Array]) -> Array:
@@ -156,8 +158,8 @@ def effect_terms(robot: Robot, signals: Signals, effects: tuple[ScoredEffect, ..
         with_memory = dataclasses.replace(signals, memory={**signals.memory, effect.name: remembered})
         return jnp.asarray(balances.added(alone, with_memory, effect.balance, effect.channel), float)
 
-    found = [map_over_shapes(e, term, m) for e, m in zip(effects, memory, strict=True)]
-    return jnp.concatenate(found) if found else jnp.zeros(0)
+    terms = [map_over_shapes(e, term, m) for e, m in zip(effects, memory, strict=True)]
+    return jnp.concatenate(terms) if terms else jnp.zeros(0)
 
 
 # --- the fit ------------------------------------------------------------------------------------------------

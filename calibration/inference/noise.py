@@ -54,8 +54,8 @@ class Noise:
     @property
     def freedom(self) -> Float[np.ndarray, " channels"]:
         """Degrees of freedom of each channel's sd; infinite if it is stated or assumed."""
-        found = {s.channel: s.freedom for s in self.along_series}
-        return np.array([found.get(c, np.inf) for c in self.channels])
+        freedoms = {s.channel: s.freedom for s in self.along_series}
+        return np.array([freedoms.get(c, np.inf) for c in self.channels])
 
     def scaled(self, factors: Mapping[str, float]) -> Noise:
         """Noise with the sds of some channels multiplied by a factor, by channel name."""
@@ -76,14 +76,14 @@ def parse_noise(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float,
         BadConfiguration: an unknown channel, a number that is not positive, or another unit.
     """
     words = {c.word: k for k, c in enumerate(shown)}
-    known = words | {c.name: k for k, c in enumerate(shown)}
-    found: dict[int, tuple[float, bool]] = {}
+    channel_of_word = words | {c.name: k for k, c in enumerate(shown)}
+    stated: dict[int, tuple[float, bool]] = {}
     for part in text.split(","):
         name, _, value = part.strip().partition("=")
-        if name not in known:
+        if name not in channel_of_word:
             raise BadConfiguration(f"--noise {part.strip()}: no such channel; {choices(name, words)}")
-        k = known[name]
-        if k in found:
+        k = channel_of_word[name]
+        if k in stated:
             raise BadConfiguration(f"--noise {part.strip()}: {name} is given twice; expected each channel once")
         channel = shown[k]
         match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*(%|[^\d\s.]+)\s*", value)
@@ -98,8 +98,8 @@ def parse_noise(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float,
         if match is None or not size > 0 or math.isinf(size) or match[2] not in ("%", *sizes):
             raise BadConfiguration(f"--noise {part.strip()}: {form}")
         relative = match[2] == "%"
-        found[k] = (size / 100 if relative else size * sizes[match[2]], relative)
-    return found
+        stated[k] = (size / 100 if relative else size * sizes[match[2]], relative)
+    return stated
 
 
 def noise_from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
@@ -135,9 +135,9 @@ def noise_from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -
         sd[:, k] = np.where(finite, size * sizes[:, k] if relative else size, 1.0)
         source.append("stated" if k in shares else "estimated")
     quantum = np.array([runs.layout.variance(name) for name in channels.names(runs.channels)])
-    known = np.array([s in ("columns", "stated") for s in source])  # an estimate already includes it
-    if (known & (quantum > 0)).any():
-        sd = np.where(known & np.isfinite(measured), np.sqrt(sd**2 + quantum), sd)
+    given = np.array([s in ("columns", "stated") for s in source])  # an estimate already includes it
+    if (given & (quantum > 0)).any():
+        sd = np.where(given & np.isfinite(measured), np.sqrt(sd**2 + quantum), sd)
     return Noise(runs.channels, sd, np.array([s == "estimated" for s in source]), tuple(source))
 
 
@@ -158,13 +158,13 @@ def infer_noise(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noi
     Raises:
         BadConfiguration, BadData: as `noise_from_table`.
     """
-    known = noise_from_table(runs, sizes, stated)
-    if not known.estimated.any():
-        return known
-    sd, words, series = known.sd.copy(), list(known.source), []
+    given = noise_from_table(runs, sizes, stated)
+    if not given.estimated.any():
+        return given
+    sd, words, series = given.sd.copy(), list(given.source), []
     guess = noise_from_table(runs, sizes, default_noise(runs.channels))
     shown = (None,) * len(words) if runs.sampled else series_noise.estimate_noise(runs, sizes)
-    for k in np.flatnonzero(known.estimated):
+    for k in np.flatnonzero(given.estimated):
         found = shown[k]
         if found is None:
             sd[:, k], words[k] = guess.sd[:, k], "assumed"

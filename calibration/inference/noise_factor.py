@@ -30,15 +30,15 @@ def noise_factors(fit: Residuals, level: float = LEVEL) -> dict[str, float]:
     tests = structure_tests(fit.rescaled(), known=False)
     if tests and min(p for p, _ in tests) * len(tests) < level:
         return {}
-    found = {}
+    factors = {}
     for channel, chi2, freedom in zip(fit.runs.channels, fit.chi2.tolist(), fit.freedom.tolist(), strict=True):
         if freedom < 1 or chi2 <= 0:
             continue
         factor = float(np.sqrt(chi2 / freedom))
         p = chdtrc(freedom, chi2) if factor > 1 else chdtr(freedom, chi2)
         if max(factor, 1 / factor) > OFF and p < IMPROBABLE:
-            found[channel.name] = factor
-    return found
+            factors[channel.name] = factor
+    return factors
 
 
 def common_factors(fit: Residuals) -> dict[str, float]:

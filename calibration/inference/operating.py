@@ -37,17 +37,17 @@ def operating_readings(
     index = np.concatenate([np.arange(runs), np.zeros(-runs % PAD, int)])
     mass = conditions.total_mass
     if mass is None:
-        own = np.asarray([float(c.mass) for c in robot.configurations.members])
-        mass = own[np.asarray(conditions.configuration)] + np.asarray(conditions.payload)
+        masses = np.asarray([float(c.mass) for c in robot.configurations.members])
+        mass = masses[np.asarray(conditions.configuration)] + np.asarray(conditions.payload)
     gripping, own_mass = jax.device_put((np.full(runs, GRIPPING), np.asarray(mass)))
     posed = dataclasses.replace(conditions, adhesion=gripping, total_mass=own_mass)
     if conditions.turns:  # the load of a turn is friction
         posed = conditions
     padded = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[index]), posed)
     strong = params.strong(robot)
-    found = shown_batch(strong, padded)[0] if conditions.turns else _settled(strong, padded)
-    reading = np.stack([np.asarray(found.reading[c]) for c in names or channels.names(robot.channels)], 1)[:runs]
-    moving = done(np.asarray(found.status))[:runs]
+    readings = shown_batch(strong, padded)[0] if conditions.turns else _settled(strong, padded)
+    reading = np.stack([np.asarray(readings.reading[c]) for c in names or channels.names(robot.channels)], 1)[:runs]
+    moving = done(np.asarray(readings.status))[:runs]
     return np.where(moving[:, None], reading, np.nan)
 
 

@@ -153,8 +153,8 @@ def _is_converged(decrement: Any, cost: Array) -> Array:
 
 def optimum_at_point(jacobian: np.ndarray, residual: np.ndarray, z: np.ndarray, data: Data) -> Optimum:
     """A point as an optimum, from its residuals (misfit, then prior) and their Jacobian, of any origin."""
-    j, r, at = (jnp.asarray(x, float) for x in (jacobian, residual, z))
-    return _optimum(j, r, at, data, no_pin(len(z)), jnp.asarray(0))
+    j, r, point = (jnp.asarray(x, float) for x in (jacobian, residual, z))
+    return _optimum(j, r, point, data, no_pin(len(z)), jnp.asarray(0))
 
 
 def _begin(solver: OneSidedLevenbergMarquardt, start: Z, size: int, aux: Any) -> Progress:
@@ -216,7 +216,7 @@ def levenberg_marquardt(
     """Optimum of one search, and the observation there; for `vmap` over starts, data and pins."""
     pin = no_pin(start.shape[0]) if pin is None else pin
     function: Any = residual_function(problem, data, pin)
-    found: optx.Solution = optx.least_squares(
+    solution: optx.Solution = optx.least_squares(
         function,
         _solver(data, problem.observe.long),
         pin.apply(start),
@@ -224,7 +224,7 @@ def levenberg_marquardt(
         max_steps=max_steps,
         throw=False,
     )
-    return _ended((found.value, found.state), data, pin), found.aux
+    return _ended((solution.value, solution.state), data, pin), solution.aux
 
 
 class Member(eqx.Module):
@@ -409,8 +409,8 @@ def search_refilling(problem: Problem, members: Member, max_steps: int, places: 
     Returns:
         End of each search, and the observation there.
     """
-    found, state = _refilled(problem, members, max_steps, places)
-    return found, state.aux
+    optima, state = _refilled(problem, members, max_steps, places)
+    return optima, state.aux
 
 
 def _refilled(problem: Problem, members: Member, max_steps: int, places: int) -> tuple[Optimum, Searching]:
@@ -449,8 +449,14 @@ def linearise(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observa
 def _first_step(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
     """Result of `linearise` with the signs of penalties, by the compiled program of the searches."""
     active = getattr(problem.coordinates, "active", None)
-    own = [np.asarray(x)[None] for x in (z, data.weight, data.measured, data.centre)]
-    members = Member(own[0], own[1], own[2], own[3], None if active is None else np.asarray(active)[None])
+    one_member = [np.asarray(x)[None] for x in (z, data.weight, data.measured, data.centre)]
+    members = Member(
+        one_member[0],
+        one_member[1],
+        one_member[2],
+        one_member[3],
+        None if active is None else np.asarray(active)[None],
+    )
     _, ended = _refilled(problem, members, 1, problem.observe.places(problem))
     state = jax.tree.map(lambda x: jnp.asarray(x[0]), ended)
     return state.found.residual, state.found.jacobian, state.aux
@@ -470,8 +476,8 @@ _clip_penalties = compiled(clip_penalties, options=SELDOM)
 def mask_uncomputed(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
     """Residuals and Jacobian; a reading with a non-finite row of the Jacobian counts as not computed."""
     counts = jnp.concatenate([data.weight.ravel() > 0, jnp.ones(data.measured.shape[0] + jacobian.shape[1], bool)])
-    known = jnp.all(jnp.isfinite(jacobian), axis=1)
-    return jnp.where(known, r, MISSING * counts), jnp.where(known[:, None], jacobian, 0.0)
+    computed = jnp.all(jnp.isfinite(jacobian), axis=1)
+    return jnp.where(computed, r, MISSING * counts), jnp.where(computed[:, None], jacobian, 0.0)
 
 
 @functools.partial(compiled, options=OVER_TIME)
@@ -513,19 +519,19 @@ def search_rollout(
     """
     pin, solver = no_pin(start.shape[0]), _solver(data, long=True)
     size = penalty_slice(data).stop + start.shape[0]
-    at, first, last = _begin(solver, start, size, None), None, None
+    progress, first, last = _begin(solver, start, size, None), None, None
     best: Optimum | None = None
     for steps in range(1, max_steps + 1):
-        ahead = at[1].ahead
+        ahead = progress[1].ahead
         # A step after a rejected one is often rejected too; that needs no Jacobian, so the previous one remains.
-        r = evaluate_residuals(problem, ahead, data) if at[1].rejected > 0 else None
+        r = evaluate_residuals(problem, ahead, data) if progress[1].rejected > 0 else None
         if r is None or best is None or 0.5 * jnp.sum(r**2) < best.cost:
             r, jacobian, seen = linearise_rollout(problem, ahead, data)
         first = seen if first is None else first
-        at = _stepped(solver, at, r, jacobian)
-        done = bool(at[1].over)
-        if at[1].rejected == 0:
-            best, last = _optimum(jacobian, r, at[0], data, pin, jnp.asarray(steps)), seen
+        progress = _stepped(solver, progress, r, jacobian)
+        done = bool(progress[1].over)
+        if progress[1].rejected == 0:
+            best, last = _optimum(jacobian, r, progress[0], data, pin, jnp.asarray(steps)), seen
             done |= bool(best.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * best.cost))
         assert best is not None  # the first step only evaluates the start, and accepts it
         tell(steps, float(best.cost))
@@ -581,7 +587,7 @@ def search_rollouts(
     mine = Places(range(len(starts)), max(places, len(starts) * rivals))
     cost, ahead = np.full(len(starts), np.inf), starts[mine.member]
     trail = np.full((LATELY, len(mine.member)), np.nan)
-    at: Progress | None = None
+    progress: Progress | None = None
     while mine:
         fresh, going = mine.fill(), np.flatnonzero(mine.taken)
         # A step accepts or rejects the point to which the last one led; an accepted point becomes y.
@@ -596,10 +602,10 @@ def search_rollouts(
             begin = functools.partial(_begin, solver, size=found[0].shape[1], aux=aux)
             begun = jax.device_get(jax.vmap(begin)(jnp.asarray(ahead)))
             put = lambda old, new: _with_values(old, fresh, new[fresh])  # noqa: B023, E731
-            at = begun if at is None else jax.tree.map(put, at, begun)
-        assert at is not None  # the first searches are fresh
-        at, ends = jax.device_get(_steps(at, found, data, weights[mine.member]))
-        state = at[1]
+            progress = begun if progress is None else jax.tree.map(put, progress, begun)
+        assert progress is not None  # the first searches are fresh
+        progress, ends = jax.device_get(_steps(progress, found, data, weights[mine.member]))
+        state = progress[1]
         ahead, seen = state.ahead, state.aux
         small = 0.1 * (DECREMENT + DECREMENT_SHARE * ends.cost)
         over = state.over | (state.steps >= max_steps) | ((state.rejected == 0) & (ends.decrement < small))
@@ -633,12 +639,12 @@ def search_starts(
         The end of each search, and the status of each row at its start and at its end.
     """
     if solver is not None:
-        found, start, end = search_with_solver(problem, starts, data, solver)
-        return found, start.status, end.status
+        optima, start, end = search_with_solver(problem, starts, data, solver)
+        return optima, start.status, end.status
     if not problem.observe.apart:
         return _search_starts(problem, starts, data)
-    own = (np.repeat(np.asarray(x)[None], len(starts), 0) for x in (data.weight, data.measured, data.centre))
-    members = Member(np.asarray(starts), *own)
+    tables = (np.repeat(np.asarray(x)[None], len(starts), 0) for x in (data.weight, data.measured, data.centre))
+    members = Member(np.asarray(starts), *tables)
     problem = dataclasses.replace(problem, data=data)
     # A search of one step evaluates its start.
     begun, ended = (search_refilling(problem, members, steps, problem.observe.places(problem)) for steps in (1, 100))
@@ -648,8 +654,8 @@ def search_starts(
 @compiled
 def _search_starts(problem: Problem, starts: Array, data: Data) -> tuple[Optimum, Array, Array]:
     def search(z: Z) -> tuple[Optimum, Array, Array]:
-        found, seen = levenberg_marquardt(problem, z, data)
-        return found, problem.observation(z).status, seen.status
+        optimum, seen = levenberg_marquardt(problem, z, data)
+        return optimum, problem.observation(z).status, seen.status
 
     return jax.vmap(search)(starts)
 
@@ -676,8 +682,8 @@ def search_with_solver(
         z, pin = solved.value, no_pin(start.size)
         r, jacobian, seen = _evaluated(problem, data, pin, z)
         r, jacobian = mask_uncomputed(r, jacobian, data)
-        found = _optimum(jacobian, r, z, data, pin, solved.stats["num_steps"])
-        return found, problem.observation(start), seen
+        optimum = _optimum(jacobian, r, z, data, pin, solved.stats["num_steps"])
+        return optimum, problem.observation(start), seen
 
     return jax.lax.map(search, starts)
 

@@ -76,14 +76,15 @@ def prepare(
     own_mass.check_priors(priors, robot, runs)
     as_stated, weighed = robot, own_mass.remarks(robot, runs)
     robot = own_mass.with_table_mass(robot, runs)
-    known = (noise_room.infer_noise if assume else noise_room.noise_from_table)(runs, observe.sizes(runs), noise)
-    known, larger = repeats.enlarge_noise(known, runs)
-    robot = observe.with_initial_states(robot, runs, known)
-    found = Prepared(robot, observe, known, priors, (), tuple(former), (), (), (), tuple(weighed))
+    estimate = noise_room.infer_noise if assume else noise_room.noise_from_table
+    channel_noise = estimate(runs, observe.sizes(runs), noise)
+    channel_noise, larger = repeats.enlarge_noise(channel_noise, runs)
+    robot = observe.with_initial_states(robot, runs, channel_noise)
+    found = Prepared(robot, observe, channel_noise, priors, (), tuple(former), (), (), (), tuple(weighed))
     names = tuple(choose(found))
     # The table's masses are compared with those of the file, which are not yet replaced there.
-    checked = checks.check_data(runs, as_stated, names, known)
-    begins = observe.check_start(runs, known, robot)
+    checked = checks.check_data(runs, as_stated, names, channel_noise)
+    begins = observe.check_start(runs, channel_noise, robot)
     return dataclasses.replace(
         found,
         names=names,

@@ -118,8 +118,8 @@ class Coordinates(eqx.Module):
 
     def value(self, z: Float[Array | np.ndarray, "... parameters"]) -> Any:
         """Parameters θ [SI] at coordinates z; NumPy in, NumPy out."""
-        xp, own = (np, jax.tree.map(np.asarray, self)) if isinstance(z, np.ndarray) else (jnp, self)
-        u = clip_softly(own.location + own.spread * z, own.low, own.high, SOFTNESS * own.spread)
+        xp, arrays = (np, jax.tree.map(np.asarray, self)) if isinstance(z, np.ndarray) else (jnp, self)
+        u = clip_softly(arrays.location + arrays.spread * z, arrays.low, arrays.high, SOFTNESS * arrays.spread)
         return xp.where(xp.asarray(self.scale), xp.exp(u), u)
 
     @property
@@ -128,9 +128,9 @@ class Coordinates(eqx.Module):
 
         For a log-normal prior m √(e^s² - 1) with median m, as a file's "m ± sd" is read.
         """
-        own = jax.tree.map(np.asarray, self)
-        size = np.exp(np.where(own.scale, own.location, 0.0))
-        return np.where(own.scale, size * np.sqrt(np.expm1(own.spread**2)), own.spread)
+        arrays = jax.tree.map(np.asarray, self)
+        size = np.exp(np.where(arrays.scale, arrays.location, 0.0))
+        return np.where(arrays.scale, size * np.sqrt(np.expm1(arrays.spread**2)), arrays.spread)
 
     def slope(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
         """dθ/dz [SI]."""
@@ -143,9 +143,9 @@ class Coordinates(eqx.Module):
 
     def beyond(self, z: np.ndarray) -> np.ndarray:
         """-1 or 1 if z is on or beyond its lower or upper bound, else 0; shape (parameters,)."""
-        own = jax.tree.map(np.asarray, self)
-        u = own.location + own.spread * z
-        return np.where(u <= own.low, -1, np.where(u >= own.high, 1, 0))
+        arrays = jax.tree.map(np.asarray, self)
+        u = arrays.location + arrays.spread * z
+        return np.where(u <= arrays.low, -1, np.where(u >= arrays.high, 1, 0))
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -259,7 +259,7 @@ def free_names(
         drive, chassis: further parameters that the data determine, see `Observer.free`.
     """
     present = set(configurations)
-    own = [
+    names = [
         name
         for c in robot.configurations
         if c in present
@@ -269,8 +269,8 @@ def free_names(
             *(f"{c}.{n}" for n in chassis if _has_nonzero(robot, c, n)),
         )
     ]
-    own = [n for n in own if _leader(robot, n) is None]
-    return (*_uncertain(robot, (*_drive(robot, (*BENCH, *drive)), *own)), *initial_state_names(robot))
+    names = [n for n in names if _leader(robot, n) is None]
+    return (*_uncertain(robot, (*_drive(robot, (*BENCH, *drive)), *names)), *initial_state_names(robot))
 
 
 def _leader(robot: Robot, name: str) -> str | None:

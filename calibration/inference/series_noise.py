@@ -64,13 +64,13 @@ def estimate_noise(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tup
     """
     measured = runs.measured()
     by_axis = {axis: series_along(runs, axis) for axis in sorted(runs.axes, key=lambda axis: axis != FIRST)}
-    found: list[SeriesNoise | None] = []
+    noises: list[SeriesNoise | None] = []
     for k, channel in enumerate(runs.channels):
         each = [_noise_of_channel(channel, measured[:, k], sizes[:, k], runs[a], a, s) for a, s in by_axis.items()]
         enough = [e for e in each if e is not None and e.freedom >= FEWEST]
         first = next((e for e in enough if e.axis == FIRST), None)
-        found.append(first or max(enough, key=lambda e: e.freedom, default=None))
-    return tuple(found)
+        noises.append(first or max(enough, key=lambda e: e.freedom, default=None))
+    return tuple(noises)
 
 
 def series_along(runs: Runs, axis: str) -> list[np.ndarray]:
@@ -95,8 +95,8 @@ def _noise_of_channel(
     """Noise as a mixture of two forms, a constant sd and a share of the reading, by their likelihood.
 
     A few series do not decide between the forms, and a pure share would give the smallest readings a far too large
-    weight. With four series of five, its smallest sd is too small by 3.7 in one table of twenty, that of the mean
-    by 2.2.
+    weight. With four series of five, its smallest sd is too small by a factor of 3.7 in one table of twenty; the
+    mixture's is too small by 2.2.
     """
     weights, used = _differences(measured, x, series)
     if not used:
@@ -125,19 +125,19 @@ def _noise_of_channel(
 def _differences(measured: np.ndarray, x: np.ndarray, series: list[np.ndarray]) -> tuple[np.ndarray, int]:
     """Difference of each reading from the line between its neighbours, as weights of all readings, shape
     (differences, rows); and the number of series with any."""
-    found, used = [], 0
+    differences, used = [], 0
     for rows in series:
         rows = rows[np.isfinite(measured[rows])]
         rows = rows[np.argsort(x[rows], kind="stable")]
-        before, at, after = rows[:-2], rows[1:-1], rows[2:]
+        before, middle, after = rows[:-2], rows[1:-1], rows[2:]
         wide = x[after] - x[before]
-        share = np.where(wide > 0, (x[after] - x[at]) / np.where(wide > 0, wide, 1.0), 0.5)
-        weights = np.zeros((len(at), len(measured)))
-        k = np.arange(len(at))
-        weights[k, at], weights[k, before], weights[k, after] = 1.0, -share, share - 1.0
-        found.append(weights)
-        used += bool(len(at))
-    return np.concatenate(found) if found else np.zeros((0, len(measured))), used
+        share = np.where(wide > 0, (x[after] - x[middle]) / np.where(wide > 0, wide, 1.0), 0.5)
+        weights = np.zeros((len(middle), len(measured)))
+        k = np.arange(len(middle))
+        weights[k, middle], weights[k, before], weights[k, after] = 1.0, -share, share - 1.0
+        differences.append(weights)
+        used += bool(len(middle))
+    return np.concatenate(differences) if differences else np.zeros((0, len(measured))), used
 
 
 def _without_wrong_readings(unit: np.ndarray) -> np.ndarray:

@@ -134,8 +134,8 @@ def window_function(share: np.ndarray, length: float) -> tuple[np.ndarray, np.nd
     s, c = np.sin(np.pi * share), np.cos(np.pi * share)
     inside = (share > 0) & (share < 1)
     rise = np.pi / length
-    found = s**4, 4 * rise * s**3 * c, 4 * rise**2 * s**2 * (3 * c**2 - s**2)
-    return tuple(np.where(inside, x, 0.0) for x in found)  # type: ignore[return-value]
+    derivatives = s**4, 4 * rise * s**3 * c, 4 * rise**2 * s**2 * (3 * c**2 - s**2)
+    return tuple(np.where(inside, x, 0.0) for x in derivatives)  # type: ignore[return-value]
 
 
 def windows_of_run(time: np.ndarray, usable: np.ndarray, broken: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -147,9 +147,9 @@ def windows_of_run(time: np.ndarray, usable: np.ndarray, broken: np.ndarray) -> 
     """
     if len(time) < 2:
         return []
-    usual, found = float(np.median(np.diff(time))), list[tuple[np.ndarray, np.ndarray]]()
+    usual, windows = float(np.median(np.diff(time))), list[tuple[np.ndarray, np.ndarray]]()
     if (FEWEST - 1) * usual > LONGEST:
-        return found
+        return windows
     starts = usable & (np.r_[True, ~usable[:-1]] | broken)
     piece = np.cumsum(starts)
     for k in np.unique(piece[usable]):
@@ -162,8 +162,8 @@ def windows_of_run(time: np.ndarray, usable: np.ndarray, broken: np.ndarray) -> 
         for begin in time[rows[0]] + np.linspace(0.0, whole - length, count):
             inside = rows[(time[rows] >= begin - 1e-9) & (time[rows] <= begin + length + 1e-9)]
             if len(inside) >= FEWEST - 1:
-                found.append((inside, (time[inside] - begin) / length))
-    return found
+                windows.append((inside, (time[inside] - begin) / length))
+    return windows
 
 
 def windows_of_log(problem: Problem, plan: Plan, rate: np.ndarray) -> list[Windows]:
@@ -174,29 +174,29 @@ def windows_of_log(problem: Problem, plan: Plan, rate: np.ndarray) -> list[Windo
     states = [k for k in (plan.current, plan.motion if plan.mechanical else -1, *plan.others) if k >= 0]
     moves = travel_directions(problem, plan, measured, sd, rate)
     late = _longest_delay(problem)
-    found = []
+    windows = []
     for r, every in enumerate(np.asarray(observe.rows_of)):
         rows = every[every >= 0]
         rows = rows[np.all(weight[rows][:, states] > 0, 1)]
         if len(rows) < FEWEST:
             continue
-        at, usable = time[rows], moves[rows] != 0
-        gap = np.r_[False, np.diff(at) > GAP * np.median(np.diff(at))]
+        times, usable = time[rows], moves[rows] != 0
+        gap = np.r_[False, np.diff(times) > GAP * np.median(np.diff(times))]
         turned = np.r_[False, np.diff(moves[rows]) != 0]
         broken = gap | turned
         for jump in _jumps(observe, r):
             # A reading at the instant of a jump still shows the state before it.
-            usable &= ~((at > jump + 1e-9) & (at <= jump + late + 1e-9))
-            broken |= np.r_[False, (at[:-1] <= jump + 1e-9) & (at[1:] > jump + 1e-9)]
-        made = windows_of_run(at, usable, broken)
-        step = np.gradient(at)
+            usable &= ~((times > jump + 1e-9) & (times <= jump + late + 1e-9))
+            broken |= np.r_[False, (times[:-1] <= jump + 1e-9) & (times[1:] > jump + 1e-9)]
+        made = windows_of_run(times, usable, broken)
+        step = np.gradient(times)
         whole = np.zeros((3, len(made), len(rows)))
         for k, (inside, share) in enumerate(made):
-            length = (at[inside[-1]] - at[inside[0]]) / max(share[-1] - share[0], 1e-12)
+            length = (times[inside[-1]] - times[inside[0]]) / max(share[-1] - share[0], 1e-12)
             whole[:, k, inside] = np.array(window_function(share, length)) * step[inside]
         if made:
-            found.append(Windows(rows, *whole))
-    return found
+            windows.append(Windows(rows, *whole))
+    return windows
 
 
 def _longest_delay(problem: Problem) -> float:

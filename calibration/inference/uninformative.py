@@ -43,7 +43,7 @@ def nothing_varies(runs: Runs, robot: Robot, noise: Noise) -> NothingVaries | No
 
 def copied_channels(runs: Runs, robot: Robot) -> list[Copied]:
     """Channels that are a linear function of another channel in all rows, to the digits of the file."""
-    found, copies = list[Copied](), set[str]()
+    copied, copies = list[Copied](), set[str]()
     names = [c for c in runs.channels if runs.has(c.column)]
     for one, other in itertools.combinations(names, 2):
         if {one.name, other.name} & copies:
@@ -52,8 +52,8 @@ def copied_channels(runs: Runs, robot: Robot) -> list[Copied]:
         both = np.isfinite(x) & np.isfinite(y)
         if (line := _line(x[both], y[both])) is not None:
             copies.add(other.name)
-            found.append(Copied(runs.source, other.column, one.column, *line, _tied(one, other, robot)))
-    return found
+            copied.append(Copied(runs.source, other.column, one.column, *line, _tied(one, other, robot)))
+    return copied
 
 
 def _tied(one: Channel, other: Channel, robot: Robot) -> bool:

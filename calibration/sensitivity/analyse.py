@@ -67,10 +67,10 @@ def analyse_sensitivity(
     if evaluations < LEAST:
         raise BadConfiguration(f"--evaluations: got {evaluations}; expected {LEAST} or more")
     study.tell(Step("points"))
-    found = local_derivatives(study)
-    if not any(np.isfinite(x).any() for x in found.value.values()):
-        raise BadConfiguration(_none_converges(study, found.statuses))
-    idle = inert_inputs(study, found, seed)
+    studies = local_derivatives(study)
+    if not any(np.isfinite(x).any() for x in studies.value.values()):
+        raise BadConfiguration(_none_converges(study, studies.statuses))
+    idle = inert_inputs(study, studies, seed)
     if idle.all():
         raise BadConfiguration(
             "--parameters: the derivative of every output by every input is zero; choose others, or change --outputs"
@@ -82,10 +82,10 @@ def analyse_sensitivity(
         study.tell(Step("sobol"))
         comparison = _compared(study, parts, sobol_indices(study, ~idle, evaluations, seed, second=False))
         study.evaluations, study.seconds, study.sampled = spent
-    outputs = {o.name: _study_of(o, study, found, parts.get(o.name)) for o in model.outputs}
+    outputs = {o.name: _study_of(o, study, studies, parts.get(o.name)) for o in model.outputs}
     if method != "local" and not any(s.studied.any() for s in outputs.values()):
         raise BadConfiguration(_none_converges(study, study.statuses()))
-    proposed = None if candidates is None else next_runs(study, found, candidates)
+    proposed = None if candidates is None else next_runs(study, studies, candidates)
     return SensitivityResult(
         method=method,
         model=model.fidelity,
@@ -94,7 +94,7 @@ def analyse_sensitivity(
         correlated=inputs.is_posterior,
         points=study.points,
         outputs=outputs,
-        statuses=found.statuses,
+        statuses=studies.statuses,
         sampled=study.statuses(),
         next_runs=proposed,
         evaluations=study.evaluations,
@@ -132,13 +132,13 @@ def _described(inputs: Inputs, idle: np.ndarray) -> dict[str, Input]:
     at = {
         q: inputs.values(x)[:, inputs.places][np.arange(len(inputs)), np.arange(len(inputs))] for q, x in rows.items()
     }
-    found = {}
+    described = {}
     for k, name in enumerate(inputs.names):
         kind = "uniform" if uniform[k] else "posterior" if inputs.is_posterior else inputs.parameters.kinds[k]
         axis = inputs.axes[name]
         interval = (float(at[-1][k]), float(at[1][k]))
-        found[name] = Input(axis.unit, axis.meaning, kind, float(at[0][k]), interval, float(sd[k]), bool(idle[k]))
-    return found
+        described[name] = Input(axis.unit, axis.meaning, kind, float(at[0][k]), interval, float(sd[k]), bool(idle[k]))
+    return described
 
 
 def _study_of(row: OutputRow, study: Study, found: Local, part: Part | None) -> OutputStudy:
@@ -181,14 +181,14 @@ def _study_of(row: OutputRow, study: Study, found: Local, part: Part | None) -> 
 
 def _compared(study: Study, bounds: dict[str, Part], sampled: dict[str, Part]) -> dict[str, dict[str, Any]]:
     """Comparison of derivative bounds with Sobol indices of the same points, by output."""
-    found: dict[str, dict[str, Any]] = {}
+    compared: dict[str, dict[str, Any]] = {}
     for name, bound in bounds.items():
         beside = sampled[name]
         if not bound.overall or not beside.overall:
             continue
         total, first = beside.overall["total"], beside.overall["first"]
         upper, lower = bound.overall["upper"], bound.overall["lower"]
-        found[name] = {
+        compared[name] = {
             "inputs": {
                 n: {
                     "lower": float(lower.value[k]),
@@ -202,7 +202,7 @@ def _compared(study: Study, bounds: dict[str, Part], sampled: dict[str, Part]) -
             "lower_holds": bool(np.all(lower.low <= first.high + 1e-12)),
             "largest_excess": float(np.max(upper.value - total.value)),
         }
-    return found
+    return compared
 
 
 def _none_converges(study: Study, statuses: dict[str, dict[str, int]]) -> str:

@@ -75,10 +75,10 @@ def local_derivatives(study: Study) -> Local:
 
 def _by_inputs(inputs: Inputs, by_columns: np.ndarray) -> np.ndarray:
     """Derivatives by inputs, shape (points, inputs), from those by columns; tied parameters follow their leader."""
-    own = by_columns[:, inputs.places].copy()
+    by_inputs = by_columns[:, inputs.places].copy()
     for j, (_, leader, ratio) in enumerate(inputs.parameters.tied):
-        own[:, leader] += ratio * by_columns[:, len(inputs.parameters) + j]
-    return own
+        by_inputs[:, leader] += ratio * by_columns[:, len(inputs.parameters) + j]
+    return by_inputs
 
 
 def _in_words(counts: dict[str, dict[str, int]]) -> dict[str, dict[str, int]]:

@@ -46,12 +46,12 @@ def _sampled(study: Study, unit: np.ndarray, which: np.ndarray) -> np.ndarray:
 
 def group_points(study: Study, moving: np.ndarray) -> dict[tuple[int, ...], list[int]]:
     """Points grouped by the inputs that act there."""
-    found: dict[tuple[int, ...], list[int]] = {}
+    groups: dict[tuple[int, ...], list[int]] = {}
     for k in range(len(study.points)):
         which = tuple(i for i in study.acting(k) if moving[i])
         if which:
-            found.setdefault(which, []).append(k)
-    return found
+            groups.setdefault(which, []).append(k)
+    return groups
 
 
 def correlated_inputs(inputs: Inputs, which: Sequence[int] | np.ndarray) -> tuple[int, ...]:
@@ -65,10 +65,10 @@ def correlated_inputs(inputs: Inputs, which: Sequence[int] | np.ndarray) -> tupl
     sd = np.sqrt(np.diagonal(covariance))
     linked = np.eye(len(inputs), dtype=bool)
     linked[:p, :p] |= np.abs(covariance) > LINKED * np.outer(sd, sd)
-    found = np.asarray(np.isin(np.arange(len(inputs)), which))
-    while (more := np.asarray(linked[found].any(0))).sum() > found.sum():
-        found = more
-    return tuple(map(int, np.flatnonzero(found)))
+    correlated = np.asarray(np.isin(np.arange(len(inputs)), which))
+    while (more := np.asarray(linked[correlated].any(0))).sum() > correlated.sum():
+        correlated = more
+    return tuple(map(int, np.flatnonzero(correlated)))
 
 
 def _blank(points: int, size: int) -> Estimate:
@@ -95,21 +95,21 @@ def sobol_indices(
         for k, made in study.sample(study.values_at(scores), group):
             spent[k] = len(design.points)
             for name in names:
-                found = sobol.sobol_terms(design, made[name])
+                output_terms = sobol.sobol_terms(design, made[name])
                 rows = design.size * design.replicates
-                lost[name][k] = 1.0 if found is None else found.lost / rows
-                if found is not None and lost[name][k] <= MOST_LOST:
-                    terms[name][k] = found.widened(which, d)
+                lost[name][k] = 1.0 if output_terms is None else output_terms.lost / rows
+                if output_terms is not None and lost[name][k] <= MOST_LOST:
+                    terms[name][k] = output_terms.widened(which, d)
     answer = {}
     for name in names:
         first, total, sd = _blank(points, d), _blank(points, d), np.full(points, np.nan)
         whole: sobol.Terms | None = None
-        for k, found in terms[name].items():
-            at = sobol.indices_of_terms(found)
-            _put(first, k, at.first)
-            _put(total, k, at.total)
-            sd[k] = np.sqrt(at.variance)
-            whole = found if whole is None else whole + found
+        for k, output_terms in terms[name].items():
+            indices = sobol.indices_of_terms(output_terms)
+            _put(first, k, indices.first)
+            _put(total, k, indices.total)
+            sd[k] = np.sqrt(indices.variance)
+            whole = output_terms if whole is None else whole + output_terms
         studied = np.array([k in terms[name] for k in range(points)])
         if whole is None:
             answer[name] = Part({}, {}, None, None, None, (), lost[name], studied)
@@ -205,15 +205,15 @@ def derivative_bounds(study: Study, moving: np.ndarray, seed: int) -> dict[str, 
         whole: derivative.Terms | None = None
         studied = np.zeros(points, bool)
         for k in map(int, np.flatnonzero(lost <= MOST_LOST)):
-            found = derivative.derivative_terms(scores, y[k], g[k], normal, replicates)
-            if found is None:
+            output_terms = derivative.derivative_terms(scores, y[k], g[k], normal, replicates)
+            if output_terms is None:
                 continue
-            at = derivative.index_bounds(found)
-            _put(lower, k, at.lower)
-            _put(upper, k, at.upper)
-            sd[k] = np.sqrt(at.variance)
+            bounds = derivative.index_bounds(output_terms)
+            _put(lower, k, bounds.lower)
+            _put(upper, k, bounds.upper)
+            sd[k] = np.sqrt(bounds.variance)
             studied[k] = True
-            whole = found if whole is None else whole + found
+            whole = output_terms if whole is None else whole + output_terms
         if whole is None:
             answer[name] = Part({}, {}, None, None, None, (), lost, studied)
             continue
@@ -250,21 +250,21 @@ def shapley_effects(study: Study, moving: np.ndarray, evaluations: int, seed: in
         values = _at_coordinates(study.inputs, z)
         for k, made in study.sample(values, group):
             for name in names:
-                found = shapley.shapley_terms(design, made[name])
-                lost[name][k] = 1.0 if found is None else found.lost
-                if found is not None and lost[name][k] <= MOST_LOST:
-                    terms[name][k] = found, which
+                output_terms = shapley.shapley_terms(design, made[name])
+                lost[name][k] = 1.0 if output_terms is None else output_terms.lost
+                if output_terms is not None and lost[name][k] <= MOST_LOST:
+                    terms[name][k] = output_terms, which
     answer = {}
     for name in names:
         shown, sd = _blank(points, d), np.full(points, np.nan)
         studied = np.zeros(points, bool)
         widened = []
-        for k, (found, which) in terms[name].items():
-            wide = np.zeros((len(found.parts), d))
-            wide[:, list(which)] = found.parts
-            widened.append(dataclasses.replace(found, parts=wide))
+        for k, (output_terms, which) in terms[name].items():
+            wide = np.zeros((len(output_terms.parts), d))
+            wide[:, list(which)] = output_terms.parts
+            widened.append(dataclasses.replace(output_terms, parts=wide))
             _put(shown, k, shapley.effects_of_terms(widened[-1]))
-            sd[k], studied[k] = np.sqrt(found.variance), True
+            sd[k], studied[k] = np.sqrt(output_terms.variance), True
         if not studied.any():
             answer[name] = Part({}, {}, None, None, None, (), lost[name], studied)
             continue

@@ -72,8 +72,8 @@ def default_outputs(robot: Robot, turns: bool) -> tuple[str, ...]:
         beside = ("power_supply",)
     elif robot.rig.imposed == "motor_speed":  # it stalls on no slope
         beside = tuple(name for name in DEFAULT if name != "steepest_slope")
-    known = known_outputs(robot)
-    return tuple(n for n in (*channels.names(robot.channels), *beside) if robot.knows(known[n].rests_on))
+    outputs = known_outputs(robot)
+    return tuple(n for n in (*channels.names(robot.channels), *beside) if robot.knows(outputs[n].rests_on))
 
 
 def chosen_outputs(words: tuple[str, ...], robot: Robot, turns: bool = False) -> tuple[OutputRow, ...]:
@@ -86,7 +86,7 @@ def chosen_outputs(words: tuple[str, ...], robot: Robot, turns: bool = False) ->
         BadConfiguration: an unknown name, with the choices; an output of a ground or stance that the robot lacks, of
             turns if it travels straight, or of straight travel if it turns.
     """
-    known, found = known_outputs(robot), []
+    outputs, chosen = known_outputs(robot), []
     start = tuple(d.name for d in derived.OF_START)
     of_turns = {*(o.name for o in derived.OF_TURNS), *(c.name for c in channels.OF_TURNS if c.settled)}
     for word in words or default_outputs(robot, turns):
@@ -96,9 +96,9 @@ def chosen_outputs(words: tuple[str, ...], robot: Robot, turns: bool = False) ->
                     f"--outputs {name}: the robot travels straight; vary the drive of its sides independently, e.g. "
                     f"--vary {OF_SIDES[0]}=0.2:0.8"
                 )
-            if name not in known:
-                raise BadConfiguration(f"--outputs {name}: no such output; {choices(name, [*known, 'start'])}")
-            if (row := known[name]) in derived.OF_GROUND and not robot.has_ground:
+            if name not in outputs:
+                raise BadConfiguration(f"--outputs {name}: no such output; {choices(name, [*outputs, 'start'])}")
+            if (row := outputs[name]) in derived.OF_GROUND and not robot.has_ground:
                 raise BadConfiguration(f"--outputs {name}: the robot's load is a shaft, which has no ground")
             if lacking := robot.unknown(row.rests_on):
                 raise BadConfiguration(
@@ -110,8 +110,8 @@ def chosen_outputs(words: tuple[str, ...], robot: Robot, turns: bool = False) ->
                 )
             if row in derived.OF_POSTURE and (why := cannot_stand(robot)):
                 raise BadConfiguration(f"--outputs {name}: {why}")
-            found.append(row)
-    return tuple(dict.fromkeys(found))
+            chosen.append(row)
+    return tuple(dict.fromkeys(chosen))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,10 +133,12 @@ class Model:
     @property
     def sources(self) -> dict[str, tuple[OutputRow, ...]]:
         """Outputs by source: the fidelity's name, or the module of derived ones."""
-        found: dict[str, list[OutputRow]] = {}
+        rows_of_source: dict[str, list[OutputRow]] = {}
         for output in self.outputs:
-            found.setdefault(output.module if isinstance(output, Derived) else self.fidelity, []).append(output)
-        return {source: tuple(rows) for source, rows in found.items()}
+            rows_of_source.setdefault(output.module if isinstance(output, Derived) else self.fidelity, []).append(
+                output
+            )
+        return {source: tuple(rows) for source, rows in rows_of_source.items()}
 
     def chunk(self, source: str, points: int, differentiated: bool = False) -> int:
         """Number of points in one call, for a number of all points."""
@@ -162,9 +164,9 @@ class Model:
 
     def joined(self, parts: Mapping[str, Answer]) -> Answer:
         """Outputs of all sources, in order."""
-        found = {name: x for part in parts.values() for name, x in part.values.items()}
+        values = {name: x for part in parts.values() for name, x in part.values.items()}
         statuses = {source: codes for part in parts.values() for source, codes in part.statuses.items()}
-        return Answer({o.name: found[o.name] for o in self.outputs}, statuses)
+        return Answer({o.name: values[o.name] for o in self.outputs}, statuses)
 
     def ignores(self, source: str) -> tuple[str, ...]:
         """Conditions without influence on any output of a source."""

@@ -65,17 +65,17 @@ def elementary_effects(points: np.ndarray, values: np.ndarray) -> Effects | None
         return None
     state = np.random.get_state()  # noqa: NPY002
     try:
-        found = analyze(_problem(points.shape[1]), points[kept], values[kept], num_levels=LEVELS, seed=0)
+        analysis = analyze(_problem(points.shape[1]), points[kept], values[kept], num_levels=LEVELS, seed=0)
     finally:
         np.random.set_state(state)  # noqa: NPY002
-    size = np.asarray(found["mu_star"], float)
+    size = np.asarray(analysis["mu_star"], float)
     elementary = _elementary(points[kept].reshape(-1, steps, points.shape[1]), by[finite])
     width = float(stats.t.ppf(0.5 + LEVEL / 2, int(finite.sum()) - 1)) / np.sqrt(finite.sum())
     error = width * np.abs(elementary).std(0, ddof=1)
     return Effects(
-        np.asarray(found["mu"], float),
+        np.asarray(analysis["mu"], float),
         Estimate(size, size - error, size + error),
-        np.asarray(found["sigma"], float),
+        np.asarray(analysis["sigma"], float),
         int(finite.sum()),
         int(count - finite.sum()),
     )
@@ -86,9 +86,9 @@ def _elementary(points: np.ndarray, values: np.ndarray) -> np.ndarray:
     moved = np.diff(points, axis=1)
     which = np.abs(moved).argmax(-1)
     change = np.diff(values, axis=1) / np.take_along_axis(moved, which[..., None], -1)[..., 0]
-    found = np.zeros_like(change)
-    np.put_along_axis(found, which, change, 1)
-    return found
+    effects = np.zeros_like(change)
+    np.put_along_axis(effects, which, change, 1)
+    return effects
 
 
 def _problem(inputs: int) -> dict[str, object]:

@@ -111,10 +111,10 @@ class Terms:
         first, total = (np.zeros((len(self.variance), inputs)) for _ in range(2))
         first[:, places], total[:, places] = self.first, self.total
         second = None
-        at = np.asarray(places)
+        columns = np.asarray(places)
         if self.second is not None:
             second = first[:, :, None] + first[:, None, :]  # without interaction
-            second[np.ix_(np.arange(len(second)), at, at)] = self.second
+            second[np.ix_(np.arange(len(second)), columns, columns)] = self.second
         return dataclasses.replace(self, first=first, total=total, second=second)
 
 

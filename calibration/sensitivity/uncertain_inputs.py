@@ -131,14 +131,16 @@ def default_input_names(
     wheels = [name for name in configurations if float(robot.configurations[name].on_tracks) < 0.5]
     out = tuple(f"{name}." for name in absent) + (() if battery else ("battery.",))
     guides = {f"{name}.{g}" for name in wheels for g in (priors.GUIDE_SHARE, priors.GUIDE_FRICTION)}
-    known = priors.parameters_by_name(robot)
-    left_out = {*guides, *fidelities.unread(model, known, turns), *robot.rig.exact}
+    by_name = priors.parameters_by_name(robot)
+    left_out = {*guides, *fidelities.unread(model, by_name, turns), *robot.rig.exact}
     if not robot.rig.inherits:  # parameters of another robot are not its own
         stated = {name for name, _, _ in robot.rig.priors}
-        left_out |= {name for name in known if name.startswith(_OTHERS) and name not in stated} | {*robot.rig.unknown}
+        left_out |= {name for name in by_name if name.startswith(_OTHERS) and name not in stated} | {
+            *robot.rig.unknown
+        }
     return tuple(
         name
-        for name, p in known.items()
+        for name, p in by_name.items()
         if not name.startswith(out) and name not in left_out and p.spec.prior_sd(float(p.value)) > 0
     )
 
@@ -156,9 +158,9 @@ def inputs_from_priors(robot: Robot, words: Sequence[str], ranges: Mapping[str, 
     names = list(
         dict.fromkeys(name for word in words for name in priors.expand_name(word, everything, "--parameters"))
     )
-    known = priors.parameters_by_name(robot)
+    by_name = priors.parameters_by_name(robot)
     for name in names:
-        if not known[name].spec.prior_sd(float(known[name].value)) > 0:
+        if not by_name[name].spec.prior_sd(float(by_name[name].value)) > 0:
             raise BadConfiguration(
                 f"--parameters {name}: its prior has no width (nominal value 0 with a relative sd), so nothing "
                 "depends on it; give it a value with --set, or leave it out"

@@ -50,14 +50,14 @@ def _margins(robot: Robot, rated: Ratings, points: Point, speeds: Array, wanted:
     """Margins by limit, shape (points, limits)."""
 
     def one(point: Point, wanted: Array) -> Array:
-        found, _ = travel(robot, point, rated)
-        turns = found["motor_speed_rpm"]
+        state, _ = travel(robot, point, rated)
+        turns = state["motor_speed_rpm"]
         each = [
-            found["adhesion"], jnp.clip(found["left"], -1.0, 1.0),
-            heat_left(robot, point, found["current"], rated.temperature),
-            1 - turns / speeds[0], 1 - turns / speeds[1], 1 - found["gearbox_Nm"] / rated.torque,
-            jnp.minimum(found["cell"] / rated.voltage_cutoff, 1.0),
-            jnp.where(wanted > 0, found["speed_m_s"] / jnp.where(wanted > 0, wanted, 1.0) - 1, 1.0),
+            state["adhesion"], jnp.clip(state["left"], -1.0, 1.0),
+            heat_left(robot, point, state["current"], rated.temperature),
+            1 - turns / speeds[0], 1 - turns / speeds[1], 1 - state["gearbox_Nm"] / rated.torque,
+            jnp.minimum(state["cell"] / rated.voltage_cutoff, 1.0),
+            jnp.where(wanted > 0, state["speed_m_s"] / jnp.where(wanted > 0, wanted, 1.0) - 1, 1.0),
         ]  # fmt: skip
         # At the limit of adhesion both margins are zero; it is assigned to adhesion.
         each[1] = jnp.where(each[0] <= each[1], 1.0, each[1])

@@ -132,8 +132,8 @@ def sizing_task(robot: Robot, asked: Requirements, options: Options) -> Task:
 
     demands = []
     for r in asked.each:
-        at = sheet.envelope_points(robot, r)
-        rows = [tuple(row(p) for p in corner) for corner in _corners(robot, r, at)]
+        envelope = sheet.envelope_points(robot, r)
+        rows = [tuple(row(p) for p in corner) for corner in _corners(robot, r, envelope)]
         demands.append(Demand(r, requirement_label(r), tuple(k for corner in dict.fromkeys(rows) for k in corner)))
     middle = row(_middle(robot, asked.envelope))
     travelling = sorted({k for d in demands if d.requirement and d.requirement.name in LASTING for k in d.rows})
@@ -192,10 +192,10 @@ def evaluate_design(asked: Task, design: Design) -> tuple[Array, Array]:
     Margins are shares of the required or permitted value; a requirement is met if its margin is not negative.
     """
     robot, ratings = build_robot(asked.robot, asked.base_mass, asked.configuration, design)
-    found = jax.vmap(lambda p: travel(robot, p, ratings)[0])(asked.points)
+    states = jax.vmap(lambda p: travel(robot, p, ratings)[0])(asked.points)
     mass = jnp.asarray(robot.configurations[asked.configuration].mass)
-    energy = found["energy_per_metre_Wh"][asked.middle] / 3600.0
-    margins = [_margin(asked, d, design, robot, ratings, found) for d in asked.demands]
+    energy = states["energy_per_metre_Wh"][asked.middle] / 3600.0
+    margins = [_margin(asked, d, design, robot, ratings, states) for d in asked.demands]
     objectives = jnp.stack([mass, energy, jnp.asarray(design.drive["cost"])])
     return objectives, jnp.stack(margins)
 
@@ -204,18 +204,18 @@ def _margin(
     asked: Task, d: Demand, design: Design, robot: Robot, ratings: Ratings, found: Mapping[str, Array]
 ) -> Array:
     rows = np.array(d.rows, int)
-    at = {key: x[rows] for key, x in found.items()}
+    states = {key: x[rows] for key, x in found.items()}
     points = jax.tree.map(lambda x: x[rows], asked.points)
-    travels = jnp.min(jnp.minimum(at["left"], 1.0))
-    above = jnp.min(jnp.minimum(at["cell"] / ratings.voltage_cutoff, 1.0))
+    travels = jnp.min(jnp.minimum(states["left"], 1.0))
+    above = jnp.min(jnp.minimum(states["cell"] / ratings.voltage_cutoff, 1.0))
     r = d.requirement
     if r is None:
         most = {
-            "winding": jnp.min(_heat(robot, points, at["current"], design.drive["temperature"])),
-            "motor_speed": 1 - jnp.max(at["motor_speed_rpm"]) / design.drive["speed_motor"],
-            "gearbox_speed": 1 - jnp.max(at["motor_speed_rpm"]) / design.drive["speed_gearbox"],
-            "gearbox_torque": 1 - jnp.max(at["gearbox_Nm"]) / design.drive["torque"],
-            "cell_current": 1 - jnp.max(jnp.where(points.battery > 0.5, at["battery"], 0.0))
+            "winding": jnp.min(_heat(robot, points, states["current"], design.drive["temperature"])),
+            "motor_speed": 1 - jnp.max(states["motor_speed_rpm"]) / design.drive["speed_motor"],
+            "gearbox_speed": 1 - jnp.max(states["motor_speed_rpm"]) / design.drive["speed_gearbox"],
+            "gearbox_torque": 1 - jnp.max(states["gearbox_Nm"]) / design.drive["torque"],
+            "cell_current": 1 - jnp.max(jnp.where(points.battery > 0.5, states["battery"], 0.0))
             / (jnp.exp(design.continuous[..., 2]) * design.cell["current"]),
         }  # fmt: skip
         return most[next(key for key, words in RATED.items() if words == d.label)]
@@ -225,22 +225,22 @@ def _margin(
     if r.name == "slope_deg":
         return jnp.minimum(travels, above)
     if r.name == "payload_kg":
-        hot = jnp.min(_heat(robot, points, at["current"], jnp.asarray(ratings.temperature)))
-        torque = 1 - jnp.max(at["gearbox_Nm"]) / ratings.torque
+        hot = jnp.min(_heat(robot, points, states["current"], jnp.asarray(ratings.temperature)))
+        torque = 1 - jnp.max(states["gearbox_Nm"]) / ratings.torque
         return jnp.min(jnp.stack([travels, above, hot, torque]))
     if r.name == "endurance_min":
-        return _endurance(r, robot, ratings, at)
+        return _endurance(r, robot, ratings, states)
     if r.limit is None:  # the rating of the parts, a demand on every design
         return jnp.minimum(travels, above)
-    if r.name not in at:  # a quantity that is not of straight travel
+    if r.name not in states:  # a quantity that is not of straight travel
         found_here = jax.vmap(lambda p: requirement(robot, p, ratings, r.name))(points)
         counts = jnp.where(found_here.outcome == CONVERGED, 1.0, -1.0)
         value, travels = found_here.value / r.quantity.factor, jnp.min(counts)
     else:
-        value = at[r.name] / r.quantity.factor
+        value = states[r.name] / r.quantity.factor
     share = jnp.min(value / _limit(r) - 1) if r.least else jnp.min(1 - value / _limit(r))
     if r.name == "winding_C":
-        share = jnp.min(_heat(robot, points, at["current"], jnp.asarray(_limit(r))))
+        share = jnp.min(_heat(robot, points, states["current"], jnp.asarray(_limit(r))))
     return jnp.min(jnp.stack([share, travels, above]))
 
 

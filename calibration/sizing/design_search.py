@@ -384,8 +384,8 @@ class _Search:
             self.problem, choice.designs(rows, x), jnp.asarray(choice.low[rows]), jnp.asarray(choice.high[rows]),
             jnp.asarray(weights), jnp.asarray(self.kept, float),
         ))  # fmt: skip
-        found = self.designs(rows, x)
-        best = np.argsort(_cost(found.f, found.g, self.kept, weights))[: REFINED * len(self.columns)]
+        designs = self.designs(rows, x)
+        best = np.argsort(_cost(designs.f, designs.g, self.kept, weights))[: REFINED * len(self.columns)]
         x[best] = self.refined(rows[best], x[best], weights[best], np.ones(3)).x
         return self.designs(rows, x)
 
@@ -396,11 +396,11 @@ class _Search:
         for c in self.columns:
             merit = np.where(np.isfinite(drawn.f[:, c]), np.log(drawn.f[:, c]) + misses, np.inf)
             ranked = np.array(list(dict.fromkeys(drawn.rows[np.argsort(merit)]))[:WHOLE])
-            own = np.eye(len(OBJECTIVES))[c]
-            more_rows, more_x, count = _best_buildable(self.problem, self.choice, ranked, self.kept, own)
+            one_objective = np.eye(len(OBJECTIVES))[c]
+            more_rows, more_x, count = _best_buildable(self.problem, self.choice, ranked, self.kept, one_objective)
             self.evaluated += count
             rows, x = np.concatenate([rows, more_rows]), np.concatenate([x, more_x])
-            w = np.concatenate([w, np.tile(own, (len(more_rows), 1))])
+            w = np.concatenate([w, np.tile(one_objective, (len(more_rows), 1))])
         return self.refined(rows, x, w, np.array([0.0, 1.0, 0.0]))
 
 

@@ -45,7 +45,7 @@ class Drive(NamedTuple):
 
 def drive_options(names: tuple[str, ...] = ()) -> tuple[Drive, ...]:
     """All motors of the sheets (or those named) with all sizes of gearbox that their source combines them with."""
-    found = []
+    options = []
     for motor in motors():
         if names and motor.name not in names:
             continue
@@ -55,8 +55,8 @@ def drive_options(names: tuple[str, ...] = ()) -> tuple[Drive, ...]:
                     (g for g in gearboxes() if (g.family, g.stages) == (family, stages)), key=lambda g: g.ratio
                 )
                 ratios = tuple(BELT_STAGE * g.ratio for g in ranked)
-                found.append(Drive(motor, family, int(stages), ratios, ranked[0]))
-    return tuple(found)
+                options.append(Drive(motor, family, int(stages), ratios, ranked[0]))
+    return tuple(options)
 
 
 def packable_cells() -> tuple[CellSheet, ...]:

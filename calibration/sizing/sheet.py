@@ -108,7 +108,7 @@ def with_ratings(robot: Robot, asked: Requirements) -> Requirements:
     Raises:
         BadConfiguration: the robot states no such rating.
     """
-    known = {
+    ratings_by_name = {
         "winding_C": robot.motor.temperature_limit, "motor_speed_rpm": robot.motor.speed_limit,
         "gearbox_speed_rpm": robot.gearbox.speed_limit, "gearbox_Nm": robot.gearbox.torque_limit,
     }  # fmt: skip
@@ -116,7 +116,7 @@ def with_ratings(robot: Robot, asked: Requirements) -> Requirements:
     for r in asked.each:
         limit = r.limit
         if limit is None:
-            stated = known[r.name]
+            stated = ratings_by_name[r.name]
             if stated is None:
                 raise BadConfiguration(f"{asked.source}, {r.name}: the robot states no rating; state a number")
             limit = stated / r.quantity.factor
@@ -227,8 +227,8 @@ def _quantity_over(
 
     def one(theta: Array, point: Point) -> tuple[Array, Array]:
         changed, changed_ratings = _changed(robot, rated, names, theta)
-        found = evaluate(changed, point, changed_ratings, name)
-        return found.value, found.outcome
+        quantity = evaluate(changed, point, changed_ratings, name)
+        return quantity.value, quantity.outcome
 
     return jax.vmap(lambda theta: jax.vmap(lambda p: one(theta, p))(at))(rows)
 
@@ -285,9 +285,9 @@ def _computed_name(requirement: Requirement) -> str:
 
 def changeable_parameters(robot: Robot, configuration: str) -> dict[str, params.Parameter]:
     """Parameters of a robot that a designer can change, by name, without cells."""
-    known = {p.name: p for p in params.walk(robot)}
+    by_name = {p.name: p for p in params.walk(robot)}
     names = (*CHANGEABLE, *(f"{configuration}.{n}" for n in OF_CONFIGURATION))
-    return {name: known[name] for name in names if name in known}
+    return {name: by_name[name] for name in names if name in by_name}
 
 
 def check_requirements(robot: Robot, asked: Requirements, *, changes: bool = True) -> tuple[Outcome, ...]:
@@ -306,15 +306,15 @@ def check_requirements(robot: Robot, asked: Requirements, *, changes: bool = Tru
         configuration = _configuration(robot, r.envelope)
         of_levers = OF_LEVERS if r.quantity.group == "posture" else ()
         held.append(_QuantityOfRobot(robot, r, (*changeable_parameters(robot, configuration), *of_levers, CELLS)))
-    found = [_outcome(h) for h in held]
+    outcomes = [_outcome(h) for h in held]
     if changes:
-        found = [o if o.met else _with_changes(h, o, held, found) for h, o in zip(held, found, strict=True)]
-    return tuple(found)
+        outcomes = [o if o.met else _with_changes(h, o, held, outcomes) for h, o in zip(held, outcomes, strict=True)]
+    return tuple(outcomes)
 
 
 def _present_values(held: _QuantityOfRobot) -> np.ndarray:
-    known = {p.name: float(p.value) for p in params.walk(held.robot)}
-    return np.array([held.robot.battery.cells if n == CELLS else known[n] for n in held.names], float)
+    value_of_name = {p.name: float(p.value) for p in params.walk(held.robot)}
+    return np.array([held.robot.battery.cells if n == CELLS else value_of_name[n] for n in held.names], float)
 
 
 def _outcome(held: _QuantityOfRobot) -> Outcome:
@@ -339,38 +339,40 @@ def _corner(held: _QuantityOfRobot, k: int) -> dict[str, Any]:
         PAYLOAD: ("payload_kg", at.payload), SLOPE: ("slope_deg", at.slope_deg), AMBIENT: ("ambient_C", at.ambient),
         CHARGE: ("state_of_charge" if e.battery else "supply_voltage_V", at.charge),
     }  # fmt: skip
-    found: dict[str, Any] = {known[a][0]: round(float(np.asarray(known[a][1])[k]), 9) for a in r.quantity.axes}
+    corner: dict[str, Any] = {known[a][0]: round(float(np.asarray(known[a][1])[k]), 9) for a in r.quantity.axes}
     if r.name == "endurance_min":
         low = e.charge_end
-        found |= {
+        corner |= {
             "duty": "driving" if r.share else "standing",
             "share": r.share,
             "state_of_charge": [low, e.charge[1]],
         }
     if r.name == STAIRS:
-        found[TREAD] = r.tread_mm
-    return {"configuration": _configuration(held.robot, e), "surface": e.surface, **found}
+        corner[TREAD] = r.tread_mm
+    return {"configuration": _configuration(held.robot, e), "surface": e.surface, **corner}
 
 
 def _with_changes(
     held: _QuantityOfRobot, outcome: Outcome, every: Sequence[_QuantityOfRobot], now: Sequence[Outcome]
 ) -> Outcome:
-    found = _changes(held, outcome)
-    if not found:
+    changes = _changes(held, outcome)
+    if not changes:
         return outcome
-    rows = np.stack([_with_value(held, c.parameter, c.after) for c in found])
-    broken: list[list[str]] = [[] for _ in found]
+    rows = np.stack([_with_value(held, c.parameter, c.after) for c in changes])
+    broken: list[list[str]] = [[] for _ in changes]
     for other, before in zip(every, now, strict=True):
         if other is held or not before.met:
             continue
         # Another configuration has other names; names in common are changed.
-        own = np.tile(_present_values(other), (len(rows), 1))
+        present = np.tile(_present_values(other), (len(rows), 1))
         for k, name in enumerate(held.names):
             if name in other.names:
-                own[:, other.names.index(name)] = rows[:, k]
-        for names, margin in zip(broken, other.worst(own), strict=True):
+                present[:, other.names.index(name)] = rows[:, k]
+        for names, margin in zip(broken, other.worst(present), strict=True):
             names += [other.requirement.name] if margin < 0 else []
-    with_breaks = [dataclasses.replace(c, breaks=tuple(dict.fromkeys(b))) for c, b in zip(found, broken, strict=True)]
+    with_breaks = [
+        dataclasses.replace(c, breaks=tuple(dict.fromkeys(b))) for c, b in zip(changes, broken, strict=True)
+    ]
     order = sorted(with_breaks, key=lambda c: (len(c.breaks) > 0, abs(math.log(c.after / c.before))))
     return dataclasses.replace(outcome, change=tuple(order))
 
@@ -401,13 +403,13 @@ def _changes(held: _QuantityOfRobot, outcome: Outcome) -> list[Change]:
         )
     )
     slopes = slopes / held.requirement.quantity.factor * (1 if held.requirement.least else -1)
-    known = {p.name: p for p in params.walk(held.robot)}
-    found = []
+    by_name = {p.name: p for p in params.walk(held.robot)}
+    changes = []
     for k, name in enumerate(names):
         if name == CELLS:
             bounds, unit = (1.0, 100.0), "-"
         else:
-            bounds, unit = known[name].spec.bounds, known[name].spec.unit
+            bounds, unit = by_name[name].spec.bounds, by_name[name].spec.unit
         if now[k] <= 0:
             continue
         low, high = max(bounds[0], REACH[0] * now[k]), min(bounds[1], REACH[1] * now[k])
@@ -420,8 +422,8 @@ def _changes(held: _QuantityOfRobot, outcome: Outcome) -> list[Change]:
         if options:
             after = min(options, key=lambda v: abs(math.log(v / now[k])))
             sense = 1 if held.requirement.least else -1
-            found.append(Change(name, float(now[k]), after, unit, float(sense * slopes[k])))
-    return found
+            changes.append(Change(name, float(now[k]), after, unit, float(sense * slopes[k])))
+    return changes
 
 
 def _nearest(held: _QuantityOfRobot, name: str, begin: float, end: float) -> float | None:

@@ -85,9 +85,9 @@ def settled_ends(problem: Problem) -> Ends:
     measured, sd, weight = (np.asarray(x) for x in (data.measured, data.sd, data.weight))
     time = np.asarray(observe.time)
     every = [s for run in observe.stretches() for s in run]
-    found = [s for s in every if s.whole or (s.driven and len(s.after(time, 1 - END)) >= FEWEST)] or every[:1]
-    mean, error, shown = (np.full((len(found), measured.shape[1]), np.nan) for _ in range(3))
-    for k, stretch in enumerate(found):
+    ends = [s for s in every if s.whole or (s.driven and len(s.after(time, 1 - END)) >= FEWEST)] or every[:1]
+    mean, error, shown = (np.full((len(ends), measured.shape[1]), np.nan) for _ in range(3))
+    for k, stretch in enumerate(ends):
         end = stretch.after(time, 1 - END) if stretch.driven else stretch.rows[:0]
         for c in range(measured.shape[1]):
             these = end[weight[end, c] > 0]
@@ -103,10 +103,10 @@ def settled_ends(problem: Problem) -> Ends:
                 error[k, c] = max(noise / 2, FLOOR * size)
     conditions = observe.conditions
     if observe.varying:
-        rows = np.array([s.rows[0] for s in found])
+        rows = np.array([s.rows[0] for s in ends])
         conditions = jax.tree.map(lambda x: x[rows], observe.of_rows)
     # Ends that are not driven forwards have no readings here, so any conditions of steady travel are possible.
-    driven = jnp.asarray([s.driven for s in found])
+    driven = jnp.asarray([s.driven for s in ends])
     conditions = dataclasses.replace(
         conditions,
         voltage=jnp.where(driven, conditions.voltage, 24.0),
@@ -132,8 +132,8 @@ def starts_from_settled_ends(
         [ends, np.where(friction, _spread_over_surfaces(problem, draws), ends[0]), 0 * ends[:1], draws]
     )
     blunt = _with_blunt_instruments(problem)
-    found = search(blunt, _recombined(blunt, points)[:SEARCHES], STEPS_BLUNT)
-    ended = np.asarray(found.z)[np.argsort(np.asarray(found.cost))]
+    optima = search(blunt, _recombined(blunt, points)[:SEARCHES], STEPS_BLUNT)
+    ended = np.asarray(optima.z)[np.argsort(np.asarray(optima.cost))]
     best = _recombined(blunt, ended)[:1]
     return _distinct_points(np.concatenate([best, _with_peaked_friction(problem, best[0]), ended]))
 
@@ -147,10 +147,10 @@ def _with_peaked_friction(problem: Problem, z: np.ndarray) -> np.ndarray:
     c, out, every = problem.coordinates, [], z.copy()
     value, nominal = np.asarray(c.value(z)), np.asarray(c.value(np.zeros(len(c))))
     for name in problem.base.configurations:
-        own = [f"{name}.{x}" for x in (*GRIP, *SLIDING)]
-        if not set(own[:3]) <= set(c.names):
+        names = [f"{name}.{x}" for x in (*GRIP, *SLIDING)]
+        if not set(names[:3]) <= set(c.names):
             continue
-        static, creep, dynamic, *sliding = (c.names.index(n) for n in own if n in c.names)
+        static, creep, dynamic, *sliding = (c.names.index(n) for n in names if n in c.names)
         rise = value[dynamic] / nominal[dynamic] * nominal[static] / value[static]
         new = {static: value[static] * rise, creep: value[creep] * rise}
         new |= {k: new[creep] * nominal[k] / nominal[creep] for k in sliding}
@@ -178,10 +178,10 @@ def _recombined(problem: Problem, points: np.ndarray) -> np.ndarray:
     mixed = np.tile(points[int(np.argmin(by_run.sum(1)))], (len(points), 1))
     which = np.asarray(problem.observe.conditions.configuration)
     for k, name in enumerate(problem.base.configurations):
-        own = [j for j, n in enumerate(problem.coordinates.names) if n.startswith(f"{name}.")]
-        if own and (which == k).any():
+        columns = [j for j, n in enumerate(problem.coordinates.names) if n.startswith(f"{name}.")]
+        if columns and (which == k).any():
             order = np.argsort(by_run[:, which == k].sum(1), kind="stable")
-            mixed[:, own] = points[order][:, own]
+            mixed[:, columns] = points[order][:, columns]
     return mixed
 
 

@@ -301,11 +301,12 @@ class Histories(Observer):
                     "a run has one configuration, so give each its own run_id"
                 )
             if runs.has("total_mass_kg"):
-                own = runs["total_mass_kg"][mine] - runs["payload_kg"][mine]
-                if np.ptp(own) > ROUNDING:
+                empty = runs["total_mass_kg"][mine] - runs["payload_kg"][mine]
+                if np.ptp(empty) > ROUNDING:
                     raise BadData(
                         f"{runs.source}, total_mass_kg: run {name or '(no run_id)'} changes by "
-                        f"{number(np.ptp(own))} kg apart from its payload; within a run only payload_kg may change it"
+                        f"{number(np.ptp(empty))} kg apart from its payload; "
+                        "within a run only payload_kg may change it"
                     )
         _check_signs(runs)
         thinned: list[Note | str] = []
@@ -419,10 +420,10 @@ class Histories(Observer):
         every = _Probed.of(robot, probes, effects)
         clock = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.knots]]
         rows = jnp.where(self.rows_of < 0, 0, self.rows_of)
-        known = self.following(robot).known
-        assert known is not None
+        followed_signals = self.following(robot).known
+        assert followed_signals is not None
         # One run at a time: each has a wide array, by its knots.
-        given = self.conditions, clock, self.instant[rows], known, self.times, self.time[rows]
+        given = self.conditions, clock, self.instant[rows], followed_signals, self.times, self.time[rows]
         knots, by_effects = jax.lax.map(lambda of_run: every.changes(*of_run, delayed=self.delayed), given)
         return jnp.moveaxis(knots, 0, 1), by_effects
 
@@ -435,8 +436,8 @@ class Histories(Observer):
 
     def whole(self, robot: Robot) -> Signals:
         """Signals of each run at each instant, shape (runs, instants)."""
-        found = jax.vmap(lambda c, t, k: histories(robot, c, t, k))(self.conditions, self.times, self.known)
-        return jax.tree.map(lambda x: jnp.broadcast_to(x, self.times.shape), found)
+        whole_runs = jax.vmap(lambda c, t, k: histories(robot, c, t, k))(self.conditions, self.times, self.known)
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, self.times.shape), whole_runs)
 
     def at_rows(self, whole: Signals) -> Signals:
         """Signals at each row."""
@@ -486,14 +487,14 @@ class Histories(Observer):
         rows = self.of_rows
         braked = np.zeros(len(rows.voltage)) if rows.load_torque is None else _merge_levels(rows.load_torque)
         if rows.voltage_follows:
-            own = "motor_current" if rows.motor_speed is None else "motor_speed"
-            levels = _merge_levels(getattr(rows, own))
+            driven_channel = "motor_current" if rows.motor_speed is None else "motor_speed"
+            levels = _merge_levels(getattr(rows, driven_channel))
             which = np.stack([rows.configuration, levels, rows.slope_deg, rows.payload, braked], 1)
             cases = np.unique(which[levels != 0], axis=0, return_index=True)[1]
             cases = np.flatnonzero(levels != 0)[cases] if len(cases) else np.arange(1)
             held = {} if rows.motor_speed is None else {"motor_acceleration": np.zeros_like(levels)}
             held |= {} if rows.load_torque is None else {"load_torque": braked}
-            steady = dataclasses.replace(rows, **{own: levels}, **held)
+            steady = dataclasses.replace(rows, **{driven_channel: levels}, **held)
             return _conditions_of_rows(steady, cases)
         applied = np.where(rows.open > 0.5, 0.0, rows.voltage * rows.duty)
         some = np.flatnonzero(applied != 0) if (applied != 0).any() else np.arange(1)
@@ -686,23 +687,23 @@ class Histories(Observer):
             evaluate = _evaluator(problem, weights, active)
             return search_rollouts(evaluate, starts, data, weights, steps, self.policy.batch, rivals=rivals)
 
-        found = searched(starts)
-        near = np.asarray(found[0].cost) < np.nanmin(found[0].cost) + NEAR
-        if most is None and np.any(near & ~np.asarray(found[0].converged)):  # a proposal has to be an optimum
-            found = searched(np.asarray(found[0].z))
+        optima = searched(starts)
+        near = np.asarray(optima[0].cost) < np.nanmin(optima[0].cost) + NEAR
+        if most is None and np.any(near & ~np.asarray(optima[0].converged)):  # a proposal has to be an optimum
+            optima = searched(np.asarray(optima[0].z))
         if not rivals or not scans.scanned_coordinates(problem):
-            return found
-        k = int(np.nanargmin(found[0].cost))
+            return optima
+        k = int(np.nanargmin(optima[0].cost))
         one = lambda x: jax.tree.map(lambda leaf: leaf[k], x)  # noqa: E731
         data = dataclasses.replace(problem.data, weight=weights[k])
         best = scans.search_lower_basins(
             problem,
-            one(found),
+            one(optima),
             data,
             lambda z: one(searched(np.tile(z, (len(starts), 1)))),
             lambda _: None,
         )
-        return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), found, best)
+        return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), optima, best)
 
     def observed(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
         return self.at(problem, z, active)[2]
@@ -774,11 +775,11 @@ def _drive_jumps(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[tuple[np.
     # An imposed speed determines the current; a linear drive does not jump; an unknown drive is refused later.
     known = rig.imposed != "motor_speed" and rig.between_rows == "held" and np.isfinite(driven).all() and driven.any()
     coasts = runs["mode"] == "coast" if runs.has("mode") else np.zeros(len(runs), bool)
-    driven, found = driven if known else np.zeros(len(runs)), []
+    driven, jumps = driven if known else np.zeros(len(runs)), []
     for rows in each:
         sizes = np.maximum(_relative_jumps(driven[rows]), coasts[rows][1:] != coasts[rows][:-1])
-        found.append((time[rows[1:]][sizes > 0], sizes[sizes > 0]))
-    return found
+        jumps.append((time[rows[1:]][sizes > 0], sizes[sizes > 0]))
+    return jumps
 
 
 def _conditions_over_time(
@@ -852,24 +853,24 @@ def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
     if robot.rig.start == "rest" or not runs.sampled:
         return robot
     measured = runs.measured()
-    found, known = dict[str, Begin](), []
+    begins, stated = dict[str, Begin](), []
     rows = runs.configurations(robot)
     for name in np.unique(runs.run_names):
         mine = runs.in_order(name)
         key = initial_state_name(str(name))
-        at: dict[str, tuple[float, float]] = {}
+        state: dict[str, tuple[float, float]] = {}
         for k, channel in enumerate(runs.channels):
             field = "motor_speed" if channel.settled else "angle"
             finite = mine[np.isfinite(measured[mine, k])][:FIRST_SAMPLES]
-            if channel.zero_at_rest and field not in at and len(finite):
+            if channel.zero_at_rest and field not in state and len(finite):
                 factor = 1 / _shown_of_unit(robot, int(rows[mine[0]]), channel)
                 value, sd = _extrapolated(runs["time_s"][finite] - runs["time_s"][mine[0]], measured[finite, k])
                 least = float(np.median(noise.sd[finite, k]))
-                at[field] = factor * value, abs(factor) * max(sd, least)
-        found[key] = Begin(**{field: value for field, (value, _) in at.items()})
-        known += [(f"rig.{key}.{field}", value, sd) for field, (value, sd) in at.items()]
-    priors = (*robot.rig.priors, *known) if robot.rig.start == "free" else robot.rig.priors
-    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, begins=Begins(found), priors=priors))
+                state[field] = factor * value, abs(factor) * max(sd, least)
+        begins[key] = Begin(**{field: value for field, (value, _) in state.items()})
+        stated += [(f"rig.{key}.{field}", value, sd) for field, (value, sd) in state.items()]
+    priors = (*robot.rig.priors, *stated) if robot.rig.start == "free" else robot.rig.priors
+    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, begins=Begins(begins), priors=priors))
 
 
 def _shown_of_unit(robot: Robot, configuration: int, channel: Channel) -> float:
@@ -952,9 +953,9 @@ def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) ->
 def _drive_changes(runs: Runs, rows: np.ndarray, share: float = 0.0) -> np.ndarray:
     """True for rows of a run with a change of its drive (of the motors' supply: above a share of its largest)."""
     supplied = (runs.layout.imposed_column, SUPPLY, "duty")
-    found = differs(rows, (runs[column] for column in changing(runs) if column not in supplied))
-    found[1:] |= _relative_jumps(applied(runs)[rows]) > share
-    return found
+    changes = differs(rows, (runs[column] for column in changing(runs) if column not in supplied))
+    changes[1:] |= _relative_jumps(applied(runs)[rows]) > share
+    return changes
 
 
 def _relative_jumps(driven: np.ndarray) -> np.ndarray:
@@ -1096,8 +1097,8 @@ def _evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Ev
 
     def some(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
         filled = np.resize(np.arange(len(members)), TOGETHER)
-        own = None if active is None else np.asarray(active)[members[filled]]
-        return jax.device_get(_evaluate(problem, z[filled], weights[members[filled]], own)[:3])
+        slots = None if active is None else np.asarray(active)[members[filled]]
+        return jax.device_get(_evaluate(problem, z[filled], weights[members[filled]], slots)[:3])
 
     def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
         parts = [(z[k : k + TOGETHER], members[k : k + TOGETHER]) for k in range(0, len(members), TOGETHER)]

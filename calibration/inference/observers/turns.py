@@ -95,8 +95,8 @@ class SettledTurns(SettledRuns):
         first = fidelities.NAMES[0]
         if fidelity not in (None, first):
             raise BadConfiguration(f"{runs.source}: settled turns are fitted with --model {first}; got {fidelity}")
-        found = super().of(runs, robot, fidelity)
-        return cls(found.conditions, found.fidelity)
+        observer = super().of(runs, robot, fidelity)
+        return cls(observer.conditions, observer.fidelity)
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
