@@ -40,7 +40,7 @@ def test_outputs_of_turns_are_refused_of_straight_travel_with_what_turns_it(name
 
 @pytest.mark.parametrize("name", ["start", "peak_current", "steepest_slope"])
 def test_outputs_of_straight_travel_are_refused_of_turns(name):
-    with pytest.raises(BadConfiguration, match=f"--outputs {name}: of straight travel"):
+    with pytest.raises(BadConfiguration, match=f"--outputs {name}: only for straight travel"):
         chosen_outputs((name,), TURNS, turns=True)
 
 
