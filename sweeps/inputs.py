@@ -146,7 +146,7 @@ def read_runs(
     if not series:
         from calibration.inference import observers
 
-        observers.kind(runs).check_settled(runs)
+        observers.observer_kind(runs).check_settled(runs)
     runs.configurations(robot)
     for note in runs.notes:
         tell(note)

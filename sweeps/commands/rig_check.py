@@ -20,7 +20,7 @@ from calibration.data.writing import finite
 from calibration.described import described, sentences
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.fit_notes import Determination
-from calibration.inference.fit_posterior import undetermined
+from calibration.inference.fit_posterior import undetermined_names
 from calibration.inference.foresight import Determined, Foresight
 from mmrjax.errors import counted
 from mmrjax.model import channels
@@ -187,7 +187,7 @@ class RigCheck:
         if self.foresight is None:
             return "Without data: give a table to see what it can determine."
         pairs = self.foresight.together
-        held = undetermined([p.name for p in self.foresight.parameters if p.held], pairs)
+        held = undetermined_names([p.name for p in self.foresight.parameters if p.held], pairs)
         traded = {name for pair in pairs for name in (pair.one, pair.other)}
         told = [p.name for p in self.foresight.parameters if not p.held and p.name not in traded]
         told += [fit_words.combination(p) for p in pairs]
@@ -245,7 +245,7 @@ def _source(word: str, channel: Channel) -> str:
 
 def _program(robot: Robot, origin: Origin) -> str:
     """A number stated without ±, with the width that the program gives it where a fit frees it."""
-    sd = float(priors.coordinates(robot, (origin.name,)).prior_sd[0])
+    sd = float(priors.parameter_coordinates(robot, (origin.name,)).prior_sd[0])
     return f"{origin.name} (±{100 * sd / abs(origin.value):.2g} %)"
 
 
@@ -302,7 +302,7 @@ def examined(file: Path, data: str | None, effects: tuple[str, ...] = ()) -> Rig
     if data is None:
         return found
     runs = read_runs(data, robot, measured=True, series=True)
-    seen = foresight.foresee(runs, robot)
+    seen = foresight.predict_identifiability(runs, robot)
     doubts = (*filter(None, (settling.doubtful_sign(runs),)), *rig_facts.doubts(runs, robot), *sentences(seen.doubts))
     return dataclasses.replace(found, runs=runs, foresight=seen, doubts=doubts)
 
