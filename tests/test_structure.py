@@ -236,13 +236,10 @@ def channels_are_counted_in_one_place(path: PurePosixPath, tree: ast.Module) -> 
                 yield node.lineno, "spells several channels"
 
 
-#: Who knows the configurations of the paper's robot, beside its reproduction: tables, that robot, and of the reader
-#: of robot files its import and the names that files formerly had.
+#: Who knows the configurations of the paper's robot, beside its reproduction: tables and that robot.
 CONFIGURED = {
     "mmrjax/model/paper_tables.py",
     "mmrjax/model/paper_robots.py",
-    "calibration/data/robot_file.py:",
-    "calibration/data/robot_file.py:OLD_NAMES",
 }
 
 
@@ -606,7 +603,6 @@ GOOD = {
     "mmrjax/model/paper_tables.py": "TRACKED, WHEELED = '6T2A', '4W2T'\n",
     "calibration/__init__.py": "",
     "calibration/data/table.py": "'''On 6T2A and 4W2T.'''\ndef f(t):\n    return {'time_s': t['time_s'], 'row': 1}\n",
-    "calibration/data/robot_file.py": "from tables import TRACKED\nOLD_NAMES = {'tracked': TRACKED}\n",
     "calibration/sizing/said.py": "def why(x):\n    return f'{x} is one two three four five six'\ndef f(x, y):\n"
     "    '''One two three four five six.'''\n    cure = 'one two three four five six' if y else 'seven'\n"
     "    if x:\n        raise BadData(why(x))\n    return BadConfiguration(f'one two three {x} four five six {cure}')\n",

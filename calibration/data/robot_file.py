@@ -6,9 +6,9 @@ import dataclasses
 import difflib
 import json
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import jax.numpy as jnp
 
@@ -25,17 +25,10 @@ from mmrjax.effects.scaled import scaled
 from mmrjax.errors import some
 from mmrjax.model import paper_robots, params, power
 from mmrjax.model.driver import DECAYS
-from mmrjax.model.paper_tables import TRACKED, WHEELED
 from mmrjax.model.robot import Configurations, Robot
 from mmrjax.model.shaft import Shaft
 
-T = TypeVar("T")
-
 SCHEMA = "mmrjax.robot/2"
-#: Schemas that are read; in the first, configurations had the names of OLD_NAMES.
-SCHEMAS = ("mmrjax.robot/1", SCHEMA)
-#: Former name of a configuration's parameters, and the configuration.
-OLD_NAMES = {"tracked": TRACKED, "wheeled": WHEELED}
 #: Whole numbers of a robot, which no fit can free: least, greatest, meaning.
 COUNTS = {
     "sides": (1, 12, "(motors driven alike)"),
@@ -118,7 +111,7 @@ def find(name_or_path: str, library: Library = effects.BY_NAME, notes: list[str]
     """A robot by its name (`nominal`, `sm1`, `sm2`) or from a TOML file, with effects of `library`.
 
     Args:
-        notes: is given a sentence for each former name that stands for a new one.
+        notes: receives a sentence for each value that is allowed and unlikely.
 
     Raises:
         BadConfiguration: no such name or file, or what `parse` raises.
@@ -165,7 +158,7 @@ def parse(path: Path, library: Library = effects.BY_NAME, notes: list[str] | Non
             'base = "nominal"'
         )
     schema = content.pop("schema", SCHEMA)
-    if schema not in SCHEMAS:
+    if schema != SCHEMA:
         raise BadConfiguration(f"{path.name}, schema: got {schema}; expected {SCHEMA}")
     base = content.pop("base", "nominal")
     if base not in (*paper_robots.ROBOTS, rig_file.NONE):
@@ -274,46 +267,6 @@ def with_effects(
     return dataclasses.replace(robot, effects=tuple(present))
 
 
-def current_names(names: Iterable[str], robot: Robot, notes: list[str] | None = None) -> list[str]:
-    """Names of parameters, or of groups ending in `.*`, with former names of configurations brought up to date.
-
-    A former name stands for the configuration of OLD_NAMES where the robot has that one, and none of the former name.
-
-    Args:
-        notes: is given a sentence for each former name of a configuration.
-    """
-    found: list[str] = []
-    changed: dict[str, list[str]] = {}
-    for name in names:
-        head, dot, rest = name.partition(".")
-        new = OLD_NAMES.get(head, "")
-        if dot and new in robot.configurations and head not in robot.configurations:
-            changed.setdefault(head, []).append(f"{name} is now {new}.{rest}")
-            name = f"{new}.{rest}"
-        found.append(name)
-    for head, sentences in changed.items():
-        others = f", and so with {len(sentences) - 1} more of {head}" if len(sentences) > 1 else ""
-        if notes is not None:
-            notes.append(f"{sentences[0]}{others}")
-    return found
-
-
-def current_values(values: Mapping[str, T], robot: Robot, where: str, notes: list[str] | None = None) -> dict[str, T]:
-    """What is stated of parameters, by their names as `current_names` brings them up to date.
-
-    Args:
-        where: opens the message of an error; notes: as for `current_names`.
-
-    Raises:
-        BadConfiguration: a parameter is stated by its former and its new name.
-    """
-    names = current_names(values, robot, notes)
-    for old, name in zip(values, names, strict=True):
-        if names.count(name) > 1:
-            raise BadConfiguration(f"{where}, {old}: its new name {name} is stated too; state it once")
-    return dict(zip(names, values.values(), strict=True))
-
-
 def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str] | None = None) -> Robot:
     """The robot with parameters replaced, each checked; `sides`, `battery.cells`, RATINGS, SWITCHES and CHOICES too.
 
@@ -323,7 +276,7 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
     Raises:
         BadConfiguration: as `parse`.
     """
-    stated = current_values(values, robot, where, notes)
+    stated = dict(values)
     counts = {name: _count(where, name, stated.pop(name)) for name in COUNTS if name in stated}
     ratings: dict[str, Any] = {name: _rating(where, name, stated.pop(name)) for name in RATINGS if name in stated}
     if CURVE & stated.keys() and "battery.capacity" in stated:  # all of one cell, unless it is said otherwise

@@ -286,7 +286,7 @@ def prepared(
         if isinstance(note, NothingVaries) or (isinstance(note, Copied) and not note.tied):
             raise BadData(sentence(note))
     at_first = (*ready.foreign, *ready.doubted)
-    said: Notes = (*notes, *ready.former, *ready.checked, *ready.begins, *ready.weighed, *at_first)
+    said: Notes = (*notes, *ready.checked, *ready.begins, *ready.weighed, *at_first)
     turned = scales.turned_in(distinct, ready.robot)
     own = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
     library = {**library, **kind.library, **own}

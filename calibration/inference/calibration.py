@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import robot_file, surfaces
+from calibration.data import surfaces
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
@@ -110,9 +110,9 @@ def calibrate(
     solver = solvers.solver(solver) if isinstance(solver, str) else solver
     runs, told = thinned(runs.of(robot), rows), in_words(tell)
     plan = _planned(runs, model, starts, profiles, blocks)
-    choose = functools.partial(_free_names, runs, plan, free, fix, tell)
+    choose = functools.partial(_free_names, runs, plan, free, fix)
     ready = prepare(runs, robot, noise, stated, assume=False, choose=choose)
-    for note in (*ready.former, *ready.foreign, *ready.doubted):
+    for note in (*ready.foreign, *ready.doubted):
         told(note)
     base, of_product = _guided(runs, ready, plan)
     setting = _Setting(runs, plan, ready, base, of_product)
@@ -161,7 +161,6 @@ def _free_names(
     plan: _Plan,
     free: Sequence[str],
     fix: Sequence[str],
-    tell: Callable[[str], None],
     prepared: Prepared,
 ) -> tuple[str, ...]:
     """Names of the free parameters.
@@ -170,11 +169,7 @@ def _free_names(
         BadConfiguration: an unknown name, or one that the fidelity does not read.
     """
     robot, fidelity, computes = prepared.robot, plan.fidelity, observers.facts(plan.fidelity).computes
-    former: list[str] = []
     words = [surfaces.names_of_surfaces(names, robot, runs) for names in (free, fix)]
-    words = [robot_file.current_names(names, robot, former) for names in words]
-    for sentence in former:  # before a name is refused that nobody has typed
-        tell(sentence)
     present = _present(runs, robot)
     default = priors.default_names(present, robot, computed=computes, turns=runs.turns)
     owned = priors.stated_names(robot, present, () if plan.observe.axis else priors.OVER_TIME)
