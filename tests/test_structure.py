@@ -214,6 +214,7 @@ SPELLED = {
     ("calibration/discovery/menu.py", "TURNING, STANDING"),
     ("calibration/words/effect_words.py", "CHECKED_BY"),  # which act checks which instrument
     ("calibration/inference/bases.py", "VARIABLES"),
+    ("calibration/data/contents.py", "MEANINGS"),  # words in the names of other people's signals
     ("calibration/inference/blocks.py", "BLOCKS"),  # what is imposed may be a channel's column
     ("calibration/inference/observers/settled_ends.py", "_sliding"),  # the two that show slip
     ("sweeps/pages/loop_figures.py", "VARIABLE_WORDS"),  # words of the same variables

@@ -120,7 +120,7 @@ class Condition(Quantity):
 
 _MILLIVOLT, _MILLIAMPERE = (("mV", 1e-3),), (("mA", 1e-3),)
 _GRAM, _RADIAN = (("g", 1e-3),), (("rad", 1.0),)
-_TIMES = (("ms", 1e-3), ("min", 60.0), ("h", 3600.0))
+_TIMES = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("min", 60.0), ("h", 3600.0))
 _TORQUES = (("mNm", 1e-3), ("kNm", 1e3))
 _SHARES = ((PERCENT, 1e-2),)
 _VOLTS, _SHARE, _SWITCH = (-100.0, 100.0), (-1.0, 1.0), (-1.0, 1.0)
