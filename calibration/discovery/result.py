@@ -715,14 +715,14 @@ class DiscoveryResult:
         table["use"] = use
         return table
 
-    def save(self, folder: Path | str, robot_name: str = "") -> None:
+    def save(self, folder: Path | str, robot_name: str = "", tables: str = "csv") -> None:
         """Write `result.json`, `rows.csv`, `posterior.nc`, `robot.toml` and `fitted.toml` (with nothing added) into a
         folder, and `robot_track.toml` too where the track model was asked; `robot_name` is that of the robot that the
-        loop began with."""
+        loop began with; `tables` is as for `write_table`."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "result.json", self.to_json())
-        write_table(folder / "rows.csv", self.rows_table())
+        write_table(folder / "rows.csv", self.rows_table(), tables)
         held = [sentence(HeldByPrior(self.held_by_prior))] if self.held_by_prior else []
         note = "\n".join([words.header(self, robot_name), *held])
         robot_file.write(self.robot, folder / "robot.toml", note=note)

@@ -453,11 +453,12 @@ class CalibrationResult:
             yield f"error_{channel.name}_percent", r.percent
             yield f"error_{channel.name}_sigma", r.sigma
 
-    def save(self, folder: Path | str, robot_name: str = "a robot") -> None:
+    def save(self, folder: Path | str, robot_name: str = "a robot", tables: str = "csv") -> None:
         """Write robot.toml, posterior.nc, result.json and rows.csv into a folder, which is made if it is not there.
 
         Args:
             robot_name: of the robot that was calibrated, for the head of robot.toml.
+            tables: as for `write_table`.
         """
         from calibration.data import robot_file
 
@@ -467,7 +468,7 @@ class CalibrationResult:
         note = "\n".join([words.header(self, robot_name), *held])
         robot_file.write(self.robot, folder / "robot.toml", note=note)
         writing.write_json(folder / "result.json", self.to_json())
-        writing.write_table(folder / "rows.csv", self.rows())
+        writing.write_table(folder / "rows.csv", self.rows(), tables)
         posterior.write(self.posterior, folder / posterior.FILE)
 
 
