@@ -83,6 +83,18 @@ def test_a_table_is_read_equal_to_its_arrays(tmp_path, robot, file):
     same(records.read(tmp_path / file, robot, columns=COLUMNS), table)
 
 
+@pytest.mark.parametrize("orient", ["records", "columns", "split", "list", "lines"])
+def test_json_of_every_form_is_read_equal_to_its_arrays(tmp_path, robot, orient):
+    table, frame = samples.table(), pd.DataFrame(samples.table())
+    text = json.dumps(frame.to_dict("list")) if orient == "list" else None
+    stated = {"orient": "records", "lines": True} if orient == "lines" else {"orient": orient}
+    text = text or frame.to_json(double_precision=15, **stated)
+    (tmp_path / "log.json").write_text(text)
+    runs = records.read(tmp_path / "log.json", robot, columns=COLUMNS)
+    for column, name in COLUMNS.items():
+        np.testing.assert_allclose(runs[column], table[name], rtol=1e-13, atol=1e-15)
+
+
 @pytest.mark.parametrize("form", FORMS)
 def test_a_table_in_memory_is_read_equal_to_its_arrays(robot, form):
     table = samples.table()
@@ -140,6 +152,17 @@ def test_a_slow_reading_is_on_the_straight_line_in_the_row_nearest_to_its_sample
     rows, time = np.arange(9.0), np.array([0.9, 4.2, 7.9])
     found = one_clock.used_once(rows, time, 10 * time)
     np.testing.assert_allclose(found, [np.nan, 10, np.nan, np.nan, 40, np.nan, np.nan, np.nan, np.nan])
+
+
+def test_samples_that_are_recorded_late_are_sorted_by_their_stamps():
+    time = np.r_[0.0, 1, 2, 4, 3, 5, 6, 7]
+    late = Signal("late", 8, lambda: 10 * time, clock=Clock("c", lambda: time, "s"))
+    found, values, notes = one_clock.on_one_grid("log", {"late": late}, lambda c: False, lambda c: True, "")
+    np.testing.assert_array_equal(values["late"], 10 * np.arange(8.0))
+    assert found.tolist() == list(range(8)) and "1 sample of c recorded late" in notes[0]
+    back = Signal("back", 60, lambda: np.zeros(60), clock=Clock("c", lambda: np.tile(np.arange(30.0), 2), "s"))
+    with pytest.raises(BadData, match="log, c: goes back from 29 to 0 s at sample 31"):
+        one_clock.on_one_grid("log", {"back": back}, lambda c: False, lambda c: True, "")
 
 
 @pytest.mark.parametrize(

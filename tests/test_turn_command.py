@@ -397,7 +397,9 @@ def test_simulate_in_python_refuses_turns_as_the_command_line_does():
 
 @pytest.mark.parametrize("duty", [1, 1.0, 0.5, [1.0, 1.0]])
 def test_a_duty_written_beside_both_sides_is_refused_whatever_it_is(duty):
-    with pytest.raises(UsageError, match=r"^duty: got it together with duty_left and duty_right; expected one of the two"):
+    with pytest.raises(
+        UsageError, match=r"^duty: got it together with duty_left and duty_right; expected one of the two"
+    ):
         mm.Conditions("6T2A", duty=duty, duty_left=1, duty_right=0.5)
     alone = mm.Conditions(0, duty=duty, duty_left=0.5)  # of the right side
     again = dataclasses.replace(alone, duty_right=jnp.asarray(0.5))

@@ -80,7 +80,7 @@ class Preset:
         return tuple(mapped), tuple(notes)
 
 
-def of_columns(columns: Mapping[str, Any], where: str = "columns") -> Preset:
+def of_columns(columns: Mapping[str, Any], where: str = "the stated table") -> Preset:
     """Returns the columns that a table `[columns]` states.
 
     Raises:

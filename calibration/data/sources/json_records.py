@@ -62,6 +62,10 @@ def _collect(value: Any, at: str, arrays: dict[str, np.ndarray], name: str, dept
     if depth > DEEPEST:
         raise BadData(f"{name}, {at}: is nested too deep; expected at most {DEEPEST} levels")
     if isinstance(value, Mapping):
+        value = _unfolded(value)
+        if isinstance(value, list):
+            arrays[at or "values"] = _array(value)
+            return
         for key, inner in value.items():
             _collect(inner, f"{at}.{key}" if at else str(key), arrays, name, depth + 1)
     elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
@@ -71,6 +75,19 @@ def _collect(value: Any, at: str, arrays: dict[str, np.ndarray], name: str, dept
             arrays[at or "values"] = _array(value)
     elif hasattr(value, "__array__"):
         arrays[at or "values"] = np.asarray(value)
+
+
+def _unfolded(value: Mapping[str, Any]) -> Mapping[str, Any] | list[Any]:
+    """A dict as pandas writes it, as arrays by name: a column by the numbers of its rows, or names beside rows."""
+    cells = [inner for inner in value.values() if isinstance(inner, str) or not isinstance(inner, Mapping | Sequence)]
+    if value and len(cells) == len(value) and all(isinstance(key, str) and key.isdigit() for key in value):
+        return cells
+    names, rows = value.get("columns"), value.get("data")
+    if not (isinstance(names, list) and isinstance(rows, list) and rows):
+        return value
+    if not all(isinstance(row, list) and len(row) == len(names) for row in rows):
+        return value
+    return dict(zip(map(str, names), map(list, zip(*rows, strict=True)), strict=True))
 
 
 def _records(records: Sequence[Mapping[str, Any]], at: str, arrays: dict[str, np.ndarray], name: str) -> None:

@@ -10,9 +10,12 @@ import numpy as np
 from calibration.data import counters
 from calibration.data.input_errors import BadData, number
 from calibration.data.sources.recorded_signals import UNITS, Clock, Signal
+from mmrjax.errors import counted
 
 #: Seconds since 1970 between which a clock may count from there: 1990 and 2100.
 EPOCH = (6.3e8, 4.2e9)
+#: Usual steps by which a sample may be recorded late.
+LATE = 20.0
 #: Share of a step of the grid by which stamps that are the same may differ.
 SAME = 1e-3
 #: Largest step of whole numbers that are ms, µs and ns: rates of 10 Hz to 10 kHz, and below.
@@ -96,6 +99,9 @@ def on_one_grid(
     read = {key: seconds(clock) for key, clock in clocks.items()}
     begin = min(elapsed.first for elapsed in read.values())
     times = {key: elapsed.time + (elapsed.first - begin) for key, elapsed in read.items()}
+    order = {key: _order(time) for key, time in times.items()}
+    late = {key: int(np.count_nonzero(np.diff(times[key]) < 0)) for key, rows in order.items() if rows is not None}
+    times = {key: time if order[key] is None else time[order[key]] for key, time in times.items()}
     same = {key: next(k for k in times if np.array_equal(times[k], time)) for key, time in times.items()}
     for key, time in times.items():
         _check(name, clocks[key].name, time)
@@ -117,7 +123,8 @@ def on_one_grid(
     values: dict[str, np.ndarray] = {}
     brought: dict[str, list[str]] = {}
     for column, signal in chosen.items():
-        own, key = signal.load(), same[id(signal.clock)]
+        own, key, sorted_by = signal.load(), same[id(signal.clock)], order[id(signal.clock)]
+        own = own if sorted_by is None else own[sorted_by]
         if key == same[main]:
             values[column] = own[kept]
             continue
@@ -142,6 +149,10 @@ def on_one_grid(
         notes.append(f"{name}: {np.count_nonzero(~kept)} rows before the first command are left out")
     for key, clock in clocks.items():
         unit, period = read[key].unit, read[key].period
+        if key in late:
+            notes.append(
+                f"{name}: {counted(late[key], 'sample')} of {clock.name} recorded late; sorted by their stamps"
+            )
         if period:
             notes.append(f"{name}: {clock.name} wraps at {period:.10g}; counted on from there")
         if not clock.unit and unit not in ("", "s"):
@@ -170,6 +181,15 @@ def used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndar
     near = near[(rows[near] >= time[0]) & (rows[near] <= time[-1])]
     found[near] = np.interp(rows[near], time, own)
     return found
+
+
+def _order(time: np.ndarray) -> np.ndarray | None:
+    """Order of samples by their stamps, where some were recorded a little late; None: they are in order, or the clock
+    was set back."""
+    step = np.diff(time)
+    if not (step < 0).any() or step.min() < -LATE * float(np.median(np.abs(step))):
+        return None
+    return np.argsort(time, kind="stable")
 
 
 def _step(time: np.ndarray) -> float:

@@ -105,7 +105,7 @@ def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset | None) -> Re
         return any(cell not in ("", "0") for cell in by_name[name])
 
     mapped, notes = columns.mapped(lambda name: name if name in by_name else None, has_readings)
-    if not any(theirs in by_name for _, theirs, _ in mapped):
+    if arrays.header and not any(theirs in by_name for _, theirs, _ in mapped):
         raise _none_of(arrays.name, columns, arrays.header)
     return Reading(
         dataclasses.replace(arrays, notes=(*arrays.notes, *notes)), presets_file.merged(mapped, layout.mapped)
@@ -113,11 +113,13 @@ def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset | None) -> Re
 
 
 def _none_of(name: str, columns: Preset, header: Sequence[str]) -> BadData:
-    wanted = ", ".join(column.theirs[0] for column in columns.columns[:6])
+    wanted = ", ".join(column.theirs[0] for column in columns.columns[:6]) + (
+        ", ..." if len(columns.columns) > 6 else ""
+    )
     has = ", ".join(header[:8]) + (", ..." if len(header) > 8 else "")
     return BadData(
-        f"{name}: has none of the columns of {columns.name} ({wanted}, ...), but {has}; choose another preset, "
-        "or copy it and change the names"
+        f"{name}: has none of the columns of {columns.name} ({wanted}), but {has}; choose another preset, or copy it "
+        "and change the names"
     )
 
 
@@ -261,8 +263,10 @@ def _raw(values: np.ndarray) -> Raw:
     if values.dtype.kind in "US":
         return [str(value).strip() for value in values.tolist()]
     if values.dtype.kind == "M":  # dates are read as text; the clock counts from the first
-        since = (values.astype("datetime64[ns]") - values.astype("datetime64[ns]")[:1]).astype(np.int64)
-        return since * 1e-9
+        since = values.astype("datetime64[ns]") - np.min(
+            values[~np.isnat(values)], initial=np.datetime64("2262-01-01")
+        )
+        return np.where(np.isnat(values), np.nan, since.astype("timedelta64[ns]").astype(np.int64) * 1e-9)
     if values.dtype.kind == "m":
-        return values.astype("timedelta64[ns]").astype(np.int64) * 1e-9
+        return np.where(np.isnat(values), np.nan, values.astype("timedelta64[ns]").astype(np.int64) * 1e-9)
     return values
