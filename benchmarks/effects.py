@@ -1,4 +1,4 @@
-"""Writes docs/effects.md: a description of each effect, its size at one prior standard deviation, its look-alikes.
+"""Writes docs/reference/effects.md: each effect, its size by one prior standard deviation, which look alike.
 
 python benchmarks/effects.py           write the page
 python benchmarks/effects.py --check   compare the page with the library
@@ -26,7 +26,7 @@ from mmrjax.model.robot import Robot
 
 jax.config.update("jax_enable_x64", True)
 
-PAGE = Path(__file__).resolve().parent.parent / "docs" / "effects.md"
+PAGE = Path(__file__).resolve().parent.parent / "docs" / "reference" / "effects.md"
 #: Adhesion that lets all of Table 8 climb, also from standstill; Table 5's does not hold 20 degrees.
 ADHESION = {
     f"{c}.ground.friction.{k}": v for c in (TRACKED, WHEELED) for k, v in (("static", 0.6), ("dynamic", 0.48))
@@ -157,93 +157,82 @@ def _about(effect: type[Effect]) -> tuple[str, ...]:
     return tuple(text.replace("|", "∣") for text in words.about(effect))
 
 
-def _row(effect: type[Effect]) -> str:
-    """Properties that an effect declares, as a row of the first table."""
+def _section(effect: type[Effect]) -> str:
+    """Section of one effect: equation, meaning, source and what it declares."""
     spec = amplitude(effect)
-    shapes = "; ".join(
-        f"{p.name} {float(p.value):g} {p.spec.unit}" for p in params.walk(effect()) if not p.spec.amplitude
-    )
+    shapes = [f"{p.name} {float(p.value):g} {p.spec.unit}" for p in params.walk(effect()) if not p.spec.amplitude]
     where = effect.balance + (f": {effect.channel}" if effect.channel else "")
     low, high = spec.bounds
-    declared = ", ".join(words.declared(effect)) or "-"
-    return (
-        f"| `{effect.name}` | {where} | {effect.family()} | {_about(effect)[0]} | {spec.unit} | "
-        f"{spec.prior_sd(0.0):g}, {low:g} to {high:g} | {shapes or '-'} | {declared} |"
-    )
+    equation, meaning, source = _about(effect)
+    declared = list(words.declared(effect))
+    lines = [
+        f"### `{effect.name}`", "", equation, "", f"{meaning} {source}".strip(), "",
+        f"- Balance `{where}`. Family: {effect.family()}.",
+        f"- Amplitude [{spec.unit}]: prior standard deviation {spec.prior_sd(0.0):g}, bounds {low:g} to {high:g}.",
+        *[f"- Shape: {'; '.join(shapes)}."] * bool(shapes),
+        *[f"- Declares: {', '.join(declared)}."] * bool(declared),
+    ]  # fmt: skip
+    return "\n".join([*lines, ""])
 
 
-def _meaning(effect: type[Effect]) -> str:
-    return "- `{}`: {} {}".format(effect.name, *_about(effect)[1:])
+INTRODUCTION = """# Effects
+
+Terms that a model may lack. Each enters one balance with an amplitude, which is zero if the effect is absent. A
+positive amplitude takes away: a voltage drop, a loss torque, a resisting force, a lost speed. In `mass`, `inertia`,
+`inductance` and `sensor` it adds.
+
+*`python benchmarks/effects.py` writes this page from the library; a test compares the two.*
+
+Effects of one equation with the same driver are a *family*. If the data cannot distinguish them, the loop reports
+the family. It looks for effects of turns in tables of turns, and for the errors of an instrument (`CHANNEL_gain`,
+`CHANNEL_offset`) on rigs that have it. The error is added to the reading; an instrument with `signed = false` adds it
+to the magnitude. Instruments that count (speed, angle, position) have no zero error.
+
+In a robot file, `[effects.churning] configurations = ["4W2T"]` limits an effect to some configurations.
+`calibrate --free effects.NAME.amplitude` frees the amplitude of an effect that the file states.
+
+## One standard deviation, and indistinguishable effects
+
+The columns give the change of current [A], motor speed [rpm] and speed [mm/s] by one prior standard deviation, for
+the unladen 6T2A robot in settled travel. The last column lists the effects that the 180 runs of Table 8 (μ_s = 0.6)
+cannot distinguish from it: the signatures have |cos| > 0.95. Signatures are in units of 0.02 A, 5 rpm and 3 mm/s.
+The eleven friction parameters that every fit frees are projected out. `left` is the share of the signature that
+remains after this projection.
+
+* `nothing`: the effect equals a change of a free parameter.
+* `not seen`: these runs climb at full duty. They show no effect that acts only when the load drives the motor.
+
+| effect | 15 V, 0°: A | rpm | mm/s | 33 V, 20°: A | rpm | mm/s | left | indistinguishable |
+|---|---|---|---|---|---|---|---|---|"""
+
+HISTORIES = """
+## Effects that need a history
+
+Largest change of each reading in the first 2 s from standstill, by one prior standard deviation. For `battery_sag` a
+full battery replaces both voltages. `cogging` is below the resolution of any display once the shaft turns. The
+influence of `armature_inductance` ends within a millisecond.
+
+| effect | 15 V, 0°: A | rpm | mm/s | 33 V, 20°: A | rpm | mm/s |
+|---|---|---|---|---|---|---|"""
 
 
 def page() -> str:
-    """The text of the page."""
+    """Text of the page."""
     example, grid, base = sensitivities()
     alike, share = look_alikes(grid, base)
     start = passing()
-    lines = [
-        "# Effects",
-        "",
-        "Terms that the paper's model lacks. Each enters one balance with an amplitude, which is 0 if the effect is",
-        "absent. A positive one is a loss (a voltage drop, a loss torque, a resisting force, a lost speed); in",
-        "`mass`, `inertia`, `inductance` and `sensor` it adds. `benchmarks/effects.py` writes this page",
-        "from the library; a test fails if the two differ.",
-        "",
-        "An effect declares its properties. `dissipative`: a positive amplitude can only remove power. `transient`:",
-        "steady travel does not show it. `settles_to`: steady travel cannot distinguish it from the named effect.",
-        "`needs_battery`: it acts only on the on-board battery. `movers`: it acts only on tracks, or on wheels.",
-        "`needs_reverse`: only runs in both directions distinguish it from a parameter of the robot. `needs_duty`:",
-        "only a duty below 1 shows it. `odd_in_travel`: it keeps its sign in space when the robot travels backward.",
-        "A robot file may limit an effect to some configurations:",
-        '`[effects.churning] configurations = ["4W2T"]`.',
-        "",
-        "Effects of one equation that change with one quantity are a family: forms of a law that data may not",
-        "distinguish. If no single name is certain, the loop names the family. On tables of turns the loop also",
-        "tries the effects that act only in turns, and on tables of a rig with a channel the errors of its",
-        "instrument (`CHANNEL_gain`, `CHANNEL_offset`). An error is added to the reading, which is a magnitude",
-        "if the instrument has `signed = false`; counters and clocks (a speed, an angle, a",
-        "position) have no zero error.",
-        "`calibrate --free effects.NAME.amplitude` frees one of a robot file that states `[effects.NAME]`.",
-        "",
-        "| effect | balance | family | equation | unit | plausible: sd, bounds | shape parameters | declares |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    lines += [_row(effect) for effect in EVERY]
-    lines += [
-        "",
-        "## Changes by one standard deviation, and look-alikes",
-        "",
-        "Change of current [A], motor speed [rpm] and speed [mm/s] of the unladen 6T2A robot in steady travel, and",
-        "the effects that 180 runs of Table 8 (μ_s = 0.6) cannot distinguish from it: |cos| > 0.95 of the",
-        "signatures, in units of 0.02 A, 5 rpm, 3 mm/s, after projecting out the eleven friction parameters that a",
-        "fit frees. `left` is the share of the signature that this projection leaves; it is 0 for an effect that",
-        "equals a parameter. These runs climb, so they do not show effects that act while a load drives the motor.",
-        "Effects that act at a duty below 1, such as `coast_decay`, are left out here.",
-        "",
-        "| effect | 15 V, 0°: A | rpm | mm/s | 33 V, 20°: A | rpm | mm/s | left | look-alikes |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    lines = [INTRODUCTION]
     for k, effect in enumerate(SETTLED):
         numbers = " | ".join(_number(x) for x in example[:, :, k].ravel())
         names = ", ".join(f"`{n}`" for n in sorted(alike[k])) or "none"
         left = "not seen" if np.isnan(share[k]) else "nothing" if share[k] <= ABSORBED else f"{share[k]:.2f}"
         lines.append(f"| `{effect.name}` | {numbers} | {left} | {names} |")
-    lines += [
-        "",
-        "## Effects that only a history shows",
-        "",
-        "Largest change of each reading in the first 2 s from standstill, for one standard deviation",
-        "(`battery_sag` on a full battery, which replaces both voltages). `cogging` is below the resolution of any",
-        "display once the shaft turns; `armature_inductance` acts for less than a millisecond.",
-        "",
-        "| effect | 15 V, 0°: A | rpm | mm/s | 33 V, 20°: A | rpm | mm/s |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    lines.append(HISTORIES)
     for k, effect in enumerate(PASSING):
         lines.append(f"| `{effect.name}` | " + " | ".join(_number(x).lstrip("+") for x in start[k].ravel()) + " |")
-    lines += ["", "## Descriptions and sources", ""]
-    lines += [_meaning(effect) for effect in EVERY]
-    return "\n".join(lines) + "\n"
+    lines += ["", "## Each effect", ""]
+    lines += [_section(effect) for effect in EVERY]
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":
@@ -253,7 +242,7 @@ if __name__ == "__main__":
     text = page()
     if check:
         same = PAGE.read_text(encoding="utf-8") == text
-        print("docs/effects.md is " + ("up to date" if same else "out of date: run python benchmarks/effects.py"))
+        print(f"{PAGE.name} is " + ("right" if same else "out of date: run python benchmarks/effects.py"))
         sys.exit(not same)
     PAGE.write_text(text, encoding="utf-8")
     print(PAGE)

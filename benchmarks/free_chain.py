@@ -3,7 +3,7 @@
 
 python benchmarks/free_chain.py            only the chain
 python benchmarks/free_chain.py --track    compared with the track model, over the guide's recess
-python benchmarks/free_chain.py --shaking --track    at the running gear that shakes (set S of docs/vibration.md)
+python benchmarks/free_chain.py --shaking --track    at set S of docs/explanation/vibration.md
 
 One side of 6T2A on level ground without payload. The masses of the belt are free in the plane, joined by stiff
 springs. Two 48-tooth pulleys hold them from inside by one-sided springs and drive them by tooth

@@ -371,7 +371,7 @@ def _seconds(r: Compared) -> str:
 def options() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--public", type=Path, metavar="FOLDER", help="public records, see docs/benchmarks.md")
+    parser.add_argument("--public", type=Path, metavar="FOLDER", help="public records, see docs/lab/head-to-head.md")
     parser.add_argument("--cases", type=Path, metavar="FOLDER", help="cases with a robot's file and a table each")
     parser.add_argument("--packages", type=Path, metavar="FOLDER", help="folder with pysindy and scikit-learn")
     parser.add_argument(

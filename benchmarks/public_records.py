@@ -215,7 +215,7 @@ def _mouse(side: str, driver: str = "", answer: Answer = Answer()) -> Public:
 
 
 _COASTS = Answer("library", ("coast_decay",), ("voltage drop that changes with duty",))
-#: Name → record; the sources and licences are in docs/benchmarks.md.
+#: Name → record; the sources and licences are in docs/lab/head-to-head.md.
 PUBLIC: dict[str, Public] = {
     "micromouse-left": _mouse("left", answer=_COASTS),
     "micromouse-right": _mouse("right", answer=_COASTS),

@@ -1,4 +1,4 @@
-"""A shaking running gear (set S of docs/vibration.md): the paper's findings, and a comparison with C MuJoCo.
+"""The paper's findings at a shaking running gear (set S of docs/explanation/vibration.md), and C MuJoCo.
 
     python benchmarks/shaking.py            # findings: twenty rows at two steps, a minute on two cores
     python benchmarks/shaking.py --native   # C MuJoCo stepped with the same forces, two points; two minutes

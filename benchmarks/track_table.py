@@ -100,7 +100,7 @@ LUMPED = (
     "effects.vibration_slip.amplitude",
     "effects.vibration_slip.exponent",
 )
-#: Sets of docs/vibration.md: S was fitted to the simulated slip, without measured rows; N to the measured slip.
+#: Sets of docs/explanation/vibration.md: S was fitted to the simulated slip, N to the measured slip.
 SET_S = (0.6093, 0.5331, 0.00961, 3.648e-4, 0.01066, 3.816e7, 649.2, 0.00011, 0.0595)
 SET_N = (0.5353, 0.4847, 0.00766, 3.841e-4, 0.01465, 1.969e7, 347.5, 0.00536, 0.0912)
 NEAR = 0.25  # spread of the first generation about a set [prior sd]
@@ -116,7 +116,7 @@ LOST = 1e3  # cost of a row that slides away, tips or leaves the ground
 class Resolved(SettledRuns):
     """Tracked rows by the track model, with repeats for changing ones, and wheeled rows by `steady`.
 
-    Wheels have no grousers: the track model returns the same numbers for them (docs/track-model.md).
+    Wheels have no grousers: the track model returns the same numbers for them (docs/explanation/track-model.md).
     """
 
     wheeled: Conditions = eqx.field(kw_only=True)

@@ -31,7 +31,7 @@ TURNS = 0.05
 
 
 def surfaces() -> None:
-    """Prints the table of docs/turning.md."""
+    """Prints the table of docs/explanation/turning.md."""
     robot = mm.nominal()
     names = [(c, s, p) for c in robot.configurations for s in SURFACES for p in (0.0, 8.0)]
     rows = [(c, s, p, float(u)) for c, s, p in names for u in VOLTAGES]
@@ -86,7 +86,7 @@ def speed(points: int) -> None:
 
 
 def tracks() -> None:
-    """Prints the table of docs/turning.md, "Beside the track model"."""
+    """Prints the table of docs/explanation/turning.md, "Against the track model"."""
     robot = mm.nominal()
     rows = [(24, 24, 10), (15, 15, -15), (33, 33, 14.85), (15, 10.5, 15), (24, -24, 24), (24, 24, 12)]
     names = ["6T2A"] * 4 + ["4W2T"] * 2

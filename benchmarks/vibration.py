@@ -5,7 +5,8 @@
 
 A track that runs over its grousers shakes: reaction and sliding speed of each contact oscillate about their means.
 Friction is nonlinear, so a robot may slip far more than Fig. 7 gives for its mean demand (Section 3.2.4, ref. [46];
-Blekhman, Vibrational Mechanics, 2000: dry friction becomes an apparent viscous one). docs/vibration.md derives it.
+Blekhman, Vibrational Mechanics, 2000: dry friction becomes an apparent viscous one).
+docs/explanation/vibration.md derives it.
 For each run the slip computed from the measured ripple of its contacts is compared with the run's own slip
 and with that of Fig. 7 without ripple. Prints a line of JSON.
 """
@@ -58,7 +59,7 @@ LOG = ("6T2A.ground.friction.speed_static", "running_gear.contact_stiffness", "r
 #: Upper ends of the classes of slip [%].
 CLASSES = (3.0, 6.0, 10.0, 100.0)
 #: Second harmonic of the sliding speed over the first: two events per pitch, a grouser landing in front and one
-#: lifting at the rear. With it bursts of sliding are short and steep, as in the track model (docs/vibration.md).
+#: lifting at the rear. With it bursts of sliding are short and steep, as in the track model.
 SECOND = 0.5
 #: Number of phases for the average.
 PHASES = 128

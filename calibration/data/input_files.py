@@ -85,7 +85,7 @@ def table(path: Path, where: str | Path) -> bytes:
     if what is not None:
         raise BadData(
             f"{where}: is {what}; expected CSV (a header line with the columns' names, then one line for each "
-            "row), Parquet, or another format of docs/formats.md; export it as CSV, from Python with "
+            "row), Parquet, or another format of docs/howto/formats.md; export it as CSV, from Python with "
             "pandas.DataFrame(...).to_csv(..., index=False)"
         )
     return found

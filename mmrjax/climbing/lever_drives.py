@@ -109,6 +109,8 @@ def swing(
     so that ω is the demanded rate; for a lever that has to stand, the smallest voltage that holds it. Each drive's
     law has straight pieces (`_PIECES`). Of all pairs of pieces the one whose solution is on both is taken, or the
     one with the smallest deviation.
+    This is exact and has no iterations. A root finder cannot replace it: where a lever stands, its law allows a range
+    of torques and is no function.
 
     Args:
         step: [s]; rate: before it [rad/s]; free: after it, of levers without torque [rad/s]; yields: [rad/(N·m·s)].

@@ -6,6 +6,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import Array, Float
 
 from mmrjax.compile.compiling import compiled
@@ -52,17 +53,17 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     flat = operating_point(robot, dataclasses.replace(conditions, slope_deg=jnp.zeros_like(conditions.slope_deg)))[0]
     still_robot, still = jax.lax.stop_gradient((robot, conditions))
 
-    def halve(bracket: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
-        low, high = bracket
-        middle = (low + high) / 2
-        holds = margin(still_robot, still, middle) > 0
-        return (jnp.where(holds, middle, low), jnp.where(holds, high, middle)), None
-
-    zero = jnp.zeros_like(conditions.slope_deg)
-    (low, high), _ = jax.lax.scan(halve, (zero, zero + STEEPEST), None, length=HALVINGS)
-    at = jax.lax.stop_gradient((low + high) / 2)
+    found: optx.Solution = optx.root_find(
+        lambda slope, _: margin(still_robot, still, slope),
+        optx.Bisection(rtol=0.0, atol=0.0, flip=True),
+        jnp.full_like(conditions.slope_deg, STEEPEST / 2),
+        options={"lower": 0.0, "upper": STEEPEST},
+        max_steps=HALVINGS,
+        throw=False,
+    )
+    at = jax.lax.stop_gradient(found.value)
     slope = jax.lax.stop_gradient(jax.jvp(lambda a: margin(still_robot, still, a), (at,), (jnp.ones_like(at),))[1])
-    found = at - margin(robot, conditions, at) / slope
-    holds_all = margin(still_robot, still, zero + STEEPEST) > 0
-    found = jnp.where(holds_all, STEEPEST, jnp.clip(found, 0.0, STEEPEST))
-    return {"steepest_slope": jnp.where(flat.status == CONVERGED, found, jnp.nan), "status": flat.status}
+    held = at - margin(robot, conditions, at) / slope
+    holds_all = margin(still_robot, still, jnp.full_like(at, STEEPEST)) > 0
+    held = jnp.where(holds_all, STEEPEST, jnp.clip(held, 0.0, STEEPEST))
+    return {"steepest_slope": jnp.where(flat.status == CONVERGED, held, jnp.nan), "status": flat.status}

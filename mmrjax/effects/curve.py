@@ -151,6 +151,19 @@ def _size(unit: str, size: float) -> Scalar:
     )
 
 
+def _description(place: str, over: str) -> str:
+    """Docstring of a curve: its equation with its units, and its source."""
+    where = f"the readings of `{place}`" if place in READINGS else f"the balance `{place}`"
+    unit, unit_x = PLACES[place][0], (VARIABLES | VARIABLES_ROUND)[over][0]
+    return f"""Δ = a y(x) along the travel in {where} [{unit}], x = {over} [{unit_x}].
+
+    y is smooth through six ordinates equally spaced from `low` to `high`, and levels out beyond.
+
+    Source: none, a discrepancy without a name; Keys, Cubic convolution interpolation for digital image
+    processing, IEEE Trans. ASSP 29 (1981) 1153, eqs. (15), (19), (25) of the interpolation.
+    """
+
+
 def _curve(place: str, over: str) -> type[Effect]:
     """The curve of one variable in one balance, or in the readings of one channel."""
     shown = place in READINGS
@@ -205,14 +218,7 @@ def _curve(place: str, over: str) -> type[Effect]:
             """The memory long after the start, at the curve's last value."""
             return self.high + jnp.zeros_like(signals.speed_motor)
 
-    where = f"the readings of `{place}`" if shown else f"the balance `{place}`"
-    Curve.__doc__ = f"""Δ = a y(x) along the travel in {where} [{unit}], x = {over} [{unit_x}].
-
-    y is smooth through six ordinates equally spaced from `low` to `high`, and levels out beyond.
-
-    Source: none, a discrepancy without a name; Keys, Cubic convolution interpolation for digital image
-    processing, IEEE Trans. ASSP 29 (1981) 1153, eqs. (15), (19), (25) of the interpolation.
-    """
+    Curve.__doc__ = _description(place, over)
     return made(Curve, "".join(w.capitalize() for w in Curve.name.split("_")))
 
 

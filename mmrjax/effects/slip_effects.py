@@ -172,9 +172,9 @@ class VibrationSlip(SlipEffect):
 
     Source: Section 3.2.4 and its ref. [46]; Blekhman, Vibrational Mechanics (2000). The law of Fig. 7 is averaged
     over contacts that oscillate by s (`mmrjax.vibration`), for V_s small compared with s. The slip is proportional to
-    s and, because the load leads, to u. s grows as 1 / (1 - u), as the track model shows (docs/vibration.md). It is
-    smoothed within 0.05 of the limit, beyond which the robot slides, and at rest. If the demand pulls forward, the
-    robot runs ahead of its tracks.
+    s and, because the load leads, to u. s grows as 1 / (1 - u), as the track model shows
+    (docs/explanation/vibration.md). It is smoothed at rest and within 0.05 of the limit; beyond, the robot slides. If
+    the demand pulls forward, the robot runs ahead of its tracks.
     """
 
     driver = "demand"
@@ -187,7 +187,7 @@ class VibrationSlip(SlipEffect):
         meaning="speed lost at V_1 and half of the adhesion",
         bounds=(-0.05, 0.5),
         sd=0.02,
-        source="contacts of the track model oscillate by 1 to 4 % of the speed: running gears of docs/vibration.md",
+        source="contacts of the track model oscillate by 1 to 4 % of the speed (docs/explanation/vibration.md)",
     )
     exponent: Scalar = parameter(
         2.0,

@@ -67,7 +67,7 @@ class Facts:
         resolves: prefixes of parameter names that only fidelities of this kind read.
         reverse: True if it supports derivatives in reverse mode (`jax.grad`) in addition to forward mode.
         slow: True if a batch takes long enough for a progress bar.
-        one_thread: True if XLA has to run on one thread; with two, runs have hung (docs/benchmarks.md).
+        one_thread: True if XLA has to run on one thread; with two, runs have hung (docs/lab/figures.md).
     """
 
     module: str

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import Array
 
 from mmrjax.model.params import Scalar, parameter
@@ -14,7 +17,8 @@ _SHEET = "maker's sheet of RE30 310007 (24 V, 60 W)"
 #: Winding temperature at which makers state the resistance [°C].
 TEMPERATURE_REFERENCE = 25.0
 UNLIMITED = 1e9  # value of a limit that is not stated, in its unit
-_LONG = 1e6  # s, many of a motor's time constants
+#: Times between which a motor reaches its limit [s]; the second is many of its time constants.
+_SHORT, _LONG = 1e-6, 1e6
 
 
 class Motor(eqx.Module):
@@ -214,22 +218,27 @@ class Motor(eqx.Module):
         ambient, limit = self.temperature_ambient, self.temperature_limit
         begin = (ambient if winding is None else winding, ambient if housing is None else housing)
 
-        def excess(time: Scalar) -> Array:
-            reached = self.temperatures_after(current, time, *begin)[0] - limit
+        def excess(time: Scalar, held: tuple[Motor, Scalar, tuple[Scalar, Scalar]]) -> Array:
+            motor, current, begin = held
+            reached = motor.temperatures_after(current, time, *begin)[0] - motor.temperature_limit
             return jnp.where(jnp.isfinite(reached), reached, jnp.inf)
 
-        def halve(_: int, between: tuple[Array, Array]) -> tuple[Array, Array]:
-            low, high = between
-            middle = jnp.sqrt(low * high)
-            hot = excess(middle) > 0
-            return jnp.where(hot, low, middle), jnp.where(hot, middle, high)
-
-        low, high = jax.lax.fori_loop(0, 60, halve, (jnp.asarray(1e-6), jnp.asarray(_LONG)))
-        found = jax.lax.stop_gradient(jnp.sqrt(low * high))
+        bounds = {"lower": math.log(_SHORT), "upper": math.log(_LONG)}
+        held = jax.lax.stop_gradient((self, current, begin))
+        solution: optx.Solution = optx.root_find(
+            lambda log_time, held: excess(jnp.exp(log_time), held),
+            optx.Bisection(rtol=0.0, atol=0.0, flip=False),
+            jnp.asarray(sum(bounds.values()) / 2),
+            held,
+            options=bounds,
+            max_steps=60,
+            throw=False,
+        )
+        found = jax.lax.stop_gradient(jnp.exp(solution.value))
         # The Newton step from here changes no value; it carries the derivative.
         hot, around = self.temperatures_after(current, found, *begin)
         rise = self.heating(self.voltage_winding(current, hot) * current, hot, around)[0]
         rises = jnp.isfinite(hot) & (rise > 0)
         found = found - jnp.where(rises, (hot - limit) / jnp.where(rises, rise, 1.0), 0.0)
-        ever = (self.temperature_settled(current) > limit) & (excess(jnp.asarray(_LONG)) > 0)
+        ever = (self.temperature_settled(current) > limit) & (excess(jnp.asarray(_LONG), held) > 0)
         return jnp.where(jnp.asarray(begin[0]) >= limit, 0.0, jnp.where(ever, found, jnp.inf))

@@ -45,7 +45,7 @@ __all__ = [
 RADIUS_WHEEL = 50e-3  # D_w / 2, Table 6
 
 DYNAMIC_SHARE = 0.8  # μ_d / μ_s, assumed; the paper prints none
-GUIDE_SHARE = 0.3  # of the weight, between the limits that Table A1 simulated sets (docs/paper-notes)
+GUIDE_SHARE = 0.3  # of the weight, between the limits that Table A1 simulated sets (docs/explanation/paper-notes.md)
 
 
 def _friction(adhesion: float) -> Friction:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -16,6 +16,73 @@ T = TypeVar("T")
 #: Number of members that are computed at a time: enough to fill vectors and caches, few enough that most are still
 #: running at the end.
 LANES = 256
+
+
+class _Loop(NamedTuple):
+    """A loop of one member, see `until`: functions of its numbers.
+
+    Attributes:
+        lanes: members that are at work at once.
+    """
+
+    begun: Callable[[Any], Any]
+    turn: Callable[[Any, Any], Any]
+    ended: Callable[[Any], Bool[Array, ""]]
+    kept: Callable[[Any], Any]
+    lanes: int
+
+    def alone(self, numbers: Any) -> Any:
+        """Returns the end of one member."""
+        turned = jax.lax.while_loop(lambda s: ~self.ended(s), lambda s: self.turn(numbers, s), self.begun(numbers))
+        return self.kept(turned)
+
+    def refilled(self, numbers: Any, batched: Any, size: int) -> Any:
+        """Returns the end of each of `size` members; a queued member replaces a finished one.
+
+        Args:
+            numbers: of the members, with a leading axis where `batched`, a tree of booleans, is true.
+        """
+        lanes = min(size, self.lanes)
+        axes = jax.tree.map(lambda b: 0 if b else None, batched)
+
+        def chosen(which: Array, one: Any, other: Any) -> Any:
+            return jax.tree.map(
+                lambda x, y: jnp.where(jnp.reshape(which, which.shape + (1,) * (x.ndim - 1)), x, y), one, other
+            )
+
+        def at(index: Array) -> Any:
+            return jax.tree.map(lambda x, b: x[index] if b else x, numbers, batched)
+
+        begin = jax.vmap(self.begun, in_axes=(axes,))
+        go = jax.vmap(self.turn, in_axes=(axes, 0))
+        over = jax.vmap(self.ended)
+
+        begins = begin(numbers)
+        idle = over(begins)
+        order, size_busy = jnp.argsort(idle), size - jnp.sum(idle)
+
+        def member_of(place: Array) -> Array:
+            return order[jnp.minimum(place, size - 1)]
+
+        def busy(carry: tuple) -> Array:
+            return jnp.any(carry[1] < size_busy)
+
+        def step(carry: tuple) -> tuple:
+            found, place, following, state = carry
+            member = member_of(place)
+            state = chosen(over(state), state, go(at(member), state))
+            free = over(state) & (place < size_busy)
+            found = jax.tree.map(
+                lambda all_, x: all_.at[jnp.where(free, member, size)].set(x, mode="drop"),
+                found,
+                jax.vmap(self.kept)(state),
+            )
+            place = jnp.where(free, following + jnp.cumsum(free) - 1, place)
+            return found, place, following + jnp.sum(free), chosen(free, begin(at(member_of(place))), state)
+
+        first = jnp.arange(lanes)
+        carry = jax.vmap(self.kept)(begins), first, jnp.asarray(lanes), begin(at(member_of(first)))
+        return jax.lax.while_loop(busy, step, carry)[0]
 
 
 def until(
@@ -43,12 +110,16 @@ def until(
     def of(numbers: Any) -> Any:
         return eqx.combine(numbers, rest)
 
+    lanes = LANES if most is None else most
+    loop = _Loop(lambda x: begun(of(x)), lambda x, state: turn(of(x), state), ended, kept, lanes)
+
     def many(numbers: Any, batched: Any, size: int) -> T:
         """The end of each of `size` members; if these are batched again, all members share the same lanes."""
 
         @custom_vmap
         def each(numbers: Any) -> T:
-            return refilled(numbers, batched, size)
+            found: T = loop.refilled(numbers, batched, size)
+            return found
 
         @each.def_vmap
         def flat(outer: int, of_outer: Any, numbers: Any) -> tuple[T, Any]:
@@ -68,52 +139,10 @@ def until(
 
         return each(numbers)
 
-    def refilled(numbers: Any, batched: Any, size: int) -> T:
-        lanes = min(size, LANES if most is None else most)
-        axes = jax.tree.map(lambda b: 0 if b else None, batched)
-
-        def chosen(which: Array, one: T, other: T) -> T:
-            return jax.tree.map(
-                lambda x, y: jnp.where(jnp.reshape(which, which.shape + (1,) * (x.ndim - 1)), x, y), one, other
-            )
-
-        def at(index: Array) -> Any:
-            return jax.tree.map(lambda x, b: x[index] if b else x, numbers, batched)
-
-        begin = jax.vmap(lambda x: begun(of(x)), in_axes=(axes,))
-        go = jax.vmap(lambda x, s: turn(of(x), s), in_axes=(axes, 0))
-        over = jax.vmap(ended)
-
-        begins = begin(numbers)
-        idle = over(begins)
-        order, size_busy = jnp.argsort(idle), size - jnp.sum(idle)
-
-        def member_of(place: Array) -> Array:
-            return order[jnp.minimum(place, size - 1)]
-
-        def busy(carry: tuple) -> Array:
-            return jnp.any(carry[1] < size_busy)
-
-        def step(carry: tuple) -> tuple:
-            found, place, following, state = carry
-            member = member_of(place)
-            state = chosen(over(state), state, go(at(member), state))
-            free = over(state) & (place < size_busy)
-            found = jax.tree.map(
-                lambda all_, x: all_.at[jnp.where(free, member, size)].set(x, mode="drop"),
-                found,
-                jax.vmap(kept)(state),
-            )
-            place = jnp.where(free, following + jnp.cumsum(free) - 1, place)
-            return found, place, following + jnp.sum(free), chosen(free, begin(at(member_of(place))), state)
-
-        first = jnp.arange(lanes)
-        carry = jax.vmap(kept)(begins), first, jnp.asarray(lanes), begin(at(member_of(first)))
-        return jax.lax.while_loop(busy, step, carry)[0]
-
     @custom_vmap
     def alone(numbers: Any) -> T:
-        return kept(jax.lax.while_loop(lambda s: ~ended(s), lambda s: turn(of(numbers), s), begun(of(numbers))))
+        found: T = loop.alone(numbers)
+        return found
 
     @alone.def_vmap
     def together(size: int, batched: Any, numbers: Any) -> tuple[T, Any]:

@@ -246,85 +246,94 @@ def _begins(robot: Robot, conditions: Conditions) -> Float[Array, " 9"]:
     return jnp.concatenate([_guess(robot, conditions)[:SETTLING], jnp.zeros(len(SIDES))])
 
 
+def _secant(held: tuple[Robot, Conditions]) -> _Secant:
+    start = _begins(*held)
+    return _Secant(start, jnp.zeros_like(start), jnp.eye(start.size), jnp.asarray(0), jnp.asarray(False))
+
+
+def _look(held: tuple[Robot, Conditions], search: _Secant) -> _Secant:
+    """Evaluates at the start, then along each unknown from there, then along the secants."""
+    size = search.y.size
+    aside = search.looks <= size
+    step = (search.inverse * search.rates).sum(-1)
+    taken = step * _share(*held, search.y, step)
+    taken = jnp.where(aside, ALONG * (np.arange(size) == search.looks - 1), taken)
+    found = _balance(*held, search.y + taken)
+    found = jnp.where(_moves(held[1]), found, _begins(*held) - search.y - taken)
+    gone = search.inverse @ (search.rates - found)
+    row = taken @ search.inverse
+    change = jnp.outer(taken - gone, row) / (taken @ gone)
+    inverse = jnp.where((search.looks > 0) & jnp.all(jnp.isfinite(change)), search.inverse + change, search.inverse)
+    y = jnp.where(aside, search.y, search.y + taken)
+    rates = jnp.where(aside & (search.looks > 0), search.rates, found)
+    return _Secant(y, rates, inverse, search.looks + 1, ~aside & (jnp.max(jnp.abs(step)) < NEAR))
+
+
+def _still(conditions: Conditions) -> Float[np.ndarray, "9 9"]:
+    """The Jacobian where nothing moves."""
+    return -np.eye(len(_moves(conditions)))
+
+
+def _around(robot: Robot, conditions: Conditions, y: Array) -> tuple[Array, Array]:
+    """The Jacobian of `_balance`, and its value; imposed unknowns have no equation."""
+    slope, found = jax.jacfwd(lambda y: (_balance(robot, conditions, y),) * 2, has_aux=True)(y)
+    return jnp.where(_moves(conditions)[:, None], slope, _still(conditions)), found
+
+
+def _unknown(held: tuple[Robot, Conditions, Array, Array]) -> _Linear:
+    return _Linear(jnp.asarray(_still(held[1])), jnp.asarray(False), jnp.asarray(False))
+
+
+def _linear(held: tuple[Robot, Conditions, Array, Array], _: _Linear) -> _Linear:
+    y, solved = held[2:]
+    slope, found = _around(*held[:2], y)
+    inverted, determinant = inverse(-slope)
+    close = jnp.max(jnp.abs(inverted @ found)) < CLOSE
+    return _Linear(slope, solved & close & (determinant > 0), jnp.asarray(True))
+
+
+def _follow(held: tuple[Robot, Conditions, Array, _Linear]) -> _Search:
+    """State before the first step, which has length 0 and only evaluates."""
+    y, known = held[2:]
+    y = jnp.where(known.sound, y, _begins(*held[:2]))
+    slope = jnp.where(known.sound, known.jacobian, _still(held[1]))
+    return _Search(y, jnp.zeros_like(y), slope, jnp.asarray(FIRST), jnp.asarray(0), known.sound)
+
+
+def _turn(held: tuple[Robot, Conditions, Array, _Linear], search: _Search) -> _Search:
+    """One step of implicit Euler along the run, taken back where the rates grow or an unknown goes too far."""
+    slow = np.diag(np.arange(search.y.size) < SETTLING)
+    step = inverse(jnp.asarray(slow) / search.step - search.jacobian)[0] @ search.rates
+    largest, next_y = jnp.max(jnp.abs(step)), search.y + step
+    slope, found = _around(*held[:2], next_y)
+    before, after = jnp.linalg.norm(search.rates), jnp.linalg.norm(found)
+    worse = (~(after <= WORSE * before + SMALL) | (largest > FAR)) & (search.turns > 0)
+    worse &= search.step > SHORTEST
+    ended = ~worse & (largest < SMALL) & ((search.step > LONG) | (after < SMALL_RATE))
+    y, found, slope = (
+        jnp.where(worse, old, new)
+        for old, new in ((search.y, next_y), (search.rates, found), (search.jacobian, slope))
+    )
+    length = jnp.clip(search.step * jnp.where(worse, SHORTER, LONGER), SHORTEST, LONGEST)
+    return _Search(y, found, slope, length, search.turns + 1, ended)
+
+
 def _unknowns(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 9"], Bool[Array, ""]]:
     """The unknowns of a settled turn on level ground, see `_Search`, and whether it was found.
 
     Broyden's method, which first evaluates along each unknown, finds most. If it does not converge, or converges to
     an unstable turn, implicit Euler with growing steps follows a run until it settles. Only its shortest steps may
     let the rates grow. The last step is Newton's and carries the implicit derivatives.
+
+    Of 128 turns at random duties this finds all, and optimistix's `Newton` from the same start finds 83. In batches
+    each member ends on its own (`lanes`), while a search by `optimistix.root_find` lasts as long as its slowest.
     """
-    moves = _moves(conditions)
-    size = len(moves)
-    still, slow = -np.eye(size), np.diag(np.arange(size) < SETTLING)
-
-    def guess(held: tuple[Robot, Conditions]) -> Float[Array, " 9"]:
-        return _begins(*held)
-
-    def secant(held: tuple[Robot, Conditions]) -> _Secant:
-        start = guess(held)
-        return _Secant(start, jnp.zeros_like(start), jnp.eye(size), jnp.asarray(0), jnp.asarray(False))
-
-    def look(held: tuple[Robot, Conditions], search: _Secant) -> _Secant:
-        """Evaluates at the start, then along each unknown from there, then along the secants."""
-        aside = search.looks <= size
-        step = (search.inverse * search.rates).sum(-1)
-        taken = step * _share(*held, search.y, step)
-        taken = jnp.where(aside, ALONG * (np.arange(size) == search.looks - 1), taken)
-        found = _balance(*held, search.y + taken)
-        found = jnp.where(moves, found, guess(held) - search.y - taken)
-        gone = search.inverse @ (search.rates - found)
-        row = taken @ search.inverse
-        change = jnp.outer(taken - gone, row) / (taken @ gone)
-        inverse = jnp.where(
-            (search.looks > 0) & jnp.all(jnp.isfinite(change)), search.inverse + change, search.inverse
-        )
-        y = jnp.where(aside, search.y, search.y + taken)
-        rates = jnp.where(aside & (search.looks > 0), search.rates, found)
-        return _Secant(y, rates, inverse, search.looks + 1, ~aside & (jnp.max(jnp.abs(step)) < NEAR))
-
-    def around(robot: Robot, conditions: Conditions, y: Array) -> tuple[Array, Array]:
-        """The Jacobian of `_balance`, and its value; imposed unknowns have no equation."""
-        slope, found = jax.jacfwd(lambda y: (_balance(robot, conditions, y),) * 2, has_aux=True)(y)
-        return jnp.where(moves[:, None], slope, still), found
-
-    def unknown(_: tuple[Robot, Conditions, Array, Array]) -> _Linear:
-        return _Linear(jnp.asarray(still), jnp.asarray(False), jnp.asarray(False))
-
-    def linear(held: tuple[Robot, Conditions, Array, Array], _: _Linear) -> _Linear:
-        y, solved = held[2:]
-        slope, found = around(*held[:2], y)
-        inverted, determinant = inverse(-slope)
-        close = jnp.max(jnp.abs(inverted @ found)) < CLOSE
-        return _Linear(slope, solved & close & (determinant > 0), jnp.asarray(True))
-
-    def follow(held: tuple[Robot, Conditions, Array, _Linear]) -> _Search:
-        """State before the first step, which has length 0 and only evaluates."""
-        y, known = held[2:]
-        y = jnp.where(known.sound, y, guess(held[:2]))
-        first, turns = jnp.asarray(FIRST), jnp.asarray(0)
-        return _Search(y, jnp.zeros_like(y), jnp.where(known.sound, known.jacobian, still), first, turns, known.sound)
-
-    def turn(held: tuple[Robot, Conditions, Array, _Linear], search: _Search) -> _Search:
-        step = inverse(jnp.asarray(slow) / search.step - search.jacobian)[0] @ search.rates
-        largest, next_y = jnp.max(jnp.abs(step)), search.y + step
-        slope, found = around(*held[:2], next_y)
-        before, after = jnp.linalg.norm(search.rates), jnp.linalg.norm(found)
-        worse = (~(after <= WORSE * before + SMALL) | (largest > FAR)) & (search.turns > 0)
-        worse &= search.step > SHORTEST
-        ended = ~worse & (largest < SMALL) & ((search.step > LONG) | (after < SMALL_RATE))
-        y, found, slope = (
-            jnp.where(worse, old, new)
-            for old, new in ((search.y, next_y), (search.rates, found), (search.jacobian, slope))
-        )
-        length = jnp.clip(search.step * jnp.where(worse, SHORTER, LONGER), SHORTEST, LONGEST)
-        return _Search(y, found, slope, length, search.turns + 1, ended)
-
     held = robot, conditions
-    first = lanes.until(secant, look, lambda s: (s.looks >= SOON) | s.solved, held, lambda s: (s.y, s.solved))
-    known = lanes.until(unknown, linear, lambda s: s.known, (*held, *first))
-    end = lanes.until(follow, turn, lambda s: (s.turns >= TURNS) | s.solved, (*held, first[0], known), most=FEW)
+    first = lanes.until(_secant, _look, lambda s: (s.looks >= SOON) | s.solved, held, lambda s: (s.y, s.solved))
+    known = lanes.until(_unknown, _linear, lambda s: s.known, (*held, *first))
+    end = lanes.until(_follow, _turn, lambda s: (s.turns >= TURNS) | s.solved, (*held, first[0], known), most=FEW)
     sound = end.solved & jnp.all(jnp.isfinite(end.jacobian))
-    slope = jnp.where(sound, end.jacobian, jnp.asarray(still))
+    slope = jnp.where(sound, end.jacobian, jnp.asarray(_still(conditions)))
     return end.y + inverse(-slope)[0] @ jnp.where(sound, _balance(robot, conditions, end.y), 0.0), sound
 
 

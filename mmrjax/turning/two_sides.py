@@ -31,7 +31,9 @@ SIDES = np.array([0.5, -0.5])
 BETWEEN, OVER = 0.208, 0.278
 #: Square of a sliding speed that is too small to have a direction [m²/s²].
 STILL = 1e-16
-#: Newton steps of the load transfer; the contact's forces are nearly bilinear in it.
+#: Newton steps of the load transfer; the contact's forces are nearly bilinear in it. The loop over three steps is
+#: unrolled: for 1024 turns `newton.FewUnknowns` takes 1.28 times its time, and optimistix's `Newton` 4.8 times, for
+#: the same loads (two cores, processor time in one run, 2026-11-28).
 LOAD_STEPS = 3
 
 

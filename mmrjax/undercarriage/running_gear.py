@@ -54,7 +54,7 @@ class RunningGear(eqx.Module):
         meaning="height of the lower guide above the line that touches both pulleys",
         bounds=(-2e-3, 5e-3),
         sd=2e-4,
-        source=f"flush; {_ASSUMED}. Decides the guides' share of the weight: docs/track-model.md gives the curve",
+        source=f"flush; {_ASSUMED}. Decides the guides' share of the weight (docs/explanation/track-model.md)",
     )
     guide_gap: Scalar = parameter(
         20e-3,
