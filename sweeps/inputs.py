@@ -7,8 +7,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from calibration.data import effect_file, robot_file, surface_labels
-from calibration.data import posterior_file as posterior
+from calibration.data import effect_file, posterior_file, robot_file, surface_labels
 from calibration.data import runs as records
 from calibration.data.columns import IMPOSED, Layout
 from calibration.data.contradictions import misplaced
@@ -80,8 +79,8 @@ def beside_robot(file: RobotFile) -> Posterior:
         raise BadConfiguration(
             f"--posterior: {file.source} has none; expected --robot FOLDER/robot.toml of calibrate or loop"
         )
-    path = Path(file.source).with_name(posterior.FILE)
-    found = posterior.read(path)
+    path = Path(file.source).with_name(posterior_file.FILE)
+    found = posterior_file.read(path)
     found.check(file.robot, str(path))
     return found
 

@@ -213,11 +213,9 @@ REPRODUCTION = ("sweeps", "paper")
 SPELLED = {
     ("calibration/discovery/menu.py", "TURNING, STANDING"),
     ("calibration/words/effect_words.py", "CHECKED_BY"),  # which act checks which instrument
-    ("calibration/inference/bases.py", "VARIABLES"),
     ("calibration/data/contents.py", "MEANINGS"),  # words in the names of other people's signals
     ("calibration/inference/blocks.py", "BLOCKS"),  # what is imposed may be a channel's column
     ("calibration/inference/observers/settled_ends.py", "_sliding"),  # the two that show slip
-    ("sweeps/pages/loop_figures.py", "VARIABLE_WORDS"),  # words of the same variables
 }
 
 
@@ -611,7 +609,6 @@ GOOD = {
     "calibration/discovery/menu.py": "TURNING, STANDING = ('total_current', 'motor_speed'), ('total_current',)\n",
     "calibration/discovery/search.py": "def f(space: CandidateSpace) -> int: ...\n",
     "calibration/inference/observers/one.py": "def f(runs, o):\n    return runs.has('time_s') or isinstance(o, Histories)\n",
-    "calibration/inference/bases.py": "VARIABLES = {'a': 'speed_mm_s', 'b': 'motor_speed_rpm'}\n",
     "sweeps/__init__.py": "",
     "sweeps/points/cluster.py": "_compiled = {}\ndef f(k):\n    _compiled[k] = 1\n",
     "sweeps/local.py": "import numpy as np\nX = {}\nX[1] = 2\ndef f(X, y):\n    X[1] = y\n    z = np.append(y, 1)\n    z[0] = 1\n",

@@ -8,22 +8,22 @@ from collections.abc import Mapping
 import numpy as np
 
 from calibration.data import surfaces
-from calibration.data.columns import DRIVEN, DUTY, WORDS, Layout, Meaning
+from calibration.data.columns import DRIVEN, DUTY, WORDS, Column, Layout
 from calibration.data.input_errors import choices, number, parsed
 from calibration.data.named_arrays import Raw, missing, numbers, texts
 from mmrjax.model import quantities
 
-#: From how many times the largest value that is allowed another unit is supposed.
+#: Ratio to the largest allowed value from which another unit is probable.
 FAR = 2.0
-#: How far a value may be beyond a limit because it is written with few digits, and because a factor from its unit is,
-#: as shares of the limit.
+#: Rounding of a value with few digits, and of one with a factor of few digits, that may carry it beyond a limit, as
+#: shares of the limit.
 ROUNDED, ROUNDED_FACTOR = 1e-6, 5e-4
-#: What people write there.
+#: Entries of people for a missing reading.
 NOTHING = ("n.a.", "-", "--", "?", "x", "inf", "-inf")
 _WITH_UNIT = re.compile(r"([+-]?\d*\.?\d+(?:[eE][+-]?\d+)?)\s*([^\d\s.,].*)")
 
 
-def values(meaning: Meaning, raw: Raw, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+def values(meaning: Column, raw: Raw, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """Returns a column's values in its unit, NaN where there is no reading, and True for each cell to be refused.
 
     All cells are read at once, since a log may have a million rows; `refusal` makes the sentence about one of them.
@@ -42,12 +42,11 @@ def values(meaning: Meaning, raw: Raw, layout: Layout) -> tuple[np.ndarray, np.n
     return found if meaning.as_named else _in_its_unit(meaning, found), refused
 
 
-def _in_its_unit(meaning: Meaning, written: np.ndarray) -> np.ndarray:
-    """Numbers of cells in the unit of the column, as `Meaning.value` of each."""
-    quantity = meaning.quantity
-    if quantity is not None and quantity.percent and meaning.unit == quantities.PERCENT:  # not proportional
+def _in_its_unit(meaning: Column, written: np.ndarray) -> np.ndarray:
+    """Numbers of cells in the unit of the column, as `Column.value` of each."""
+    if meaning.quantity.percent and meaning.unit == quantities.PERCENT:  # not proportional
         return np.array([meaning.value(x) for x in written.tolist()])
-    return written * meaning.factor * (1.0 if quantity is None else quantity.units[meaning.unit])
+    return written * meaning.factor * meaning.quantity.units[meaning.unit]
 
 
 def _may_be_empty(column: str, layout: Layout) -> bool:
@@ -58,7 +57,7 @@ def _may_be_empty(column: str, layout: Layout) -> bool:
 
 
 def _allowed_words(column: str, word: str, layout: Layout) -> str:
-    """Words that a message offers in the place of one that is refused; empty for one that is allowed."""
+    """Allowed words for the message about a word; empty if the word is allowed itself."""
     if column == "surface":
         return surfaces.refused(word, layout)
     if column == "mode" and word not in DRIVEN:
@@ -68,14 +67,18 @@ def _allowed_words(column: str, word: str, layout: Layout) -> str:
     return ""
 
 
-def refusal(where: str, meaning: Meaning, cell: str, layout: Layout) -> str:
-    """Returns the sentence about a cell that `values` refuses; `where` opens it."""
+def refusal(where: str, meaning: Column, cell: str, layout: Layout, *, hints: bool = True) -> str:
+    """Returns the sentence about a cell that `values` refuses.
+
+    Args:
+        where: opens it; hints: True to guess the unit that was meant.
+    """
     column, hint = meaning.column, ""
     if column in WORDS:
         allowed = _allowed_words(column, cell, layout)
     else:
         low, high = meaning.limits()
-        hint = _hint(meaning, cell, (*layout.measured_columns, *layout.deviation_columns, *DUTY))
+        hint = _hint(meaning, cell, hints, (*layout.measured_columns, *layout.deviation_columns, *DUTY))
         more = "more than " if column in layout.deviation_columns else ""
         allowed = f"{more}{number(low)} to {number(high)}"
         try:
@@ -85,12 +88,12 @@ def refusal(where: str, meaning: Meaning, cell: str, layout: Layout) -> str:
     return f"{where}, {meaning.shown}: got {cell or 'an empty cell'}; {hint}expected {allowed}"
 
 
-def _hint(meaning: Meaning, cell: str, readings: tuple[str, ...]) -> str:
-    """What a cell that is refused probably means, with a semicolon behind it; empty where nothing is known."""
+def _hint(meaning: Column, cell: str, units: bool, readings: tuple[str, ...]) -> str:
+    """Guess at the meaning of a refused cell, with a semicolon at its end; empty where there is none."""
     if cell.lower() in NOTHING:
         return "leave the cell empty where there is no reading; " if meaning.column in readings else ""
     quantity, mine = meaning.quantity, meaning.unit
-    if quantity is None or meaning.factor != 1.0:
+    if not units or meaning.factor != 1.0:
         return ""
     named = {unit: column for column, unit in quantity.columns().items()}
     try:
@@ -109,7 +112,7 @@ def _hint(meaning: Meaning, cell: str, readings: tuple[str, ...]) -> str:
 
 
 def _unit_hint(value: str, written: str, mine: str, named: Mapping[str, str]) -> str:
-    """What to do with a unit beside a number; `mine`: the column's own, `named`: columns by their units."""
+    """Advice on a unit next to a number; `mine`: the column's own unit, `named`: columns by their units."""
     unit = quantities.spelled(written)
     if unit == mine:
         return f"write {value}, the unit stands in the column's name; "

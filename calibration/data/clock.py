@@ -10,11 +10,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from calibration.data import counters
-from calibration.data.columns import Meaning
+from calibration.data.columns import Column
 from calibration.data.input_errors import number
 from calibration.data.named_arrays import Raw, numbers
 
-#: What follows a day where a cell holds a time alone, and how long a day lasts [s].
+#: Day of a cell that holds a time alone, and length of a day [s].
 _SOME_DAY, _DAY = "1970-01-01T", 86400.0
 #: Seconds since 1970 between which a clock may count from there, 1990 and 2100; and seconds of one of other units.
 EPOCH, PARTS = (6.3e8, 4.2e9), {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -22,7 +22,7 @@ EPOCH, PARTS = (6.3e8, 4.2e9), {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _WITH_POINTS = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})(?=[ T])")
 
 
-def from_the_first(name: str, meaning: Meaning, raw: Raw, runs: Sequence[str] | None) -> tuple[Raw, tuple[str, ...]]:
+def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | None) -> tuple[Raw, tuple[str, ...]]:
     """Returns a column of time as the time since the first row of each run, and notes on what that changes.
 
     A run begins at its first row, whatever its clock shows there: the time since a controller started, or a time of
@@ -78,7 +78,7 @@ def from_the_first(name: str, meaning: Meaning, raw: Raw, runs: Sequence[str] | 
 
 
 def _counted(
-    name: str, meaning: Meaning, count: np.ndarray, run: np.ndarray | None
+    name: str, meaning: Column, count: np.ndarray, run: np.ndarray | None
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Numbers of a clock without wraps and without stamps that rows share, and notes on these."""
     step = np.diff(count)
@@ -105,12 +105,12 @@ def _past_midnight(clock: np.ndarray, cells: Sequence[str], run: np.ndarray) -> 
 
 
 def _alone(cell: str) -> bool:
-    """Whether a cell has a time without a date."""
+    """True if a cell has a time without a date."""
     return cell[2:3] == ":"
 
 
 def _seconds(cell: str) -> float:
-    """Since some day of a date and time, NaN of what is none."""
+    """Seconds of a date and time since a fixed day, NaN for other cells."""
     if ":" not in cell:
         return math.nan
     dated = _WITH_POINTS.sub(r"\3-\2-\1", cell)

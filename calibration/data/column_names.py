@@ -7,7 +7,7 @@ import difflib
 import re
 from collections.abc import Sequence
 
-from calibration.data.columns import HEADING, SIDES, SPEED, SUPPLY, TIME, VOLTS, Layout, Meaning
+from calibration.data.columns import HEADING, SIDES, SPEED, SUPPLY, TIME, VOLTS, WORDS, Column, Layout
 from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays
 from mmrjax.model import channels, quantities
@@ -15,7 +15,7 @@ from mmrjax.model.channels import Channel
 
 #: Most columns of a table that a message names.
 NAMED = 8
-#: How people call the sides.
+#: Other words for the sides.
 _SIDE = {"l": "left", "lh": "left", "lft": "left", "port": "left", "r": "right", "rh": "right", "starboard": "right"}
 
 
@@ -57,7 +57,7 @@ def _in_case(name: str, header: Sequence[str], layout: Layout, inferred: bool) -
 
 
 def _with_channels(name: str, header: list[str], layout: Layout, more: Sequence[Channel]) -> Layout:
-    """`layout` with those of some more channels of which a file has a column."""
+    """`layout` with each of `more` for which the file has a column."""
     meanings = dataclasses.replace(layout, channels=channels.EVERY).meanings(name, header)
     stated = {m.column for m in meanings if m is not None}
     found = tuple(c for c in channels.EVERY if c in layout.channels or (c in more and c.column in stated))
@@ -65,7 +65,7 @@ def _with_channels(name: str, header: list[str], layout: Layout, more: Sequence[
 
 
 def check_header(
-    name: str, header: list[str], meanings: list[Meaning | None], measured: bool, battery: bool, layout: Layout
+    name: str, header: list[str], meanings: list[Column | None], measured: bool, battery: bool, layout: Layout
 ) -> None:
     stated = {m.column for m in meanings if m is not None}
     strange = [c for c, m in zip(header, meanings, strict=True) if m is None]
@@ -107,8 +107,8 @@ def check_header(
             raise BadData(f"{name}: unknown column {column}; did you mean {close[0]}? rename or remove it")
 
 
-def check_time(name: str, header: list[str], meanings: list[Meaning | None], layout: Layout) -> None:
-    """Refuse readings of a log without its time."""
+def check_time(name: str, header: list[str], meanings: list[Column | None], layout: Layout) -> None:
+    """Refuses readings of a log without a column of time."""
     stated = {m.column: m.shown for m in meanings if m is not None}
     over_time = [stated[c.column] for c in layout.channels if c.column in stated and not c.settled]
     if over_time and stated.keys().isdisjoint(TIME):
@@ -120,7 +120,7 @@ def check_time(name: str, header: list[str], meanings: list[Meaning | None], lay
 
 
 def _other_names(strange: list[str], column: str) -> str:
-    """How columns that have names of their own are told apart, for a message; empty where there are none."""
+    """Advice on columns with unknown names, for a message; empty if there are none."""
     if not strange:
         return ""
     unit = column.rpartition("_")[2]
@@ -133,7 +133,7 @@ def _other_names(strange: list[str], column: str) -> str:
 
 
 def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layout: Layout) -> None:
-    """Refuse columns that name a side in other words, or elsewhere in the column's name."""
+    """Refuses columns that name a side in other words, or elsewhere in the column's name."""
 
     def words(column: str) -> list[str]:
         return sorted(_SIDE.get(word.casefold(), word.casefold()) for word in column.split("_"))
@@ -155,11 +155,11 @@ def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layou
             )
 
 
-def check_units(arrays: NamedArrays, meanings: Sequence[Meaning | None]) -> None:
+def check_units(arrays: NamedArrays, meanings: Sequence[Column | None]) -> None:
     """Refuses a column whose name, or whose source, states another unit than it is read in."""
     below = [""] * len(meanings)
     for j, (unit, meaning) in enumerate(zip(arrays.units, meanings, strict=bool(arrays.units))):
-        if meaning is None or meaning.quantity is None:
+        if meaning is None or meaning.column in WORDS:
             continue
         known = meaning.quantity.columns().values()
         if unit and unit not in known:
@@ -170,7 +170,7 @@ def check_units(arrays: NamedArrays, meanings: Sequence[Meaning | None]) -> None
             )
         below[j] = unit
     for stated_below, meaning in zip(below, meanings, strict=True):
-        if meaning is None or meaning.quantity is None or abs(meaning.factor) != 1.0:
+        if meaning is None or abs(meaning.factor) != 1.0:
             continue
         named = {unit: column for column, unit in meaning.quantity.columns().items()}
         for stated, where in (

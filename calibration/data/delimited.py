@@ -21,12 +21,12 @@ from mmrjax.model import channels, quantities
 
 #: Size of a file from which on plain tables are read as arrays at once [bytes].
 LONG = 2_000_000
-#: What may separate cells beside a comma, and how it is called.
+#: Separators of cells other than a comma, and a word for each.
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
 #: Bytes that no text has.
 _CONTROLS = re.compile(rb"[\0-\x08\x0e-\x1f]")
 _COMMA, _POINT = (re.compile(rf"[+-]?\d*{mark}\d+(?:[eE][+-]?\d+)?") for mark in (",", r"\."))
-#: What may be a number of thousands with a mark between, and one below a thousand without.
+#: Possible numbers of thousands with a mark between, and numbers below a thousand.
 _THOUSANDS, _BELOW = re.compile(r"[+-]?[1-9]\d{0,2}[,.]\d{3}"), re.compile(r"[+-]?[1-9]\d{0,2}")
 
 
@@ -119,8 +119,8 @@ def row_of_units(header: Sequence[str], first: Sequence[str]) -> tuple[str, ...]
 
 
 def text(name: str, content: bytes) -> tuple[str, tuple[str, ...]]:
-    """What a file says: UTF-8, UTF-16 that begins with its mark, or else what Windows writes in the West (code page
-    1252); and sentences on what was read otherwise than as UTF-8.
+    """Returns the text of a file in UTF-8, in UTF-16 that begins with its mark, or in Windows-1252; and a note if it
+    is not in UTF-8.
 
     Raises:
         BadData: bytes that are no text.
@@ -140,8 +140,8 @@ def text(name: str, content: bytes) -> tuple[str, tuple[str, ...]]:
 
 
 def below_comments(lines: Sequence[str]) -> list[str]:
-    """Lines of a table, its header first, without those above that begin with #; where no other header stands above
-    the numbers, the last of them is it."""
+    """Returns the lines of a table, its header first, without comments above; the last comment is the header if
+    numbers follow it."""
     first = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
     below = list(lines[first:])
     if first and below and any(map(math.isfinite, map(number, re.split(r"[,;\t]", below[0])))):
@@ -150,7 +150,7 @@ def below_comments(lines: Sequence[str]) -> list[str]:
 
 
 def cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], tuple[str, ...]]:
-    """Rows of cells without blanks around them, numbers with points; and sentences on what was read otherwise.
+    """Returns rows of cells without blanks around them, numbers with points; and notes on separators and marks.
 
     Semicolons or tabs separate cells where the header has no comma; numbers may have decimal commas then.
 

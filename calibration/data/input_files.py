@@ -19,7 +19,7 @@ BINARY = {
     b"PK\x03\x04": "an Excel workbook or a zip file", b"\xd0\xcf\x11\xe0": "an Excel workbook",
     b"\x1f\x8b": "a gzip file", b"SQLite format 3\0": "an SQLite file", b"%PDF": "a PDF",
 }  # fmt: skip
-#: How JSON and web pages begin.
+#: Beginnings of JSON and of web pages.
 TEXTS = {
     re.compile(rb"\s*(\{|\[\s*[\[{\"\d-])"): "JSON",
     re.compile(rb"\s*<(!doctype|html|\?xml)", re.I): "a web page or XML",

@@ -11,7 +11,7 @@ from calibration.data.input_errors import parsed
 
 #: Raw values of a column: a list of texts as written, or an array of numbers with NaN where there is no reading.
 Raw = list[str] | np.ndarray
-#: What programs write where there is no reading, as an empty cell.
+#: Entries of programs for a missing reading.
 MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "<na>", "none", "null"})
 
 

@@ -30,7 +30,7 @@ SEPARATOR = ","
 
 
 @dataclasses.dataclass(frozen=True)
-class Column:
+class PresetColumn:
     """A column of this program, and where a logger's file has it.
 
     Attributes:
@@ -54,7 +54,7 @@ class Preset:
     """
 
     name: str
-    columns: tuple[Column, ...]
+    columns: tuple[PresetColumn, ...]
     header: tuple[str, ...] = ()
 
     def mapped(
@@ -206,7 +206,7 @@ def _numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[str, fl
     return found
 
 
-def _column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) -> Column:
+def _column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) -> PresetColumn:
     form = f'expected {mine} = "THEIRS", or {mine} = {{column = "THEIRS", factor = 0.001}}'
     table = theirs if isinstance(theirs, dict) else {"column": theirs}
     for key in table:
@@ -231,7 +231,7 @@ def _column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) ->
     note = table.get("note", "")
     if not isinstance(note, str):
         raise BadConfiguration(f"{where}.note: got {note!r}; expected a sentence")
-    return Column(mine, tuple(_filled(name, where, numbers) for name in names), factor, note)
+    return PresetColumn(mine, tuple(_filled(name, where, numbers) for name in names), factor, note)
 
 
 def _filled(name: str, where: str, numbers: Mapping[str, float]) -> str:
@@ -262,7 +262,7 @@ def merged(
 
 
 def _bare(mine: str) -> str:
-    """Column without its unit, so that time_ms and time_s are the same."""
+    """PresetColumn without its unit, so that time_ms and time_s are the same."""
     layout = Layout(channels=channels.EVERY)
     found = layout.quantities()
     return next((column for column, quantity in found.items() if mine in quantity.columns()), mine)

@@ -38,7 +38,7 @@ COUNTS = {
 #: Key of an effect's table by which a file brings the library's priors and limits to the rig's size.
 FACTORS = "scaled"
 
-#: What makers allow, which no fit can free: least, greatest, unit and meaning. Experiments stay within it.
+#: Ratings by makers, which no fit can free: least, greatest, unit and meaning. Experiments stay within them.
 RATINGS = {
     "motor.voltage_limit": (0.1, 1000.0, "V", "highest supply voltage; not stated: what the table used"),
     "motor.speed_limit": (1.0, 1e5, "rad/s", "permissible speed of the motor"),
@@ -54,12 +54,12 @@ RATINGS = {
 }
 #: The parabola of a cell's no-load voltage; stated beside a capacity it is that of a cell of this capacity.
 CURVE = {"battery.curvature", "battery.slope"}
-#: What a robot has or has not, which no fit can free: meaning.
+#: Switches of a robot, which no fit can free: meaning.
 SWITCHES = {
     "gearbox.mesh_theory": "load driving the motor loses 2 - 1/η of the mesh's theory, else η",
     "driver.returns_current": "supply and driver take back what the motors return, else a diode blocks it",
 }
-#: What a robot is, in words, which no fit can free: those that there are, meaning.
+#: Choices by word, which no fit can free: allowed words, meaning.
 CHOICES = {"driver.decay": (DECAYS, "between pulses the driver shorts the motors (slow) or lets them coast (fast)")}
 
 
@@ -84,7 +84,7 @@ class RobotFile:
 
     @property
     def name(self) -> str:
-        """Of a file the last part of its path."""
+        """Name of the robot, or name of its file."""
         return Path(self.source).name
 
 
@@ -373,7 +373,7 @@ def _count(where: str, name: str, value: Any) -> int:
 
 
 def _parameters(name: str, known: Collection[str]) -> str:
-    """What to choose from in place of an unknown parameter."""
+    """List of parts and parameters to choose from, for the message about an unknown parameter."""
     head = name.partition(".")[0]
     heads = list(dict.fromkeys(n.partition(".")[0] for n in known))
     near = difflib.get_close_matches(name, known, n=5, cutoff=0.4)
@@ -447,7 +447,7 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
 
 
 def _lines_of_effect(effect: Effect) -> list[str]:
-    """What the table of an effect states beside its parameters."""
+    """Keys of an effect's table other than its parameters."""
     named = effect.configurations or type(effect)().configurations
     lines = [f"configurations = {json.dumps(effect.configurations)}  # on which it acts"] if named else []
     if type(effect).plain is not None:
@@ -508,7 +508,7 @@ def _lines_of_ratings(robot: Robot, nothing: Robot, stated: set[str]) -> Iterato
 
 
 def _start(robot: Robot) -> Robot:
-    """What the file of a robot starts from."""
+    """Robot that the file of a robot starts from."""
     if robot.rig.inherits:
         return paper_robots.nominal()
     nothing = paper_robots.blank(robot.configurations)

@@ -26,14 +26,14 @@ from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 from mmrjax.model.rig import Instrument
 
-#: How far beyond zero a reading's noise may carry it: in sds that are stated, and as a share of the channel's rms.
+#: Excess of a reading beyond zero by its noise, in stated sds, and as a share of the channel's rms.
 SIGN_SDS, SIGN_SHARE = 4.0, 0.05
 #: Share of the largest reading of a speed below which a motor that nothing drives stands.
 STILL = 0.02
 
 
 def complete(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) -> None:
-    """Fill columns that a table may leave out, and refuse values that contradict each other."""
+    """Fills columns that a table may leave out, and refuses values that contradict each other."""
     _fill(name, columns, rows, layout)
     _check_driving(name, columns)
     _check_sides(name, columns, layout)
@@ -69,7 +69,7 @@ def without_copies(name: str, columns: dict[str, np.ndarray]) -> tuple[np.ndarra
 
 
 def _fill(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) -> None:
-    """Put in what a table of a rig need not state: its only configuration, and conditions as they mostly are."""
+    """Adds columns that a table of a rig may leave out: its only configuration, and conditions with a usual value."""
     if layout.complete:
         return
     if "configuration" not in columns and layout.configurations:
@@ -81,7 +81,7 @@ def _fill(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) 
 
 
 def _only(name: str, columns: dict[str, np.ndarray], layout: Layout) -> str:
-    """The configuration that a table need not state: the robot's only one, or the one whose surfaces it has."""
+    """Returns the configuration of a table without that column: the only one, or the one that has its surfaces."""
     labels = np.unique(columns.get("surface", np.zeros(0, str)))
     found = surfaces.common(layout.configurations, labels)
     if found is None:
@@ -197,7 +197,7 @@ def _driven(name: str, columns: dict[str, np.ndarray], layout: Layout) -> tuple[
 
 
 def _check_level(name: str, columns: dict[str, np.ndarray]) -> None:
-    """Refuse readings of turns on a slope, of which none is settled."""
+    """Refuses readings of turns on a slope, since no turn is settled there."""
     slope = columns["slope_deg"]
     if slope.any():
         row = int(np.flatnonzero(slope)[0])
@@ -210,7 +210,7 @@ def _check_level(name: str, columns: dict[str, np.ndarray]) -> None:
 
 
 def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> None:
-    """Refuse readings without a sign where what is imposed drives the robot backward."""
+    """Refuses readings without a sign in rows that drive the robot backward."""
     column = layout.imposed_column
     imposed, unit = columns[column], column.split("_")[-1]
     if layout.imposed == "voltage":
@@ -255,14 +255,14 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
 
 
 def _doubt(columns: dict[str, np.ndarray], channel: Channel) -> np.ndarray | float:
-    """What a reading may lie beyond zero by its noise: SIGN_SDS of its stated sd, or a share of the channel's rms."""
+    """Largest excess of a reading beyond zero by noise: SIGN_SDS of its sd, or a share of the channel's rms."""
     readings = columns[channel.column]
     share = SIGN_SHARE * float(np.sqrt(np.nanmean(readings**2))) if np.isfinite(readings).any() else 0.0
     return np.fmax(share, SIGN_SDS * np.nan_to_num(columns.get(channel.sd_column, np.zeros(len(readings)))))
 
 
 def lacks(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
-    """Sentences on channels and readings that a table lacks, on copies of rows and on names of several."""
+    """Yields notes on missing channels and readings, on copies of rows, and on runs with several rows."""
     for channel in layout.channels:
         if channel.column not in columns:
             if layout.complete:
@@ -301,7 +301,7 @@ def lacks(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator
 
 
 def drives(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
-    """A sentence on settled rows in which a load torque without a sign drives a shaft that runs backward."""
+    """Yields a note on settled rows in which a load torque without a sign drives a shaft that runs backward."""
     on = np.flatnonzero(driven_on(columns, layout))
     if on.size and not set(TIME) & set(columns) and columns[LOAD].min() >= 0:
         more = f", and so in {on.size} rows" if on.size > 1 else ""

@@ -27,7 +27,7 @@ from calibration.data import (
     row_checks,
     sides,
 )
-from calibration.data.columns import CONDITIONS, DUTY, SUPPLY, TIME, WHEN, Layout, Meaning
+from calibration.data.columns import CONDITIONS, DUTY, SUPPLY, TIME, WHEN, Column, Layout
 from calibration.data.input_errors import BadConfiguration, BadData, number
 from calibration.data.named_arrays import NamedArrays, Raw, missing, numbers, texts
 from calibration.data.sources import opening, reading
@@ -114,17 +114,16 @@ def of_arrays(
     Args:
         arrays: columns of the source.
         measured: True if at least one channel is required; without any, `total_mass_kg` may be missing too.
-        battery: True if the runs are on the on-board battery, whose voltage no table states: its column is left out,
-            or empty.
-        robot: that the table is of; it says which columns are needed, and which channels it has. None: the packaged
-            one; the table then has every other channel too of which it has a column.
-        of_turns: True if a table of turns has every channel of either side, and of the yaw, of which it has a column.
+        battery: True if the runs are on the on-board battery; the column of the voltage is missing then, or empty.
+        robot: defines the columns that are needed, and the channels. None: the packaged robot, with a channel for
+            each further column of one.
+        of_turns: True to give a table of turns a channel for each of its columns of one side or of the yaw.
         mapped: columns that have other names in the source, as `Layout.mapped`; None: those of the robot's file.
 
     Raises:
-        BadData: no columns or rows, no channel, a missing, misspelt or repeated column, another unit than a column's,
-            values that contradict each other or the robot, or a value that is no number, not finite or out of range.
-            The sentence has source, row, column, value and what is allowed.
+        BadData: no columns or rows, no channel, a missing, misspelt or repeated column, or a wrong unit; values that
+            contradict each other or the robot; a value that is no number, not finite or out of range. The sentence
+            has source, row, column, value and the allowed values.
     """
     inferred = robot is None
     name, layout = arrays.name, Layout.of(robot)
@@ -171,7 +170,7 @@ def of_arrays(
 
 
 def _columns(
-    arrays: NamedArrays, meanings: Sequence[Meaning | None], layout: Layout, battery: bool
+    arrays: NamedArrays, meanings: Sequence[Column | None], layout: Layout, battery: bool
 ) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
     """Values of the columns that mean something, and notes on cells that are read as something else."""
     columns: dict[str, np.ndarray] = {}
@@ -206,7 +205,7 @@ def _columns(
 
 
 def _listed(name: str, said: Sequence[str], count: int) -> str:
-    """What is wrong with a file's cells, the first row's first; what to do about it once.
+    """One message on all refused cells, the first row first; each advice stands once.
 
     Args:
         said: sentences, among them the first `LISTED`; count: number of cells.
@@ -268,7 +267,7 @@ def _extra(raw: Raw) -> np.ndarray:
     return found if missing(raw, lost).all() else np.array(raw)
 
 
-def _refuse_idle(arrays: NamedArrays, meaning: Meaning, raw: Raw, layout: Layout) -> None:
+def _refuse_idle(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Layout) -> None:
     """Refuses a condition that does not act on the robot's load, unless it is 0 or not stated."""
     why = (
         f"{NO_BRAKE}; state slope_deg or payload_kg, or describe the load as a shaft"
@@ -307,13 +306,15 @@ def single(cells: dict[str, Any], layout: Layout | None = None) -> Runs:
         BadConfiguration: an option that is out of range, not finite or an unknown word.
     """
     layout = Layout() if layout is None else layout
+    rows = layout.quantities()
     columns: dict[str, np.ndarray] = {}
     for column, value in cells.items():
-        meaning = Meaning(column, column)
+        quantity = rows[column]
+        meaning = Column(quantity, column, next(iter(quantity.units)))
         text = number(value) if isinstance(value, float) else str(value)
         columns[column], refused = cell_values.values(meaning, [text], layout)
         if refused.any():
-            raise BadConfiguration(cell_values.refusal("option", meaning, text, layout))
+            raise BadConfiguration(cell_values.refusal("option", meaning, text, layout, hints=False))
     if layout.imposed == "voltage":
         columns.setdefault(SUPPLY, np.array([math.nan]))
     if "total_mass_kg" in cells and cells["total_mass_kg"] <= cells["payload_kg"]:

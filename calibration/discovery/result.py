@@ -26,8 +26,7 @@ from calibration.inference.fit_notes import HeldByPrior, Notes, Pair
 from calibration.inference.fit_posterior import determined_together
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.simulation_errors import OF_SIZE
-from calibration.words import experiment_words, fit_words
-from calibration.words import loop_words as words
+from calibration.words import experiment_words, fit_words, loop_words
 from calibration.words.note_words import sentence, sentences
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
@@ -121,7 +120,7 @@ class Formula:
     @property
     def formula(self) -> str:
         """Its expression, or that there is none."""
-        return self.expression or words.NO_FORMULA
+        return self.expression or loop_words.NO_FORMULA
 
     def to_json(self) -> dict[str, Any]:
         """As in result.json."""
@@ -195,7 +194,7 @@ class Alternative:
     @property
     def why(self) -> str:
         """Why they are not plausible, in words."""
-        return words.why_ruled_out(self.reasons)
+        return loop_words.why_ruled_out(self.reasons)
 
     def to_json(self) -> dict[str, Any]:
         """As in result.json."""
@@ -426,7 +425,7 @@ class Resolved:
     @property
     def statement(self) -> str:
         """In a sentence or two."""
-        return words.resolved(self)
+        return loop_words.resolved(self)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -436,7 +435,7 @@ class Resolved:
     def to_json(self) -> dict[str, Any]:
         """As in result.json."""
         return {
-            "asked": words.asked(self.asked),
+            "asked": loop_words.asked(self.asked),
             "statement": self.statement,
             "explains": self.explains,
             "rows": self.rows,
@@ -546,7 +545,7 @@ class DiscoveryResult:
     @property
     def statement(self) -> str:
         """The verdict in one sentence."""
-        return words.statement(self.summary)
+        return loop_words.statement(self.summary)
 
     @property
     def headline(self) -> Headline:
@@ -561,7 +560,7 @@ class DiscoveryResult:
     @property
     def standing(self) -> str:
         """Why names do not stand, or beside what they do, in words; "" where there is nothing to say."""
-        return words.why(self)
+        return loop_words.why(self)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -624,7 +623,7 @@ class DiscoveryResult:
             "verdict": self.verdict,
             "mechanism": None if self.summary.mechanism is None else _mechanism(self.summary.mechanism, self.unnamed),
             "missed": [m._asdict() for m in self.summary.missed],
-            "headline": dataclasses.asdict(self.headline) | {"statement": words.headline(self.headline)},
+            "headline": dataclasses.asdict(self.headline) | {"statement": loop_words.headline(self.headline)},
             "statement": self.statement,
             "rows": len(self.runs),
             "rows_used": int(self.included.sum()),
@@ -728,9 +727,9 @@ class DiscoveryResult:
         write_json(folder / "result.json", self.to_json())
         write_table(folder / "rows.csv", self.rows_table(), tables)
         held = [sentence(HeldByPrior(self.held_by_prior))] if self.held_by_prior else []
-        note = "\n".join([words.header(self, robot_name), *held])
+        note = "\n".join([loop_words.header(self, robot_name), *held])
         robot_file.write(self.robot, folder / "robot.toml", note=note)
-        robot_file.write(self.refit, folder / REFIT_FILE, note=words.refit_header(self, robot_name))
+        robot_file.write(self.refit, folder / REFIT_FILE, note=loop_words.refit_header(self, robot_name))
         posterior.write(self.posterior, folder / posterior.FILE)
         if self.resolved is not None:
             robot_file.write(self.resolved.robot, folder / TRACK_FILE, note=self.resolved.statement)
@@ -751,7 +750,7 @@ class Sensitivity:
     @property
     def statement(self) -> str:
         """The verdict in one sentence."""
-        return words.statement(self.summary)
+        return loop_words.statement(self.summary)
 
     def to_json(self) -> dict[str, Any]:
         """As in result.json."""
@@ -795,7 +794,7 @@ def _mechanism(m: Mechanism, curve: UnnamedDiscrepancy | None) -> dict[str, Any]
         **found,
         "errors": errors,
         "established": not m.fails,
-        "course": "" if curve is None else words.course(curve),
+        "course": "" if curve is None else loop_words.course(curve),
     }
 
 
@@ -819,7 +818,7 @@ def _unnamed(d: UnnamedDiscrepancy) -> dict[str, Any]:
         "effect": d.effect,
         "score_free_in_each_run": d.score_free_in_each_run,
         "curve": curve,
-        "course": words.course(d),
+        "course": loop_words.course(d),
         "proposal": d.proposal.to_json(),
     }
 

@@ -24,12 +24,12 @@ from calibration.inference import (
     lack_of_fit,
     multistart,
     observers,
+    optimizers,
     population,
     priors,
     scans,
     solvers,
 )
-from calibration.inference import optimizers as fit
 from calibration.inference.fit_notes import Elsewhere, Fact, Note, OfRows, PriorOfProduct, Step
 from calibration.inference.fit_posterior import of_coordinates
 from calibration.inference.multistart import Found
@@ -73,7 +73,7 @@ def calibrate(
     profiles: bool | None = None,
     blocks: Sequence[str] | bool | None = None,
     rows: int = ROWS,
-    solver: str | fit.Solver | None = None,
+    solver: str | optimizers.Solver | None = None,
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> CalibrationResult:
     """Calibrate `robot` to measured runs.
@@ -265,7 +265,7 @@ def _searched(
     evolved: _Evolved,
     seed: int,
     tell: Callable[[Step], None],
-    solver: fit.Solver | None,
+    solver: optimizers.Solver | None,
 ) -> tuple[Found, np.ndarray | None]:
     """The searches of a problem, and where they began at the optimum of `steady`, that optimum."""
     rng, size = np.random.default_rng(seed), len(posed.coordinates)
@@ -342,7 +342,7 @@ class _Optimum:
 
     z: np.ndarray
     robot: Robot
-    after: fit.Observation
+    after: optimizers.Observation
     status: np.ndarray
     status_before: np.ndarray
     seen: np.ndarray
@@ -357,7 +357,7 @@ def _optimum(setting: _Setting, found: Found) -> _Optimum:
     """
     posed, z = found.problem, np.asarray(found.best.z)
     fitted = posed.robot(jnp.asarray(z))
-    after, before = fit.observation(posed, jnp.asarray(z)), fit.read(posed, posed.base)
+    after, before = optimizers.observation(posed, jnp.asarray(z)), optimizers.read(posed, posed.base)
     status, status_before = np.asarray(after.status), np.asarray(before.status)
     lost = multistart.unreachable(posed, status)
     if lost.any():

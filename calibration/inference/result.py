@@ -20,7 +20,7 @@ from calibration.inference.multistart import Starts
 from calibration.inference.population import Searched
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.simulation_errors import OF_SIZE
-from calibration.words import fit_words as words
+from calibration.words import fit_words
 from calibration.words.note_words import sentence, sentences
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
@@ -49,7 +49,7 @@ class Prior:
 
     def to_json(self) -> dict[str, Any]:
         """As in result.json."""
-        return {**dataclasses.asdict(self), "source": words.PRIORS.get(self.source, self.source)}
+        return {**dataclasses.asdict(self), "source": fit_words.PRIORS.get(self.source, self.source)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -343,7 +343,7 @@ class CalibrationResult:
 
     def determined(self, name: str) -> str:
         """`yes`, `no`, or with which parameters together these data determine one."""
-        return words.determined(name, self.parameters[name].held_by_prior, self.together)
+        return fit_words.determined(name, self.parameters[name].held_by_prior, self.together)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -424,7 +424,7 @@ class CalibrationResult:
                         {"singular_value": s, "components": main} for s, main in about.weak_directions()
                     ],
                     "correlated": [{"a": a, "b": b, "correlation": r} for a, b, r in about.correlated()],
-                    "together": [words.pair(pair) for pair in self.together],
+                    "together": [fit_words.pair(pair) for pair in self.together],
                 },
                 "statuses_before": _counts(self.status_before),
                 "statuses": self.counts,
@@ -465,7 +465,7 @@ class CalibrationResult:
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         held = [sentence(HeldByPrior(self.undetermined))] if self.undetermined else []
-        note = "\n".join([words.header(self, robot_name), *held])
+        note = "\n".join([fit_words.header(self, robot_name), *held])
         robot_file.write(self.robot, folder / "robot.toml", note=note)
         writing.write_json(folder / "result.json", self.to_json())
         writing.write_table(folder / "rows.csv", self.rows(), tables)

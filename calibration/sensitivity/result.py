@@ -12,7 +12,7 @@ from calibration.data.runs import Runs
 from calibration.inference.fit_notes import Note
 from calibration.sensitivity.model import OutputRow
 from calibration.sensitivity.replicates import LEVEL, REPLICATES, Estimate
-from calibration.words import sensitivity_words as words
+from calibration.words import sensitivity_words
 from calibration.words.note_words import sentences
 
 SCHEMA = "mmrjax.sensitivity/1"
@@ -268,7 +268,7 @@ class SensitivityResult:
 
     def statement(self) -> str:
         """What decides these outputs, in one sentence."""
-        return words.statement(self)
+        return sensitivity_words.statement(self)
 
     @property
     def notes(self) -> tuple[str, ...]:

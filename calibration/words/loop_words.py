@@ -13,8 +13,7 @@ from calibration.discovery import loop_notes
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME
-from calibration.inference import bases
-from calibration.inference import blocks as blocks_room
+from calibration.inference import bases, blocks
 from calibration.inference.series_noise import SeriesNoise
 from calibration.words import fit_words
 from mmrjax import effects
@@ -385,7 +384,7 @@ def use_it(found: DiscoveryResult) -> list[str]:
         else []
     )
     for kind, both in found.errors_held_out.items():
-        lines.append(f"Another {blocks_room.in_words(kind)}: {_worst(both[when], len(found.runs))}.")
+        lines.append(f"Another {blocks.in_words(kind)}: {_worst(both[when], len(found.runs))}.")
     return lines
 
 
@@ -626,7 +625,7 @@ def worse(found: Sequence[Worse], predicted: Mapping[str, tuple[int, int]]) -> s
         if before > after:
             changes.append(f"{counted(before - after, 'row')} fewer predicted")
         if changes:
-            parts.append(f"by {blocks_room.in_words(kind)} {', '.join(changes)}")
+            parts.append(f"by {blocks.in_words(kind)} {', '.join(changes)}")
     return f"Held out, what was found predicts worse: {'; '.join(parts)}." if parts else ""
 
 
@@ -798,7 +797,7 @@ SAID: dict[type, str | Callable[[Any], str]] = {
     loop_notes.Led: led,
     loop_notes.NotPredictable: lambda note: (
         f"not predictable from the others, so neither scored nor tested: blocks by "
-        f"{' and by '.join(blocks_room.in_words(kind) for kind in note.kinds)} that hold all runs of a configuration "
+        f"{' and by '.join(blocks.in_words(kind) for kind in note.kinds)} that hold all runs of a configuration "
         "with parameters of its own"
     ),
     loop_notes.LostReplicates: "only {settled} of {asked} bootstrap tables could be fitted again; the thresholds are "

@@ -14,8 +14,7 @@ from calibration.data import instruments
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
-from calibration.inference import preparation
-from calibration.inference import simulation_errors as residual
+from calibration.inference import preparation, simulation_errors
 from calibration.inference.ranges import check_ranges
 from calibration.words.note_words import sentences
 from mmrjax import fidelities
@@ -129,7 +128,7 @@ def compared(
     for channel in measured.channels:
         table[channel.column] = measured.columns.get(channel.column, nothing)
         table[f"simulated_{channel.column}"] = simulated[channel.column]
-        table[f"error_{channel.name}_percent"] = residual.percent_error(
+        table[f"error_{channel.name}_percent"] = simulation_errors.percent_error(
             simulated[channel.column], table[channel.column], crosses_zero=crosses_zero
         )
     table["status"] = simulated["status"]
@@ -146,10 +145,10 @@ def compared(
 def _summary(channel: Channel, table: dict[str, np.ndarray]) -> dict[str, Any]:
     measured, simulated = table[channel.column], table[f"simulated_{channel.column}"]
     return {
-        **residual.summary(table[f"error_{channel.name}_percent"]),
-        "rms": residual.root_mean_square(simulated - measured),
+        **simulation_errors.summary(table[f"error_{channel.name}_percent"]),
+        "rms": simulation_errors.root_mean_square(simulated - measured),
         "unit": channel.unit,
-        "r2": residual.certainty(measured, simulated),
+        "r2": simulation_errors.certainty(measured, simulated),
         "missing": int(np.isnan(measured).sum()),
     }
 

@@ -14,7 +14,7 @@ from calibration.data import robot_file, settling
 from calibration.data.settling import Inertia, Settled
 from calibration.inference import ranges
 from calibration.inference.observers import SettledRuns
-from calibration.words import settle_words as words
+from calibration.words import settle_words
 from calibration.words.note_words import sentences
 from mmrjax.model import balances
 from mmrjax.model.channels import Channel
@@ -42,7 +42,7 @@ def settle(config: configuration.Settle, source: str, out: Path | None, force: b
         rolling=rolling(robot),
         loop=loop,
     )
-    few = words.too_few(found, SettledRuns.fewest, loop)
+    few = settle_words.too_few(found, SettledRuns.fewest, loop)
     with open_folder("settle", config, robot, out, force, runs) as folder:
         robot_file.write(robot, folder.partial / "robot.toml", note=f"the rig of this log, from {config.robot}")
         folder.write_table("settled.csv", found.table())
@@ -107,7 +107,7 @@ def stretches(found: Settled) -> dict[str, np.ndarray]:
         "first_row": np.array([s.rows[0] + 1 for s in every]),
         "last_row": np.array([s.rows[-1] + 1 for s in every]),
         "imposed": np.array([s.imposed for s in every]),
-        "left_out": np.array([words.reason(s) if s.why else "" for s in every]),
+        "left_out": np.array([settle_words.reason(s) if s.why else "" for s in every]),
     }
     for signal in found.signals:
         channel = signal.channel
@@ -123,10 +123,10 @@ def stretches(found: Settled) -> dict[str, np.ndarray]:
 
 def to_json(found: Settled, few: str = "") -> dict[str, Any]:
     """`result.json`; `few` is the sentence of `words.too_few`."""
-    left = words.left_out(found.stretches, bool(few))
+    left = settle_words.left_out(found.stretches, bool(few))
     return {
         "schema": "mmrjax.settle/1",
-        "statement": words.statement(found),
+        "statement": settle_words.statement(found),
         "samples": len(found.runs),
         "settled": len(found.kept),
         "shortest_s": found.shortest,
@@ -137,16 +137,16 @@ def to_json(found: Settled, few: str = "") -> dict[str, Any]:
             s.channel.name: sum(k.glitches.get(s.channel.name, 0) for k in found.kept) for s in found.signals
         },
         "left_out": [dict(zip(("why", "stretches", "samples", "rows", "do"), row, strict=True)) for row in left],
-        "notes": [*filter(None, [few]), *words.remarks(found)],
+        "notes": [*filter(None, [few]), *settle_words.remarks(found)],
     }
 
 
 def print_settled(found: Settled, few: str = "") -> None:
     """Print what was found, the log's own command where that is too few, and what was left out."""
-    say(words.statement(found))
+    say(settle_words.statement(found))
     if few:
         say(few)
-    left = words.left_out(found.stretches, bool(few))
+    left = settle_words.left_out(found.stretches, bool(few))
     if left:
         shown = Table(title="left out", title_justify="left", box=None, pad_edge=False)
         for heading in ("why", "stretches", "samples", "rows, as", "what to do"):
@@ -154,5 +154,5 @@ def print_settled(found: Settled, few: str = "") -> None:
         for row in left:
             shown.add_row(*map(str, row))
         say(shown)
-    for sentence in words.remarks(found):
+    for sentence in settle_words.remarks(found):
         say(f"- {sentence}")

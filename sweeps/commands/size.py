@@ -19,7 +19,7 @@ from sweeps.console import say
 from sweeps.inputs import load_robot
 from sweeps.pages import words
 from sweeps.points import imposed
-from sweeps.results import check_results as check_result
+from sweeps.results import check_results
 from sweeps.results.size_results import SizeResult, described, missed, objective, verdict
 from sweeps.skeleton import leave, page
 from sweeps.store import RunFolder, open_folder
@@ -99,5 +99,5 @@ def print_size(found: SizeResult) -> None:
     if lacking:
         say(
             "the best as `check` has it misses: "
-            + "; ".join(f"{check_result.label(o)} {check_result.shortfall(o)}" for o in lacking)
+            + "; ".join(f"{check_results.label(o)} {check_results.shortfall(o)}" for o in lacking)
         )

@@ -16,7 +16,7 @@ from calibration.data.columns import SIDES, SUPPLY
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.table import Runs
 from mmrjax import fidelities
-from mmrjax.derived import turning_figures as derived
+from mmrjax.derived import turning_figures
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.rest import voltage_at_rest
@@ -77,7 +77,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
             folder.write_table("history.csv", history_table(history, shown))
         own = {name: np.asarray(values) for name, values in first.columns.items()}
         table = {**run.conditions(robot, runs), **_columns(robot, shown, asked, first), **own}
-        turn = {name: _number(table[name][0]) for name in derived.COLUMNS}
+        turn = {name: _number(table[name][0]) for name in turning_figures.COLUMNS}
         facts = turn_words.turn(robot, {name: values[0] for name, values in table.items()}, _ended(history))
         say(facts.answer)
         if facts.sides:
@@ -224,7 +224,7 @@ def _columns(robot: Robot, shown: tuple[Channel, ...], conditions: Conditions, b
     reading = batch.result.reading
     return {
         **outputs.columns(batch.result, shown),
-        **derived.columns(robot, reading, radii[np.asarray(conditions.configuration)]),
+        **turning_figures.columns(robot, reading, radii[np.asarray(conditions.configuration)]),
     }
 
 

@@ -10,7 +10,7 @@ from calibration.data.input_errors import rounded
 from calibration.data.robot_file import RobotFile
 from sweeps.pages import check_figures, posture_figures
 from sweeps.pages.page import Album, named, render
-from sweeps.results import check_results as check_result
+from sweeps.results import check_results
 from sweeps.results.check_results import CheckResult
 
 
@@ -29,28 +29,31 @@ def write(folder: Path, found: CheckResult, file: RobotFile) -> Path:
         source=found.asked.source,
         rows=[_row(o) for o in found.outcomes],
         missed=[
-            {"label": f"{check_result.label(o)} {check_result.wanted(o)}", "changes": [_change(c) for c in o.change]}
+            {
+                "label": f"{check_results.label(o)} {check_results.wanted(o)}",
+                "changes": [_change(c) for c in o.change],
+            }
             for o in found.missed
         ],
         **named(file),
     )
 
 
-def _row(o: check_result.Outcome) -> dict[str, Any]:
+def _row(o: check_results.Outcome) -> dict[str, Any]:
     return {
         "met": o.met,
-        "label": check_result.label(o),
+        "label": check_results.label(o),
         "name": o.requirement.name,
-        "wanted": check_result.wanted(o),
-        "reached": check_result.reached(o),
+        "wanted": check_results.wanted(o),
+        "reached": check_results.reached(o),
         "margin": "–" if o.margin is None else f"{'+' if o.margin >= 0 else '−'}{rounded(abs(o.margin))}",
-        "corner": check_result.corner(o),
+        "corner": check_results.corner(o),
         "place": f"{o.at['configuration']}, {o.at['surface'].replace('_', ' ')}",
         "source": o.requirement.source,
     }
 
 
-def _change(c: check_result.Change) -> dict[str, Any]:
+def _change(c: check_results.Change) -> dict[str, Any]:
     return {
         "parameter": c.parameter,
         "before": f"{c.before:.4g}",

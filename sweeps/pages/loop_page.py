@@ -15,8 +15,7 @@ from calibration.inference import blocks
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
 from calibration.inference.fit_notes import Copied, FarFromPrior, Repeats
 from calibration.inference.simulation_errors import root_mean_square
-from calibration.words import fit_words
-from calibration.words import loop_words as words
+from calibration.words import fit_words, loop_words
 from calibration.words.note_words import sentence
 from mmrjax.effects import BY_NAME
 from mmrjax.model import params
@@ -67,17 +66,17 @@ def alike(found: DiscoveryResult) -> list[str]:
     """Of each effect, and of a discrepancy without a name, what these data cannot tell from it, in words."""
     curve = [] if found.unnamed is None else [found.unnamed]
     without_name = [", ".join(b for b in c.balances_alike if b != c.balance) for c in curve]
-    return [*(words.alike(found, e) for e in found.effects), *without_name]
+    return [*(loop_words.alike(found, e) for e in found.effects), *without_name]
 
 
 def findings(found: DiscoveryResult, changed: Mapping[str, loop_figures.Change]) -> list[dict[str, str]]:
     """Each effect of the model for the first screen: what it is, how large, how sure, what else it could be."""
     listed = []
     for e in found.effects:
-        size = words.size(e)
+        size = loop_words.size(e)
         if (change := changed.get(e.name)) is not None:
             size += f", which changes the {change.channel.label} by {change.rms:.2g} %"
-        sure, other = words.how_sure(found, e), words.alike(found, e)
+        sure, other = loop_words.how_sure(found, e), loop_words.alike(found, e)
         listed.append({"name": e.name, "what": ", or ".join(e.families), "size": size, "sure": sure, "alike": other})
     return listed
 
@@ -171,7 +170,7 @@ def check_first(found: DiscoveryResult) -> list[str]:
     the table contradicts."""
     far = [sentence(note) for note in found.remarks if isinstance(note, FarFromPrior | Repeats | Copied)]
     against = [note for note in found.remarks if isinstance(note, str)]
-    said = [words.largest_share(found), *far, *against[:1]]
+    said = [loop_words.largest_share(found), *far, *against[:1]]
     # a sentence begins with a capital, a parameter's name does not
     return [f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in said if text]
 
@@ -208,7 +207,7 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         album,
         of_channels=found.channels,
         title=f"Is the {words_shown(Path(robot_name).name)} model complete?",
-        answer=words.answer(found),
+        answer=loop_words.answer(found),
         findings=findings(found, changed),
         summary=summary(found),
         unseen=unseen(found),
@@ -220,17 +219,17 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
             "fitted.toml": "the robot refitted, with nothing added",
         },
         seen_by=next((blocks.in_words(kind) for kind in found.errors_held_out), "nothing"),
-        use_it=words.use_it(found),
+        use_it=loop_words.use_it(found),
         check_first=check_first(found),
         document=found.to_json(),
-        p=words.p_value(found.before.p_value),
-        cluster="" if found.cluster is None else words.cluster(found.cluster),
-        standing=words.standing(found),
-        ruled_out=words.ruled_out(found),
+        p=loop_words.p_value(found.before.p_value),
+        cluster="" if found.cluster is None else loop_words.cluster(found.cluster),
+        standing=loop_words.standing(found),
+        ruled_out=loop_words.ruled_out(found),
         alike=alike(found),
-        doubts=[words.tentative(found, e) for e in found.effects] + [""] * (found.unnamed is not None),
-        other_noise=words.at_other_noise(found.sensitivity),
-        worse=words.worse(found.held_out_worse, found.predicted),
+        doubts=[loop_words.tentative(found, e) for e in found.effects] + [""] * (found.unnamed is not None),
+        other_noise=loop_words.at_other_noise(found.sensitivity),
+        worse=loop_words.worse(found.held_out_worse, found.predicted),
         rows=first_rows(rows_of(found)),
         conditions=conditions(rows_of(found)),
         columns=columns(found.channels),

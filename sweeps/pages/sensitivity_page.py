@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.data.robot_file import RobotFile
 from calibration.sensitivity.result import NEGLIGIBLE, OutputStudy, SensitivityResult, interactions
-from calibration.words import sensitivity_words as words
+from calibration.words import sensitivity_words
 from sweeps.pages import sensitivity_figures
 from sweeps.pages.page import Album, named, number, render
 
@@ -54,7 +54,7 @@ def write(folder: Path, found: SensitivityResult, file: RobotFile) -> Path:
         album,
         title="Which parameters matter",
         found=found,
-        method=words.METHODS[found.method],
+        method=sensitivity_words.METHODS[found.method],
         sections=sections,
         inputs=_inputs(found),
         runs=_next_runs(found),

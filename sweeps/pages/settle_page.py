@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from calibration.data.courses import applied
 from calibration.data.settling import Settled
-from calibration.words import settle_words as words
+from calibration.words import settle_words
 from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, figure
 from sweeps.pages.page import ROWS, Album, render
 
@@ -39,10 +39,10 @@ def write(folder: Path, found: Settled, *, few: str = "") -> Path:
         curves=(),  # nothing is simulated
         of_channels=tuple(s.channel for s in found.signals),
         title=f"Settled runs of {Path(found.runs.source).name}",
-        statement=words.statement(found),
+        statement=settle_words.statement(found),
         few=few,
-        notes=words.remarks(found),
-        left=words.left_out(found.stretches, bool(few)),
+        notes=settle_words.remarks(found),
+        left=settle_words.left_out(found.stretches, bool(few)),
         imposed="{} [{}]".format(*IMPOSED[found.runs.layout.imposed]),
         settled=_rows(found),
         count=len(found.kept),

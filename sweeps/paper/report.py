@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from calibration.data.robot_file import RobotFile
-from calibration.inference import simulation_errors as residual
+from calibration.inference import simulation_errors
 from mmrjax.model.paper_robots import ROBOTS
 from mmrjax.model.paper_tables import TRACKED
 from mmrjax.model.robot import Robot
@@ -94,7 +94,7 @@ def _variants(name: str, rows: dict[str, data.Rows]) -> dict[str, np.ndarray]:
         pick = np.isin(rows["nominal"].conditions["configuration"], list(mine.ratio))
         nominal = rows["nominal"]
         answer["nominal (PM): adhesion raised, its own mass"] = error(nominal.weighed, nominal.measured)[pick]
-    return answer | {"the paper's own simulation": residual.relative_error(mine.paper, mine.measured)}
+    return answer | {"the paper's own simulation": simulation_errors.relative_error(mine.paper, mine.measured)}
 
 
 def _sliding_rows(rows: data.Rows) -> tuple[np.ndarray, ...]:
