@@ -262,7 +262,7 @@ def merged(
 
 
 def _bare(mine: str) -> str:
-    """PresetColumn without its unit, so that time_ms and time_s are the same."""
+    """Name of a column without its unit, so that time_ms and time_s are the same."""
     layout = Layout(channels=channels.EVERY)
     found = layout.quantities()
     return next((column for column, quantity in found.items() if mine in quantity.columns()), mine)
