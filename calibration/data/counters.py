@@ -15,7 +15,7 @@ SHARED, ODD = 0.1, 0.1
 
 
 def unwrapped(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns a counter that goes on past its end, and the number at which it wraps; 0 where it does not.
+    """Returns a counter that goes on past its end, and its period; 0 where it does not.
 
     A counter wraps where it falls from its last numbers to its first ones, within `LACKING` usual steps, and never
     goes back otherwise.

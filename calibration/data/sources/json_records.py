@@ -78,7 +78,7 @@ def _collect(value: Any, at: str, arrays: dict[str, np.ndarray], name: str, dept
 
 
 def _unfolded(value: Mapping[str, Any]) -> Mapping[str, Any] | list[Any]:
-    """A dict as pandas writes it, as arrays by name: a column by the numbers of its rows, or names beside rows."""
+    """A dict as pandas writes it, as arrays by name: a column by the numbers of its rows, or names next to rows."""
     cells = [inner for inner in value.values() if isinstance(inner, str) or not isinstance(inner, Mapping | Sequence)]
     if value and len(cells) == len(value) and all(isinstance(key, str) and key.isdigit() for key in value):
         return cells

@@ -27,7 +27,7 @@ class Elapsed(NamedTuple):
 
     Attributes:
         time: since its first sample [s], shape (n,); first: that sample by the clock [s].
-        unit: of its numbers, empty for dates; period: number at which it wraps, 0 where it does not.
+        unit: of its numbers, empty for dates; period: of a counter that wraps, else 0.
     """
 
     time: np.ndarray

@@ -263,10 +263,9 @@ def _raw(values: np.ndarray) -> Raw:
     if values.dtype.kind in "US":
         return [str(value).strip() for value in values.tolist()]
     if values.dtype.kind == "M":  # dates are read as text; the clock counts from the first
-        since = values.astype("datetime64[ns]") - np.min(
-            values[~np.isnat(values)], initial=np.datetime64("2262-01-01")
-        )
-        return np.where(np.isnat(values), np.nan, since.astype("timedelta64[ns]").astype(np.int64) * 1e-9)
+        whole, lost = values.astype("datetime64[ns]").astype(np.int64), np.isnat(values)
+        first = whole[~lost].min() if not lost.all() else 0
+        return np.where(lost, np.nan, (whole - first) * 1e-9)
     if values.dtype.kind == "m":
         return np.where(np.isnat(values), np.nan, values.astype("timedelta64[ns]").astype(np.int64) * 1e-9)
     return values
