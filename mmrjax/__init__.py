@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from mmrjax.model.signals import State as State
     from sweeps import sweep as sweep
     from sweeps.compilation_cache import keep_programs as keep_programs
+    from sweeps.report.words.note_words import describe as describe
 
 #: Module of each public name.
 _HOME = {
@@ -63,6 +64,7 @@ _HOME = {
 #: Names of the layers above `mmrjax`; each is imported when it is first used.
 _ABOVE = {
     "calibrate": "calibration",
+    "describe": "sweeps.report.words.note_words",
     "discover": "calibration",
     "keep_programs": "sweeps.compilation_cache",
     "read_robot": "calibration",
@@ -84,6 +86,7 @@ __all__ = [
     "UsageError",
     "__version__",
     "calibrate",
+    "describe",
     "discover",
     "initial_state",
     "keep_programs",

@@ -212,7 +212,7 @@ REPRODUCTION = ("sweeps", "paper")
 #: what shows slip.
 SPELLED = {
     ("calibration/discovery/menu.py", "TURNING, STANDING"),
-    ("calibration/words/effect_words.py", "CHECKED_BY"),  # which act checks which instrument
+    ("sweeps/report/words/effect_words.py", "CHECKED_BY"),  # which act checks which instrument
     ("calibration/data/contents.py", "MEANINGS"),  # words in the names of other people's signals
     ("calibration/inference/blocks.py", "BLOCKS"),  # what is imposed may be a channel's column
     ("calibration/inference/observers/settled_ends.py", "_sliding"),  # the two that show slip
@@ -400,7 +400,7 @@ def _rebound(function: Function) -> set[str]:
     return {name for n in walked(function) if isinstance(n, ast.Global) for name in n.names}
 
 
-#: Rooms that compute, and most words of a string of theirs; what is said in more is said in `calibration/words`.
+#: Rooms that compute, and most words of a string of theirs; what is said in more is said in `sweeps/report/words`.
 COMPUTING = tuple(f"calibration/{room}/" for room in ("inference", "discovery", "sensitivity", "sizing"))
 MOST_WORDS = 5
 
@@ -605,7 +605,7 @@ GOOD = {
     "calibration/sizing/said.py": "def why(x):\n    return f'{x} is one two three four five six'\ndef f(x, y):\n"
     "    '''One two three four five six.'''\n    cure = 'one two three four five six' if y else 'seven'\n"
     "    if x:\n        raise BadData(why(x))\n    return BadConfiguration(f'one two three {x} four five six {cure}')\n",
-    "calibration/words/loop_words.py": "X = 'one two three four five six seven'\n",
+    "sweeps/report/words/loop_words.py": "X = 'one two three four five six seven'\n",
     "calibration/discovery/menu.py": "TURNING, STANDING = ('total_current', 'motor_speed'), ('total_current',)\n",
     "calibration/discovery/search.py": "def f(space: CandidateSpace) -> int: ...\n",
     "calibration/inference/observers/one.py": "def f(runs, o):\n    return runs.has('time_s') or isinstance(o, Histories)\n",

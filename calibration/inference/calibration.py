@@ -16,6 +16,7 @@ from calibration.data.columns import ROWS
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.data.thinning import thinned
+from calibration.described import in_words
 from calibration.inference import blocks as holdout
 from calibration.inference import (
     checks,
@@ -41,7 +42,6 @@ from calibration.inference.problem import Problem
 from calibration.inference.remarks import numbers, remarks
 from calibration.inference.residual_clusters import residual_clusters
 from calibration.inference.result import CalibrationResult
-from calibration.words.note_words import in_words
 from mmrjax import fidelities
 from mmrjax.compile.precision import SINGLE, in_double, is_double
 from mmrjax.model.robot import Robot

@@ -12,13 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.described import described
 from calibration.inference import identifiability, optimizers, scans, series_noise
 from calibration.inference import noise as noise_room
 from calibration.inference.fit_notes import Agreement, Step
 from calibration.inference.noise import Noise
 from calibration.inference.population import Population, Searched, most_probable
 from calibration.inference.problem import Data, Observation, Problem
-from calibration.words import fit_words
 from mmrjax.model.robot import Robot
 
 #: Costs closer than this to the best [½σ²] are the same optimum.
@@ -66,7 +66,7 @@ class Starts:
 
     def statement(self) -> str:
         """Whether the starts agree, as a sentence."""
-        return fit_words.agreement(self.agreement)
+        return described(self.agreement)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from calibration.data import effect_file, robot_file
 from calibration.data.columns import Layout
+from calibration.described import in_words
 from calibration.discovery import findings
 from calibration.discovery.discover import discover
 from calibration.discovery.kept import OutOfTime
@@ -23,13 +24,12 @@ from calibration.discovery.result import REFIT_FILE, DiscoveryResult, Ranking
 from calibration.discovery.settings import fewest_replicates
 from calibration.inference import blocks, observers, priors
 from calibration.inference.simulation_errors import OF_SIZE
-from calibration.words import loop_words
-from calibration.words.note_words import in_words
-from calibration.words.step_words import expected
 from sweeps import config as configuration
 from sweeps.console import pulse, say, tell
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
+from sweeps.report.words import loop_words
+from sweeps.report.words.step_words import expected
 from sweeps.skeleton import leave, page
 from sweeps.store import SOLVER_FAILED, RunFolder, open_folder
 

@@ -14,6 +14,7 @@ from calibration.data.columns import Layout
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
+from calibration.described import in_words
 from calibration.inference import noise
 from calibration.sensitivity import uncertain_inputs
 from calibration.sensitivity.analyse import analyse
@@ -22,8 +23,6 @@ from calibration.sensitivity.next_runs import Candidates
 from calibration.sensitivity.result import METHODS, NEGLIGIBLE, Points, SensitivityResult
 from calibration.sensitivity.study import Study, Supply
 from calibration.sensitivity.uncertain_inputs import Inputs
-from calibration.words import sensitivity_words
-from calibration.words.note_words import in_words
 from mmrjax.model.conditions import OF_TURNS
 from mmrjax.model.paper_tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
 from mmrjax.model.power import COULOMB_PER_MAH
@@ -40,6 +39,7 @@ from sweeps.points import imposed
 from sweeps.points.grid import configurations, grid
 from sweeps.points.job import showing_turns
 from sweeps.points.run import refuse
+from sweeps.report.words import sensitivity_words
 from sweeps.skeleton import leave, page
 from sweeps.store import open_folder
 

@@ -10,19 +10,22 @@ import numpy as np
 
 import mmrjax as mm
 from calibration.data.columns import Layout
+from calibration.described import described
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference import blocks
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
-from calibration.inference.fit_notes import Copied, FarFromPrior, Repeats
+from calibration.inference.fit_notes import Copied, Determination, FarFromPrior, Repeats
 from calibration.inference.simulation_errors import root_mean_square
-from calibration.words import fit_words, loop_words
-from calibration.words.note_words import sentence
 from mmrjax.effects import BY_NAME
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from sweeps.pages import cluster_figures, loop_figures
-from sweeps.pages.page import Album, columns, conditions, curves, first_rows, render, words_shown
-from sweeps.pages.words import GLOSSARY
+from sweeps.pages.page import Album, columns, curves, first_rows, render
+from sweeps.pages.time_overlay import time_overlay
+from sweeps.pages.words import GLOSSARY, words_shown
+from sweeps.report.condition_columns import conditions
+from sweeps.report.words import loop_words
+from sweeps.report.words.note_words import describe
 
 #: Change of an rms error that is marked [%].
 NOTABLE = 0.05
@@ -52,6 +55,10 @@ def _run_by_run(album: Album, found: DiscoveryResult) -> None:
 def _over_time(album: Album, found: DiscoveryResult) -> None:
     assert isinstance(found.detail, TimeStatistics)
     detail = found.detail
+    simulated = {"after_": "with what was found", "before_": "before"}
+    if _drawn(found) == "none":
+        simulated = {"after_": "simulated"}
+    album.add_overlay("overlay", time_overlay(rows_of(found), found.channels, simulated))
     album.add(
         "before_after", lambda: loop_figures.over_time(found.runs, rows_of(found), found.channels, _drawn(found))
     )
@@ -168,7 +175,7 @@ def summary(found: DiscoveryResult) -> list[dict[str, Any]]:
 def check_first(found: DiscoveryResult) -> list[str]:
     """What to look at before the robot is used: the reading that weighs most, parameters that moved too far, and what
     the table contradicts."""
-    far = [sentence(note) for note in found.remarks if isinstance(note, FarFromPrior | Repeats | Copied)]
+    far = [describe(note) for note in found.remarks if isinstance(note, FarFromPrior | Repeats | Copied)]
     against = [note for note in found.remarks if isinstance(note, str)]
     said = [loop_words.largest_share(found), *far, *against[:1]]
     # a sentence begins with a capital, a parameter's name does not
@@ -238,6 +245,8 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         sides=max(1, len(loop_figures.defects_of(table, "before", "track"))),
         closed=loop_figures.closed(table) if sized and isinstance(found.detail, EquationDefects) else [],
         rms=found.rms,
-        determined={n: fit_words.determined(n, p.held_by_prior, found.together) for n, p in found.base_shift.items()},
+        determined={
+            n: described(Determination.of(n, p.held_by_prior, found.together)) for n, p in found.base_shift.items()
+        },
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",
     )

@@ -13,7 +13,7 @@ from mmrjax.model.paper_robots import ROBOTS
 from mmrjax.model.paper_tables import TRACKED
 from mmrjax.model.robot import Robot
 from sweeps.pages import history_figures, page
-from sweeps.pages.page import words_shown
+from sweeps.pages.words import words_shown
 from sweeps.paper import components, data, error_tables, run_figures
 
 

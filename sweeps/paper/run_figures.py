@@ -24,7 +24,7 @@ from sweeps.pages.figure_style import (
     label_end,
     note,
 )
-from sweeps.pages.page import words_shown
+from sweeps.pages.words import words_shown
 from sweeps.paper import data
 from sweeps.paper.look import CONFIGURATION, MODEL
 
