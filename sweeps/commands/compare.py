@@ -45,13 +45,12 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
     drawn = None if config.posterior is None else beside_robot(file)
     with open_folder("compare", config, robot, out, force, runs) as folder:
         table = run.evaluate(robot, runs, config, folder)
-        sized = stated.turns or stated.layout.crosses_zero
-        comparison, summary = compared(stated, table, robot, sized)
+        comparison, summary = compared(stated, table, robot)
         folder.write_table("comparison.csv", comparison)
         notes = (*missing(comparison, stated.channels), *said)
         found = Comparison(
             comparison, summary, stated.channels, Path(runs.source).name, config.model, capabilities.shown_name(file),
-            sized, fit_of(file, runs), notes=notes,
+            fit_of(file, runs), notes=notes,
         )  # fmt: skip
         shown = report(comparison_report.document(found), dataclasses.replace(file, robot=robot))
         if drawn is not None and config.posterior is not None:
@@ -82,13 +81,13 @@ def _over_time(
     ready = preparation.prepare(runs, file.robot)
     with open_folder("compare", config, ready.robot, out, force, runs) as folder:
         table = run.followed(ready.robot, runs, model)
-        comparison, summary = compared(runs, table, ready.robot, sized=True)
+        comparison, summary = compared(runs, table, ready.robot)
         comparison |= {column: runs[column] for column in (*OVER, "run_id") if runs.has(column)}
         folder.write_table("comparison.csv", comparison)
         notes = (*missing(comparison, runs.channels), *sentences((*ready.checked, *ready.begins, *ready.weighed)))
         found = Comparison(
             comparison, summary, runs.channels, Path(runs.source).name, HISTORIES, capabilities.shown_name(file),
-            True, fit_of(file, runs), OVER, notes,
+            fit_of(file, runs), OVER, notes,
         )  # fmt: skip
         shown = report(comparison_report.document(found), dataclasses.replace(file, robot=ready.robot))
         result = run.SimulationResult(

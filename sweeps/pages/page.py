@@ -21,7 +21,7 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
-from sweeps.pages.figure_style import can_stack, has_colour_scale, stacked_panels, style, svg, with_labels
+from sweeps.pages.figure_style import NARROW, can_stack, has_colour_scale, style, svg, with_labels
 from sweeps.pages.time_overlay import TimeOverlay
 from sweeps.report.document import PAGE_ROWS as ROWS
 from sweeps.report.document import Column, Note, Section, Table, tone
@@ -41,16 +41,18 @@ class Album:
         """Draw one figure, and a narrow one for phones if its panels stand side by side.
 
         Args:
-            draw: returns the figure, alone or followed by numbers, which are returned.
+            draw: returns the figure, alone or followed by numbers, which are returned; or an overlay over time.
         """
         with style():
             drawn = draw()
+            if isinstance(drawn, TimeOverlay):
+                return self.add_overlay(name, drawn)
             figure, *numbers = drawn if isinstance(drawn, tuple) else (drawn,)
             text, narrow = svg(figure), ""
-            if can_stack(figure):
-                with stacked_panels():
-                    drawn = draw()
-                    narrow = svg(with_labels(drawn[0] if isinstance(drawn, tuple) else drawn))
+        if can_stack(figure):
+            with style(NARROW):
+                drawn = draw()
+                narrow = svg(with_labels(drawn[0] if isinstance(drawn, tuple) else drawn))
         write_text(self.folder / f"{name}.svg", text)
         looks = "scale " * has_colour_scale(figure)
         picture = _inline(text, name, looks + ("wide" if narrow else "only"))

@@ -62,7 +62,8 @@ def answer(runs: Table) -> str:
     total = len(runs["status"])
     settled = np.isin(runs["status"], words.SETTLED)
     over = settled & (runs["flags"] != "")
-    first = f"{settled.sum()} of {counted(total, 'run')} {'has' if 1 in (total, settled.sum()) else 'have'} an operating point"
+    verb = "has" if 1 in (total, settled.sum()) else "have"
+    first = f"{settled.sum()} of {counted(total, 'run')} {verb} an operating point"
     if not over.any():
         return f"{first}; all within every limit." if settled.any() else f"{first}."
     raised = Counter(flag for flags in runs["flags"][over] for flag in str(flags).split(";"))

@@ -18,15 +18,10 @@ _FITS = {
     "others": "This robot was fitted to other rows: the errors are a prediction.",
     "": "",
 }
-_SIZED = (
-    "Errors are simulated − measured; percent are of the channel's root mean square; "
+_ERRORS = (
+    "Errors are simulated − measured; percent are of the channel's measured root mean square; "
     "R² = 1 − Σ(error)² / Σ(measured − mean)² in each group."
 )
-_RELATIVE = (
-    "Errors by eq. (35): δ = (simulated − measured) / simulated; R² by (A1) compares them with the spread of the "
-    "measured values in each group."
-)
-_COLOURS = "Green: up to 5 %; yellow: up to 10 %; red: above."
 _PARITY = (
     "**Simulated against measured.** On the line both agree; above it the simulation is too high. Rows without a "
     "simulated number are not drawn; the table gives the reason."
@@ -36,17 +31,18 @@ _PARITY = (
 def document(found: Comparison) -> Document:
     """The report of a comparison."""
     known = found.table, found.channels
-    band = "" if found.sized else " Band: ±5 %."
     lead = (
         f"Robot: **{found.robot_name}**. Fidelity: **{found.model}**. Measured: **{found.source}**, "
         f"{counted(len(found.table['status']), 'row')}."
     )
-    draw = drawing("comparison_figures.errors_over", *known, in_units=found.sized, beside=found.over)
-    parity = Figure(
-        "parity", _bias(found), _PARITY, drawing("comparison_figures.parity", *known, band=not found.sized)
-    )
+    draw = drawing("comparison_figures.errors_over", *known, in_units=True, beside=found.over)
+    parity = Figure("parity", _bias(found), _PARITY, drawing("comparison_figures.parity", *known, band=False))
     errors = Figure(
-        "errors", _trend(found), f"**Errors.** A trend along a condition points at what the model lacks.{band}", draw
+        "errors",
+        _trend(found),
+        "**Errors.** A trend along a condition points at what the model lacks. Band: ±2 standard deviations of the "
+        "readings, where they are known.",
+        draw,
     )
     return Document(
         f"{found.robot_name} against {found.source}",
@@ -55,16 +51,28 @@ def document(found: Comparison) -> Document:
             Note(lead, "lead", terminal=False),
             *(Note(text, "warn") for text in _unsolved(found)),
             _summary(found),
-            Note(_SIZED if found.sized else _RELATIVE, "key"),
-            *([] if found.sized else [Note(_COLOURS, "key", terminal=False)]),
+            Note(_ERRORS, "key"),
             *([Note(found.notes, name="notes")] if found.notes else []),
         ),
         (
+            *_over_time(found),
             Section("Parity", (parity,)),
             Section("Errors over conditions", (errors,)),
             Section("Rows", (_rows(found),)),
         ),
     )
+
+
+def _over_time(found: Comparison) -> tuple[Section, ...]:
+    """The section with readings over time of a log; none for a table of settled runs."""
+    if found.over is None:
+        return ()
+    caption = (
+        "**Measured and simulated readings over time, each with its residual below.** "
+        "The run with the largest residuals comes first."
+    )
+    draw = drawing("time_overlay.time_overlay", found.table, found.channels, {"simulated_": "simulated"})
+    return (Section("Over time", (Figure("overlay", answer(found), caption, draw),)),)
 
 
 def answer(found: Comparison) -> str:
@@ -98,24 +106,17 @@ def _unsolved(found: Comparison) -> list[str]:
     ]
 
 
-def _tone(percent: float) -> str:
-    """Tone of an error [%]; the paper claims 7 %."""
-    return "" if missing(percent) else "good" if abs(percent) <= 5 else "fair" if abs(percent) <= 10 else "bad"
-
-
 def _summary(found: Comparison) -> Table:
-    share = "% of its size" if found.sized else "%"
     columns = (
         Column("rows of"), Column("channel"), Column("rows", form="{}"), Column("rms error", form="{}"),
-        Column("rms error", share, "{:.1f}"), Column("worst", share, "{:.1f}"), Column("R²", form="{:.3f}"),
+        Column("rms error", "%", "{:.1f}"), Column("worst", "%", "{:.1f}"), Column("R²", form="{:.3f}"),
     )  # fmt: skip
     rows = []
     for group, by_channel in found.summary.items():
         for c in found.channels:
             e = by_channel[c.name]
             rms = None if missing(e["rms"]) else f"{e['rms']:.{c.resolution}f} {c.unit}"
-            percent = Cell(e["rms_percent"], "" if found.sized else _tone(e["rms_percent"]))
-            rows.append((group, c.label, e["rows"], rms, percent, e["max_percent"], e["r2"]))
+            rows.append((group, c.label, e["rows"], rms, e["rms_percent"], e["max_percent"], e["r2"]))
     return Table("errors", columns, rows)
 
 
@@ -129,13 +130,8 @@ def _rows(found: Comparison) -> Table:
         measured, simulated = table[c.column], table[f"simulated_{c.column}"]
         form = f"{{:.{max(c.resolution - 1, 0)}f}}"
         columns += [Column(name, c.unit, form, c.label, terminal=False) for name in ("measured", "simulated")]
-        columns.append(
-            Column("error", c.unit, f"{{:+.{c.resolution}f}}", c.label)
-            if found.sized
-            else Column("δ", "%", "{:+.1f}", c.label)
-        )
-        relative = [Cell(e, _tone(e)) for e in table[f"error_{c.name}_percent"]]
-        cells += [measured, simulated, simulated - measured if found.sized else relative]
+        columns.append(Column("error", c.unit, f"{{:+.{c.resolution}f}}", c.label))
+        cells += [measured, simulated, simulated - measured]
     return Table("rowtable", tuple(columns), list(zip(*cells, strict=True)), file="comparison.csv", wide=True)
 
 

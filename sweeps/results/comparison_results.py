@@ -1,4 +1,4 @@
-"""Result of the command `compare`: measured and simulated readings with errors (35) and R² (A1)."""
+"""Result of the command `compare`: measured and simulated readings with errors and R² (A1)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ class Comparison:
         table: conditions, `<column>` measured, `simulated_<column>`, `error_<channel>_percent`, `status`.
         summary: errors of all rows and of each configuration.
         channels: of the readings; source: name of the table; model: fidelity; robot_name: of the simulated robot.
-        sized: True if percent are of a channel's size, as for histories and readings that cross zero.
         fit: `these` if the robot was fitted to these rows, `others` if to other rows, "" if no fit is recorded.
         over: further columns of histories for the axes of the errors, with their headings.
         notes: sentences on the table.
@@ -37,23 +36,19 @@ class Comparison:
     source: str
     model: str
     robot_name: str
-    sized: bool
     fit: str = ""
     over: Mapping[str, str] | None = None
     notes: tuple[str, ...] = ()
 
 
 def compared(
-    measured: Runs, simulated: dict[str, np.ndarray], robot: Robot | None = None, sized: bool | None = None
+    measured: Runs, simulated: dict[str, np.ndarray], robot: Robot | None = None
 ) -> tuple[dict[str, np.ndarray], Summary]:
-    """Measured and simulated readings with their errors (35), and their summary by group.
+    """Measured and simulated readings with their errors, and their summary by group.
 
     Groups are configurations, or surfaces of `robot`. A missing reading is NaN and counts as `missing`.
-
-    Args:
-        sized: True if percent are of a channel's size; None: True where readings of the table's layout cross zero.
+    Percent are of the channel's measured rms over all rows, as in results of fits.
     """
-    crosses_zero = measured.layout.crosses_zero if sized is None else sized
     table = {
         key: simulated[key] for key in ("configuration", *dict.fromkeys((*measured.layout.axes, *measured.axes)))
     }
@@ -63,8 +58,8 @@ def compared(
     for channel in measured.channels:
         table[channel.column] = measured.columns.get(channel.column, nothing)
         table[f"simulated_{channel.column}"] = simulated[channel.column]
-        table[f"error_{channel.name}_percent"] = residual.percent_error(
-            simulated[channel.column], table[channel.column], crosses_zero=crosses_zero
+        table[f"error_{channel.name}_percent"] = residual.sized_error(
+            simulated[channel.column], table[channel.column]
         )
     table["status"] = simulated["status"]
     groups = {"all": np.ones(len(measured), bool)}

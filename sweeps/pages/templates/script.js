@@ -27,7 +27,8 @@ document.querySelectorAll("table").forEach(table => {
   }));
 });
 document.querySelectorAll("table").forEach((table, number) => {  // every table as CSV
-  if (table.rows.length < 3 || table.closest(".overlay") || table.dataset.file) return;
+  const next = (table.closest(".scroll") || table).nextElementSibling;
+  if (table.rows.length < 3 || table.closest(".overlay") || next && next.querySelector("a.csv")) return;
   const cell = text => /[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
   const link = Object.assign(document.createElement("a"), {className: "download", textContent: "CSV", href: "#", download: (table.id || `table-${number + 1}`) + ".csv"});
   link.setAttribute("aria-label", "download this table as CSV");
