@@ -725,7 +725,7 @@ class DiscoveryResult:
         table["use"] = use
         return table
 
-    def save(self, folder: Path | str, robot_name: str = "") -> None:
+    def save(self, folder: Path | str, robot_name: str = "", tables: str = "csv") -> None:
         """Write `result.json`, `rows.csv`, `posterior.nc`, `robot.toml` and `fitted.toml` (with nothing added).
 
         `robot_track.toml` is also written if the track model was run.
@@ -733,11 +733,12 @@ class DiscoveryResult:
         Args:
             folder: created if missing.
             robot_name: name of the initial robot.
+            tables: as for `write_table`.
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "result.json", self.to_json())
-        write_table(folder / "rows.csv", self.rows_table())
+        write_table(folder / "rows.csv", self.rows_table(), tables)
         held = [described(HeldByPrior(self.held_by_prior))] if self.held_by_prior else []
         note = "\n".join([described(self, "header", robot_name), *held])
         robot_file.write(self.robot, folder / "robot.toml", note=note)

@@ -452,11 +452,12 @@ class CalibrationResult:
             yield f"error_{channel.name}_percent", r.percent
             yield f"error_{channel.name}_sigma", r.sigma
 
-    def save(self, folder: Path | str, robot_name: str = "a robot") -> None:
+    def save(self, folder: Path | str, robot_name: str = "a robot", tables: str = "csv") -> None:
         """Write robot.toml, posterior.nc, result.json and rows.csv into a folder, which is created if missing.
 
         Args:
             robot_name: name of the initial robot, for the head of robot.toml.
+            tables: as for `write_table`.
         """
         from calibration.data import robot_file
 
@@ -466,7 +467,7 @@ class CalibrationResult:
         note = "\n".join([described(self, "header", robot_name), *held])
         robot_file.write(self.robot, folder / "robot.toml", note=note)
         writing.write_json(folder / "result.json", self.to_json())
-        writing.write_table(folder / "rows.csv", self.rows())
+        writing.write_table(folder / "rows.csv", self.rows(), tables)
         posterior.write(self.posterior, folder / posterior.FILE)
 
 

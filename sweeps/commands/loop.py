@@ -65,7 +65,7 @@ def _loop(
 ) -> int:
     began = time.monotonic()
     robot = load_robot(config).robot
-    runs = read_runs(source, robot, measured=True, series=True)
+    runs = read_runs(source, robot, columns=config.columns, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
     if config.resolve:
         check_resolvable(runs, members)
@@ -113,7 +113,7 @@ def _loop(
         print_discovery(found)
         if config.resolve and found.resolved is None:
             say("The track model was not asked: nothing remains in slip, track or ground that it has a say in.")
-        found.save(folder.partial, config.robot)
+        found.save(folder.partial, config.robot, folder.tables)
         if config.report:
             progress("writing the report")
         manifest = {"seed": config.seed, "verdict": found.verdict}

@@ -274,7 +274,7 @@ def _use(column: str, robot: Robot) -> str:
     return "condition"
 
 
-def check(file: Path, data: str | None, effects: tuple[str, ...], as_json: bool) -> int:
+def check(file: Path, data: str | None, effects: tuple[str, ...], as_json: bool, columns: str | None = None) -> int:
     """Say what was understood of a rig's file, and what a table can tell of it; returns 0.
 
     Raises:
@@ -285,7 +285,7 @@ def check(file: Path, data: str | None, effects: tuple[str, ...], as_json: bool)
         raise BadConfiguration(f"{file}: is a folder; expected a rig's TOML file")
     if not file.is_file():
         raise BadConfiguration(f"{file}: no such file; mmrjax rig new {file} writes one to fill in")
-    found = examined(file, data, effects)
+    found = examined(file, data, effects, columns)
     if as_json:
         print(json.dumps(finite(found.to_json()), indent=2, ensure_ascii=False))
     else:
@@ -293,15 +293,15 @@ def check(file: Path, data: str | None, effects: tuple[str, ...], as_json: bool)
     return 0
 
 
-def examined(file: Path, data: str | None, effects: tuple[str, ...] = ()) -> RigCheck:
-    """What there is to say of a rig's file, and of a table beside it."""
+def examined(file: Path, data: str | None, effects: tuple[str, ...] = (), columns: str | None = None) -> RigCheck:
+    """Remarks on a rig's file, and on a table whose columns a preset may name."""
     rig = load_robot(RobotPart(robot=str(file), effects=effects))
     lines, robot = rig.text.splitlines(), rig.robot
     examples = tuple(k for k, line in enumerate(lines, 1) if EXAMPLE in line and not line.startswith("#"))
     found = RigCheck(rig.name, robot, examples, tuple(rig_facts.origins(rig)), tuple(rig_facts.facts(robot)))
     if data is None:
         return found
-    runs = read_runs(data, robot, measured=True, series=True)
+    runs = read_runs(data, robot, columns=columns, measured=True, series=True)
     seen = foresight.predict_identifiability(runs, robot)
     doubts = (*filter(None, (settling.doubtful_sign(runs),)), *rig_facts.doubts(runs, robot), *sentences(seen.doubts))
     return dataclasses.replace(found, runs=runs, foresight=seen, doubts=doubts)

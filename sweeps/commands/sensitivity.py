@@ -175,7 +175,7 @@ def _inputs(
 def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs, turns: bool) -> Candidates:
     """Runs of a table, or of Table 8 in every configuration; of a rig, and of turns, its operating points."""
     if config.candidates:
-        runs = read_runs(config.candidates, robot, measured=False)
+        runs = read_runs(config.candidates, robot, columns=config.columns, measured=False)
         source = runs.source
     elif turns or not Layout.of(robot).table8:
         runs, source = points, "the operating points"
