@@ -341,6 +341,23 @@ def settle(
 
 
 @_command(
+    config.Export,
+    arguments=("robot",),
+    example="mmrjax export found/robot.toml --to mujoco --data runs.csv --out exported",
+    failure="does not occur: runs that do not settle are left out of the comparison",
+)
+def export(told: Told, out: _Out = None, force: _Force = False) -> int:
+    """Write a drive in the format of another simulator, and a page on what the format loses.
+
+    Parameters of the format are refitted to this model over the runs of --data. LAW.md describes the law to people
+    who have never seen this program: equations, constants with intervals, conditions seen, what was not tested.
+    """
+    from sweeps.commands import export as room
+
+    return room.export(told.config, out, force)
+
+
+@_command(
     config.Loop,
     beside=config.LoopBeside,
     example="mmrjax loop measured --out found, then mmrjax sweep --robot found/robot.toml",
