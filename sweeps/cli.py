@@ -476,15 +476,20 @@ def new(
     kind: Annotated[
         str, typer.Option(help="tracked, wheeled, bench, dyno, pendulum, servo, linear or carriage.")
     ] = "bench",
+    source: Annotated[
+        Path | None, typer.Option("--from", help="A model of MuJoCo (.xml) whose driven joint is the rig.")
+    ] = None,
+    joint: Annotated[str | None, typer.Option(help="Name of that joint.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file where there is one.")] = False,
 ) -> int:
     """Write a rig's file to fill in, with units and where each number comes from; it asks nothing.
 
     As written it can be read, with numbers of an example. Units are SI but where a comment says another.
+    With --from the numbers are those of a model's joint, as export --to mujoco writes them.
     """
     from sweeps.commands import rig_new
 
-    return rig_new.new(file, kind, force)
+    return rig_new.new(file, kind, force, source, joint)
 
 
 @rig.command("check", epilog="Example: mmrjax rig check my-rig.toml my-runs.csv")

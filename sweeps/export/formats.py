@@ -108,9 +108,10 @@ def _mujoco(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> E
     motor, name = mujoco.motor(drive, found.refitted), f"{drive.name}_drive"
     about = mujoco.attribute_notes(drive, begun.constants, found.translated, found.refitted)
     mass = float(np.mean(np.asarray(runs.signals.mass)))
+    volts = float(drive.robot.motor.voltage_limit or np.max(np.abs(runs.command)))
     middle = (float(np.mean(runs.command)), float(np.mean(runs.load)))
     texts = {
-        "drive.xml": mujoco.fragment(drive, motor, about, notes_of(runs), name, at),
+        "drive.xml": mujoco.fragment(drive, motor, about, notes_of(runs), name, at, volts),
         "scene.xml": mujoco.scene(drive, mass, name, at, *middle),
     }
     checks = _checked(texts, motor, runs, found)

@@ -261,10 +261,13 @@ def _comment(lines: Sequence[str], indent: str) -> str:
     return "".join(f"{indent}<!-- {t} -->\n" for t in text)
 
 
-def fragment(joint: Joint, found: Motor, about: Mapping[str, str], notes: Sequence[str], name: str, at: str) -> str:
+def fragment(
+    joint: Joint, found: Motor, about: Mapping[str, str], notes: Sequence[str], name: str, at: str, volts: float
+) -> str:
     """Text of the fragment that a model includes.
 
     Args:
+        volts: highest voltage seen or allowed [V], which the control's range states and does not enforce.
         about: words for the source and interval of each attribute; notes: of the header.
         name: of the actuator and the default class; at: name of the joint.
     """
@@ -274,7 +277,8 @@ def fragment(joint: Joint, found: Motor, about: Mapping[str, str], notes: Sequen
         "motorconst": (v[CONSTANT],), "resistance": (v[RESISTANCE],), "inductance": (found.inductance,),
         "thermal": found.thermal, "lugre": found.lugre, "cogging": found.cogging,
     }  # fmt: skip
-    limits = "" if found.limit is None else f' forcelimited="true" forcerange="{_digits(-found.limit, found.limit)}"'
+    limits = f' ctrllimited="false" ctrlrange="{_digits(-volts, volts)}"'
+    limits += "" if found.limit is None else f' forcelimited="true" forcerange="{_digits(-found.limit, found.limit)}"'
     written = "".join(f' {key}="{_digits(*x)}"' for key, x in attributes.items() if x)
     head = [
         f"Drive of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}; MuJoCo {_version()} "
