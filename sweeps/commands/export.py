@@ -49,7 +49,6 @@ def to_json(found: Export) -> dict[str, Any]:
         "runs": len(compared.situation.command),
         "source": compared.situation.source,
         "reference": compared.reference,
-        "held_out_blocks": compared.blocks,
         "errors_percent": {e.label: dict(e.percent) for e in compared.errors},
         "translated": dict(compared.translated),
         "refitted": dict(compared.refitted),

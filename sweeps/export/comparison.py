@@ -25,8 +25,6 @@ NEARLY_ALL = 0.999
 NEAR = 1e-3
 #: Residual below which translated parameters are exact, and no refit changes them.
 EXACT = 1e-7
-#: Blocks where what is imposed has fewer levels than `LEAST`.
-FOLDS, LEAST = 5, 3
 HELD, APPROXIMATED, DROPPED = "held", "approximated", "dropped"
 
 
@@ -76,7 +74,7 @@ class Comparison:
         situation: the runs; translated, refitted: parameters of the format by name [SI], before and after the refit.
         fates: of base terms and effects; errors: of native, exported, translated, and exported without the effects.
         reference: what errors are relative to, in words; readings: of the exported drive [SI], (runs, channels).
-        blocks: how many the refit was held out by; exported: at the joint, after the refit to all runs.
+        exported: at the joint.
     """
 
     situation: Situation
@@ -86,7 +84,6 @@ class Comparison:
     errors: tuple[Errors, ...]
     reference: str
     readings: np.ndarray
-    blocks: int
     exported: AtJoint
 
     def of(self, label: str) -> Mapping[str, float]:
@@ -127,21 +124,21 @@ def compare(
         if not np.isfinite(kept) and effect.name not in held:  # nothing of it shows in steady travel
             verdict, how = DROPPED, "it shows only while the motion changes, and the format has no term for it"
         found.append(Fate(effect.name, verdict, how, kept))
-    blocks = blocks_of(situation)
-    models = {NATIVE: situation.native, EXPORTED: situation.readings(held_out(law, situation, inside, blocks))}
+    exported = _at(law, theta, situation)
+    models = {NATIVE: situation.native, EXPORTED: situation.readings(exported)}
     if law.names:
         models[TRANSLATED] = situation.readings(_at(law, law.start, situation))
     if names:
         plain = law_of(joint, dict.fromkeys(names, 0.0))
-        models[WITHOUT] = situation.readings(held_out(plain, situation, situation.without(names), blocks))
+        bare = refit(plain, situation, situation.without(names))
+        models[WITHOUT] = situation.readings(_at(plain, bare, situation))
     reference = situation.measured if situation.is_measured else situation.native
-    exported = _at(law, theta, situation)
     return Comparison(
         situation, dict(zip(law.names, map(float, law.start), strict=True)),
         dict(zip(law.names, map(float, theta), strict=True)), tuple(found),
         tuple(Errors(label, errors(joint, shown, reference)) for label, shown in models.items()),
         "the measured readings" if situation.is_measured else "the native model",
-        situation.readings(exported), len(blocks), exported,
+        models[EXPORTED], exported,
     )  # fmt: skip
 
 
@@ -157,35 +154,31 @@ def errors(joint: Joint, shown: np.ndarray, reference: np.ndarray) -> dict[str, 
 
 
 def _at(law: FormatLaw, theta: Any, situation: Situation) -> AtJoint:
-    current, speed = _evaluated(law, jnp.asarray(theta), situation.command, situation.load, situation.way)
+    current, speed = evaluated(law, jnp.asarray(theta), situation.command, situation.load, situation.way)
     return AtJoint(np.asarray(current), np.asarray(speed))
 
 
 @eqx.filter_jit
-def _evaluated(law: FormatLaw, theta: Any, command: Any, load: Any, way: Any) -> tuple[Any, Any]:
+def evaluated(law: FormatLaw, theta: Any, command: Any, load: Any, way: Any) -> tuple[Any, Any]:
+    """Current of one motor [A] and speed of the joint [rad/s] by a format's law, compiled."""
     return law(theta, *map(jnp.asarray, (command, load, way)))
 
 
-def refit(law: FormatLaw, situation: Situation, native: AtJoint, rows: np.ndarray | None = None) -> np.ndarray:
+def refit(law: FormatLaw, situation: Situation, native: AtJoint) -> np.ndarray:
     """Parameters of a format at which its currents and speeds are nearest the native model's, by least squares.
 
-    Residuals are relative to each quantity's rms. Parameters stay positive: each is the square of an unknown.
-
-    Args:
-        rows: mask of the runs that count; None: all.
+    Residuals are relative to each quantity's rms. Parameters stay positive: each is the square of an unknown. No
+    reading enters, so errors against readings are as honest as those of the native model.
     """
     if not law.names:
         return np.zeros(0)
-    counts = np.ones(len(situation.command)) if rows is None else rows.astype(float)
-    given = (situation.command, situation.load, situation.way, native.current, native.speed, counts)
+    given = (situation.command, situation.load, situation.way, native.current, native.speed)
     least = 1e-3 * float(np.max(np.abs(situation.load))) + 1e-9
     return np.asarray(_refitted(law, jnp.asarray(least), *map(jnp.asarray, given)))
 
 
 @eqx.filter_jit
-def _refitted(
-    law: FormatLaw, least: Any, command: Any, load: Any, way: Any, current: Any, speed: Any, counts: Any
-) -> Any:
+def _refitted(law: FormatLaw, least: Any, command: Any, load: Any, way: Any, current: Any, speed: Any) -> Any:
     sizes = [jnp.sqrt(jnp.mean(x**2)) for x in (current, speed)]
     scale = jnp.sqrt(jnp.maximum(law.start, least))
 
@@ -194,7 +187,7 @@ def _refitted(
 
     def residual(z: jax.Array, args: Any) -> jax.Array:
         found = law((scale * z) ** 2, command, load, way)
-        apart = [counts * (a - b) / s for a, b, s in zip(found, (current, speed), sizes, strict=True)]
+        apart = [(a - b) / s for a, b, s in zip(found, (current, speed), sizes, strict=True)]
         return jnp.concatenate([*apart, NEAR * jnp.sqrt(1.0 * len(command)) * (z - start)])
 
     solver: Any = solvers.solver("lm")
@@ -227,23 +220,3 @@ def _stacked(found: AtJoint) -> np.ndarray:
 
 def _sizes(found: AtJoint) -> np.ndarray:
     return np.sqrt(np.mean(_stacked(found) ** 2, 0))
-
-
-def blocks_of(situation: Situation) -> list[np.ndarray]:
-    """Masks of rows: a block for each level of what is imposed, else every fifth run; one of all if there are few."""
-    level = np.unique(np.round(situation.command, 1), return_inverse=True)[1]
-    if level.max() + 1 < LEAST or level.max() + 1 > len(level) // 2:
-        level = np.arange(len(level)) % min(FOLDS, len(level))
-    found = [level == k for k in range(level.max() + 1)]
-    return found if len(found) > 1 else []
-
-
-def held_out(law: FormatLaw, situation: Situation, native: AtJoint, blocks: Sequence[np.ndarray]) -> AtJoint:
-    """The exported drive in each run with parameters refitted to the runs of the other blocks."""
-    if not law.names or not blocks:
-        return _at(law, refit(law, situation, native), situation)
-    current, speed = np.empty(len(situation.command)), np.empty(len(situation.command))
-    for block in blocks:
-        found = _at(law, refit(law, situation, native, ~block), situation)
-        current[block], speed[block] = found.current[block], found.speed[block]
-    return AtJoint(current, speed)

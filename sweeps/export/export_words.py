@@ -78,8 +78,7 @@ def kept(fate: Fate) -> str:
 def errors_title(found: Export) -> str:
     """Title of the table of errors."""
     compared = found.comparison
-    held = f", refitted without the block of each run ({compared.blocks} blocks)" if compared.blocks else ""
-    return f"error against {compared.reference}, rms over rms{held if compared.refitted else ''}"
+    return f"error against {compared.reference}, rms over rms"
 
 
 def remarks(found: Export) -> list[str]:

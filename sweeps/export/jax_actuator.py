@@ -41,12 +41,13 @@ class ActuatorLaw(eqx.Module):
         def torque(speed: Any) -> Any:
             return settled(self.module, self.params, command, speed)[0] - load
 
-        speed = self.guess
-        for _ in range(STEPS):
+        def nearer(speed: Any, _: None) -> tuple[Any, None]:
             left, rise = jax.jvp(torque, (speed,), (jnp.ones_like(speed),))
-            # Never across rest, where friction turns round.
             stride = jnp.where(rise != 0, -left / jnp.where(rise != 0, rise, 1.0), 0.0)
-            speed = jnp.where(way * (speed + stride) > 0, speed + stride, 0.5 * speed)
+            # Never across rest, where friction turns round.
+            return jnp.where(way * (speed + stride) > 0, speed + stride, 0.5 * speed), None
+
+        speed = jax.lax.scan(nearer, self.guess, None, STEPS)[0]
         return settled(self.module, self.params, command, speed)[1]["current"], speed
 
 
