@@ -592,9 +592,7 @@ class Settle(RobotPart, OutputPart):
 class Export(RobotPart, OutputPart):
     """A drive in the format of another simulator."""
 
-    robot: str = about(
-        "nominal", "nominal, sm1, sm2, or a robot's TOML file", metavar="[ROBOT.toml]", format="path"
-    )
+    robot: str = about("nominal", "nominal, sm1, sm2, or a robot's TOML file", metavar="[ROBOT.toml]", format="path")
     to: Literal["mujoco", "jax", "onnx", "mjlab", "table", "randomization"] = about(
         "mujoco", "Format (docs/export.md)"
     )

@@ -11,6 +11,7 @@ import numpy as np
 from calibration.data.input_errors import BadConfiguration, choices
 from calibration.data.posterior_file import Posterior
 from calibration.data.robot_file import RobotFile
+from calibration.data.runs import Runs
 from mmrjax.compile.precision import in_double
 from sweeps.export import comparison, feed_forward, jax_actuator, mjlab, mujoco, onnx, randomization
 from sweeps.export.comparison import Comparison, Fate
@@ -56,17 +57,19 @@ def exported(
     to: str,
     *,
     configuration: str | None = None,
-    data: str | None = None,
+    data: Runs | str | None = None,
     at: str = "drive",
     draws: int = 1000,
     seed: int = 0,
+    posterior: Posterior | None = None,
 ) -> Export:
     """Returns the drive of a robot in a format, compared with the native model over runs.
 
     Args:
         to: one of `FORMATS`; configuration: name, None: the robot's first.
-        data: a table of runs, settled or over time; None: a grid of operating points.
+        data: runs, or the file of a table or log; None: a grid of operating points.
         at: name of the joint in the simulator's model; draws, seed: of `randomization`.
+        posterior: of the robot; None: what lies beside its file.
 
     Raises:
         BadConfiguration, BadData: a format, a drive or a table that is refused.
@@ -78,7 +81,7 @@ def exported(
     if to in ("mujoco", "randomization"):
         mujoco.library()
     drive = joint(file, configuration)
-    posterior = posterior_of(drive)
+    posterior = posterior_of(drive) if posterior is None else posterior
     runs = situation(drive, data)
     constants = constants_of(drive, runs.signals, posterior)
     make = {

@@ -117,7 +117,7 @@ def _solved(robot: Robot, conditions: Conditions) -> tuple[np.ndarray, Signals]:
     return np.asarray(done(result.status)), signals
 
 
-def situation(joint: Joint, data: str | None) -> Situation:
+def situation(joint: Joint, data: Runs | str | None) -> Situation:
     """Returns the runs of a table in the joint's configuration, or of a grid where there is no table.
 
     Raises:
@@ -129,7 +129,7 @@ def situation(joint: Joint, data: str | None) -> Situation:
         source = "a grid of operating points, without readings"
     else:
         runs = _table(data, joint)
-        source = data
+        source = runs.source
     conditions = runs.conditions(robot)
     moves, whole = _solved(robot, conditions)
     turns, signals = _solved(_absent(joint), conditions) if joint.outside else (moves, whole)
@@ -156,18 +156,19 @@ def _measured(runs: Runs, channels: tuple[Any, ...]) -> np.ndarray:
     return np.stack([known.get(c.name, np.full(len(runs), np.nan)) for c in channels], -1)
 
 
-def _table(data: str, joint: Joint) -> Runs:
-    """Runs of a file in the joint's configuration; of a log its settled stretches."""
+def _table(data: Runs | str, joint: Joint) -> Runs:
+    """Runs of a table in the joint's configuration; of a log its settled stretches."""
     robot = joint.file.robot
-    runs = read_runs(data, robot, measured=True, series=True)
+    runs = read_runs(data, robot, measured=True, series=True) if isinstance(data, str) else data.of(robot)
     if runs.turns:
         raise BadData(
-            f"{data}: its runs drive the sides independently, and one joint has one drive; expected straight travel"
+            f"{runs.source}: its runs drive the sides independently, and one joint has one drive; expected straight "
+            "travel"
         )
     if levers := [name for name in runs.axes if name.startswith("lever")]:
         raise BadData(
-            f"{data}, {levers[0]}: the levers' posture moves the load, and one joint has one drive; expected runs "
-            "without columns of the levers"
+            f"{runs.source}, {levers[0]}: the levers' posture moves the load, and one joint has one drive; expected "
+            "runs without columns of the levers"
         )
     if runs.sampled:
         from calibration.data import settling
@@ -177,5 +178,5 @@ def _table(data: str, joint: Joint) -> Runs:
         runs = found.settled_runs()
     here = runs.configurations_named(robot) == joint.configuration
     if not here.any():
-        raise BadData(f"{data}: no run of {joint.configuration}; expected runs of the exported configuration")
+        raise BadData(f"{runs.source}: no run of {joint.configuration}; expected runs of the exported configuration")
     return runs.where(here)
