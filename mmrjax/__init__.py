@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from mmrjax.model.signals import State as State
     from sweeps import sweep as sweep
     from sweeps.compilation_cache import keep_programs as keep_programs
-    from sweeps.export.door import export as export
+    from sweeps.export.drive_export import export as export
 
 #: Where each public name lives.
 _HOME = {
@@ -61,7 +61,7 @@ _HOME = {
 _ABOVE = {
     "calibrate": "calibration",
     "discover": "calibration",
-    "export": "sweeps.export.door",
+    "export": "sweeps.export.drive_export",
     "keep_programs": "sweeps.compilation_cache",
     "read_robot": "calibration",
     "read_runs": "calibration",

@@ -14,8 +14,8 @@
 # %% [markdown]
 # # Into MuJoCo
 #
-# A drive that the loop has found goes where people train and control: as a `<dcmotor>` into MuJoCo, and as an actuator
-# function into MJX. How much does each format lose? The same as `mmrjax loop measured --out found`, then
+# A drive that the loop has found goes where people train and control: as a `<dcmotor>` into MuJoCo, and as an
+# actuator function into MJX. How much does each format lose? The same as `mmrjax loop measured --out found`, then
 # `mmrjax export found/robot.toml --to mujoco --configuration 4W2T --data measured`.
 
 # %%
@@ -55,8 +55,8 @@ print(drive.files["drive.xml"][start:].splitlines()[0])
 
 # %% [markdown]
 # ## In MuJoCo C
-# The scene that comes with the export: one side of the robot rolls on its wheel. The torque of slope and ground is the
-# actuator `load`. Runs of Table 8 on wheels, each until it has settled, against `mm.simulate`.
+# The scene that comes with the export: one side of the robot rolls on its wheel. The torque of slope and ground is
+# the actuator `load`. Runs of Table 8 on wheels, each until it has settled, against `mm.simulate`.
 
 # %%
 model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
@@ -143,7 +143,7 @@ plt.show()
 
 # %% [markdown]
 # ## A move that takes little energy
-# Half a metre in one second, from rest to rest, with the least energy: gradients go through the actuator and the joint.
+# Half a metre in one second, from rest to rest, with the least energy: gradients go through actuator and joint.
 
 # %%
 STEPS, DT, KNOTS, TARGET = 200, 0.005, 21, 0.5

@@ -352,7 +352,7 @@ def export(told: Told, out: _Out = None, force: _Force = False) -> int:
     Parameters of the format are refitted to this model over the runs of --data. LAW.md describes the law to people
     who have never seen this program: equations, constants with intervals, conditions seen, what was not tested.
     """
-    from sweeps.commands import export as room
+    from sweeps.commands import export_drive as room
 
     return room.export(told.config, out, force)
 

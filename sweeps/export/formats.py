@@ -13,6 +13,7 @@ from calibration.data.posterior_file import Posterior
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from mmrjax.compile.precision import in_double
+from mmrjax.errors import counted
 from sweeps.export import comparison, feed_forward, jax_actuator, mjlab, mujoco, onnx, randomization
 from sweeps.export.comparison import Comparison, Fate
 from sweeps.export.constants import constants_of, posterior_of
@@ -96,7 +97,7 @@ def notes_of(runs: Situation) -> list[str]:
     """Sentences for the head of every file."""
     command = runs.command
     return [
-        f"Seen: {len(command)} runs of {runs.source}, {np.min(command):.4g} to {np.max(command):.4g} V, "
+        f"Seen: {counted(len(command), 'run')} of {runs.source}, {np.min(command):.4g} to {np.max(command):.4g} V, "
         f"{np.min(runs.load):.4g} to {np.max(runs.load):.4g} N·m at the joint. Nothing beyond was tested. "
         "LAW.md has the equations, the intervals and what is lost."
     ]
