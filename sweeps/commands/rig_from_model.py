@@ -131,7 +131,7 @@ class _Drive:
         library.mj_fullM(model, mass, data.qM) if hasattr(data, "qM") else library.mj_fullM(model, data, mass)
         self.inertia = float(mass[dof, dof]) - armature
         # The weight acts against forward rotation as M sin(θ - θ_0).
-        self.weight = float(np.hypot(*weights))
+        self.weight = float(np.hypot(weights[0], weights[1]))
         self.angle = float(np.arctan2(-weights[0], weights[1])) if self.weight > LEAST_WEIGHT else 0.0
 
 

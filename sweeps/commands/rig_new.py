@@ -33,7 +33,7 @@ def new(file: Path, kind: str, force: bool, source: Path | None = None, joint: s
         source: the model; None: a file of a kind; joint: its name in the model.
 
     Raises:
-        BadConfiguration: no such kind, model, joint or folder, or a file that is there without `force`.
+        BadConfiguration: no such kind, model, joint or folder, or a file that exists without `force`.
     """
     if joint is not None and source is None:
         raise BadConfiguration(f"--joint: got {joint} without --from; expected a model that has this joint")

@@ -1,4 +1,4 @@
-"""Refit of a format's parameters to the native model, what becomes of each effect, and the errors of an export."""
+"""Refit of a format's parameters to the native model, the fate of each effect, and the errors of an export."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class FormatLaw(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Fate:
-    """What becomes of an effect, or of a term of the base, in a format.
+    """Fate of an effect, or of a term of the base, in a format.
 
     Attributes:
         name: of the effect or term; verdict: `HELD`, `APPROXIMATED` or `DROPPED`; how: in words.
@@ -108,7 +108,7 @@ def compare(
         law_of: the format's law of a joint in which some amplitudes, by name of the effect, have other values.
         fates: of terms that are no effects inside the joint.
         held: effects that the format holds by a term of its own → words for that term.
-        approximated: words for the terms that stand in for an effect of a balance.
+        approximated: words for the terms that replace an effect of a balance.
     """
     joint = situation.joint
     law = law_of(joint, {})
@@ -165,7 +165,7 @@ def evaluated(law: FormatLaw, theta: Any, command: Any, load: Any, way: Any) -> 
 
 
 def refit(law: FormatLaw, situation: Situation, native: AtJoint) -> np.ndarray:
-    """Parameters of a format at which its currents and speeds are nearest the native model's, by least squares.
+    """Least-squares fit of a format's parameters to the native model's currents and speeds.
 
     Residuals are relative to each quantity's rms. Parameters stay positive: each is the square of an unknown. No
     reading enters, so errors against readings are as honest as those of the native model.

@@ -20,7 +20,7 @@ OF_POSTERIOR, OF_PRIOR = "95 % interval", "prior, two sds either side: no poster
 
 
 def posterior_of(joint: Joint) -> Posterior | None:
-    """Returns the posterior beside the robot's file, with parameters of this joint; None where there is none.
+    """Returns the posterior next to the robot's file; None if there is no such file.
 
     Raises:
         BadData: it cannot be read, or is of another robot.

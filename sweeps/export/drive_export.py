@@ -31,9 +31,9 @@ def export(
     """Export a robot's drive as the actuator of one joint in another simulator, compared with the native model.
 
     Args:
-        robot: a robot, the name of a packaged one, or its TOML file, whose posterior is read from beside it.
+        robot: a robot, the name of a packaged one, or its TOML file; the posterior next to it is read.
         to: `mujoco`, `jax`, `onnx`, `mjlab`, `table` or `randomization` (docs/export.md).
-        out: folder for the files and `LAW.md`, made where there is none; None: nothing is written.
+        out: folder for the files and `LAW.md`, made if it does not exist; None: no files are written.
         data: runs to compare with, or the file of a table or log; None: a grid of operating points.
         configuration: which of the robot's; None: its first.
         joint: name of the joint in the simulator's model, for `mujoco`.

@@ -89,8 +89,7 @@ def remarks(found: Export) -> list[str]:
         said.append("no readings were given, so the reference is the native model; give runs with --data")
     else:
         said.append(
-            "the native model's parameters were fitted before: its error is a held-out one only if the fit has not "
-            "seen these runs"
+            "the refit used no reading: these are hold-out errors if the robot's own fit has not seen these runs"
         )
     lost = [f.name for f in compared.fates if f.verdict == DROPPED]
     if lost:
@@ -98,12 +97,12 @@ def remarks(found: Export) -> list[str]:
     if drive.idle:
         said.append(f"{', '.join(drive.idle)}: not exported, since it does not act on {drive.configuration}")
     if found.posterior is None and drive.file.source.endswith(".toml"):
-        said.append("no posterior.nc beside the robot's file: intervals are those of the priors")
+        said.append("no posterior.nc next to the robot's file: intervals are those of the priors")
     return said
 
 
 def conditions_seen(found: Export) -> list[str]:
-    """What the compared runs cover, a line each."""
+    """Ranges of the compared runs, a line each."""
     runs = found.comparison.situation
     lines = [
         f"{counted(len(runs.command), 'settled run')} of {runs.source}",
@@ -124,7 +123,7 @@ def _span(values: np.ndarray) -> str:
 
 
 def not_tested(found: Export) -> list[str]:
-    """What the compared runs say nothing about, a sentence each."""
+    """Limits of the comparison, a sentence each."""
     runs = found.comparison.situation
     backward = bool(np.any(runs.load * runs.inside.speed < 0))
     return [*NOT_TESTED, *([] if backward else [BACKWARD])]

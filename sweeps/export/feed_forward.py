@@ -126,7 +126,7 @@ def law_of(situation: Situation, constants: Sequence[Constant]) -> Any:
 
 
 def fates(situation: Situation, constants: Sequence[Constant]) -> list[Fate]:
-    """What becomes of the base's terms, and of effects outside the joint."""
+    """Fates of the base's terms, and of effects outside the joint."""
     joint = situation.joint
     found = [f for f in jax_actuator.fates(joint) if f.name not in ("rotor inertia", "current limit of the driver")]
     means = {c.name: c.value for c in constants}

@@ -89,7 +89,7 @@ def law_of(situation: Situation, constants: Sequence[Constant]) -> Any:
 
 
 def fates(joint: Joint) -> list[Fate]:
-    """What becomes of the base's terms, and of effects outside the joint."""
+    """Fates of the base's terms, and of effects outside the joint."""
     robot = joint.robot
     found = [
         Fate("motor, winding and gearbox", HELD, "functions of the law"),
@@ -109,7 +109,7 @@ def fates(joint: Joint) -> list[Fate]:
 
 
 def held(joint: Joint) -> dict[str, str]:
-    """Words for each effect inside the joint, all of which the law has."""
+    """Words for each effect inside the joint; the law has all of them."""
     return {e.name: "a function of the law" for e in joint.inside}
 
 

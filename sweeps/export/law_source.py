@@ -60,7 +60,7 @@ _TORCH = _Library(
 
 
 def arguments(symbol: Symbol) -> list[str]:
-    """Arguments of the function of an expression beside its parameters."""
+    """Arguments of the function of an expression, besides its parameters."""
     used = names_of(symbol)
     found = [n for n in _ARGUMENTS if n in used]
     return [*found, "memory"] if any(n.startswith("memory.") for n in used) else found

@@ -134,7 +134,7 @@ def translated(joint: Joint, normal: float, amplitudes: Mapping[str, float] | No
 
 
 def stribeck(joint: Joint, known: Mapping[str, Mapping[str, float]]) -> tuple[float, float] | None:
-    """Excess of friction at a crawl [N·m] and the speed over which it fades [rad/s], at the joint; None without."""
+    """Excess of friction at a crawl [N·m] and its fading speed [rad/s], at the joint; None without such effects."""
     gear = joint.robot.gearbox
     ratio, share = float(gear.ratio), float(gear.efficiency_load)
     found = [
@@ -149,7 +149,7 @@ def stribeck(joint: Joint, known: Mapping[str, Mapping[str, float]]) -> tuple[fl
 
 
 def fates(joint: Joint, normal: float) -> list[Fate]:
-    """What becomes of the base's terms, and of effects outside the joint."""
+    """Fates of the base's terms, and of effects outside the joint."""
     robot, load = joint.robot, joint.load
     gear = robot.gearbox
     found = [
@@ -181,7 +181,7 @@ def fates(joint: Joint, normal: float) -> list[Fate]:
 
 
 def outside(joint: Joint) -> list[Fate]:
-    """What becomes of effects that no joint has."""
+    """Fates of effects that no joint has."""
     where = {
         "sensor": "an error of an instrument, no part of a drive",
         "supply": "the battery; the command is a voltage, so reduce that",
@@ -192,7 +192,7 @@ def outside(joint: Joint) -> list[Fate]:
 
 
 def approximated(balance: str) -> str:
-    """Terms that stand in for an effect of a balance."""
+    """Terms that replace an effect of a balance."""
     return "resistance" if balance in ("supply", "electrical") else "resistance, frictionloss and damping"
 
 
@@ -312,8 +312,8 @@ def _version() -> str:
 def scene(joint: Joint, mass: float, name: str, at: str, command: float, load: float) -> str:
     """Text of a model of one joint that runs: what the drive moves as a body that turns with it.
 
-    A vehicle rolls without sliding, so one side's share of its mass acts at the wheel as m r². What slope and ground
-    take is the torque of the actuator `load`.
+    A vehicle rolls without sliding, so one side's share of its mass acts at the wheel as m r². The actuator
+    `load` gives the torque of slope and ground.
 
     Args:
         mass: of the vehicle [kg]; command, load: of the key frame `run` [V], [N·m].

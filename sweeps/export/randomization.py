@@ -39,8 +39,8 @@ def drawn(
     """
     if posterior is None:
         raise BadConfiguration(
-            f"--to randomization: no {FILE} beside {joint.file.source}, so the spread of its parameters is unknown; "
-            "expected --robot FOLDER/robot.toml of calibrate or loop"
+            f"--to randomization: no {FILE} next to {joint.file.source}, so the spread of its parameters is unknown; "
+            "expected FOLDER/robot.toml of calibrate or loop"
         )
     values = posterior.draw(draws, seed)
     own = {p.name for p in params.walk(joint.robot)}

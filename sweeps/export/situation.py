@@ -1,4 +1,4 @@
-"""Runs over which an exported drive is compared with the native model, and what the native model shows in them."""
+"""Runs for the comparison of an exported drive with the native model, and the native model's results in them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from sweeps.points.grid import grid
 
 @dataclasses.dataclass(frozen=True)
 class AtJoint:
-    """What a drive does at its joint in each run, by one model; arrays of shape (runs,).
+    """Current and speed of a drive in each run, by one model; arrays of shape (runs,).
 
     Attributes:
         current: of one motor [A]; speed: of the joint [rad/s].
@@ -80,7 +80,7 @@ class Situation:
         return AtJoint(np.asarray(signals.current)[self.kept], np.asarray(signals.speed_motor)[self.kept] / ratio)
 
     def readings(self, found: AtJoint) -> np.ndarray:
-        """What the instruments would show of an exported drive [SI], shape (runs, channels).
+        """Readings of the instruments for an exported drive [SI], shape (runs, channels).
 
         The wheel or shaft is read at its rim: what slips on the ground is the simulator's.
         """
@@ -112,7 +112,7 @@ def _absent(joint: Joint, names: tuple[str, ...] = ()) -> Robot:
 
 
 def _solved(robot: Robot, conditions: Conditions) -> tuple[np.ndarray, Signals]:
-    """Whether each run ends as its conditions ask, and its signals."""
+    """Mask of the runs that end as their conditions ask, and the signals of all."""
     result, signals = shown_batch(robot, conditions)
     return np.asarray(done(result.status)), signals
 
