@@ -75,4 +75,5 @@ def _interval(
     if not sd:
         return None, None, ""
     kind = "prior, two sds either side: not fitted" if fitted else OF_PRIOR
-    return value - 2 * sd, value + 2 * sd, kind
+    low, high = parameter.spec.bounds
+    return max(value - 2 * sd, low), min(value + 2 * sd, high), kind

@@ -168,7 +168,7 @@ def law(found: Export) -> str:
     """Text of LAW.md."""
     drive, compared = found.joint, found.comparison
     about = {"name": drive.name, "at": "drive", "armature": armature(found)}
-    verdicts = {HELD: "held", APPROXIMATED: "approximated by", DROPPED: "dropped:"}
+    verdicts = {HELD: "held by", APPROXIMATED: "approximated by", DROPPED: "dropped:"}
     constants = "\n".join(
         f"| `{c.name}` | {c.value:.6g} | {c.unit} | {c.interval or '–'} | {c.meaning} | {c.source} |"
         for c in found.constants

@@ -93,7 +93,7 @@ def fates(joint: Joint) -> list[Fate]:
     robot = joint.robot
     found = [
         Fate("motor, winding and gearbox", HELD, "functions of the law"),
-        Fate("rotor inertia", HELD, "`armature(params)`, for the joint's own armature"),
+        Fate("rotor inertia", HELD, "`armature(params)`, to be set as the joint's own armature"),
     ]
     if joint.surroundings():
         names = ", ".join(joint.surroundings())
