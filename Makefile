@@ -7,7 +7,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 READY := $(VENV)/ready
 TOOLS := $(VENV)/tools
 
-.PHONY: demo test quick test-all slow nightly lint mutants campaign bench docs clean
+.PHONY: demo test quick test-all slow nightly lint mutants campaign bench docs gallery clean
 
 demo: $(READY)
 	$(BIN)/mmrjax loop measured --out runs/demo/loop --force
@@ -63,7 +63,20 @@ docs: $(READY)
 	$(PYTHON) -m venv runs/docs-venv
 	runs/docs-venv/bin/pip install --quiet --disable-pip-version-check "mkdocs-material>=9.5,<10"
 	NO_MKDOCS_2_WARNING=1 runs/docs-venv/bin/mkdocs build --strict --quiet
+	rm -f site/404.html  # of a server's root, which a site on disk has not
 	@echo "open site/index.html"
+
+# The pictures of the docs and the tutorial about the loop, from runs of today; needs chromium.
+gallery: $(TOOLS)
+	$(BIN)/mmrjax loop measured --out runs/gallery/loop --force
+	$(BIN)/mmrjax simulate --configuration 6T2A --voltage 24 --slope 10 --out runs/gallery/run --force
+	$(BIN)/mmrjax sweep --out runs/gallery/sweep --force
+	$(BIN)/mmrjax simulate --profile patrol --battery --payload 5 --out runs/gallery/mission --force
+	$(BIN)/mmrjax check --out runs/gallery/check --force
+	$(BIN)/mmrjax size --out runs/gallery/size --force
+	$(BIN)/mmrjax sensitivity --outputs total_current,slip --out runs/gallery/sensitivity --force
+	$(BIN)/python docs/gallery/make.py $(foreach page,loop run sweep mission check size sensitivity,$(page)=runs/gallery/$(page))
+	$(BIN)/python docs/site.py runs/gallery/loop
 
 clean:
 	rm -rf $(VENV) runs site

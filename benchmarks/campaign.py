@@ -1,4 +1,4 @@
-"""The command of a campaign: so many cases of each kind, one line of a file each, on many processes, resumable."""
+"""The command of a campaign: many cases of each kind, one line of a file for each, on many processes, resumable."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [p for p in (str(ROOT), str(ROOT / "tests")) if p not in sys.path]
 
-#: A worker is one thread: as many workers as cores share a machine without waiting for one another.
+#: A worker has one thread, so that as many workers as cores share a machine without waiting for each other.
 ALONE = {
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
 }
-#: Memory mappings of a worker beyond which its compiled programs are dropped; Linux allows 65530.
+#: Number of memory mappings beyond which a worker drops its compiled programs; Linux allows 65530.
 MAPPINGS = 30_000
-#: The same of resident memory [bytes].
+#: The same limit for resident memory [bytes].
 MEMORY = 5e9
 
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """One case: its kind and seed, and how it is judged."""
+    """One case: its kind, seed and options of the judgement."""
 
     kind: str
     seed: int
@@ -55,7 +55,7 @@ class Task:
 
 @functools.cache
 def ready() -> None:
-    """Double precision; and what loops compile is kept on disk for the other workers."""
+    """Sets double precision, and stores compiled programs on disk for the other workers."""
     import jax
 
     from sweeps import compilation_cache
@@ -73,15 +73,15 @@ def robot_of(name: str) -> Any:
     return robot_file.load(name)
 
 
-#: Amplitudes of more than so many ordinary sizes are left out: no library should believe them.
+#: Largest amplitude of a case, in ordinary sizes; larger ones are implausible for any library.
 SIZES = 3.0
 
 
 def refused(label: Mapping[str, Any], low: float, sizes: bool = True, sigmas: bool = True) -> str:
-    """Why a case is none; empty for one that is.
+    """Reason for leaving out a case; empty for a valid one.
 
     Args:
-        low: sigmas that each effect has to leave; sizes, sigmas: whether these are asked for.
+        low: sigmas that each effect has to leave; sizes, sigmas: True to check these.
     """
     if label.get("rows_lost"):
         return "rows would slide or stand still"
@@ -94,12 +94,12 @@ def refused(label: Mapping[str, Any], low: float, sizes: bool = True, sigmas: bo
     return ""
 
 
-#: Of a label, what is no property of a case that a scorer looks at.
+#: Entries of a label that are not properties of the case.
 TRUTH = ("schema", "seed", "kind", "stratum", "effects", "constants", "z", "sd_over_prior")
 
 
 def begun(case: Any, task: Task, stated: Mapping[str, tuple[float, float]] | None = None) -> Any:
-    """What the loop begins with, read from the files of a case as a user's are."""
+    """The problem with which the loop begins, read from the files of a case as a user's files are."""
     ready()
     from calibration.data import robot_file
     from calibration.data import runs as records
@@ -113,7 +113,7 @@ def begun(case: Any, task: Task, stated: Mapping[str, tuple[float, float]] | Non
 
 
 def looped(case: Any, task: Task, stated: Mapping[str, tuple[float, float]] | None = None) -> tuple[Any, Any, dict]:
-    """What the loop began with, what it found, and the line of a case: verdict and findings beside its label."""
+    """The loop's problem, its result, and the line of a case: its label with verdict and findings."""
     began, spent = time.perf_counter(), time.process_time()
     given = begun(case, task, stated)
     found = given.trace()
@@ -132,7 +132,7 @@ def looped(case: Any, task: Task, stated: Mapping[str, tuple[float, float]] | No
 
 
 def guarded(work: Callable[[Task], dict], task: Task) -> dict:
-    """What came of a case, or the error that it ended with."""
+    """The line of a case, or the error that it ended with."""
     try:
         return {"kind": task.kind, "seed": task.seed, **work(task)}
     except Exception as error:
@@ -152,7 +152,7 @@ def _make_room() -> None:
 
 
 def known(path: Path) -> list[dict]:
-    """Lines of a file; the last may have been cut off."""
+    """Lines of a file; the last one may be cut off."""
     lines = []
     for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
         try:
@@ -166,7 +166,7 @@ def known(path: Path) -> list[dict]:
 
 
 def programs(program: Callable[[Task], Hashable | dict], task: Task) -> tuple[Task, Hashable | dict]:
-    """A task with the shape of what it compiles, or the line of a case that is none."""
+    """A task with the shape of its compiled programs, or the line of an invalid case."""
     try:
         return task, program(task)
     except Exception as error:
@@ -174,9 +174,9 @@ def programs(program: Callable[[Task], Hashable | dict], task: Task) -> tuple[Ta
 
 
 class Shares:
-    """Tasks that wait, dealt out so that a worker keeps to what it has compiled.
+    """Queue of tasks that prefers to give a worker tasks for programs that it has compiled.
 
-    Compiling takes a minute and judging seconds, and a program is compiled in every process that runs it.
+    Compiling takes a minute and judging seconds, and each process compiles the programs that it runs.
     """
 
     def __init__(self, tasks: Iterable[tuple[Task, Hashable]]) -> None:
@@ -186,9 +186,9 @@ class Shares:
         self.at_work: Counter[Hashable] = Counter()
 
     def next(self, before: Hashable | None) -> tuple[Task, Hashable] | None:
-        """A task for a worker that has just done one of shape `before`, and its shape; None where all are dealt out.
+        """A task for a worker whose last one had shape `before`, and its shape; None if no task is left.
 
-        Where none of that shape is left, one of the shape for which the fewest work, by what waits of it.
+        If no task of that shape is left, the one of the shape with the most waiting tasks per worker.
         """
         if before is not None:
             self.at_work[before] -= 1
@@ -206,7 +206,7 @@ class Shares:
 
 
 def _worker(work: Callable[[Task], dict], line: Connection, core: int | None) -> None:
-    """Judge what comes along a line, on one core if one is given: XLA's pool has a thread for each it may use."""
+    """Judges tasks from a connection, on one core if one is given, because XLA's pool has a thread for each core."""
     if core is not None:
         os.sched_setaffinity(0, {core})
     while (task := line.recv()) is not None:
@@ -214,9 +214,9 @@ def _worker(work: Callable[[Task], dict], line: Connection, core: int | None) ->
 
 
 def judged(work: Callable[[Task], dict], shares: Shares, jobs: int, limit: float = np.inf) -> Iterator[dict]:
-    """Lines of tasks as workers finish them, until all are done or `limit` seconds have passed.
+    """Yields the lines of tasks as workers finish them, until all are done or `limit` seconds have passed.
 
-    A worker that dies costs its case, which then has an error, and another takes its place.
+    If a worker dies, its case gets an error, and another worker replaces it.
     """
     began, spawn = time.monotonic(), multiprocessing.get_context("spawn")
     workers: dict[Connection, tuple[BaseProcess, Task, Hashable]] = {}
@@ -239,7 +239,7 @@ def judged(work: Callable[[Task], dict], shares: Shares, jobs: int, limit: float
         while workers:
             ready = wait(list(workers), timeout=max(min(limit - (time.monotonic() - began), 1e6), 0.01))
             if not ready:
-                print("the limit is reached", flush=True)
+                print("the time limit is reached", flush=True)
                 return
             for line in ready:
                 process, task, shape = workers.pop(line)
@@ -273,11 +273,11 @@ def campaign(
     summary: Callable[..., list[str]],
     out: str,
 ) -> None:
-    """Read the command line, make and judge cases in processes of their own, and print the figures.
+    """Reads the command line, makes and judges cases in separate processes, and prints the figures.
 
     Args:
-        work: a function of a module; summary: of all lines.
-        program: of a module too: the shape of what a task compiles, or the line of a case that is none.
+        work: a function of a module; summary: function of all lines.
+        program: function of a module that returns the shape of a task's programs, or the line of an invalid case.
     """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     for kind in kinds:
@@ -285,16 +285,16 @@ def campaign(
     parser.add_argument("--replicates", type=int, default=500)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--first", "--seed", type=int, default=0, help="first seed")
-    parser.add_argument("--robot", default="nominal", help="of the paper's robot's cases")
-    parser.add_argument("--stratum", default="", help="one stratum of the wide kinds alone, e.g. plain")
-    parser.add_argument("--narrow", action="store_true", help="one surface, its adhesion stated, as before")
+    parser.add_argument("--robot", default="nominal", help="robot of the cases of the paper's robot")
+    parser.add_argument("--stratum", default="", help="only one stratum of the wide kinds, e.g. plain")
+    parser.add_argument("--narrow", action="store_true", help="one surface with stated adhesion")
     parser.add_argument(
-        "--brief", action="store_true", help="verdicts and findings alone, no experiments carried out"
+        "--brief", action="store_true", help="only verdicts and findings, without carrying out experiments"
     )
     parser.add_argument("--out", type=Path, default=Path(out))
     parser.add_argument("--cache", type=Path, help="folder of compiled programs that the workers share")
     parser.add_argument("--limit", type=float, default=np.inf, help="seconds after which the campaign stops")
-    parser.add_argument("--only-summary", action="store_true", help="figures of --out as it is")
+    parser.add_argument("--only-summary", action="store_true", help="print the figures of an existing --out")
     given = parser.parse_args()
     given.out.parent.mkdir(parents=True, exist_ok=True)
     lines = [x for x in known(given.out) if "error" not in x]  # errors are tried again
@@ -309,7 +309,7 @@ def campaign(
         for seed in range(given.first, given.first + count)
         if (kind, seed) not in done
     ]
-    tasks.sort(key=lambda t: (t.seed - given.first) / wanted[t.kind])  # kinds go on side by side
+    tasks.sort(key=lambda t: (t.seed - given.first) / wanted[t.kind])  # kinds progress in parallel
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     if given.jobs > 1:
         os.environ.update({k: v for k, v in ALONE.items() if k not in os.environ})

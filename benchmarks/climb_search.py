@@ -1,13 +1,14 @@
-"""The highest step that a robot gets over, by a search over sequences of its lever angles; and time of 1000 climbs.
+"""The highest step that a robot climbs, found by a search over sequences of lever angles; and time of 1000 climbs.
 
     python benchmarks/climb_search.py --surface asphalt --members 1024 --generations 4 --out found.csv
     mmrjax climb --step 400 --surface asphalt --sequence found.csv --film
 
-Members have angles of front and rear levers at knots of time, and a height of their own; those that do best beget the
-next generation, angles and height changed at random. Where a grouser meets the edge decides, so one climb may be
-luck: each member climbs `--tries` steps within `BAND` below its height, and what it does is that height less `MISSED`
-times the share that it does not get over. `--adhesion 4` is a ground that holds whatever is asked, which shows what
-geometry and torque leave. `--begin` begets the first generation of a sequence, which `--stretch` makes slower.
+Members have angles of front and rear levers at times, and a step height. The best ones are parents of the next
+generation, with angles and height changed at random. One success may be luck, because the grouser
+that reaches the edge first decides the outcome. Each member therefore climbs `--tries` steps within `BAND` below its
+height; its score is the height less `MISSED` times the share of failures. `--adhesion 4` is a ground of unlimited
+grip, which shows the limits of geometry and torque. `--begin` makes the first generation from a sequence, which
+`--stretch` slows down.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ from mmrjax.model.paper_tables import SURFACES, adhesion_ratio
 
 jax.config.update("jax_enable_x64", True)
 
-#: Times at which angles are free [s], between which they go straight.
+#: Times of the free angles [s]; angles are linear in between.
 KNOTS = np.array([0.3, 1.5, 3.0, 4.5, 6.0, 7.5, 9.0, 10.5])
 LENGTH = 13.0
-#: Least angle in which a lever begins [deg].
+#: Least initial angle of a lever [deg].
 FLUSH = -8.4
-#: Heights over which a member is tried, and what it loses where none of them is got over [m].
+#: Range of heights of a member's tries, and the loss of score if none succeeds [m].
 BAND, MISSED = 0.04, 0.2
 
 
@@ -62,7 +63,7 @@ def run(
 
 
 def begotten(random: np.random.Generator, begin: Sequence, stretch: float, n: int) -> np.ndarray:
-    """Angles of a first generation: those of a sequence over time, made slower, and moved in all but one."""
+    """Angles of a first generation: those of a sequence over time, slowed down, and perturbed in all but one."""
     at = stretch * np.asarray(begin.at)
     own = np.stack([np.interp(KNOTS, at, np.degrees(np.asarray(a))) for a in (begin.front, begin.rear)])
     spread = np.linspace(0, 30, n)[:, None, None]
@@ -70,38 +71,38 @@ def begotten(random: np.random.Generator, begin: Sequence, stretch: float, n: in
 
 
 def mutated(random: np.random.Generator, parents: np.ndarray, n: int, spread: float) -> np.ndarray:
-    """Angles of members of the next generation: of two parents each, moved."""
+    """Angles of members of the next generation: of two parents each, perturbed."""
     a, b = parents[random.integers(len(parents), size=(2, n))]
     angles = np.where(random.random(a.shape) < 0.8, a, b) + spread * random.normal(size=a.shape)
     return bounded(angles)
 
 
 def bounded(angles: np.ndarray) -> np.ndarray:
-    """Angles within the range of the levers, not below the ground in the beginning."""
+    """Angles limited to the range of the levers, and to above the ground at the start."""
     angles = np.clip(angles, -170, 180)
     angles[:, :, 0] = np.maximum(angles[:, :, 0], FLUSH)
     return angles
 
 
 def main() -> None:
-    """Search, and say what was found."""
+    """Runs the search and prints the result."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--surface", default="lacquered_wood", choices=list(SURFACES))
-    parser.add_argument("--adhesion", type=float, help="in place of the surface's, as a ratio to the bench")
+    parser.add_argument("--adhesion", type=float, help="replaces the surface's, as a ratio to the bench")
     parser.add_argument("--members", type=int, default=256)
-    parser.add_argument("--tries", type=int, default=4, help="steps that each member climbs")
+    parser.add_argument("--tries", type=int, default=4, help="number of steps that each member climbs")
     parser.add_argument("--generations", type=int, default=4)
     parser.add_argument("--volts", type=float, default=12.0)
     parser.add_argument("--payload", type=float, default=0.0)
     parser.add_argument("--step", type=float, default=2e-4)
-    parser.add_argument("--seconds", type=float, default=1e9, help="after which no generation is begun")
+    parser.add_argument("--seconds", type=float, default=1e9, help="time after which no generation is started")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--begin", type=Path, help="CSV of time_s, front_deg, rear_deg: begets the first generation")
+    parser.add_argument("--begin", type=Path, help="CSV of time_s, front_deg, rear_deg for the first generation")
     parser.add_argument("--stretch", type=float, default=1.0)
     parser.add_argument("--heights", type=float, nargs=2, default=(100.0, 300.0), help="of the first generation [mm]")
-    parser.add_argument("--levers-voltage", type=float, help="highest of the levers' motors; else the supply's")
-    parser.add_argument("--levers-current", type=float, help="at which the levers' driver limits their motors")
-    parser.add_argument("--out", type=Path, help="CSV of the sequence that does best, for mmrjax climb --sequence")
+    parser.add_argument("--levers-voltage", type=float, help="highest of the levers' motors; default: the supply's")
+    parser.add_argument("--levers-current", type=float, help="current limit of the levers' driver")
+    parser.add_argument("--out", type=Path, help="CSV of the best sequence, for mmrjax climb --sequence")
     told = parser.parse_args()
     robot, random = paper_robots.nominal(), np.random.default_rng(told.seed)
     if told.levers_current is not None:
@@ -115,7 +116,7 @@ def main() -> None:
         if not best:
             low, high = (h / 1000 for h in told.heights)
             held = random.uniform([[-60], [-90]], [[120], [180]], (n, 2, len(KNOTS)))
-            # half of them stay for a while where they are
+            # half of them keep their angles for a while
             angles = bounded(np.where(random.random(held.shape) < 0.5, np.roll(held, 1, axis=2), held))
             if told.begin is not None:
                 begin = terrains.read_sequence(told.begin, robot, (0.0, 0.0))

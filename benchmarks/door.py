@@ -1,11 +1,11 @@
 # ruff: noqa: E402 (cores are chosen before jax starts)
-"""`mmrjax.simulate`, the public API's one verb, against the equations that it compiles and vectorised NumPy of them.
+"""`mmrjax.simulate` compared with its compiled equations and with the same equations in vectorised NumPy.
 
 python benchmarks/door.py
 
-All sides are timed in turn, round after round; printed are the best and median wall time and the least processor time
-of each, and how many times as fast as NumPy's closed form of currents and speeds (one core, as it runs) the API gives
-the same three numbers and statuses, conditions made from arrays included. The last line is of JSON.
+All sides are timed in turn, in rounds. The best and median wall time and the least processor time of each are
+printed. A ratio compares NumPy's closed form of currents and speeds (on one core) with the API. The API returns the
+same three numbers and statuses and makes conditions from arrays. The last line is JSON.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 options.add_argument("--points", type=int, default=262_144)
 options.add_argument("--rounds", type=int, default=40, help="timed calls of each side")
-options.add_argument("--cores", type=int, default=2, help="cores that the process may use")
+options.add_argument("--cores", type=int, default=2, help="number of cores that the process may use")
 arguments = options.parse_args()
 os.environ["JAX_PLATFORMS"] = "cpu"
 os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: arguments.cores])
@@ -37,7 +37,7 @@ NAMES = vectorised.NAMES
 
 
 def read(results: mm.Results) -> list[Any]:
-    """What the instruments show, and how the runs ended."""
+    """Readings of the instruments, and statuses of the runs."""
     return [*(getattr(results, name) for name in NAMES), results.status]
 
 

@@ -1,8 +1,8 @@
 """Draws mutants at random by the operators of mutation tools, over all rooms, for tests/mutants.toml.
 
-Each is one change of one line: an arithmetic, comparison or logical operator, a number, a sign, a truth value, a
-condition, or one of a pair of functions (minimum and maximum, sin and cos, any and all). Text, annotations and
-imports stay. The same seed draws the same mutants from the same sources.
+Each is one change of one line: an operator (arithmetic, comparison or logical), a number, a sign, a truth value or a
+condition. Pairs of functions are swapped too (minimum and maximum, sin and cos, any and all). Text, annotations and
+imports are not changed. The same seed draws the same mutants from the same sources.
 
     python benchmarks/draw_mutants.py --number 100 --seed 1        # TOML without `killed_by` on stdout
 """
@@ -21,7 +21,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("mmrjax", "calibration", "sweeps")
-#: Mutants of one file at most.
+#: Most mutants of one file.
 OF_A_FILE = 2
 
 BINARY = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*", ast.FloorDiv: "*", ast.Mod: "*", ast.Pow: "*"}
@@ -35,7 +35,7 @@ OTHER = PAIRS | {b: a for a, b in PAIRS.items()}
 
 @dataclasses.dataclass(frozen=True)
 class Draw:
-    """One change of one place in a file: characters `begin` to `end` of its text become `by`."""
+    """One change in a file: characters `begin` to `end` of its text are replaced by `by`."""
 
     file: str
     line: int
@@ -46,7 +46,7 @@ class Draw:
 
 
 class _Finder(ast.NodeVisitor):
-    """Collects the places of a module at which an operator applies, text, annotations and imports left out."""
+    """Collects the places of a module that an operator applies to, except text, annotations and imports."""
 
     def __init__(self, file: str, source: str) -> None:
         self.file, self.source = file, source
@@ -69,7 +69,7 @@ class _Finder(ast.NodeVisitor):
         self.found.append(Draw(self.file, line, operator, begin, end, by))
 
     def between(self, left: ast.expr, right: ast.expr, sign: str, by: str, operator: str) -> None:
-        """Replace the operator's sign in the text between its operands."""
+        """Replaces the operator's sign in the text between its operands."""
         begin, end = self.span(left)[1], self.span(right)[0]
         text = self.source[begin:end]
         if text.count(sign) == 1 and "\n" not in text and "#" not in text:
@@ -155,7 +155,7 @@ class _Finder(ast.NodeVisitor):
 
 
 def places(file: Path) -> list[Draw]:
-    """All places of a file at which an operator applies."""
+    """All places of a file that an operator applies to."""
     source = file.read_text(encoding="utf-8")
     finder = _Finder(file.relative_to(ROOT).as_posix(), source)
     finder.visit(ast.parse(source))
@@ -176,7 +176,7 @@ def context(source: str, draw: Draw) -> tuple[str, str] | None:
 
 
 def drawn(number: int, seed: int) -> Iterator[tuple[Draw, str, str]]:
-    """Mutants drawn at random: first a file, by the square root of its size, then a place in it, then its texts."""
+    """Mutants drawn at random: a file, weighted by the square root of its size, then a place, then its texts."""
     rng = random.Random(seed)
     files = sorted(file for package in PACKAGES for file in (ROOT / package).rglob("*.py"))
     found = {file: places(file) for file in files}

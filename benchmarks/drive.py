@@ -1,4 +1,4 @@
-"""The 180 runs of Table 8, 2 s from standstill, against loops of scipy.integrate.solve_ivp at the same accuracy.
+"""The 180 runs of Table 8, 2 s from standstill, compared with scipy.integrate.solve_ivp at the same accuracy.
 
 python benchmarks/drive.py
 python benchmarks/drive.py --no-baseline --batches 180,16384,262144
@@ -13,15 +13,15 @@ import numpy as np
 from measure import finish, machine, parser, set_precision, time_batches
 
 options = parser(__doc__.splitlines()[0], "180")
-options.add_argument("--tolerance", type=float, default=1e-6, help="of a step of ours")
+options.add_argument("--tolerance", type=float, default=1e-6, help="error of a step of our method")
 METHODS = ("LSODA", "Radau", "BDF", "RK45")
 TOLERANCES = (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
-TRIAL = 9  # one run in so many chooses SciPy's method and tolerance
+TRIAL = 9  # every ninth run is used to choose SciPy's method and tolerance
 INSTANTS = np.concatenate([[0.0], np.geomspace(1e-3, 2.0, 20)])
 
 
 def conditions(size: int) -> np.ndarray:
-    """Rows (wheeled, slope [rad], payload [kg], voltage [V]): Table 8, again and again with other payloads."""
+    """Rows (wheeled, slope [rad], payload [kg], voltage [V]): Table 8, repeated with other payloads."""
     axes = (0.0, 1.0), np.radians([0, 5, 10, 15, 20]), (0, 1.5, 3, 5, 6.5, 8), (15.0, 24.0, 33.0)
     table = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 4)
     rows = np.tile(table, (-(-size // len(table)), 1))[:size]
@@ -38,8 +38,8 @@ def errors(states: np.ndarray, exact: np.ndarray) -> np.ndarray:
 def baseline(ours: np.ndarray) -> dict:
     """The fastest method and tolerance of solve_ivp that is as accurate as ours, timed over all runs.
 
-    As accurate: in the median of the runs and in the worst one. (Two runs on 15 degrees start next to an
-    unstable equilibrium, which magnifies any error; the worst alone would say little of the other 178.)
+    It has to be as accurate in the median of the runs and in the worst one. (Two runs on 15 degrees start next to an
+    unstable equilibrium, which magnifies any error; the worst run alone would not represent the other 178.)
     """
     from worlds import paper
 
@@ -70,7 +70,7 @@ def baseline(ours: np.ndarray) -> dict:
             accurate = all(tried[-1][k] <= target[k] for k in target)
             if accurate or row["s_per_run"] > slowest:
                 break
-        if method == METHODS[0]:  # what takes longer than its best accurate answer need not go on
+        if method == METHODS[0]:  # stop once it takes longer than its best accurate answer
             slowest = tried[-1]["s_per_run"]
     enough = [t for t in tried if all(t[k] <= target[k] for k in target)]
     chosen = min(enough, key=lambda t: t["s_per_run"]) if enough else min(tried, key=lambda t: t["median"])

@@ -1,7 +1,7 @@
-"""Writes docs/effects.md: what each effect is, what one prior standard deviation does, which look alike.
+"""Writes docs/reference/effects.md: each effect, its size by one prior standard deviation, which look alike.
 
 python benchmarks/effects.py           write the page
-python benchmarks/effects.py --check   say whether the page is what the library gives
+python benchmarks/effects.py --check   compare the page with the library
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from mmrjax.model.robot import Robot
 
 jax.config.update("jax_enable_x64", True)
 
-PAGE = Path(__file__).resolve().parent.parent / "docs" / "effects.md"
-#: Adhesion at which all of Table 8 climbs, from standstill too; Table 5's does not hold 20 degrees.
+PAGE = Path(__file__).resolve().parent.parent / "docs" / "reference" / "effects.md"
+#: Adhesion that lets all of Table 8 climb, also from standstill; Table 5's does not hold 20 degrees.
 ADHESION = {
     f"{c}.ground.friction.{k}": v for c in (TRACKED, WHEELED) for k, v in (("static", 0.6), ("dynamic", 0.48))
 }
-#: In the units of the channels' columns; only the ratios of what a display resolves matter for look-alikes.
+#: In the units of the channels' columns; only the ratios of display resolutions matter for look-alikes.
 SHOWN = 1 / np.array(channels.factors(channels.usual()))
 NOISE = np.array([0.02, 5.0, 3.0])
-#: Base parameters that every fit frees, projected out.
+#: Base parameters that every fit frees; they are projected out.
 FREED = (
     *(f"{TRACKED}.{n}" for n in ("track.loss_coulomb", "track.loss_viscous", "track.guide_share")),
     *(f"{WHEELED}.{n}" for n in ("track.loss_coulomb", "track.loss_viscous")),
@@ -45,7 +45,7 @@ FREED = (
     ),
 )
 ALIKE = 0.95
-#: Share of a signature below which nothing of it is left.
+#: Share of a signature below which it counts as 0.
 ABSORBED = 1e-9
 STARTS = np.concatenate([[0.0], np.geomspace(1e-4, 0.05, 40), np.linspace(0.06, 2.0, 98)])  # [s]
 
@@ -79,8 +79,11 @@ def table8() -> Conditions:
 
 
 def sensitivities() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Change of the shown readings by one prior sd of each settled effect at `examples`, shape (2, 3, effects);
-    whitened over Table 8, shape (540, effects); and that of the freed parameters, shape (540, parameters)."""
+    """Three arrays of changes of the shown readings.
+
+    By one prior sd of each settled effect at `examples`, shape (2, 3, effects); the same whitened over Table 8, shape
+    (540, effects); and whitened changes by the freed parameters, shape (540, parameters).
+    """
     full = robot(SETTLED)
     names = [f"effects.{e.name}.amplitude" for e in SETTLED] + list(FREED)
     values = {p.name: p.value for p in params.walk(full)}
@@ -100,8 +103,10 @@ def sensitivities() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def look_alikes(effects: np.ndarray, base: np.ndarray) -> tuple[list[list[str]], np.ndarray]:
-    """For each settled effect the others with |cos| above ALIKE once the base is projected out, and what
-    share of its signature is left by the base."""
+    """For each settled effect the others with |cos| above ALIKE after projecting out the base.
+
+    Also returns the share of its signature that the projection leaves.
+    """
     q, _ = np.linalg.qr(base / np.linalg.norm(base, axis=0))
     left = effects - q @ (q.T @ effects)
     whole, beside = np.linalg.norm(effects, axis=0), np.linalg.norm(left, axis=0)
@@ -116,8 +121,10 @@ def look_alikes(effects: np.ndarray, base: np.ndarray) -> tuple[list[list[str]],
 
 
 def passing() -> np.ndarray:
-    """Largest change of each reading through 2 s from standstill by one prior sd of each effect that only a
-    history shows, at `examples`, on the battery where it needs one; shape (effects, 2, 3)."""
+    """Largest change of each reading in 2 s from standstill by one prior sd of each effect that only histories show.
+
+    At `examples`, on the battery if an effect needs one; shape (effects, 2, 3).
+    """
     full = robot(PASSING)
     names = [f"effects.{e.name}.amplitude" for e in PASSING]
 
@@ -146,106 +153,96 @@ def _number(value: float) -> str:
 
 
 def _about(effect: type[Effect]) -> tuple[str, ...]:
-    """Equation, what it stands for, and source, as cells of a table."""
+    """Equation, description and source, as cells of a table."""
     return tuple(text.replace("|", "∣") for text in words.about(effect))
 
 
-def _row(effect: type[Effect]) -> str:
-    """What an effect declares, as a row of the first table."""
+def _section(effect: type[Effect]) -> str:
+    """Section of one effect: equation, meaning, source and what it declares."""
     spec = amplitude(effect)
-    shapes = "; ".join(
-        f"{p.name} {float(p.value):g} {p.spec.unit}" for p in params.walk(effect()) if not p.spec.amplitude
-    )
+    shapes = [f"{p.name} {float(p.value):g} {p.spec.unit}" for p in params.walk(effect()) if not p.spec.amplitude]
     where = effect.balance + (f": {effect.channel}" if effect.channel else "")
     low, high = spec.bounds
-    declared = ", ".join(words.declared(effect)) or "-"
-    return (
-        f"| `{effect.name}` | {where} | {effect.family()} | {_about(effect)[0]} | {spec.unit} | "
-        f"{spec.prior_sd(0.0):g}, {low:g} to {high:g} | {shapes or '-'} | {declared} |"
-    )
+    equation, meaning, source = _about(effect)
+    declared = list(words.declared(effect))
+    lines = [
+        f"### `{effect.name}`", "", equation, "", f"{meaning} {source}".strip(), "",
+        f"- Balance `{where}`. Family: {effect.family()}.",
+        f"- Amplitude [{spec.unit}]: prior standard deviation {spec.prior_sd(0.0):g}, bounds {low:g} to {high:g}.",
+        *[f"- Shape: {'; '.join(shapes)}."] * bool(shapes),
+        *[f"- Declares: {', '.join(declared)}."] * bool(declared),
+    ]  # fmt: skip
+    return "\n".join([*lines, ""])
 
 
-def _meaning(effect: type[Effect]) -> str:
-    return "- `{}`: {} {}".format(effect.name, *_about(effect)[1:])
+INTRODUCTION = """# Effects
+
+Terms that a model may lack. Each enters one balance with an amplitude, which is zero if the effect is absent. A
+positive amplitude takes away: a voltage drop, a loss torque, a resisting force, a lost speed. In `mass`, `inertia`,
+`inductance` and `sensor` it adds.
+
+*`python benchmarks/effects.py` writes this page from the library; a test compares the two.*
+
+Effects of one equation with the same driver are a *family*. If the data cannot distinguish them, the loop reports
+the family. It looks for effects of turns in tables of turns, and for the errors of an instrument (`CHANNEL_gain`,
+`CHANNEL_offset`) on rigs that have it. The error is added to the reading; an instrument with `signed = false` adds it
+to the magnitude. Instruments that count (speed, angle, position) have no zero error.
+
+In a robot file, `[effects.churning] configurations = ["4W2T"]` limits an effect to some configurations.
+`calibrate --free effects.NAME.amplitude` frees the amplitude of an effect that the file states.
+
+## One standard deviation, and indistinguishable effects
+
+The columns give the change of current [A], motor speed [rpm] and speed [mm/s] by one prior standard deviation, for
+the unladen 6T2A robot in settled travel. The last column lists the effects that the 180 runs of Table 8 (μ_s = 0.6)
+cannot distinguish from it: the signatures have |cos| > 0.95. Signatures are in units of 0.02 A, 5 rpm and 3 mm/s.
+The eleven friction parameters that every fit frees are projected out. `left` is the share of the signature that
+remains after this projection.
+
+* `nothing`: the effect equals a change of a free parameter.
+* `not seen`: these runs climb at full duty. They show no effect that acts only when the load drives the motor.
+
+| effect | 15 V, 0°: A | rpm | mm/s | 33 V, 20°: A | rpm | mm/s | left | indistinguishable |
+|---|---|---|---|---|---|---|---|---|"""
+
+HISTORIES = """
+## Effects that need a history
+
+Largest change of each reading in the first 2 s from standstill, by one prior standard deviation. For `battery_sag` a
+full battery replaces both voltages. `cogging` is below the resolution of any display once the shaft turns. The
+influence of `armature_inductance` ends within a millisecond.
+
+| effect | 15 V, 0°: A | rpm | mm/s | 33 V, 20°: A | rpm | mm/s |
+|---|---|---|---|---|---|---|"""
 
 
 def page() -> str:
-    """The page as it should be."""
+    """Text of the page."""
     example, grid, base = sensitivities()
     alike, share = look_alikes(grid, base)
     start = passing()
-    lines = [
-        "# Effects",
-        "",
-        "Terms that the paper's model lacks. Each enters one balance with an amplitude that is zero when it is",
-        "absent; a positive one takes away (a voltage drop, a loss torque, a resisting force, a lost speed), and",
-        "adds in `mass`, `inertia`, `inductance` and `sensor`. This page is written by `benchmarks/effects.py`",
-        "from the library itself; a test fails when the two differ.",
-        "",
-        "An effect declares what others have to know of it: that a positive amplitude only takes power out",
-        "(`dissipative`), that settled travel shows nothing of it (`transient`) or cannot tell it from another",
-        "(`settles_to`), that it acts on the on-board battery alone (`needs_battery`) or on tracks or wheels alone",
-        "(`movers`), that only runs both ways tell it from a parameter of the robot (`needs_reverse`), that only a",
-        "duty below 1 shows it (`needs_duty`), that it keeps",
-        "its sign in space when the robot goes backward (`odd_in_travel`). A robot file may name the configurations",
-        'that one acts on: `[effects.churning] configurations = ["4W2T"]`.',
-        "",
-        "Effects of one equation that change with one and the same thing are a family: forms of a law that data may",
-        "not tell apart. Where no single name is sure, the loop names the family. Those that act in turns alone the",
-        "loop looks for in tables of turns, errors of an instrument (`CHANNEL_gain`, `CHANNEL_offset`) in those of a",
-        "rig that has it. An error is added to what the instrument shows, a magnitude where it has `signed = false`;",
-        "what counts or times (a speed, an angle, a position) misses no zero.",
-        "`calibrate --free effects.NAME.amplitude` frees one of a robot file that states `[effects.NAME]`.",
-        "",
-        "| effect | balance | family | equation | unit | plausible: sd, bounds | shape parameters | declares |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    lines += [_row(effect) for effect in EVERY]
-    lines += [
-        "",
-        "## What one standard deviation does, and what looks alike",
-        "",
-        "Change of current [A], motor speed [rpm] and speed [mm/s] of the unladen 6T2A robot in settled travel,",
-        "and the effects that 180 runs of Table 8 (μ_s = 0.6) cannot tell from it: |cos| > 0.95 of the",
-        "signatures, in units of 0.02 A, 5 rpm, 3 mm/s, once the eleven friction parameters that a fit frees are",
-        "projected out. `left` is the share of the signature that this projection leaves: nothing of a parameter by",
-        "another name; what acts where a load drives the motor is not seen in these runs, which climb; nor is what",
-        "acts at a duty below 1, as `coast_decay`, which is left out here.",
-        "",
-        "| effect | 15 V, 0°: A | rpm | mm/s | 33 V, 20°: A | rpm | mm/s | left | look-alikes |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    lines = [INTRODUCTION]
     for k, effect in enumerate(SETTLED):
         numbers = " | ".join(_number(x) for x in example[:, :, k].ravel())
         names = ", ".join(f"`{n}`" for n in sorted(alike[k])) or "none"
         left = "not seen" if np.isnan(share[k]) else "nothing" if share[k] <= ABSORBED else f"{share[k]:.2f}"
         lines.append(f"| `{effect.name}` | {numbers} | {left} | {names} |")
-    lines += [
-        "",
-        "## What only a history shows",
-        "",
-        "Largest change of each reading through the first 2 s from standstill, for one standard deviation",
-        "(`battery_sag` on a full battery, which then takes the place of both voltages). `cogging` stays below",
-        "any display once the shaft turns; `armature_inductance` is over within a millisecond.",
-        "",
-        "| effect | 15 V, 0°: A | rpm | mm/s | 33 V, 20°: A | rpm | mm/s |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    lines.append(HISTORIES)
     for k, effect in enumerate(PASSING):
         lines.append(f"| `{effect.name}` | " + " | ".join(_number(x).lstrip("+") for x in start[k].ravel()) + " |")
-    lines += ["", "## What they stand for, and sources", ""]
-    lines += [_meaning(effect) for effect in EVERY]
-    return "\n".join(lines) + "\n"
+    lines += ["", "## Each effect", ""]
+    lines += [_section(effect) for effect in EVERY]
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="compare with the page, and write nothing")
+    parser.add_argument("--check", action="store_true", help="compare with the page without writing")
     check = parser.parse_args().check
     text = page()
     if check:
         same = PAGE.read_text(encoding="utf-8") == text
-        print("docs/effects.md is " + ("right" if same else "out of date: run python benchmarks/effects.py"))
+        print(f"{PAGE.name} is " + ("right" if same else "out of date: run python benchmarks/effects.py"))
         sys.exit(not same)
     PAGE.write_text(text, encoding="utf-8")
     print(PAGE)

@@ -1,12 +1,12 @@
-"""Missions beside NREL's FASTSim: energy at the wheel and from the battery, on vehicles that both can express.
+"""Missions compared with NREL's FASTSim: energy at the wheel and from the battery, for vehicles both can express.
 
     python benchmarks/fastsim_comparison.py                # needs fastsim in the same environment
 
-A battery vehicle without aerodynamic drag, whose only losses are rolling resistance and one constant efficiency of
-its transmission, follows a speed trace of ramps, a climb and a descent on which it regenerates; nothing is fitted.
-Two sizes: this project's robot, and a car. A third opinion is the integral of rolling, climbing and acceleration.
-Prints a line of JSON for each vehicle. Exit code 2: fastsim is not installed; 3: an energy is further off than the
-goals (0.5 % at the wheel, 1 % in Wh/km, at either step of FASTSim).
+A battery vehicle without aerodynamic drag follows a speed trace of ramps, a climb and a descent with regeneration.
+Its only losses are rolling resistance and a constant efficiency of its transmission; no parameter is fitted.
+Two sizes: this project's robot, and a car. A third result is the integral of rolling, climbing and acceleration.
+Prints a line of JSON for each vehicle. Exit code 2: fastsim is not installed; 3: an energy misses the goals (0.5 % at
+the wheel, 1 % in Wh/km, at either step of FASTSim).
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ from mmrjax.model.signals import CONVERGED, GRAVITY, STATUSES  # noqa: E402
 INSTALL = "fastsim is not installed here: pip install fastsim==3.1.0 (Python 3.10 to 3.15), then run this again"
 #: g of FASTSim 3.1.0 (`ACC_GRAV`, 9.8015 rounded to three figures) [m/s²].
 GRAVITY_FASTSIM = 9.80
-#: Accepted steps of a mission that are kept; it has to take fewer.
+#: Largest number of recorded steps of a mission; it has to take fewer.
 KEEP = 1000
 
 
 @dataclasses.dataclass(frozen=True)
 class Vehicle:
-    """What both sides are built from, in SI units.
+    """Parameters of the vehicle for both simulators, in SI units.
 
     Attributes:
         mass: [kg]; rolling: coefficient of rolling resistance [-]; radius: of the wheels [m]; inertia: of all wheels
-            together [kg·m²]; efficiency: of the transmission, either way [-].
+            together [kg·m²]; efficiency: of the transmission, in both directions [-].
         cells: in series, of 4 V at any charge, without resistance; capacity: of one [C].
-        ratio, torque_constant [N·m/A], resistance [Ω], inductance [H]: of gearbox and motors, which FASTSim has not;
-            the resistance is small enough to lose next to nothing.
+        ratio, torque_constant [N·m/A], resistance [Ω], inductance [H]: of gearbox and motors, which FASTSim lacks;
+            the resistance is small enough for negligible losses.
     """
 
     name: str
@@ -69,7 +69,7 @@ class Vehicle:
 
 @dataclasses.dataclass(frozen=True)
 class Trace:
-    """Ground speed [m/s] and slope [deg] at `time` [s], linear between; corners lie on whole seconds."""
+    """Ground speed [m/s] and slope [deg] at `time` [s], linear in between; corners are at whole seconds."""
 
     time: np.ndarray
     speed: np.ndarray
@@ -85,7 +85,7 @@ CAR = Vehicle("car of 300 kg", 300.0, 0.012, 0.25, 0.8, 0.85, 10.0, 0.5, 2e-3, 2
 
 
 def trace(slow: float, fast: float, climb: float, descent: float) -> Trace:
-    """From rest to two speeds [m/s], up a `climb` and down a `descent` [deg], and to rest again."""
+    """A trace from rest to two speeds [m/s], up a `climb` and down a `descent` [deg], and back to rest."""
     rows = [
         (0, 0, 0), (10, slow, 0), (40, slow, 0), (50, fast, 0), (80, fast, 0), (81, fast, climb), (110, fast, climb),
         (111, fast, 0), (120, fast, 0), (130, slow, 0), (150, slow, 0), (151, slow, -descent), (180, slow, -descent),
@@ -96,7 +96,7 @@ def trace(slow: float, fast: float, climb: float, descent: float) -> Trace:
 
 
 def robot_of(vehicle: Vehicle) -> Robot:
-    """The vehicle as a wheeled robot: no loss but by rolling and by the gearbox's efficiency is more than tiny."""
+    """The vehicle as a wheeled robot with negligible losses except rolling and the gearbox's efficiency."""
     values = {
         "motor.resistance": vehicle.resistance,
         "motor.inductance": vehicle.inductance,
@@ -138,7 +138,7 @@ def followed(robot: Robot, conditions: Conditions, course: Profile) -> Mission:
 
 
 def energies(time: np.ndarray, wheel: np.ndarray) -> dict[str, float]:
-    """Work of the power at the `wheel` [W] over `time` [s], by sign; the power is linear between."""
+    """Work of the power at the `wheel` [W] over `time` [s], by sign; the power is linear in between."""
     out, back = (np.trapezoid(np.maximum(sign * wheel, 0.0), time) for sign in (1, -1))
     return {"wheel_J": float(out), "wheel_back_J": float(back)}
 
@@ -178,7 +178,7 @@ def mmrjax_of(vehicle: Vehicle, asked: Trace) -> dict[str, Any]:
 def fastsim_of(vehicle: Vehicle, asked: Trace, step: float, *, sine: bool = False) -> dict[str, Any]:
     """FASTSim's run in steps of `step` [s].
 
-    Its grade is rise over run, tan α; with `sine` sin α is given in its place.
+    Its grade is rise over run, tan α; with `sine` it is given sin α instead.
     """
     import fastsim
 
@@ -200,7 +200,7 @@ def fastsim_of(vehicle: Vehicle, asked: Trace, step: float, *, sine: bool = Fals
     count = round(asked.time[-1] / step)
     time = np.arange(count + 1) * step
     speed, _ = asked.at(time)
-    # The grade of a step is that of the interval before it.
+    # The grade of a step belongs to the interval before it.
     _, slope = asked.at(np.concatenate([time[:1], (time[1:] + time[:-1]) / 2]))
     grade = np.sin(slope) if sine else np.tan(slope)
     cycle = fastsim.Cycle.from_dict(
@@ -231,7 +231,7 @@ def fastsim_of(vehicle: Vehicle, asked: Trace, step: float, *, sine: bool = Fals
 def integral_of(vehicle: Vehicle, asked: Trace, gravity: float = GRAVITY, *, tangent: bool = False) -> dict[str, Any]:
     """Rolling, climbing and acceleration integrated over the trace, with `gravity` [m/s²].
 
-    With `tangent` the climb takes tan α in place of sin α, as FASTSim does.
+    With `tangent` the climb uses tan α instead of sin α, as FASTSim does.
     """
     mass = vehicle.mass + vehicle.inertia / vehicle.radius**2
     total = dict.fromkeys(("wheel_J", "wheel_back_J", "distance_m"), 0.0)
@@ -249,13 +249,13 @@ def integral_of(vehicle: Vehicle, asked: Trace, gravity: float = GRAVITY, *, tan
 
 
 def percent(a: dict[str, Any], b: dict[str, Any]) -> dict[str, float]:
-    """By how much `a` is above `b` [%]."""
+    """Relative difference of `a` from `b` [%]."""
     names = ("wheel_J", "wheel_back_J", "distance_m", "Wh_per_km")
     return {name: round(100 * (a[name] / b[name] - 1), 4) for name in names}
 
 
 def compared(vehicle: Vehicle, asked: Trace) -> dict[str, Any]:
-    """Both simulators and the integral, and by how much they are apart."""
+    """Results of both simulators and the integral, and their differences."""
     ours, exact = mmrjax_of(vehicle, asked), integral_of(vehicle, asked)
     theirs, fine = (fastsim_of(vehicle, asked, step) for step in (1.0, 0.1))
     like_theirs = integral_of(vehicle, asked, GRAVITY_FASTSIM, tangent=True)
@@ -277,7 +277,7 @@ def compared(vehicle: Vehicle, asked: Trace) -> dict[str, Any]:
     }
 
 
-#: What is compared: each vehicle with its trace.
+#: Each vehicle with its trace.
 CASES = ((ROBOT, trace(0.5, 1.0, 5.0, 4.0)), (CAR, trace(6.0, 12.0, 3.0, 2.0)))
 
 

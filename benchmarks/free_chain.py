@@ -1,18 +1,18 @@
 # ruff: noqa: E402 (double precision is set before anything is imported)
-"""A free chain of 168 masses as a second opinion on the belt that runs on its path: guide share and ripple.
+"""A free chain of 168 masses as an independent check of the belt model: guide share and ripple.
 
-python benchmarks/free_chain.py            the chain alone
-python benchmarks/free_chain.py --track    beside the track model, over the guide's recess
-python benchmarks/free_chain.py --shaking --track    at the running gear that shakes (set S of docs/vibration.md)
+python benchmarks/free_chain.py            only the chain
+python benchmarks/free_chain.py --track    compared with the track model, over the guide's recess
+python benchmarks/free_chain.py --shaking --track    at set S of docs/explanation/vibration.md
 
-One side of 6T2A on the flat without payload. The masses of the belt are free in the plane; stiff springs
-join them; two 48-tooth pulleys hold them from inside by one-sided springs and carry them along by tooth
-springs; the guides are one-sided springs. Every seventh mass has a grouser, which stands on the line of its
-two neighbours and meets the ground by (27)-(29) and Fig. 7, the library's own laws. The chassis is rigid
+One side of 6T2A on level ground without payload. The masses of the belt are free in the plane, joined by stiff
+springs. Two 48-tooth pulleys hold them from inside by one-sided springs and drive them by tooth
+springs; the guides are one-sided springs. Every seventh mass has a grouser, normal to the line of its
+two neighbours, which meets the ground by (27)-(29) and Fig. 7, the library's own laws. The chassis is rigid
 (travel, height, pitch), the driving pulley turns at a given speed, the driven one is free.
 
-Nothing here is taken from `belt` or `undercarriage`. The chain is chaotic: it serves averages and periods,
-not derivatives.
+The chain shares no code with `belt` or `undercarriage`. It is chaotic: its averages and periods are meaningful,
+its derivatives are not.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ from mmrjax.undercarriage.ripple import period_pitch, ripple
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT, TEETH_PULLEY, RunningGear
 
 # [s]; half of it changes the share by less than the scatter of two windows. Explicit: the damping of a grouser on the
-# mass of its link allows 2 m / b_max = 1.6e-6 s at 300 N·s/m, 0.6e-6 s at 800; main() takes a third of it if less.
+# mass of its link allows 2 m / b_max = 1.6e-6 s at 300 N·s/m, 0.6e-6 s at 800; main() uses a third of it if smaller.
 STEP = 1e-6
 SAMPLE = 500  # steps
 SPEED = 25.66  # [rad/s], of the driving pulley; 6T2A at 33 V on the flat
 
-# Not in the track model, where pulley, guide and teeth are rigid. Stiff beside a grouser (2e5 N/m under 8 N).
+# Not in the track model, where pulley, guide and teeth are rigid. Stiff compared with a grouser (2e5 N/m under 8 N).
 TEETH_STIFFNESS, TEETH_DAMPING = 2e6, 10.0  # [N/m], [N·s/m] of a mass on pulley, tooth or guide
-# A run's own damping (10 N·s/m) would overdamp its 60 links one by one and cap the step.
+# A run's own damping (10 N·s/m) would overdamp each of its 60 links and limit the step.
 LINK_DAMPING = 20.0  # [N·s/m]
 
 FIRST = jnp.arange(GROUSERS) * (TEETH_BELT // GROUSERS)  # the masses that carry grousers
@@ -70,7 +70,7 @@ class Motion(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """Of an instant [N]; `off` how far the outermost mass is off the nominal path [m]."""
+    """Sums of an instant [N]; `off`: distance of the outermost mass from the nominal path [m]."""
 
     normal: jax.Array
     guide: jax.Array
@@ -87,12 +87,12 @@ class Chain(NamedTuple):
     half: mjcf.Masses
     ground: object
     guide_friction: float
-    radius: float  # of the pulley's polygon, where the masses lie
+    radius: float  # of the pulley's polygon, at the masses
     link: float  # pitch of the belt [m]
 
 
 def chain(gear: RunningGear, robot: Robot | None = None) -> Chain:
-    """A robot's 6T2A on the flat (None: the nominal one's), with `gear`."""
+    """A robot's 6T2A on level ground (None: the nominal one's), with `gear`."""
     robot = dataclasses.replace(nominal() if robot is None else robot, running_gear=gear)
     run = Conditions(voltage=33.0)
     rest = State(*(jnp.zeros(()) for _ in range(4)))
@@ -117,7 +117,7 @@ def _turn(vector, angle):
 
 
 def start(c: Chain, speed: float) -> Motion:
-    """The belt on its path, everything already at speed, the robot on the ground."""
+    """The belt on its path, all parts at their final speed, the robot on the ground."""
     at = jnp.arange(TEETH_BELT) * c.link
     base, arc = c.gear.wheelbase, TEETH_PULLEY // 2 * c.link
     turned = jnp.where(at < base, 0.0, jnp.minimum((at - base) / arc, 1.0))
@@ -152,7 +152,7 @@ def forces(c: Chain, m: Motion, turn, speed):
     tension = stiffness * (long - rest) + LINK_DAMPING * jnp.sum((ahead(m.speed) - m.speed) * unit, -1)
     pull = jnp.maximum(tension, 0.0)[:, None] * unit
     total = pull - behind(pull) + jnp.asarray([0.0, -gear.belt_mass * GRAVITY / TEETH_BELT])
-    # grousers: the tip stands on the line of both neighbours; virtual work shares its force among the three
+    # grousers: the tip is normal to the line of both neighbours; virtual work splits its force among the three
     line = (ahead(m.place) - behind(m.place))[FIRST]
     size = jnp.sqrt(jnp.sum(line**2, -1, keepdims=True))
     along = line / size
@@ -297,7 +297,7 @@ def measure(
         "pulley_share": mean["pulleys"] / mean["normal"],
         "carried_over_weight": mean["normal"] / weight,
         "normal_std_over_mean": float(normal.std() / normal.mean()),
-        "normal_std_over_mean_1_ms": float(coarse.std() / coarse.mean()),  # as the track model is read
+        "normal_std_over_mean_1_ms": float(coarse.std() / coarse.mean()),  # sampled as in the track model
         "ripple_amplitude": found.amplitude,
         "ripple_period_s": found.period,
         "period_34_s": period,
@@ -320,7 +320,7 @@ def harmonics(values: np.ndarray, periods: int, count: int = 4) -> dict:
 
 
 def beside(gears: list[RunningGear], robot: Robot | None = None) -> list[dict]:
-    """The track model at the same recesses, 33 V on the flat: what the chain is compared with."""
+    """Results of the track model at the same recesses, 33 V on level ground, for comparison with the chain."""
     runs = Conditions(voltage=np.full(1, 33.0))
     found = []
     for gear in gears:
@@ -348,9 +348,9 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("--recess", help="of the lower guide [mm], comma-separated; default the gear's own")
     options.add_argument("--duration", type=float, default=0.5)
-    options.add_argument("--step", type=float, help="[s]; default 1e-6, or what a stiff damper asks for")
+    options.add_argument("--step", type=float, help="[s]; default 1e-6, or the limit of a stiff damper")
     options.add_argument("--speed", type=float, default=SPEED)
-    options.add_argument("--track", action="store_true", help="run the track model beside it")
+    options.add_argument("--track", action="store_true", help="run the track model too")
     options.add_argument("--shaking", action="store_true", help="friction and running gear of set S (shaking.py)")
     options.add_argument("--json", type=Path)
     chosen = options.parse_args()

@@ -1,4 +1,4 @@
-"""Our loop against other ways, on the same unseen blocks of the same records.
+"""Comparison of our loop with other methods, on the same hold-out blocks of the same records.
 
     python benchmarks/head_to_head.py --jobs 30 --public FOLDER --cases FOLDER
     python benchmarks/head_to_head.py --records packaged,rig-00 --methods refit,scipy,ridge
@@ -6,13 +6,13 @@
 
 Records are the packaged table, public records of others, cases of a folder and synthetic rigs of `tests/worlds`.
 Methods are our refit, our verdict, SciPy's least squares on independent NumPy physics, MuJoCo's identification
-toolbox and PySINDy on the defects. Two regressions on the refit's residuals are the ceiling of what these channels
-predict. Optional packages that are not installed leave a line that says so. `--packages FOLDER` looks for them there:
+toolbox and PySINDy on the defects. Two regressions on the refit's residuals estimate the best prediction that these
+channels allow. For each optional package that is missing a line reports it. `--packages FOLDER` adds a search path:
 
     pip install --target FOLDER --no-deps pysindy derivative scikit-learn joblib threadpoolctl narwhals \\
         absl-py colorama imageio plotly tabulate
 
-Each record and method is a line of `--out`. A run that is started again continues where it ended.
+Each record and method is a line of `--out`. A restarted run continues where it ended.
 """
 
 from __future__ import annotations
@@ -39,24 +39,24 @@ from loop_findings import plain
 from loop_scores import interval
 
 METHODS = tuple(rivals.METHODS)
-#: Methods that are compared with the verdict; regressions whose best is the ceiling.
+#: Methods to compare with the verdict; regressions whose better one is the ceiling.
 COMPETITORS, CEILING = ("refit", "scipy", "mujoco", "sindy"), ("ridge", "boosted")
 #: Words of the table.
 WORDS = {
     "refit": "our refit", "verdict": "our terms", "scipy": "SciPy", "mujoco": "MuJoCo sysid", "sindy": "PySINDy",
     "ridge": "ridge", "boosted": "boosted trees", "true": "true term",
 }  # fmt: skip
-#: Share of the refit's rows that a method has to predict to be compared.
+#: Least share of the refit's rows that a method has to predict for a comparison.
 PREDICTED = 0.9
-#: Share by which a competitor's error has to be lower to count as lower.
+#: Relative difference by which a competitor's error has to be lower to count as lower.
 TENTH = 0.1
-#: What `--quick` runs.
+#: Records and methods of `--quick`.
 QUICK = {"records": "rig-00", "methods": "refit,ridge"}
 
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """A record with the methods that are to run on it, and options of the run."""
+    """A record with its methods and options of the run."""
 
     record: str
     methods: tuple[str, ...]
@@ -71,18 +71,18 @@ class Job:
 
 
 def work(job: Job, line: Connection, core: int | None = None) -> None:
-    """Run the methods of a record, sending ("begin", method) and ("line", line) for each."""
+    """Runs the methods of a record; sends ("begin", method) and ("line", line) for each."""
     if core is not None:
         os.sched_setaffinity(0, {core})
     if job.packages is not None:
-        sys.path.append(str(job.packages))  # behind what is installed
+        sys.path.append(str(job.packages))  # after the installed packages
     for method, result in lines(job, lambda method: line.send(("begin", method))):
         line.send(("line", {"record": job.record, "method": method, **result}))
     line.send(("end", ""))
 
 
 def lines(job: Job, begin: Any = lambda method: None) -> Iterable[tuple[str, dict[str, Any]]]:
-    """(Method, what its line says) of a record, one after the other; a failure is a line too.
+    """Yields (method, its line) for the methods of a record; a failure is a line too.
 
     Args:
         begin: called with each method before it runs.
@@ -142,9 +142,9 @@ def _short(x: float) -> float | None:
 
 
 def run(jobs: Sequence[Job], count: int, within: float, keep: Any) -> None:
-    """Run records on `count` processes.
+    """Runs records on `count` processes.
 
-    A method that takes longer than `within` seconds is ended with its process. The record's further methods run in
+    A method that takes longer than `within` seconds is ended with its process. The record's remaining methods run in
     another one.
 
     Args:
@@ -196,9 +196,9 @@ def run(jobs: Sequence[Job], count: int, within: float, keep: Any) -> None:
 
 
 def ended(job: Job, method: str, why: str, keep: Any) -> list[Job]:
-    """Keep the line of a method whose process ended, and return the job of the methods that are left.
+    """Keeps the line of a method whose process ended, and returns the job of the remaining methods.
 
-    Without a base no method is left.
+    Without a base no method remains.
     """
     over = job.methods if method == "base" else (method,)
     for name in over:
@@ -218,8 +218,8 @@ class Compared:
     Attributes:
         record: its name; truth: kind of its answer; channels: names.
         percent: method → rms error of each channel [% of the measured rms].
-        partial: the same of a method that predicts too few of the rows, over its own; with their share.
-        rows: rows that are compared, over the kinds of blocks; lines: method → line.
+        partial: the same for a method that predicts too few rows, over its own rows; with their share.
+        rows: compared rows, over the kinds of blocks; lines: method → line.
     """
 
     record: str
@@ -231,21 +231,21 @@ class Compared:
     lines: dict[str, dict[str, Any]]
 
     def over_all(self, method: str) -> float:
-        """Rms over the channels [%]; NaN for a method that is not compared."""
+        """Rms over the channels [%]; NaN for a method outside the comparison."""
         there = self.percent.get(method)
         return float("nan") if there is None else float(np.sqrt(np.nanmean(there**2)))
 
     @property
     def ceiling(self) -> float:
-        """The lower error of the two regressions [%]; NaN without either."""
+        """The lower error of the two regressions [%]; NaN without both."""
         values = [self.over_all(m) for m in CEILING]
         return float(np.nanmin(values)) if np.isfinite(values).any() else float("nan")
 
     @property
     def share(self) -> float:
-        """Share of the way from the refit to the ceiling that our terms cover [-].
+        """Share of the improvement from the refit to the ceiling that our terms reach [-].
 
-        It is 1 where our terms are below the ceiling, NaN where neither is lower than the refit by a tenth.
+        It is 1 if our terms are below the ceiling, NaN if neither is lower than the refit by a tenth.
         """
         refit, ours = self.over_all("refit"), self.over_all("verdict")
         lowest = float(np.fmin(self.ceiling, ours))
@@ -258,7 +258,7 @@ class Compared:
 
 
 def compared(every: Sequence[dict[str, Any]]) -> list[Compared]:
-    """Records in the order in which they came; of a method whose line came twice the later one counts."""
+    """Records in their order; for a repeated method the last line counts."""
     by: dict[str, dict[str, dict[str, Any]]] = {}
     for line in every:
         by.setdefault(line["record"], {})[line["method"]] = line
@@ -285,7 +285,7 @@ def _stacked(off: dict[str, list[list[float | None]]]) -> np.ndarray:
 
 
 def table(records: Sequence[Compared]) -> list[str]:
-    """The comparison in markdown: figures first, then a row for each record."""
+    """The comparison in markdown: first the figures, then a row for each record."""
     columns = ("refit", "verdict", "scipy", "mujoco", "sindy", "ridge", "boosted", "true")
     head = [
         "record",
@@ -371,32 +371,30 @@ def _seconds(r: Compared) -> str:
 def options() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--public", type=Path, metavar="FOLDER", help="records of others, as in docs/benchmarks.md")
+    parser.add_argument("--public", type=Path, metavar="FOLDER", help="public records, see docs/lab/head-to-head.md")
     parser.add_argument("--cases", type=Path, metavar="FOLDER", help="cases with a robot's file and a table each")
-    parser.add_argument(
-        "--packages", type=Path, metavar="FOLDER", help="where pysindy and scikit-learn are installed"
-    )
+    parser.add_argument("--packages", type=Path, metavar="FOLDER", help="folder with pysindy and scikit-learn")
     parser.add_argument(
         "--records", default="packaged,public,cases,synthetic",
         help="groups (packaged, public, cases, synthetic) or names, e.g. packaged,real-01,rig-07",
     )  # fmt: skip
     parser.add_argument("--methods", default=",".join(METHODS), help="of %(default)s")
     parser.add_argument("--rigs", type=int, default=public_records.RIGS, help="number of synthetic rigs")
-    parser.add_argument("--seed", type=int, default=0, help="of the synthetic rigs, of bootstraps and trees")
+    parser.add_argument("--seed", type=int, default=0, help="for the synthetic rigs, bootstraps and trees")
     parser.add_argument("--replicates", type=int, default=500, help="of the bootstrap")
-    parser.add_argument("--within", type=float, default=900.0, help="seconds that a method may take")
-    parser.add_argument("--jobs", type=int, default=1, help="processes, each with one record")
+    parser.add_argument("--within", type=float, default=900.0, help="time limit of a method [s]")
+    parser.add_argument("--jobs", type=int, default=1, help="number of processes, each with one record")
     parser.add_argument(
-        "--out", type=Path, default=Path("runs/head_to_head.jsonl"), help="a line a record and method"
+        "--out", type=Path, default=Path("runs/head_to_head.jsonl"), help="one line for each record and method"
     )
     parser.add_argument("--cache", type=Path, help="folder of compiled programs that the processes share")
     parser.add_argument("--quick", action="store_true", help="one synthetic rig and two methods, in this process")
-    parser.add_argument("--table", action="store_true", help="print the table of --out as it is")
+    parser.add_argument("--table", action="store_true", help="print the table of an existing --out")
     return parser
 
 
 def wanted(given: argparse.Namespace, done: set[tuple[str, str]]) -> list[Job]:
-    """Records with the methods that have no line yet.
+    """Records with their methods that have no line yet.
 
     Raises:
         SystemExit: an unknown record or method.
@@ -416,7 +414,7 @@ def wanted(given: argparse.Namespace, done: set[tuple[str, str]]) -> list[Job]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run records, or print the table."""
+    """Runs records, or prints the table."""
     given = options().parse_args(arguments)
     if given.quick:
         given.records, given.methods = QUICK["records"], QUICK["methods"]

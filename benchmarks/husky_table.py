@@ -1,11 +1,11 @@
-"""Settled turns of the Husky's runs, and what a regression says of them.
+"""Settled turns of the Husky's runs, and regressions on them.
 
     python benchmarks/husky_table.py husky_turning.csv    write docs/rigs/husky/husky.csv from the runs' samples
-    python benchmarks/husky_table.py --regressions        errors of regressions of that table, each run held out
-    python benchmarks/husky_table.py --result FOLDER      the same of a calibration, by surface
+    python benchmarks/husky_table.py --regressions        errors of regressions on that table, each run held out
+    python benchmarks/husky_table.py --result FOLDER      the same for a calibration, by surface
 
-Means over windows of 2 s in which no wheel's speed has a standard deviation above 16 mm/s, two steps of its
-instrument, and one of them rolls at more than 50 mm/s. Of each run those that spread its yaw rates, at most 12.
+Means over windows of 2 s with a wheel faster than 50 mm/s. No wheel speed has a standard deviation above 16 mm/s, two
+steps of its instrument. At most 12 windows of each run, spread over its yaw rates.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ import numpy as np
 import turning_data as study
 
 TABLE = Path(__file__).resolve().parents[1] / "docs" / "rigs" / "husky" / "husky.csv"
-STEADY, MOVES, OF_RUN = 0.016, 0.05, 12  # [m/s], [m/s], rows of a run at most
+STEADY, MOVES, OF_RUN = 0.016, 0.05, 12  # [m/s], [m/s], most rows of a run
 
 
 def settled(samples: study.Table) -> list[np.ndarray]:
-    """Samples of each window that is kept."""
+    """Samples of each selected window."""
     speeds, _, yaw = study.sides(samples)
     found = []
     for run in np.unique(samples["run_id"]):
@@ -34,7 +34,7 @@ def settled(samples: study.Table) -> list[np.ndarray]:
         ]
         steady.sort(key=lambda rows: yaw[rows].mean())
         rates = np.array([yaw[rows].mean() for rows in steady])
-        if len(steady) > OF_RUN:  # nearest to rates evenly apart
+        if len(steady) > OF_RUN:  # nearest to equally spaced rates
             picked = {int(np.argmin(np.abs(rates - r))) for r in np.linspace(rates[0], rates[-1], OF_RUN)}
             steady = [steady[k] for k in sorted(picked)]
         found += steady
@@ -68,7 +68,7 @@ def regressions() -> None:
 
 
 def by_surface(error: np.ndarray, size: np.ndarray, table: study.Table) -> list[float]:
-    """rms of the errors over rms of the readings [%], of each surface and of all."""
+    """Rms of the errors over rms of the readings [%], of each surface and of all."""
     return [*study.by_surface(error, size, table["surface"]), study.percent(error, size)]
 
 
@@ -94,9 +94,9 @@ def result(folder: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("table", type=Path, nargs="?", help="file that the table is written to")
-    what.add_argument("--regressions", action="store_true", help="regressions of the table")
-    what.add_argument("--result", type=Path, metavar="FOLDER", help="figures of a run folder")
+    what.add_argument("table", type=Path, nargs="?", help="samples of the runs, to write the table from")
+    what.add_argument("--regressions", action="store_true", help="print errors of regressions on the table")
+    what.add_argument("--result", type=Path, metavar="FOLDER", help="print figures of a run folder")
     given = parser.parse_args()
     if given.regressions:
         regressions()

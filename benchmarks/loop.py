@@ -3,13 +3,12 @@
     python benchmarks/loop.py --clean-wide 1000 --library 500 --variants 300 --outside 300 --pairs 200 --jobs 2
     python benchmarks/loop.py --clean-unstated 300 --clean-heavy 100 --clean-uneven 100 --clean-rounded 100 --jobs 2
 
-Tables come from `tests/worlds/tables.py`, which shares nothing with the simulator; labels
-are read by the scorer alone. Every table is one line of `--out`, and a run that is started again goes on where it
-ended.
-Surfaces are wide (adhesion 0.2 to 1, V_s 2 to 60 mm/s, known by the fields' priors alone), and some tables come from
-other robots or poor instruments; with `--narrow` all come from the paper's robot on one surface that is stated.
-Kinds with a noise of their own (`NOISES`) are the same without sds in the table, or with heavy-tailed, uneven or
-coarsely rounded readings, of which every other table states sds.
+Tables come from `tests/worlds/tables.py`, which shares no code with the simulator; only the scorer reads the
+labels. Every table is one line of `--out`, and a restarted run continues where it ended.
+Surfaces are wide (adhesion 0.2 to 1, V_s 2 to 60 mm/s, known only by the fields' priors), and some tables come from
+other robots or poor instruments. With `--narrow` all come from the paper's robot on one stated surface.
+Kinds with a special noise (`NOISES`) have no sds in the table, or heavy-tailed, uneven or coarsely rounded readings;
+of these every other table states sds.
 """
 
 from __future__ import annotations
@@ -35,33 +34,33 @@ KINDS = (
     "drift", "cluster", "coverage", "clean_unstated", "clean_heavy", "clean_uneven", "clean_rounded",
     "library_unstated", "outside_unstated", "pairs_unstated",
 )  # fmt: skip
-#: Kinds whose noise is their own: of what effects they are, its law, whether sds are stated (None: every other time).
+#: Kinds with a special noise: kind of its effects, its law, and whether sds are stated (None: in every other table).
 NOISES: dict[str, tuple[str, str, bool | None]] = {
     "clean_unstated": ("clean_wide", "normal", False), "clean_heavy": ("clean_wide", "heavy", None),
     "clean_uneven": ("clean_wide", "uneven", None), "clean_rounded": ("clean_wide", "normal", None),
     "library_unstated": ("library", "normal", False), "outside_unstated": ("outside", "normal", False),
     "pairs_unstated": ("pairs", "normal", False),
 }  # fmt: skip
-#: Kinds that keep to the paper's robot on one stated surface.
+#: Kinds with only the paper's robot on one stated surface.
 NARROW = ("clean", "compensating")
-#: Sigmas of each effect, least and most.
+#: Least and greatest sigmas of each effect.
 SIGMAS = {
     "library": (5.0, 15.0), "variants": (5.0, 15.0), "outside": (8.0, 15.0), "blind": (8.0, 15.0),
     "pairs": (8.0, 15.0), "compensating": (8.0, 15.0), "triples": (8.0, 15.0), "drift": (8.0, 15.0),
     "cluster": (8.0, 15.0), "coverage": (8.0, 15.0),
 }  # fmt: skip
-#: Worlds of all kinds but `clean_wide`, which goes through each as often, and their shares.
+#: Worlds of all kinds but `clean_wide`, which uses each equally often, and their shares.
 SHARES = {
     "plain": 0.52, "quantised": 0.08, "outliers": 0.08, "missing": 0.08, "long": 0.08, "short": 0.04, "tracks": 0.04,
     "wheels": 0.04, "both": 0.04,
 }  # fmt: skip
-#: The same of kinds whose noise is their own: tables with series, and such as Tables A1 and A2.
+#: The same for kinds with a special noise: tables with series, and tables like A1 and A2.
 SERIES = {"plain": 0.5, "few": 0.3, "missing": 0.1, "both": 0.1}
-#: Draws of names until effects of the wanted strength are not too large together.
+#: Draws of names until effects of the wanted strength are plausible together.
 TRIES = {"pairs": 6, "triples": 12}
-#: Proposals that are carried out, one after the other, to resolve a class.
+#: Number of proposals carried out in sequence to resolve a class.
 EXPERIMENTS = 3
-#: The analyst's prior on the one surface of narrow tables, which Table 5 does not know.
+#: The analyst's prior on the one surface of narrow tables, which Table 5 does not contain.
 STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("6T2A", "4W2T")}
 
 
@@ -69,7 +68,7 @@ STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("6T2A", "4W2T")}
 
 
 def attempt(kind: str, seed: int, narrow: bool = False, only: str = "") -> Case | str:
-    """The case of a kind and a seed, or why there is none; `only` of a stratum."""
+    """The case of a kind and a seed, or the reason why it is invalid; `only`: of one stratum."""
     rng = np.random.default_rng([KINDS.index(kind), seed])
     own, rounded = kind in NOISES, kind == "clean_rounded"
     kind, law, stated = NOISES.get(kind, (kind, "normal", True))
@@ -104,8 +103,10 @@ def attempt(kind: str, seed: int, narrow: bool = False, only: str = "") -> Case 
 
 
 def _weakened(world: tables.World, kind: str, names: list[str], wanted: list[float], seed: int) -> tuple[Case, str]:
-    """A case and why it is none, if so; where effects would be too large for the sigmas that are wanted, as strong as
-    they may be."""
+    """A case, and the reason if it is invalid.
+
+    Effects that would be implausibly large at the wanted sigmas are as strong as is plausible.
+    """
     low = SIGMAS.get(kind, (0.0, 0.0))[0]
     case = tables.case(world, names, wanted, seed=seed)
     why = _refused(case, kind, low)
@@ -118,7 +119,7 @@ def _weakened(world: tables.World, kind: str, names: list[str], wanted: list[flo
 
 
 def _names(kind: str, seed: int, rng: np.random.Generator, library: tuple[str, ...]) -> list[str]:
-    """Effects of a case."""
+    """Names of the effects of a case."""
     if kind in ("clean", "clean_wide", "noise"):
         return []
     if kind in ("pairs", "compensating", "triples"):
@@ -134,7 +135,7 @@ def _names(kind: str, seed: int, rng: np.random.Generator, library: tuple[str, .
 
 
 def _refused(case: Case, kind: str, low: float) -> str:
-    """Why a case of a kind is none; empty for one that is."""
+    """Reason why a case of a kind is invalid; empty for a valid one."""
     return refused(case.label, low, kind not in ("drift", "cluster", "blind"), kind != "compensating")
 
 
@@ -142,7 +143,7 @@ def _refused(case: Case, kind: str, low: float) -> str:
 
 
 def work(task: Task) -> dict:
-    """A case made, looped over and scored against its label, in a worker."""
+    """Makes a case, runs the loop on it and scores it against its label, in a worker."""
     case = attempt(task.kind, task.seed, task.narrow, task.stratum)
     if isinstance(case, str):
         return {"skipped": case}
@@ -155,7 +156,7 @@ def work(task: Task) -> dict:
     if kind == "library" and found.verdict == "class" and case.toml is None and not task.brief:
         try:
             line["experiments"] = carried_out(case, found, given.settings)
-        except Exception as error:  # a menu that the generator does not know costs a figure, not the table
+        except Exception as error:  # an unknown menu loses a figure, not the table
             line["experiments"], line["experiments_error"] = [], f"{type(error).__name__}: {error}"
     if kind == "coverage":
         line |= deviates(case, found, given.settings)
@@ -168,7 +169,7 @@ def work(task: Task) -> dict:
 def deviates(case: Case, found, settings) -> dict:
     """Distances of the fit from the truth in its own sds: of each base parameter, and of the amplitude.
 
-    Empty where the truth is not in the class that is found, or something is found that is not there.
+    Empty if the found class does not contain the truth, or if there is a wrong finding.
     """
     from calibration.discovery.findings import size_of
 
@@ -186,7 +187,7 @@ def deviates(case: Case, found, settings) -> dict:
             best = min(ladder, key=lambda c: c.cost)
     coordinates, z = space.coordinates.base, case.label["z"]
     names, free = coordinates.names, space.free
-    # Truths are drawn from the fields' priors; of the ground's friction the loop takes wider ones.
+    # Truths are drawn from the fields' priors; the loop uses wider ones for the ground's friction.
     wider = {n: tables.spread(n) / float(coordinates.spread[k]) for k, n in enumerate(names) if coordinates.scale[k]}
     line = {
         "deviates": {
@@ -204,7 +205,7 @@ def deviates(case: Case, found, settings) -> dict:
 
 
 def after(case: Case, runs, found) -> dict:
-    """Errors held out by slope before and after, over the noise's sd, and the bias of the base parameters."""
+    """Hold-out errors by slope before and after, over the noise's sd, and the bias of the base parameters."""
     from calibration.inference import blocks
     from calibration.inference.held_out import held_out
 
@@ -227,7 +228,7 @@ def after(case: Case, runs, found) -> dict:
 
 
 def carried_out(case: Case, found, settings) -> list[dict]:
-    """Experiments proposed and carried out one after the other, until one alternative or nothing to do is left."""
+    """Proposed experiments carried out in sequence, until one alternative or no proposal is left."""
     import loop_experiments
 
     from calibration.discovery import experiments
@@ -254,7 +255,7 @@ def carried_out(case: Case, found, settings) -> list[dict]:
 
 
 def program(task: Task) -> tuple | dict:
-    """What tables have alike that share what is compiled; the line of a case that is none."""
+    """Properties that tables with the same programs share; or the line of an invalid case."""
     from calibration.discovery.discover import padded
     from calibration.inference.observers.settled import SettledRuns
 
@@ -285,7 +286,7 @@ def summary(lines: list[dict]) -> list[str]:
 
 
 def _experiments(f: scores.Figures) -> None:
-    """Next experiments, and what adding an effect does to errors held out and to base parameters."""
+    """Figures of the next experiments, and the change of hold-out errors and base parameters by an added effect."""
     library = f.of("library")
     asked = [x for x in library if x["verdict"] == "class" and scores.contains(x) and "experiments" in x]
 

@@ -2,8 +2,8 @@
 
     python benchmarks/loop_baselines.py --clean 40 --library 66 --outside 36 --pairs 30 --jobs 2
 
-Tables, priors and fits are the loop's; only the choice of effects is plain. PySINDy comes with the extra
-`bench`. Every table is one line of `--out`, and a run that is started again goes on where it ended.
+Tables, priors and fits are the loop's; only the selection of effects is plain. PySINDy comes with the extra
+`bench`. Every table is one line of `--out`, and a restarted run continues where it ended.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from loop_scores import MIMIC, interval
 from worlds import tables
 
 KINDS = ("clean", "library", "outside", "pairs")
-#: Effects that are refitted beside a fit: the loop's own number.
+#: Number of effects that are refitted for each fit, the same as in the loop.
 BATCH = 16
-#: Thresholds that are tried: of a coefficient, where columns and target have an rms of 1.
+#: Thresholds of a coefficient, for columns and target with an rms of 1.
 THRESHOLDS = tuple(np.geomspace(0.02, 20.0, 40))
-#: Share of a signature's norm below which an equation does not see an effect.
+#: Share of a signature's norm below which an equation does not show an effect.
 UNSEEN = 1e-3
 METHODS = {
     "aicc": "stepwise AICc",
@@ -47,7 +47,7 @@ def bic(chi2: float, k: int, n: int) -> float:
 
 
 class Ladder:
-    """Fits of sets of effects, each made once.
+    """Fits of sets of effects, each computed once.
 
     Args:
         runs: the table; fitted: its base fit.
@@ -63,7 +63,7 @@ class Ladder:
         self.looks: dict = {}
 
     def look(self, candidate) -> tuple:
-        """A fit linearised, and the scores of the library there."""
+        """A fit linearised, and the scores of the library at it."""
         import jax
         import jax.numpy as jnp
 
@@ -91,7 +91,7 @@ class Ladder:
 
 
 def stepwise(ladder: Ladder, criterion) -> list[str]:
-    """Effects added one by one, each the one with the lowest criterion, while that falls and slots are left.
+    """Adds effects one by one, each with the lowest criterion, while it falls and slots are left.
 
     Args:
         criterion: of χ² with priors, free parameters and readings. A free parameter is a constant of the base,
@@ -118,11 +118,11 @@ def stepwise(ladder: Ladder, criterion) -> list[str]:
 
 
 def sparse(theta: np.ndarray, target: np.ndarray, known: bool) -> np.ndarray:
-    """Columns that STLSQ keeps at the threshold of the lowest BIC, which may be none.
+    """Columns that STLSQ keeps at the threshold of the lowest BIC; possibly none.
 
     Args:
         theta: columns, shape (points, columns); target: shape (points,).
-        known: whether the target's noise has an sd of 1; else BIC takes that of the residual.
+        known: True if the target's noise has an sd of 1; else BIC uses that of the residual.
     """
     n = len(target)
 
@@ -140,28 +140,28 @@ def sparse(theta: np.ndarray, target: np.ndarray, known: bool) -> np.ndarray:
     supports = [np.zeros(theta.shape[1], bool)]
     for threshold in THRESHOLDS:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of thresholds that leave nothing
+            warnings.simplefilter("ignore")  # of thresholds that leave no column
             found = pysindy.STLSQ(threshold=threshold).fit(x, y[:, None])
         supports.append(np.ravel(found.coef_) != 0)
     return min(supports, key=value)
 
 
 def strongest(space, scores) -> list[int]:
-    """Of every effect, its instance at the shape whose score is the strongest."""
+    """Instance of every effect at the shape with the strongest score."""
     return [space.library.best_instance(name, scores.single) for name in space.library.names]
 
 
 def sindy(space, linear, scores) -> list[str]:
     """STLSQ on the defect of each of the three equations, over the effects' unit terms.
 
-    A term of another balance, or of an instrument, is taken as the defects that change the readings as it does.
+    A term of another balance, or of an instrument, is replaced by the defects that change the readings equally.
     """
     from calibration.inference.linearization import PROBED
     from calibration.inference.observers.settled import EQUATIONS
 
     rows, at = space.included, strongest(space, scores)
     whole = np.asarray(linear.signatures)[:, at]
-    signatures = whole.reshape(len(rows), -1, len(at))[rows]  # rows that count, channels, effects
+    signatures = whole.reshape(len(rows), -1, len(at))[rows]  # valid rows, channels, effects
     sensitivity = np.stack([np.asarray(linear.defects)[PROBED.index(b)][rows] for b in EQUATIONS], 2)
     terms = np.linalg.solve(sensitivity, signatures)  # rows, equations, effects
     lacks = -np.linalg.solve(sensitivity, np.asarray(linear.by_row())[rows][..., None])[..., 0]
@@ -176,12 +176,12 @@ def sindy(space, linear, scores) -> list[str]:
 
 
 def sindy_refit(space, linear, scores, sees=None) -> list[str]:
-    """STLSQ on all three equations together, weighted by the readings' sds, the constants refitted beside it.
+    """STLSQ on all three equations together, weighted by the readings' sds; the constants are refitted too.
 
-    Both sides are what a linear refit of the constants leaves of them (Frisch, Waugh and Lovell).
+    Both sides are the residuals of a linear refit of the constants (Frisch, Waugh and Lovell).
 
     Args:
-        sees: mask of the residuals that count; None: all.
+        sees: mask of the residuals to use; None: all.
     """
     jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
     theta = np.zeros((len(residual), len(space.library)))
@@ -191,7 +191,7 @@ def sindy_refit(space, linear, scores, sees=None) -> list[str]:
     root = np.linalg.qr(jacobian)[0]
     left, target = theta - root @ (root.T @ theta), residual - root @ (root.T @ residual)
     seen = np.linalg.norm(left, axis=0) > UNSEEN * np.maximum(np.linalg.norm(theta, axis=0), 1e-12)
-    counts = np.abs(target) + np.abs(left[:, seen]).sum(1) > 0  # rows that pad the table are zero
+    counts = np.abs(target) + np.abs(left[:, seen]).sum(1) > 0  # padding rows are zero
     kept = sparse(left[counts][:, seen], -target[counts], known=True)
     return [space.library.names[j] for j in np.flatnonzero(seen)[kept]]
 
@@ -200,7 +200,7 @@ def sindy_refit(space, linear, scores, sees=None) -> list[str]:
 
 
 def base_of(given):
-    """The base fit of what `discover.prepared` gives, as the loop begins: `candidates.BaseFit`."""
+    """The base fit of the result of `discover.prepared`, with which the loop begins: `candidates.BaseFit`."""
     from calibration.discovery.candidates import fit_base
     from calibration.discovery.discover import pose
 
@@ -209,7 +209,7 @@ def base_of(given):
 
 
 def work(task: Task) -> dict:
-    """A case made, and what each method names, in a worker."""
+    """Makes a case and lists the names that each method finds, in a worker."""
     case = loop.attempt(task.kind, task.seed, narrow=True)
     if isinstance(case, str):
         return {"skipped": case}
@@ -232,7 +232,7 @@ def work(task: Task) -> dict:
 
 
 def alike(truth: dict) -> set[str]:
-    """Effects that noise-free data could not tell from the truth, itself included."""
+    """Effects that noise-free data could not distinguish from the truth, including itself."""
     return {truth["class"], *truth["class_oracle"]}
 
 
@@ -292,7 +292,7 @@ def summary(lines: list[dict]) -> list[str]:
 
 
 def program(task: Task) -> tuple | dict:
-    """What tables have alike that share what is compiled, as of the loop's narrow tables."""
+    """Properties that tables with the same programs share, as for the loop's narrow tables."""
     return loop.program(dataclasses.replace(task, narrow=True))
 
 

@@ -1,4 +1,4 @@
-"""What readings of experiments that the loop proposed say of its alternatives."""
+"""Judgement of a loop's alternatives by the readings of its proposed experiments."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from calibration.discovery import experiments, predicted
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """What readings of experiments say of alternatives.
+    """Judgement of alternatives by the readings of experiments.
 
     Attributes:
-        chi2: of each alternative, by name; best: whose is the smallest.
+        chi2: of each alternative, by name; best: the one with the smallest.
         refuted: alternatives whose χ² is larger by `Settings.refuted` or more.
-        resolved: whether the best alone is left.
+        resolved: True if only the best is left.
     """
 
     chi2: dict[str, float]
@@ -27,7 +27,7 @@ class Verdict:
 
     @property
     def resolved(self) -> bool:
-        """Whether one alternative is left."""
+        """True if one alternative is left."""
         return len(self.refuted) == len(self.chi2) - 1
 
     @property
@@ -37,7 +37,7 @@ class Verdict:
 
 
 def among(seen: experiments.PredictedReadings, names: Sequence[str]) -> experiments.PredictedReadings:
-    """Of these alternatives alone, in their order; the first is the best fit only while that is among them."""
+    """The readings of these alternatives, in their order; the first is the best fit only if that is among them."""
     kept = [k for k, n in enumerate(seen.names) if n in names]
     return dataclasses.replace(
         seen, names=tuple(seen.names[k] for k in kept), value=seen.value[kept], half=seen.half[kept]
@@ -45,12 +45,12 @@ def among(seen: experiments.PredictedReadings, names: Sequence[str]) -> experime
 
 
 def supported(seen: experiments.PredictedReadings, carried_out: Mapping[str, Mapping[str, Any]]) -> Verdict:
-    """Which alternative the readings of experiments support.
+    """Judges alternatives by the readings of experiments.
 
     Args:
-        seen: what was foreseen.
+        seen: predicted readings.
         carried_out: experiment → `value` and `sd` of its readings [SI], repeats averaged, in the menu's order;
-            NaN for what was not read.
+            NaN for missing ones.
     """
     spans = predicted.spans(seen.experiments)
     at = np.concatenate([np.arange(len(seen.sd))[spans[name]] for name in carried_out])

@@ -1,6 +1,6 @@
-"""What a campaign keeps of the findings of a table: each effect, its tests in numbers, and what predicts.
+"""Record of the findings of a table in a campaign: each effect, its tests in numbers, and the model that predicts.
 
-Numbers are raw, so that the constants of the tests can be chosen again from the lines of a campaign alone.
+Numbers are raw, so that the constants of the tests can be chosen again from the lines of a campaign.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-#: What a result may hold beside its verdict.
+#: Further parts that a result may have, in addition to its verdict.
 FURTHER = ("families", "mechanism", "events", "events_alike", "noise_factor", "implausible", "hidden", "stands_for")
 
 
 def plain(x: Any) -> Any:
-    """Anything that a result holds, as JSON can."""
+    """Any value of a result in a form that JSON can hold."""
     if dataclasses.is_dataclass(x) and not isinstance(x, type):
         return {f.name: plain(getattr(x, f.name)) for f in dataclasses.fields(x)}
     if isinstance(x, Mapping):
@@ -29,7 +29,7 @@ def plain(x: Any) -> Any:
 
 
 def verdict(found) -> dict:
-    """What a `LoopStages` says."""
+    """The verdict of a `LoopStages`."""
     base = found.screened.base.candidate
     further = {name: plain(getattr(found, name)) for name in FURTHER if getattr(found, name, None) is not None}
     return {
@@ -46,15 +46,15 @@ def verdict(found) -> dict:
 
 
 def located(found) -> tuple | None:
-    """(balance, variable, balances that act alike) of what has no name, or remains."""
+    """(balance, variable, indistinguishable balances) of an unnamed or remaining discrepancy."""
     return None if found.where is None else (found.where.place, found.where.variable, list(found.where.alike))
 
 
 def findings(given: Any, found: Any) -> dict[str, Any]:
-    """Effects of the model, tests of each, the noise, and what is written.
+    """Effects of the model, tests of each, the noise, and the written model.
 
     Args:
-        given: what `discover.prepared` gave; found: the `LoopStages` of it.
+        given: result of `discover.prepared`; found: the `LoopStages` of it.
     """
     alike, best, base = found.alike, found.best, found.screened.base.candidate
     members = () if alike is None else alike.members
@@ -84,7 +84,7 @@ def findings(given: Any, found: Any) -> dict[str, Any]:
 
 
 def _tests(found: Any) -> list[dict[str, Any]]:
-    """Of each effect that was tested by itself; a root without any one row that is infinite is None."""
+    """Tests of each effect that was tested separately; None for an infinite root without any one row."""
     tests = () if found.standing is None else found.standing.tests
     return [
         {f.name: getattr(t, f.name) for f in dataclasses.fields(t)}
@@ -94,7 +94,7 @@ def _tests(found: Any) -> list[dict[str, Any]]:
 
 
 def _noise(noise: Any) -> dict[str, dict[str, Any]]:
-    """Channel → where its sd comes from, its median [SI], and what an estimate is like."""
+    """Channel → source of its sd, its median [SI], and properties of an estimate."""
     series = {s.channel.name: s for s in noise.along_series}
     known = {}
     for k, channel in enumerate(noise.channels):
@@ -109,7 +109,7 @@ def _noise(noise: Any) -> dict[str, dict[str, Any]]:
 
 
 def _held_out(runs: Any, found: Any) -> dict[str, Any]:
-    """Scores of the model and of smaller sets over the refit, by data held out, and errors by channel."""
+    """Scores of the model and of smaller sets over the refit on held-out data, and errors by channel."""
     from calibration.discovery import prediction
     from calibration.discovery.search import path
     from calibration.inference import blocks as blocks_room
@@ -149,13 +149,13 @@ def _held_out(runs: Any, found: Any) -> dict[str, Any]:
 
 
 def elsewhere(given: Any, found: Any, runs: Any) -> dict[str, Any]:
-    """By how much the model predicts runs at other conditions better than the refit does, and errors by channel.
+    """Improvement of the model over the refit for runs at other conditions, and errors by channel.
 
-    The blocks that `prediction` scores by choose what is written too; nothing was chosen by these runs. By the same
-    density, of errors over the sds that the runs state; empty where the model is the refit.
+    The blocks of `prediction` also choose the written model; these runs chose nothing. The score uses the same
+    density of errors over the stated sds; empty if the model is the refit.
 
     Args:
-        runs: further ones of the same robot, as many, so that programs are shared.
+        runs: further runs of the same robot, with an equal number, so that programs are shared.
     """
     from calibration.discovery import findings as results
     from calibration.discovery import prediction
@@ -184,8 +184,7 @@ def elsewhere(given: Any, found: Any, runs: Any) -> dict[str, Any]:
 
 
 def _rms(before: np.ndarray, after: np.ndarray, names: Sequence[str]) -> dict[str, list[float]]:
-    """Channel → rms errors of the refit and of the model [σ], over the rows that both predict, and how many each
-    does."""
+    """Channel → rms errors of the refit and of the model [σ] over the rows that both predict, and rows of each."""
     both = np.isfinite(before) & np.isfinite(after)
     return {
         name: [

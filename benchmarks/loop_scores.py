@@ -1,6 +1,6 @@
-"""What a campaign's lines say: shares with their intervals, of tables and of histories alike.
+"""Figures of a campaign: shares with their intervals, of tables and of histories.
 
-A line holds the verdict (`verdict`, `classes`, `where`, `families`, `events`) beside the truth of its case.
+A line holds the verdict (`verdict`, `classes`, `where`, `families`, `events`) and the truth of its case.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import numpy as np
 #: Verdicts without an established name; `unnamed` in lines of campaigns before schema 3.
 WITHOUT_NAME = ("mechanism", "place", "unnamed")
 
-#: Channels, whose readings may be off.
+#: Channels with readings that may be wrong.
 CHANNELS = ("total_current", "motor_speed", "speed")
-#: Balances that act on the same of the three equations that current, motor speed and speed close.
+#: Groups of balances that act on the same of the three equations of current, motor speed and speed.
 EQUATION = {
     **dict.fromkeys(("supply", "electrical", "inductance"), "electrical"),
     **dict.fromkeys(("motor", "gearbox", "track", "ground", "mass", "inertia"), "torque"),
@@ -25,9 +25,9 @@ EQUATION = {
 }
 #: Sigmas that the best library effect has to leave of a foreign one for it not to be a mimic.
 MIMIC = 5.0
-#: Least number of cases of a stratum that is judged; most of the false findings.
+#: Least number of cases of a judged stratum; largest share of false findings.
 STRATUM, FALSE = 60, 5.0
-#: What drives each effect that has another form among the variants: variables that a curve could have.
+#: Drivers of each effect that has another form among the variants: possible variables of a curve.
 SPEEDS = ("speed_motor", "speed", "voltage")
 LOADS = ("slope", "payload", "current")
 DRIVEN: dict[str, tuple[str, ...]] = {
@@ -38,8 +38,8 @@ DRIVEN: dict[str, tuple[str, ...]] = {
     "weight_transfer": ("slope",), "sinkage": ("payload",), "belt_creep": LOADS, "nonlinear_slip": LOADS,
     "speed_slip": SPEEDS, "load_slip": LOADS,
 }  # fmt: skip
-#: What drives each law that the library does not hold, in the words of `Effect.driver`: one variable, or the two of
-#: which either is a right answer.
+#: Drivers of each law outside the library, in the words of `Effect.driver`: one variable, or two that are both
+#: right answers.
 DRIVERS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("resonance_bump", "root_friction", "friction_step", "rotor_whirl", "belt_flutter",
                      "heave_resonance", "lost_counts"), ("speed",)),
@@ -55,11 +55,11 @@ DRIVERS: dict[str, tuple[str, ...]] = {
     "hop": ("speed", "load"), "tread_heating": ("demand", "speed"), "order_two": ("order 2",), "warming": ("time",),
     "supply_recovery": ("time",),
 }  # fmt: skip
-#: Laws of `DRIVERS` of one variable, though two words stand for it.
+#: Laws of `DRIVERS` with one variable but two words for it.
 ONE_DRIVER = ("commutation_step", "guide_binding")
 #: Drivers that a table of settled runs varies by the same columns: load by payload and slope.
 SAME_DRIVER = ({"load", "slope", "weight", "demand", "configuration"}, {"voltage", "duty"})
-#: Properties by which clean cases are looked at again: name, edges of the bins.
+#: Properties for a breakdown of clean cases: name, edges of the bins.
 BINS: tuple[tuple[str, tuple[float, ...]], ...] = (
     ("adhesion", (0.2, 0.35, 0.5, 0.75, 1.0)),
     ("V_s", (0.002, 0.006, 0.02, 0.06)),
@@ -91,17 +91,17 @@ def interval(hits: int, n: int) -> str:
 
 
 def single(x: dict) -> bool:
-    """Whether one effect is named."""
+    """True if one effect is named."""
     return x["verdict"] == "named" and len(x["classes"]) == 1
 
 
 def contains(x: dict) -> bool:
-    """Whether one effect is found, and its class holds the truth."""
+    """True if one effect is found and its class contains the truth."""
     return len(x["classes"]) == 1 and x["truth"][0]["class"] in x["classes"][0]
 
 
 def everything(x: dict) -> bool:
-    """Whether there is a class for each truth, and no other."""
+    """True if there is a class for each truth and no other."""
 
     def matched(truths: Sequence[str], classes: Sequence[Sequence[str]]) -> bool:
         if not truths:
@@ -115,7 +115,7 @@ def everything(x: dict) -> bool:
 
 
 def placed(x: dict) -> bool:
-    """Whether what has no name is in the truth's equation."""
+    """True if an unnamed discrepancy is in the truth's equation."""
     return x["verdict"] in WITHOUT_NAME and _equation(x) == EQUATION[x["truth"][0]["balance"]]
 
 
@@ -124,17 +124,17 @@ def _equation(x: dict) -> str:
 
 
 def false_finding(x: dict) -> bool:
-    """Whether something is said to be missing somewhere: a name, or a place."""
+    """True if a verdict reports that something is missing: a name, or a place."""
     return x["verdict"] != "none"
 
 
 def located(x: dict) -> bool:
-    """Whether a finding has a name or a place; that the noise is not as stated has neither."""
+    """True if a finding has a name or a place; a noise that differs from the stated one has neither."""
     return x["verdict"] in ("named", "class") or (x["verdict"] in WITHOUT_NAME and bool(x.get("where")))
 
 
 def family_right(x: dict) -> bool:
-    """Whether the verdict names the truth or its family: the equation it enters and what drives it."""
+    """True if the verdict names the truth or its family: the equation it enters and its driver."""
     if contains(x):
         return True
     from mmrjax.effects import BY_NAME
@@ -153,7 +153,7 @@ def _equation_of(truth: dict) -> str:
 
 
 def established_families(x: dict) -> list[tuple[str, ...]]:
-    """Families of each thing that a verdict establishes as a law or as a mechanism."""
+    """Families of each law or mechanism that a verdict establishes."""
     from mmrjax.effects import BY_NAME
 
     if x["verdict"] == "mechanism":
@@ -164,11 +164,11 @@ def established_families(x: dict) -> list[tuple[str, ...]]:
 
 
 def same_mechanism(family: str, truth: dict, loosely: bool = False) -> bool:
-    """True if a family is the mechanism of a truth: what it enters, and what drives it.
+    """True if a family is the mechanism of a truth: the balance it enters, and its driver.
 
     Args:
-        loosely: take drivers for the same that settled runs vary by the same columns, and balances for the same that
-            close one equation.
+        loosely: True to identify drivers that settled runs vary by the same columns, and balances of
+            one equation.
     """
     from mmrjax.effects import BY_NAME
     from mmrjax.effects.base import EQUATION as WORDS
@@ -192,30 +192,32 @@ def same_mechanism(family: str, truth: dict, loosely: bool = False) -> bool:
 
 
 def mechanism_right(x: dict, loosely: bool = False) -> bool:
-    """True if a law or a mechanism is established, and each that is has the mechanism of a truth."""
+    """True if a law or a mechanism is established, and each of them has the mechanism of a truth."""
     found = established_families(x)
     return bool(found) and not mechanism_wrong(x, loosely)
 
 
 def mechanism_wrong(x: dict, loosely: bool = False) -> bool:
-    """True if something is established that has the mechanism of no truth, alone or among those that act alike."""
+    """True if an established one has the mechanism of no truth, alone or among indistinguishable ones."""
     return any(
         not any(same_mechanism(f, t, loosely) for f in those for t in x["truth"]) for those in established_families(x)
     )
 
 
 def in_place(x: dict, alike: bool = False) -> bool:
-    """Whether a drift, a cluster or an event is placed: over the right variable in the right equation, or by an event
-    that shares half of its rows or of its time with the truth.
+    """True if a drift, a cluster or an event is placed correctly.
+
+    That is over the right variable in the right equation, or by an event that shares half of its rows or of its time
+    with the truth.
 
     Args:
-        alike: whether variables and events count from which these data cannot tell what is said.
+        alike: True to accept variables and events that these data cannot distinguish from the reported one.
     """
     truth = x["truth"][0]
     where = truth["where"]
     right = truth["balance"] == "sensor" or _equation(x) == _equation_of(truth)
     over = {"order": ("order", "row"), "time": ("time",)}.get(where.get("variable", ""), (where.get("variable"),))
-    over = (*over, truth.get("name", "").split(".")[0])  # of a condition, all of whose rows are shifted
+    over = (*over, truth.get("name", "").split(".")[0])  # of a condition with all rows shifted
     variables = {x["where"][1], *(x.get("variables_alike", ()) if alike else ())} if x["where"] else set()
     if x["verdict"] in WITHOUT_NAME and right and variables & set(over):
         return True
@@ -235,7 +237,7 @@ def in_place(x: dict, alike: bool = False) -> bool:
 
 
 def sigmas(truth: dict) -> float:
-    """What is left of an effect after the base is refitted: by the loop's own base where that is known."""
+    """Sigmas of an effect after the base is refitted; by the loop's own base if known."""
     left = truth.get("sigmas_left")
     return truth["sigmas"] if left is None else left
 
@@ -244,7 +246,7 @@ def sigmas(truth: dict) -> float:
 
 
 class Figures:
-    """Lines of text, one a figure."""
+    """Lines of text, one for each figure."""
 
     def __init__(self, lines: list[dict]) -> None:
         self.lines, self.out = lines, []
@@ -254,19 +256,19 @@ class Figures:
         return [x for x in self.lines if x["kind"] in kinds and "verdict" in x]
 
     def say(self, what: str, those: Sequence[dict], hit: Callable[[dict], object]) -> None:
-        """One share, where there is any case."""
+        """Adds a share, if there is any case."""
         if those:
             self.out.append(f"{what:76s} {interval(sum(bool(hit(x)) for x in those), len(those))}")
 
     def note(self, text: str) -> None:
-        """One line more."""
+        """Adds a line."""
         self.out.append(text)
 
 
 def findings(f: Figures) -> None:
-    """Each effect by itself: established, tentative, right or wrong, and whether what is written predicts.
+    """Each effect separately: established, tentative, right or wrong, and whether the written model predicts.
 
-    By kind, and where a kind has tables whose sds are stated and such whose are not, by that.
+    By kind, and for kinds with both tables with stated sds and tables without, by that.
     """
     known = [x for x in f.lines if "verdict" in x and "effects" in x]
     for kind in dict.fromkeys(x["kind"] for x in known):
@@ -280,7 +282,7 @@ def findings(f: Figures) -> None:
 
 
 def _found(f: Figures, what: str, those: Sequence[dict]) -> None:
-    """What was found of these cases, of one kind."""
+    """Findings of these cases, of one kind."""
     count = max((len(x.get("truth", ())) for x in those), default=0)
     if count == 0:
         f.say(f"{what}: rejected (goal <= 5 %)", those, false_finding)
@@ -303,12 +305,12 @@ def _found(f: Figures, what: str, those: Sequence[dict]) -> None:
     f.say("  something wrong tentative", those, lambda x: wrong(x, "tentative"))
     free = [x for x in those if x["truth"][0].get("best_other", np.inf) >= MIMIC]
     if len(free) < len(those):
-        f.say("  the same where no effect mimics: wrong established", free, lambda x: wrong(x, "established"))
+        f.say("  the same without a mimic: wrong established", free, lambda x: wrong(x, "established"))
         f.say("  wrong tentative", free, lambda x: wrong(x, "tentative"))
 
 
 def _written(f: Figures, those: Sequence[dict]) -> None:
-    """Whether what is written predicts, by data held out and by runs at other conditions."""
+    """Predictions of the written model, for held-out data and for runs at other conditions."""
     from calibration.discovery.prediction import WORSE
 
     def kept(x: dict) -> bool:
@@ -316,7 +318,7 @@ def _written(f: Figures, those: Sequence[dict]) -> None:
 
     further = [x for x in those if "elsewhere" in x]
     f.say(
-        f"  elsewhere not below the refit by more than {WORSE:g} nat a reading (goal >= 98 %)",
+        f"  elsewhere not below the refit by more than {WORSE:g} nat per reading (goal >= 98 %)",
         further,
         lambda x: not kept(x) or not x["elsewhere"] or x["elsewhere"]["gain"][0] >= -WORSE,
     )
@@ -327,24 +329,24 @@ def _written(f: Figures, those: Sequence[dict]) -> None:
         added,
         lambda x: any(after > 1.1 * before for before, after, *_ in x["elsewhere"]["rms_sigma"].values()),
     )
-    scored = [x for x in those if x["effects"] and "gain" in x]  # of histories nothing is held out here
+    scored = [x for x in those if x["effects"] and "gain" in x]  # no hold-out for histories here
     f.say("  effects found and not written", scored, lambda x: not kept(x))
 
 
 def wrong(x: dict, standing: str) -> bool:
-    """Whether an effect of this standing holds no truth in its class."""
+    """True if the class of an effect of this standing contains no truth."""
     truths = {t["class"] for t in x["truth"]}
     return any(e["standing"] == standing and not truths & set(e["class"]) for e in x["effects"])
 
 
 def all_in(x: dict, *standings: str) -> bool:
-    """Whether each truth is in the class of an effect of one of these standings."""
+    """True if each truth is in the class of an effect of one of these standings."""
     classes = [e["class"] for e in x["effects"] if e["standing"] in standings]
     return all(any(t["class"] in c for c in classes) for t in x["truth"])
 
 
 def mechanisms(f: Figures) -> None:
-    """Right and wrong mechanisms, of laws or of what has no law, by kind; the levels that verdicts reach."""
+    """Right and wrong mechanisms, of laws and others, by kind; the levels that verdicts reach."""
     known = [x for x in f.lines if "verdict" in x]
     for kind in dict.fromkeys(x["kind"] for x in known):
         those = [x for x in known if x["kind"] == kind and x.get("truth")]
@@ -353,13 +355,13 @@ def mechanisms(f: Figures) -> None:
         foreign = any(not t["class"] for x in those for t in x["truth"])
         goals = ("85", "3") if foreign else ("97", "3")
         f.say(f"{kind}: right mechanism established (goal >= {goals[0]} %)", those, mechanism_right)
-        f.say("  where balances and drivers that act alike count", those, lambda x: mechanism_right(x, True))
+        f.say("  counting indistinguishable balances and drivers", those, lambda x: mechanism_right(x, True))
         f.say(f"  wrong mechanism (goal <= {goals[1]} %)", those, mechanism_wrong)
-        f.say("  wrong where those that act alike count", those, lambda x: mechanism_wrong(x, True))
+        f.say("  wrong, counting indistinguishable ones", those, lambda x: mechanism_wrong(x, True))
         if foreign:
             one = [x for x in those if _one_driver(x["truth"][0])]
             f.say("  one driver: right mechanism established", one, mechanism_right)
-            f.say("  one driver: right where those that act alike count", one, lambda x: mechanism_right(x, True))
+            f.say("  one driver: right, counting indistinguishable ones", one, lambda x: mechanism_right(x, True))
             f.say("  one driver: wrong mechanism", one, mechanism_wrong)
         if those:
             f.note(f"  levels: {dict(Counter(x['verdict'] for x in those))}")
@@ -370,7 +372,7 @@ def _one_driver(truth: dict) -> bool:
 
 
 def clean(f: Figures, kinds: Sequence[str]) -> None:
-    """False findings, per stratum and per property; a stratum that is too high is marked."""
+    """False findings, by stratum and by property; a stratum with too many is marked."""
     for kind in kinds:
         f.say(f"{kind}: a false finding (goal <= 5 %)", f.of(kind), false_finding)
     wide = f.of("clean_wide")
@@ -383,7 +385,7 @@ def clean(f: Figures, kinds: Sequence[str]) -> None:
 
 
 def values(x: dict, name: str) -> list[float]:
-    """A property of a case; one of a surface has a value for each configuration."""
+    """Values of a property of a case; a property of a surface has one for each configuration."""
     made = x.get("made", {})
     if name in ("adhesion", "V_s"):
         return [s[name] for s in made.get("surface", {}).values()]
@@ -393,7 +395,7 @@ def values(x: dict, name: str) -> list[float]:
 
 
 def stratum(f: Figures, what: str, those: list[dict]) -> None:
-    """False findings of a part of the clean cases, marked where they are surely too many."""
+    """False findings of a part of the clean cases, marked if they are significantly too many."""
     if not those:
         return
     hits = sum(map(false_finding, those))
@@ -403,11 +405,11 @@ def stratum(f: Figures, what: str, those: list[dict]) -> None:
 
 
 def noise(f: Figures) -> None:
-    """Noise that is not as stated."""
+    """Figures of noise that differs from the stated one."""
     those = f.of("noise")
     f.say("noise half or twice: a located finding (goal <= 5 %)", those, located)
     told = [x for x in those if x.get("noise_factor") is not None]
-    f.say("  a factor is told", those, lambda x: x in told)
+    f.say("  a factor is reported", those, lambda x: x in told)
     f.say("  and is right within 20 %", told, lambda x: abs(x["noise_factor"] / x["made"]["noise"] - 1) < 0.2)
 
 
@@ -449,7 +451,7 @@ def variants(f: Figures) -> None:
 
 
 def outside(f: Figures, kind: str) -> None:
-    """Effects that the library does not hold."""
+    """Effects that the library does not contain."""
     those = [x for x in f.of(kind) if x["truth"][0]["sigmas"] >= 7.5]
     free = [x for x in those if x["truth"][0].get("best_other", np.inf) >= MIMIC]
     mimics = [x for x in those if x["truth"][0].get("best_other", np.inf) < MIMIC]
@@ -463,7 +465,7 @@ def outside(f: Figures, kind: str) -> None:
         lambda x: x["verdict"] in WITHOUT_NAME and x["where"] and x["where"][0] == x["truth"][0]["balance"],
     )
     f.say(
-        "  the very balance among those said to act alike",
+        "  the very balance among the indistinguishable ones",
         free,
         lambda x: x["verdict"] in WITHOUT_NAME and x["where"] and x["truth"][0]["balance"] in x["where"][2],
     )
@@ -473,7 +475,7 @@ def outside(f: Figures, kind: str) -> None:
 
 
 def by_name(f: Figures, those: Sequence[dict], hit: Callable[[dict], object]) -> None:
-    """Of each effect that was not always right, how often it was, and what was said instead."""
+    """For each effect with errors, its rate of right verdicts, and the other verdicts."""
     for name in sorted({x["truth"][0]["name"] for x in those}):
         some = [x for x in those if x["truth"][0]["name"] == name]
         other = Counter(str(x["classes"]) if x["classes"] else x["verdict"] for x in some if not hit(x))
@@ -487,7 +489,7 @@ def several(f: Figures) -> None:
         those = f.of(kind)
         if kind != "compensating":
             those = [x for x in those if all(t["sigmas"] >= 7.2 for t in x["truth"])]
-        f.say(f"{kind} >= 8 sigma each beside the others: all classes ({goal})", those, everything)
+        f.say(f"{kind} >= 8 sigma each given the others: all classes ({goal})", those, everything)
         f.say("  something found", those, false_finding)
         f.say("  more effects than there are", those, lambda x: len(x["classes"]) > len(x["truth"]))
         f.say("  a class that holds none of them", those, lambda x: any(
@@ -495,23 +497,25 @@ def several(f: Figures) -> None:
 
 
 def placed_kinds(f: Figures, kinds: Sequence[str]) -> None:
-    """Drifts, clusters, events."""
+    """Figures of drifts, clusters and events."""
     for kind in kinds:
         those = [x for x in f.of(kind) if x["truth"][0]["sigmas"] >= 7.5]
         f.say(f"{kind} >= 8 sigma: found and placed (goal >= 90 %)", those, lambda x: in_place(x, alike=True))
-        f.say("  and said first, where others are said to act alike", those, in_place)
+        f.say("  and reported first among indistinguishable ones", those, in_place)
         f.say("  something found", those, false_finding)
         f.say("  a library name", those, lambda x: x["classes"])
-        f.say("  none, and rows or samples set aside", those, lambda x: x["verdict"] == "none" and x["outliers"])
+        f.say(
+            "  no finding, and rows or samples set aside", those, lambda x: x["verdict"] == "none" and x["outliers"]
+        )
 
 
 def coverage(f: Figures) -> None:
-    """How often 95 % intervals hold the truth: base parameters each, amplitudes apart."""
+    """Coverage of the truth by 95 % intervals: of base parameters, and of amplitudes."""
     those = [x for x in f.of("coverage") if "deviates" in x]
     names = dict.fromkeys(n for x in those for n in x["deviates"])
     whole = [d for x in those for d in x["deviates"].values()]
     f.say(
-        "coverage: the truth is in the class, or nothing is missing and none said",
+        "coverage: the truth is in the class, or nothing is missing and no finding",
         f.of("coverage"),
         lambda x: "deviates" in x,
     )
@@ -531,7 +535,7 @@ def _covered(deviates: Sequence[float]) -> str:
 
 
 def ends(f: Figures) -> None:
-    """What was skipped and why, errors, time, outliers."""
+    """Skipped cases with reasons, errors, time, outliers."""
     skipped = Counter((x["kind"], str(x["skipped"])) for x in f.lines if x.get("skipped"))
     for (kind, why), count in sorted(skipped.items()):
         f.note(f"skipped: {kind}: {why}: {count}")

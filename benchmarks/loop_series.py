@@ -1,11 +1,11 @@
-"""The closed loop on synthetic time histories: false findings, right names, discrepancies without one, events.
+"""The closed loop on synthetic time histories: false findings, right names, unnamed discrepancies, events.
 
     python benchmarks/loop_series.py --clean-wide 300 --library 80 --outside 40 --event 40 --pairs 20 --jobs 2
 
-Sets of starts from `tests/worlds/histories.py`, which shares nothing with the simulator: any surface, several
-durations and samplings, poor instruments, other robots (foreign laws on the paper's alone). Labels are read by the
-scorer alone. Every set is one line of `--out`, and a run that is started again goes on where it ended. With
-`--narrow`, six starts of 1.5 s of the paper's robot on one surface that is stated.
+Sets of starts from `tests/worlds/histories.py`, which shares no code with the simulator: any surface, several
+durations and samplings, poor instruments, other robots (foreign laws only on the paper's). Only the scorer reads the
+labels. Every set is one line of `--out`, and a restarted run continues where it ended. With
+`--narrow`, six starts of 1.5 s of the paper's robot on one stated surface.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from campaign import SIZES, Task, campaign, looped, refused
 from worlds import foreign, histories, settled
 
 KINDS = ("clean", "library", "outside", "pairs", "clean_wide", "noise", "blind", "triples", "event")
-#: Kinds that keep to the paper's robot on one stated surface.
+#: Kinds with only the paper's robot on one stated surface.
 NARROW = ("clean",)
 #: Effects of narrow histories; `thermal_drift` and `battery_sag` need longer ones and a battery.
 LIBRARY = (
     "pulley_eccentricity", "grouser_polygon", "rotating_inertia", "series_resistance", "churning",
     "armature_inductance", "cogging", "stick_slip",
 )  # fmt: skip
-#: Effects that hardly ever leave eight sigmas at a size that may be believed.
+#: Effects that rarely leave eight sigmas at a plausible size.
 WEAK = ("cogging", "stick_slip")
 OUTSIDE = ("pulley_ovality", "belt_splice", "supply_recovery", "oil_warming")
-#: Strata of all kinds but `clean_wide`, which goes through each as often, and their shares; foreign laws and events
-#: are of the paper's robot's size, and know no other robots.
+#: Strata of all kinds but `clean_wide`, which uses each equally often, and their shares; foreign laws and events have
+#: the size of the paper's robot and no other robots.
 SHARES = {"plain": 0.5, "durations": 0.2, "faults": 0.2, "robots": 0.1}
-#: The analyst's priors on the one surface of narrow histories, which Table 5 does not know.
+#: The analyst's priors on the one surface of narrow histories, which Table 5 does not contain.
 STATED = {
     f"{c}.ground.friction.{name}": prior
     for c in ("6T2A", "4W2T")
@@ -44,9 +44,10 @@ STATED = {
 
 
 def attempt(kind: str, seed: int, narrow: bool = False, only: str = "") -> histories.SeriesCase | str:
-    """The case of a kind and a seed, or why there is none.
+    """The case of a kind and a seed, or the reason why it is invalid.
 
-    Every constant that has a prior is off its nominal value, and refitted when an effect is sized, as in the loop.
+    Every constant with a prior differs from its nominal value, and is refitted for the size of an effect, as in the
+    loop.
     """
     rng = np.random.default_rng([10 + KINDS.index(kind), seed])
     low = 5.0 if kind == "library" else 8.0
@@ -78,14 +79,14 @@ def attempt(kind: str, seed: int, narrow: bool = False, only: str = "") -> histo
     most = max((e["sizes"] for e in case.label["effects"]), default=0.0)
     weaker = [max(0.95 * x * SIZES / most, 1.01 * low) if most else x for x in wanted]
     if kind not in ("event", "blind") and most >= SIZES and min(weaker) > 0.5 * min(wanted):
-        case = histories.case(w, names, weaker, seed=seed)  # as strong as may be believed
+        case = histories.case(w, names, weaker, seed=seed)  # as strong as is plausible
     return refused(case.label, low, sizes=kind not in ("event", "blind")) or case
 
 
 def program(task: Task) -> tuple | dict:
-    """What sets of histories have alike that share what is compiled; the line of a case that is none.
+    """Properties that sets with the same programs share; or the line of an invalid case.
 
-    To make a set takes long; those of the plain stratum are alike without that.
+    Making a set takes long; sets of the plain stratum are equal without it.
     """
     if task.stratum == "plain":
         return ("plain",)
@@ -96,7 +97,7 @@ def program(task: Task) -> tuple | dict:
 
 
 def work(task: Task) -> dict:
-    """One case in a worker."""
+    """Runs one case in a worker."""
     case = attempt(task.kind, task.seed, task.narrow, task.stratum)
     if isinstance(case, str):
         return {"skipped": case}
@@ -109,7 +110,7 @@ def work(task: Task) -> dict:
 
 
 def _left(found, effect: dict, settings) -> dict:
-    """What the loop's own base leaves of a library effect, which is what its base frees at its own fit."""
+    """Remainder of a library effect after the loop's own base, which frees its base parameters at its own fit."""
     from calibration.discovery.findings import effect_scores, size_of
 
     if not effect["class"]:
@@ -123,7 +124,7 @@ def _left(found, effect: dict, settings) -> dict:
 
 
 def _amplitudes(found, settings) -> dict:
-    """Amplitude of each effect that is named, and its sd [SI]."""
+    """Amplitude of each named effect, and its sd [SI]."""
     from calibration.discovery.findings import size_of
 
     space, best = found.screened.base.space, found.best

@@ -1,4 +1,4 @@
-"""What benchmarks share: the machine in words, timing, memory, and which limit a batch meets."""
+"""Shared parts of benchmarks: the machine in words, timing, memory, and the limit that a batch meets."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))  # the pl
 
 
 def parser(description: str, batches: str) -> argparse.ArgumentParser:
-    """Options that both benchmarks take."""
+    """Options of all benchmarks with batches."""
     options = argparse.ArgumentParser(description=description)
     options.add_argument("--batches", default=batches, help="batch sizes, comma separated")
-    options.add_argument("--repeats", type=int, default=20, help="timed calls of each batch")
-    options.add_argument("--no-baseline", action="store_true", help="leave the loop of SciPy out")
-    options.add_argument("--float32", action="store_true", help="single precision (default double)")
-    options.add_argument("--json", type=Path, metavar="FILE", help="write every number there too")
+    options.add_argument("--repeats", type=int, default=20, help="number of timed calls of each batch")
+    options.add_argument("--no-baseline", action="store_true", help="leave out the loop of SciPy")
+    options.add_argument("--float32", action="store_true", help="single precision (default: double)")
+    options.add_argument("--json", type=Path, metavar="FILE", help="write every number to this file too")
     return options
 
 
 def set_precision(single: bool) -> None:
-    """Single or double precision, of this process and of those that it starts."""
+    """Sets single or double precision for this process and its child processes."""
     os.environ["JAX_ENABLE_X64"] = str(not single).lower()
     jax.config.update("jax_enable_x64", not single)
 
@@ -69,14 +69,14 @@ def seconds(call: Callable[[], Any], repeats: int) -> tuple[float, float]:
 
 
 def yardstick_points(size: int) -> tuple[np.ndarray, ...]:
-    """Configuration, voltage [V], slope [deg] and payload [kg], over what nominal adhesion holds of Table 8."""
+    """Configuration, voltage [V], slope [deg] and payload [kg], from Table 8 within nominal adhesion."""
     rng = np.random.default_rng(8)
     wheeled, slope, payload, voltage = rng.uniform((0, 0, 0, 15), (1, 12, 8, 33), (size, 4)).T.copy()
     return np.round(wheeled).astype(int), voltage, slope, payload
 
 
 def in_turn(calls: dict[str, Callable[[], Any]], rounds: int) -> dict[str, np.ndarray]:
-    """Wall and processor times [s] of each call, one of each in every round, shape (rounds, 2)."""
+    """Wall and processor times [s] of each call, one of each per round, shape (rounds, 2)."""
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in calls}
     for call in calls.values():
         jax.block_until_ready(call())
@@ -89,7 +89,7 @@ def in_turn(calls: dict[str, Callable[[], Any]], rounds: int) -> dict[str, np.nd
 
 
 def memory() -> dict[str, int]:
-    """Peak of this process on the device so far and what it may use [bytes]; empty where it cannot say."""
+    """Peak of this process on the device so far and its limit [bytes]; empty if the device does not report them."""
     stats = jax.devices()[0].memory_stats() or {}
     wanted = {"peak": "peak_bytes_in_use", "limit": "bytes_limit"}
     return {name: int(stats[key]) for name, key in wanted.items() if key in stats}
@@ -98,7 +98,7 @@ def memory() -> dict[str, int]:
 def over_batches(
     batches: list[int], prepare: Callable[[int], Callable[[], Any]], repeats: int
 ) -> list[dict[str, Any]]:
-    """Time one batch after another, upward, until one does not fit the device."""
+    """Times one batch after another, upward, until one does not fit the device."""
     rows: list[dict[str, Any]] = []
     for size in sorted(batches):
         try:
@@ -120,7 +120,7 @@ def over_batches(
 
 
 def row_words(row: dict[str, Any]) -> str:
-    """One row of the table that is printed."""
+    """One row of the printed table."""
     if row.get("out_of_memory"):
         return f"{row['batch']:>10}  does not fit the device"
     peak = f"  peak {row['peak'] / 2**30:8.2f} GiB" if "peak" in row else ""
@@ -131,7 +131,7 @@ def row_words(row: dict[str, Any]) -> str:
 
 
 def limit_words(rows: list[dict[str, Any]]) -> str:
-    """Which limit the batches met: the rate saturates, memory is full, or none yet."""
+    """The limit that the batches met: the rate saturates, memory is full, or none yet."""
     timed = [row for row in rows if "per_s" in row]
     if not timed:
         return "memory: not even the smallest batch fits"
@@ -139,7 +139,7 @@ def limit_words(rows: list[dict[str, Any]]) -> str:
     share = f", {top['peak'] / top['limit']:.0%} of the device's memory in use" if "limit" in top else ""
     words = []
     if len(timed) < 2:
-        return "one batch size only: no limit looked for"
+        return "only one batch size: no limit determined"
     growth = timed[-1]["per_s"] / timed[-2]["per_s"] / (timed[-1]["batch"] / timed[-2]["batch"])
     gain = timed[-1]["per_s"] / timed[-2]["per_s"]
     if gain < 1.1:
@@ -157,7 +157,7 @@ def limit_words(rows: list[dict[str, Any]]) -> str:
 
 
 def finish(record: dict[str, Any], path: Path | None) -> None:
-    """Print the machine and write the record."""
+    """Prints the machine and writes the record."""
     m = record["machine"]
     versions = ", ".join(f"{k} {v}" for k, v in m["versions"].items())
     print(f"machine: {m['cpu']}, {m['cores']} cores; {m['device']}; {m['precision']} precision; {m['date']}")
@@ -167,7 +167,7 @@ def finish(record: dict[str, Any], path: Path | None) -> None:
 
 
 def time_batches(record: dict[str, Any], arguments: argparse.Namespace, prepare: Callable[[int], Callable]) -> None:
-    """Time each batch of the options into the record, and say which limit the last meets."""
+    """Times each batch of the options into the record, and prints the limit of the last one."""
     record["batches"] = over_batches([int(b) for b in arguments.batches.split(",")], prepare, arguments.repeats)
     if record["batches"][-1].get("out_of_memory"):
         print(row_words(record["batches"][-1]))

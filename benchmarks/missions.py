@@ -1,9 +1,9 @@
-"""How fast missions run: a patrol of an hour with 120 starts, the current resolved at each.
+"""Speed of missions: a patrol of an hour with 120 starts, the current resolved at each.
 
     python benchmarks/missions.py                      # one robot, 180, and SciPy on a few of them
-    python benchmarks/missions.py --robots 100000      # a batch of robots with masses and frictions of their own
+    python benchmarks/missions.py --robots 100000      # a batch of robots with different masses and frictions
 
-Prints lines of JSON. The first call of each compiles and is not counted, unless it says so.
+Prints lines of JSON. The first call of each compiles and is not counted unless stated.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ PERIOD, DRIVEN, CYCLES, VOLTAGE = 30.0, 22.0, 120, 24.0
 
 
 def patrol() -> Profile:
-    """An hour of it."""
+    """An hour of the patrol."""
     return profile([0.0, DRIVEN, PERIOD], ["voltage", "brake", "brake"], voltage=VOLTAGE, cycles=CYCLES)
 
 
 @eqx.filter_jit
 def fleet(robots: Robot, conditions: Conditions, course: Profile) -> dict[str, jax.Array]:
-    """Numbers of a batch: leading axis of the conditions and of `mass` and `loss` in the robot."""
+    """Numbers of a batch with a leading axis in the conditions and in `mass` and `loss` of the robot."""
     axes = jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, eqx.filter(robots, eqx.is_array))
 
     def one(robot: Robot, c: Conditions) -> dict[str, jax.Array]:
@@ -56,7 +56,7 @@ def fleet(robots: Robot, conditions: Conditions, course: Profile) -> dict[str, j
 
 
 def drawn(count: int, seed: int = 0) -> tuple[Robot, Conditions]:
-    """Robots of masses, losses and resistances around the nominal one, in both configurations, on small slopes."""
+    """Robots with masses, losses and resistances around the nominal ones, in both configurations, on small slopes."""
     rng = np.random.default_rng(seed)
     robot = params.strong(paper_robots.nominal())
     base = {p.name: float(p.value) for p in params.walk(robot)}
@@ -70,7 +70,7 @@ def drawn(count: int, seed: int = 0) -> tuple[Robot, Conditions]:
 
 
 def seconds(function: Any, *arguments: Any, rounds: int = 3) -> tuple[float, float, Any]:
-    """The first call, the best of the next, and what it gave."""
+    """Time of the first call, the best time of the next ones, and the result."""
     begun = time.perf_counter()
     found = jax.block_until_ready(function(*arguments))
     first, best = time.perf_counter() - begun, np.inf
@@ -83,8 +83,10 @@ def seconds(function: Any, *arguments: Any, rounds: int = 3) -> tuple[float, flo
 
 
 def scipy_hour(conditions: Conditions, k: int, cycles: int = 2) -> float:
-    """Seconds that SciPy takes for an hour of one run, from a few cycles: plain rates with heat and with where the
-    energy goes, which is what a mission gives. LSODA was the fastest of its stiff methods."""
+    """Time that SciPy takes for an hour of one run [s], from a few cycles.
+
+    It integrates plain rates with heat and the energy sinks of a mission. LSODA was its fastest stiff method.
+    """
     sys.path.append(str(Path(__file__).parent.parent / "tests"))
     from worlds import paper
 
@@ -126,7 +128,7 @@ def scipy_hour(conditions: Conditions, k: int, cycles: int = 2) -> float:
 
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("--robots", type=int, help="robots of a batch; else one and 180, and SciPy")
+    options.add_argument("--robots", type=int, help="number of robots in a batch; default: one and 180, and SciPy")
     options.add_argument("--rounds", type=int, default=3)
     arguments = options.parse_args()
     course = patrol()

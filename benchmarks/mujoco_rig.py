@@ -1,9 +1,10 @@
 """A drive as a model of MuJoCo, for its identification toolbox: a hinge that is the output shaft.
 
-Back-EMF is an actuator's bias. In a log the winding's lag is a filter of the actuator's voltage. Viscous losses are
-the joint's damping, dry ones its frictionloss, weights further actuators whose controls are known. MuJoCo has no gear
-that loses a share of its load either way and no slip of this kind: the efficiency is that of a motor that drives, and
-a vehicle rolls. Free constants are parameters of the toolbox in sds of their tolerances, within three of them.
+Back-EMF is the bias of an actuator. In a log the winding's lag is a filter of the actuator's voltage. Viscous losses
+are the joint's damping, dry ones its frictionloss, weights further actuators with known controls. MuJoCo has neither
+a gear that loses a share of its load in both directions nor a slip of this kind: the efficiency is that of a driving
+motor, and a vehicle rolls. Free constants are parameters of the toolbox in sds of their tolerances, within three of
+them.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from mujoco import sysid
 from plain_drives import Unable
 from worlds.paper import G
 
-#: Sds of its tolerance within which a parameter is.
+#: Bound of a parameter in sds of its tolerance.
 BOUND = 3.0
 #: Steps for which each settled row is held, and their length [s]; longest step of a log [s].
 HOLD, STEP, LONGEST = 40, 1e-3, 0.001
@@ -54,11 +55,11 @@ MODEL = """
 
 @dataclasses.dataclass(frozen=True)
 class Sequence:
-    """Rows that are simulated one after the other.
+    """Rows that are simulated in sequence.
 
     Attributes:
         rows: of the table, in order; configuration: name; step: [s]; at: instants of the rows since the start [s].
-        control: of every step, shape (steps, 5); settled: True where each row is held until it is settled.
+        control: of every step, shape (steps, 5); settled: True if each row is held until it has settled.
         speed: of the output shaft at the start [rad/s].
     """
 
@@ -81,7 +82,7 @@ class Rig:
     def fitted(
         self, measured: np.ndarray, sd: np.ndarray, counts: np.ndarray, start: np.ndarray | None = None
     ) -> np.ndarray:
-        """Parameters that the toolbox finds [prior sds], from `start` on; arrays of shape (rows, channels)."""
+        """Parameters found by the toolbox from `start` [prior sds]; arrays of shape (rows, channels)."""
         free = sysid.ParameterDict()
         begin = np.zeros(self.drive.constants) if start is None else start
         for name, z in zip(self.drive.coordinates.names, begin, strict=True):
@@ -92,7 +93,7 @@ class Rig:
             every = [part(x, params, **options) for part in parts]
             return [r for residuals, _, _ in every for r in residuals], [], []
 
-        logging.getLogger("absl").setLevel(logging.ERROR)  # it warns of each start on a bound
+        logging.getLogger("absl").setLevel(logging.ERROR)  # suppresses a warning for each start on a bound
         with contextlib.redirect_stdout(io.StringIO()):
             found, _ = sysid.optimize(free, residual, optimizer="mujoco", verbose=False)
         return np.asarray(found.as_vector())
@@ -171,7 +172,7 @@ class Rig:
         """Readings of a sequence's rows [SI] from the sensors of every step."""
         c, given = self._constants(s, z), self.drive.given
         if s.settled:
-            at = HOLD * np.arange(1, len(s.rows) + 1) - 2  # the toolbox leaves the last step out
+            at = HOLD * np.arange(1, len(s.rows) + 1) - 2  # the toolbox leaves out the last step
             speed, torque = sensors[at, 0], sensors[at, 1]
         else:
             time = np.arange(len(sensors)) * s.step
@@ -220,7 +221,7 @@ def rig(runs: Any, robot: Any, coordinates: Any) -> Rig:
     """
     drive = plain_drives.drive(runs, robot, coordinates)
     if robot.driver.decay == "fast":
-        raise Unable("a driver in fast decay is no MuJoCo actuator")
+        raise Unable("MuJoCo has no actuator for a driver in fast decay")
     given = drive.given
     ratio = drive.known["gearbox.ratio"]
     sequences = []
@@ -245,7 +246,7 @@ def rig(runs: Any, robot: Any, coordinates: Any) -> Rig:
 
 
 def _controls(given: SimpleNamespace, driven: np.ndarray) -> np.ndarray:
-    """Controls of every row: what is imposed, weight along and across the slope of one side [N], one, and a brake."""
+    """Controls of every row: imposed input, weight along and across the slope of one side [N], one, and a brake."""
     weight = np.zeros(len(driven)) if given.mass is None else given.mass / given.sides * G
     across = weight * np.cos(given.slope) * given.d
     return np.stack([driven, weight * np.sin(given.slope), across, np.ones(len(driven)), given.load_torque], 1)

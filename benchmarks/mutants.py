@@ -1,14 +1,14 @@
-"""Tries the plausible mistakes of tests/mutants.toml: each has to make one of the tests that it names fail.
+"""Applies the plausible mistakes of tests/mutants.toml: each has to make one of its listed tests fail.
 
-Each mutant replaces one piece of text in a copy of the tree and runs the tests that it names, in a process of its
-own. Before that the same tests have to pass without any mutant. Tests of `make test` kill at least 97 % of the list;
-a mutant with `slow = true` dies by a slow test, one of `make test-all`.
+Each mutant replaces one piece of text in a copy of the tree and runs its tests in a separate process. Before that the
+same tests have to pass without any mutant. Tests of `make test` kill at least 97 % of the list;
+a mutant with `slow = true` is killed by a slow test, one of `make test-all`.
 
     python benchmarks/mutants.py                          # all of them, one at a time
     python benchmarks/mutants.py --jobs 2
     python benchmarks/mutants.py --only track_drops_guide --only gravity_takes_cosine
 
-Ends with 1 where a mutant survives, its tests can't run, or its text does not stand exactly once in its file.
+Exits with 1 if a mutant survives, its tests cannot run, or its text does not occur exactly once in its file.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 LIST = ROOT / "tests" / "mutants.toml"
-#: What takes most of a test's start is imported once, before processes are forked; nothing of ours.
+#: Slow imports of the tests, done once before processes are forked; no module of this project.
 PRELOADED = ("numpy", "scipy.stats", "jax", "jax.numpy", "equinox", "optimistix", "optax", "mujoco")
-#: A module that is imported before pytest sees it, which it warns of, has no asserts to rewrite here.
+#: A module that is imported before pytest sees it causes a warning, but has no asserts to rewrite here.
 OPTIONS = ("-x", "-q", "-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAssertRewriteWarning")
-#: How long the tests of a mutant may run [s]: a mutant may loop for ever.
+#: Time limit of a mutant's tests [s]: a mutant may loop for ever.
 PATIENCE = 900.0
 LEFT_OUT = shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", ".*_cache", "*.egg-info", ".hypothesis")
 
@@ -46,9 +46,9 @@ class Mutant:
     """A plausible mistake.
 
     Attributes:
-        kind: what it is in; file: from the root of the tree.
+        kind: where it is; file: from the root of the tree.
         text: replaced, once in the file; by: its replacement.
-        killed_by: node ids of tests, of which at least one has to fail.
+        killed_by: node ids of tests, at least one of them has to fail.
         slow: these tests are marked slow.
     """
 
@@ -62,18 +62,18 @@ class Mutant:
 
     @property
     def marks(self) -> str:
-        """Selection of the tests that may kill it, as pytest's option -m takes it."""
+        """Selection of the tests that may kill it, for pytest's option -m."""
         return "not nightly" if self.slow else "not slow"
 
     def applied(self, source: str) -> str:
         """The file's text with the mistake in it.
 
         Raises:
-            ValueError: the text does not stand there exactly once.
+            ValueError: the text does not occur exactly once in the file.
         """
         found = source.count(self.text)
         if found != 1:
-            raise ValueError(f"{self.name}: its text stands {found} times in {self.file}; expected once")
+            raise ValueError(f"{self.name}: its text occurs {found} times in {self.file}; expected once")
         return source.replace(self.text, self.by)
 
 
@@ -85,7 +85,7 @@ def mutants() -> list[Mutant]:
 
 
 class _Passed:
-    """Node ids of tests that pass, for pytest."""
+    """Pytest plugin that collects the node ids of tests that pass."""
 
     def __init__(self) -> None:
         self.names: list[str] = []
@@ -96,7 +96,7 @@ class _Passed:
 
 
 def _run(tree: str, tests: list[str], marks: str, log: str, answer: str) -> None:
-    """Run tests of a tree in this process; leaves exit code of pytest and tests that passed in a file."""
+    """Runs tests of a tree in this process; writes pytest's exit code and the passed tests to a file."""
     os.chdir(tree)
     os.environ["PYTHONPATH"] = tree  # for processes that tests start
     sys.path.insert(0, tree)
@@ -115,7 +115,7 @@ def _run(tree: str, tests: list[str], marks: str, log: str, answer: str) -> None
 
 
 def run(tree: Path, tests: list[str], marks: str, log: Path) -> tuple[int | None, list[str]]:
-    """Exit code of pytest over tests in a process of its own, None where it hangs or dies, and what passed."""
+    """Exit code of pytest over tests in a separate process, None if it hangs or dies, and the passed tests."""
     context = multiprocessing.get_context("forkserver")
     answer = tree / "mutant.json"
     answer.unlink(missing_ok=True)
@@ -132,13 +132,13 @@ def run(tree: Path, tests: list[str], marks: str, log: Path) -> tuple[int | None
 
 
 def tested(mutant: Mutant, tree: Path, stamp: int) -> tuple[str, float, str]:
-    """Outcome of a mutant in a copy of the tree, seconds, and the end of what pytest printed."""
+    """Outcome of a mutant in a copy of the tree, seconds, and the end of pytest's output."""
     path, log = tree / mutant.file, tree / "mutant.log"
     original, times = path.read_text(encoding="utf-8"), path.stat()
     begin = time.perf_counter()
     try:
         path.write_text(mutant.applied(original), encoding="utf-8")
-        os.utime(path, (stamp, stamp))  # so that no compiled module is taken for that of another text
+        os.utime(path, (stamp, stamp))  # so that no compiled module of another text is used
         code, _ = run(tree, list(mutant.killed_by), mutant.marks, log)
     except ValueError as error:
         return "error", 0.0, str(error)
@@ -152,7 +152,7 @@ def tested(mutant: Mutant, tree: Path, stamp: int) -> tuple[str, float, str]:
 
 
 def unmutated(chosen: list[Mutant], trees: list[Path]) -> str | None:
-    """Reason why the killing tests cannot serve; None if all pass without a mutant and run under the marks stated."""
+    """Reason why the killing tests are not usable; None if all pass without a mutant under the stated marks."""
     for marks in dict.fromkeys(mutant.marks for mutant in chosen):
         tests = list(dict.fromkeys(test for mutant in chosen if mutant.marks == marks for test in mutant.killed_by))
         files = list(dict.fromkeys(test.split("::")[0] for test in tests))
@@ -173,7 +173,7 @@ def unmutated(chosen: list[Mutant], trees: list[Path]) -> str | None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", action="append", metavar="NAME", help="this mutant alone; may be repeated")
+    parser.add_argument("--only", action="append", metavar="NAME", help="only this mutant; may be repeated")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="mutants at a time (default 1)")
     options = parser.parse_args()
     every = mutants()
@@ -217,7 +217,7 @@ def main() -> int:
         print(f"{kind:14}{by_kind[kind, 'killed']:8}{by_kind[kind, 'survived']:10}{by_kind[kind, 'error']:7}")
     left = [m.name for m, (outcome, _) in zip(chosen, outcomes, strict=True) if outcome != "killed"]
     quick = sum(outcome == "killed" and not m.slow for m, (outcome, _) in zip(chosen, outcomes, strict=True))
-    print(f"{quick} of {len(chosen)} die by `make test` alone ({100 * quick / len(chosen):.1f} %)")
+    print(f"{quick} of {len(chosen)} are killed by `make test` alone ({100 * quick / len(chosen):.1f} %)")
     print(f"{len(chosen) - len(left)} of {len(chosen)} killed" + (f"; not: {', '.join(left)}" if left else ""))
     return 1 if left else 0
 

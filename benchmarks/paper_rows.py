@@ -1,9 +1,9 @@
-"""The paper's simulated rows by one set of constants: what misses, what each freed constant gains.
+"""The paper's simulated rows fitted by one set of constants: errors, and the gain by each freed constant.
 
     python benchmarks/paper_rows.py            # the lumped model, several ways; some minutes on two cores
-    python benchmarks/paper_rows.py --track    # and the best way's constants in the track model, on the tracked rows
+    python benchmarks/paper_rows.py --track    # also the best constants in the track model, on the tracked rows
 
-Fifteen rows: the five tracked ones at 15 V imply 0.88 ohm where all others imply 0.61 and stand apart. Errors are
+Fifteen rows: the five tracked ones at 15 V imply 0.88 ohm while all others imply 0.61; they are left out. Errors are
 (ours / the paper's - 1) in percent. Prints a line of JSON for each way.
 """
 
@@ -32,11 +32,11 @@ from mmrjax.model.robot import Robot  # noqa: E402
 from mmrjax.model.signals import STATUSES  # noqa: E402
 
 NOISE = "current=1%,motor_speed=0.5%,speed=0.5%"
-#: Decimals that the paper prints of each channel's column.
+#: Printed decimals of each channel's column.
 PRINTED = {"total_current_A": 0.01, "motor_speed_rpm": 1.0, "speed_mm_s": 1.0}
-#: The wheeled robot in the columns of Table A2, less that of Table 7 [kg].
+#: Mass of the wheeled robot in the columns of Table A2, less that of Table 7 [kg].
 MASS_PRINTED, MASS = 13.1, 11.5
-#: Adhesion and creep, which the paper does not print, and the effect of contacts that shake: free in every way.
+#: Adhesion and creep, which the paper does not state, and the effect of shaking contacts: free in every way.
 SLIP = {
     "6T2A.ground.friction.static": (0.57, 0.1),
     "6T2A.ground.friction.speed_static": (0.02, 0.02),
@@ -45,7 +45,7 @@ SLIP = {
     "effects.vibration_slip.amplitude": None,
     "effects.vibration_slip.exponent": None,
 }
-#: Priors of the constants that decide the current: wide, so that the rows decide.
+#: Priors of the constants that determine the current: wide, so that the rows decide.
 DRIVE = {
     "gearbox.efficiency_load": (0.74, 0.05),
     "motor.resistance": (0.611, 0.06),
@@ -61,7 +61,7 @@ GUIDES = {"6T2A.track.guide_share": None}
 EFFICIENCY = {k: v for k, v in DRIVE.items() if "efficiency" in k}
 SPEEDS = {"motor.friction_viscous": None, "gearbox.friction_coulomb": None, "gearbox.friction_viscous": None}
 TRACKS = {n: None for n in ("6T2A.track.loss_coulomb", "6T2A.track.loss_viscous", "6T2A.ground.rolling_resistance")}
-#: What is free beside `SLIP`, what is changed before, and whether the wheeled robot has the mass as printed.
+#: Free constants in addition to `SLIP`, changes made before, and whether the wheeled robot has its printed mass.
 WAYS: dict[str, tuple[dict[str, Any], dict[str, float], bool]] = {
     "nothing": ({}, {}, False),
     "drive, mass as printed": (DRIVE | GUIDES, {}, True),
@@ -89,14 +89,14 @@ def rows(printed_mass: bool) -> Runs:
 
 
 def base(changed: dict[str, float]) -> Robot:
-    """Nominal with contacts that shake, adhesion on which every row climbs."""
+    """Nominal robot with shaking contacts, and an adhesion that lets every row climb."""
     adhesion = {name: prior[0] for name, prior in SLIP.items() if prior is not None}
     robot = dataclasses.replace(paper_robots.nominal(), effects=(VibrationSlip(amplitude=jnp.asarray(0.02)),))
     return params.replace(robot, {name: jnp.asarray(value) for name, value in (adhesion | changed).items()})
 
 
 def errors(table: Runs, reading: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Of each channel [%]: rms, and row by row."""
+    """Errors of each channel [%]: rms, and row by row."""
     found = {}
     for channel in channels.usual():
         e = 100 * (np.asarray(reading[channel.name]) / channel.factor / table[channel.column] - 1)
@@ -105,8 +105,11 @@ def errors(table: Runs, reading: dict[str, np.ndarray]) -> dict[str, Any]:
 
 
 def least(table: Runs) -> dict[str, Any]:
-    """What no smooth model can pass below [%]: printing, and a straight line of the current over sin α through each
-    of the three groups of five rows; and currents of the motor's own balance at the printed speeds."""
+    """Lower bounds of the errors of any smooth model [%].
+
+    They follow from printing, from a straight line of the current over sin α through each of the three groups of five
+    rows, and from currents of the motor's own balance at the printed speeds.
+    """
     printed = {c: 100 * w / np.sqrt(12) / table[c] for c, w in PRINTED.items()}
     left = []
     for group in range(3):
@@ -123,7 +126,7 @@ def least(table: Runs) -> dict[str, Any]:
 
 
 def way(name: str) -> tuple[dict[str, Any], Robot]:
-    """What a way comes to, and its robot."""
+    """Result of a way, and its robot."""
     free, changed, printed_mass = WAYS[name]
     free, table, robot = SLIP | free, rows(printed_mass), base(changed)
     stated = {n: prior for n, prior in free.items() if prior is not None}
@@ -140,8 +143,11 @@ def way(name: str) -> tuple[dict[str, Any], Robot]:
 
 
 def resolved(robot: Robot) -> list[dict[str, Any]]:
-    """The tracked rows by the track model, with the drive of `robot` and set S: at the guide friction whose product
-    with the share that the guides carry is the lumped model's, and at that of the least error of the current."""
+    """The tracked rows by the track model, with the drive of `robot` and set S.
+
+    At the guide friction whose product with the share of the guides equals the lumped model's, and at the one with
+    the least error of the current.
+    """
     table = rows(False)
     table = table.where(table["configuration"] == "6T2A")
     known = {p.name: float(p.value) for p in params.walk(robot)}
@@ -171,7 +177,7 @@ def resolved(robot: Robot) -> list[dict[str, Any]]:
 
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    options.add_argument("--track", action="store_true", help="the tracked rows by the track model too")
+    options.add_argument("--track", action="store_true", help="compute the tracked rows by the track model too")
     options.add_argument("--only", help="one of: " + "; ".join(WAYS))
     arguments = options.parse_args()
     print(json.dumps({"benchmark": "paper_rows", "machine": machine(), "least": least(rows(False))}), flush=True)

@@ -1,10 +1,10 @@
-"""Modules through which a table, or a command's configuration, is handed on while a command runs.
+"""Modules that pass on a table, or a command's configuration, while a command runs.
 
     python benchmarks/passes.py runs loop measured
     python benchmarks/passes.py config sweep --voltages 24
 
-Counted are modules of the program of which a function is called with it among its arguments, but not the one that it
-is of: all of them, and those that hand it on to another. Prints a line of JSON.
+A module of the program counts if one of its functions is called with the object among its arguments, except the
+object's own module. Two counts: all modules, and modules that pass it on to another. Prints a line of JSON.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PROGRAM = ("mmrjax", "calibration", "sweeps")
 
 
 def taken(frame: FrameType, kind: type) -> bool:
-    """Whether what a function is called with is, or holds as a tuple, one of a kind."""
+    """True if an argument of a function is an object of a kind, or a tuple that contains one."""
     code = frame.f_code
     count = code.co_argcount + code.co_kwonlyargcount + bool(code.co_flags & 4) + bool(code.co_flags & 8)
     given = [frame.f_locals.get(name) for name in code.co_varnames[:count]]
@@ -34,7 +34,7 @@ def taken(frame: FrameType, kind: type) -> bool:
 
 
 def watched(kind: type, arguments: list[str]) -> dict[str, Any]:
-    """What a command with these arguments hands on of a kind."""
+    """Modules through which a command with these arguments passes an object of a kind."""
     found: dict[str, None] = {}
     steps: dict[tuple[str, str], None] = {}
     own = {base.__module__ for base in (kind, *kind.__subclasses__())} | {"sweeps.config", "sweeps.config_campaign"}
@@ -67,6 +67,6 @@ def watched(kind: type, arguments: list[str]) -> dict[str, Any]:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kind", choices=KINDS, help="what is followed")
-    parser.add_argument("command", nargs=argparse.REMAINDER, help="of mmrjax, with its options")
+    parser.add_argument("command", nargs=argparse.REMAINDER, help="command of mmrjax, with its options")
     given = parser.parse_args()
     print(json.dumps(watched(KINDS[given.kind], given.command)))

@@ -1,6 +1,6 @@
-"""Drives of the head to head in plain NumPy: settled runs by `tests/worlds/settled.py`, logs by exact steps.
+"""Drives of the comparison in plain NumPy: settled runs by `tests/worlds/settled.py`, logs by exact steps.
 
-Nothing of the simulator is used but names and values of constants: physics, solvers and integration are independent.
+Only names and values of constants come from the simulator: physics, solvers and integration are independent.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from worlds.settled import instant, newton
 
 #: Longest step of a log [s].
 LONGEST = 0.005
-#: What a fast decay of the driver adds to the voltage: between pulses the winding is at its back-EMF.
+#: Voltage added by a driver in fast decay: between pulses the winding is at its back-EMF.
 COASTS = Term("coasts", 1.0, {}, Law("", "electrical", lambda s, q: -(1 - np.abs(s.duty)) * s.C * s.w, 1.0))
 
 
 class Unable(Exception):
-    """A record that a method cannot do, and why."""
+    """Raised with the reason if a method cannot treat a record."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +32,8 @@ class Drive:
 
     Attributes:
         runs: the table; robot: with its constants; coordinates: of the free ones, `priors.Coordinates`.
-        known: name → value of every constant [SI]; term: that the rig has besides, its amplitude one more unknown.
+        known: name → value of every constant [SI]; term: an additional term of the rig, its amplitude one more
+            unknown.
         given: of each row: configuration, sides, supply [V], duty, motor_speed [rad/s], slope [rad], mass [kg],
             direction d.
     """
@@ -46,11 +47,11 @@ class Drive:
 
     @property
     def constants(self) -> int:
-        """How many constants are free."""
+        """Number of free constants."""
         return len(self.coordinates.names)
 
     def start(self) -> np.ndarray:
-        """Unknowns at the means of their priors; of the term a tenth of its ordinary size."""
+        """Unknowns at the means of their priors; for the term a tenth of its ordinary size."""
         return np.concatenate([np.zeros(self.constants), np.zeros(0) if self.term is None else [0.1]])
 
     def values(self, z: np.ndarray) -> dict[str, float]:
@@ -60,7 +61,7 @@ class Drive:
         return {**self.known, **dict(zip(self.coordinates.names, theta, strict=True)), **tied}
 
     def of_rows(self, values: Mapping[str, float]) -> dict[str, Any]:
-        """Constants by their names without the configuration, those of a load with a value for each row."""
+        """Constants by their names without the configuration; those of a load have a value for each row."""
         names, which = list(self.robot.configurations.names), self.given.configuration
         found: dict[str, Any] = {}
         for name, value in values.items():
@@ -72,7 +73,7 @@ class Drive:
         return found
 
     def terms(self, members: np.ndarray) -> list[Term]:
-        """Terms that the rig has besides, with the last unknown of each point as amplitude.
+        """Additional terms of the rig, with the last unknown of each point as amplitude.
 
         Args:
             members: unknowns, shape (points, unknowns).
@@ -84,8 +85,10 @@ class Drive:
         return own
 
     def readings(self, members: np.ndarray) -> np.ndarray:
-        """Readings of every channel [SI] for each member's unknowns, shape (members, rows, channels); NaN where a row
-        is not reached."""
+        """Readings of every channel [SI] for each member's unknowns, shape (members, rows, channels).
+
+        NaN for a row that is not reached.
+        """
         shown = self._followed(members) if self.runs.sampled else self._settled(members)
         unsigned = [k for k, c in enumerate(self.runs.channels) if c.name in self.robot.rig.magnitudes]
         shown[..., unsigned] = np.abs(shown[..., unsigned])
@@ -116,7 +119,7 @@ class Drive:
         s, f = instant(x, given, p, terms, names), residual(x)
         sound = np.isfinite(f).all(0) & (np.abs(f).max(0) < 1e-7) & ~s.slides
         shown = np.where(sound, s.shown, np.nan)
-        if not wide:  # what friction holds is at rest, unless a weight could turn it back
+        if not wide:  # friction holds the robot at rest, unless a weight could reverse it
             held = (s.w * given.d <= 0) & (given.slope == 0) & (given.load_torque == 0) & (s.pull == 0)
             volts = given.duty * given.supply
             current = volts / p["motor.resistance"]
@@ -142,7 +145,7 @@ class Drive:
             "total_current",
             "motor_current",
         }:
-            raise Unable("a channel that is not of one moment")
+            raise Unable("a channel that needs more than one instant")
         whole = self.runs.whole
         shown = np.full((len(members), len(self.runs), len(self.runs.channels)), np.nan)
         for name in dict.fromkeys(self.runs.run_names.tolist()):
@@ -189,7 +192,7 @@ class Shaft:
 
     @property
     def radius(self) -> np.ndarray:
-        """Travel for a turn of the output [m/rad]; 1 for a shaft."""
+        """Travel per radian of the output [m/rad]; 1 for a shaft."""
         return self.p.get("radius", np.ones_like(self.p["motor.resistance"]))
 
     @property
@@ -200,13 +203,13 @@ class Shaft:
     def follow(
         self, time: np.ndarray, volts: np.ndarray, duty: np.ndarray, start: float
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Returns instants [s] and what the motors do there, each of shape (members, instants).
+        """Returns instants [s] and the state of the motors at them, each of shape (members, instants).
 
-        These are the speed `w` [rad/s] and current `I` [A]; and of the step from there its acceleration `rate`
-        [rad/s²], the currents `from` and `to` which its voltage settles to at both ends [A].
+        The state is the speed `w` [rad/s] and current `I` [A]; and for the step from there its acceleration `rate`
+        [rad/s²] and the settled currents `from` and `to` of its voltage at both ends [A].
 
         In each step the voltage is constant, the winding's lag exact, and the shaft's equation linear with an exact
-        solution; where the shaft would turn round it stops.
+        solution; a shaft that would reverse stops.
 
         Args:
             time: of the samples [s]; volts: mean voltage of the pulses [V], duty: their share, of each sample; start:
@@ -252,7 +255,7 @@ class Shaft:
                 slope = np.maximum(slope, 1e-9)
                 ends = (force - rub * way) / slope
                 new = ends + (w - ends) * np.exp(-slope * h)
-                # One that reaches rest stays there, or turns round for what is left of the step.
+                # A shaft that reaches rest stays there, or reverses for the rest of the step.
                 stops = (w != 0) & (new * way < 0)
                 rest = np.where(stops, np.log1p(np.where(stops, -w / np.where(stops, ends, 1.0), 0.0)) / slope, 0.0)
                 onward = np.where(np.abs(force) > rub, (force - rub * np.sign(force)) / slope, 0.0)
@@ -273,11 +276,11 @@ class Shaft:
         """Channel → its values [SI] of one member.
 
         Args:
-            when: instants [s]; m: index of the member; grid, followed: as of `follow`.
+            when: instants [s]; m: index of the member; grid, followed: as for `follow`.
         """
         p = {n: x[m] for n, x in self.p.items()}
         k = np.clip(np.searchsorted(grid, when, side="right") - 1, 0, len(grid) - 1)
-        # A row that is the end of a step is read before the voltage that follows acts.
+        # A row at the end of a step is read before the next voltage acts.
         k = np.where((k > 0) & (when - grid[k] < 1e-9), k - 1, k)
         since, h = np.maximum(when - grid[k], 0.0), np.diff(grid, append=grid[-1] + 1.0)[k]
         of = {n: x[m, k] for n, x in followed.items()}
@@ -299,12 +302,12 @@ class Shaft:
 
 
 def _tiled(x: Any, count: int, rows: int) -> Any:
-    """A column of rows, so many times one after the other; anything else as it is."""
+    """A column of rows repeated `count` times; other values are returned unchanged."""
     return np.tile(x, count) if isinstance(x, np.ndarray) and x.shape == (rows,) else x
 
 
 def first_speed(drive: Drive, row: int) -> float:
-    """Speed of the motors at the start of a run [rad/s]: at rest, or as its first row reads."""
+    """Speed of the motors at the start of a run [rad/s]: at rest, or the reading of its first row."""
     names = [c.name for c in drive.runs.channels]
     ratio = {"motor_speed": 1.0, "output_speed": drive.known["gearbox.ratio"]}
     shown = next((n for n in ratio if n in names), None)
@@ -353,7 +356,7 @@ def drive(runs: Any, robot: Any, coordinates: Any, term: Term | None = None) -> 
         robot: of the problem; coordinates: of its free constants; term: of a synthetic rig.
 
     Raises:
-        Unable: a kind of data or channel that they do not hold.
+        Unable: a kind of data or channel that they do not support.
     """
     from calibration.inference import priors
 

@@ -1,7 +1,7 @@
-"""Records of the head to head: the packaged table, public records of others, cases of a folder, synthetic rigs.
+"""Records of the comparison: the packaged table, public records of others, cases of a folder, synthetic rigs.
 
-A record is a robot's file, a table and what is known of the answer. Tables of others stay in the folder that the
-command line names; here are the facts that make a robot's file of each.
+A record is a robot's file, a table and the known part of the answer. Public tables stay in the folder stated on the
+command line; this module holds the data for a robot's file of each.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [p for p in (str(ROOT), str(ROOT / "tests")) if p not in sys.path]
 
-#: Number of synthetic rigs, and kinds of four of them in turn.
+#: Number of synthetic rigs, and four kinds of them in turn.
 RIGS, TURN = 40, ("library", "outside", "library", "clean")
-#: Seeds of a kind that are tried, one after the other, for a synthetic rig.
+#: Number of seeds tried in sequence for a synthetic rig of a kind.
 TRIES = 20
 
 
@@ -29,8 +29,8 @@ class Answer:
 
     Attributes:
         kind: `clean`, `library`, `outside` or `unknown`, which is not judged.
-        names: effects of the library that are right, with all that data without noise cannot tell from them.
-        families: mechanisms that are right, as beginnings of `Effect.family()`.
+        names: right effects of the library, including all that noise-free data cannot distinguish.
+        families: right mechanisms, as beginnings of `Effect.family()`.
     """
 
     kind: str = "unknown"
@@ -55,7 +55,7 @@ class Record:
 
 
 class NoRecord(Exception):
-    """A record that cannot be made here, and why."""
+    """Raised with the reason if a record cannot be made."""
 
 
 # --- others' records ----------------------------------------------------------------------------------
@@ -168,7 +168,7 @@ loss_coulomb = "0.1 ± 100 %"
 
 @dataclasses.dataclass(frozen=True)
 class Public:
-    """A record of others: its file in the folder, the columns that are read, the robot's file and the answer."""
+    """A public record: its file in the folder, the columns to read, the robot's file and the answer."""
 
     file: str
     columns: tuple[str, ...]
@@ -181,7 +181,7 @@ class Public:
             return list(csv.DictReader(file, skipinitialspace=True))
 
     def write(self, public: Path, folder: Path) -> tuple[Path, Path]:
-        """The robot's file and the table, as a user would have them, in a folder.
+        """Writes the robot's file and the table, in the form of a user's files, into a folder.
 
         Raises:
             NoRecord: a file without one of the columns.
@@ -200,7 +200,7 @@ class Public:
 
 
 class Braked(Public):
-    """A dyno whose brake's torque of each row is in the file of its robot, by the row's configuration."""
+    """A dyno with the brake torque of each row in the file of its robot, by the row's configuration."""
 
     def rows(self, public: Path) -> list[dict[str, str]]:
         """Rows of the record's file, with the torque of the brake."""
@@ -215,7 +215,7 @@ def _mouse(side: str, driver: str = "", answer: Answer = Answer()) -> Public:
 
 
 _COASTS = Answer("library", ("coast_decay",), ("voltage drop that changes with duty",))
-#: Name → record; the sources and licences are in docs/benchmarks.md.
+#: Name → record; the sources and licences are in docs/lab/head-to-head.md.
 PUBLIC: dict[str, Public] = {
     "micromouse-left": _mouse("left", answer=_COASTS),
     "micromouse-right": _mouse("right", answer=_COASTS),
@@ -230,7 +230,7 @@ PUBLIC: dict[str, Public] = {
     "drivetrain": Public("drivetrain/log.csv", ("run_id", "timestamp", "l_voltage", "l_velocity"), DRIVETRAIN),
 }
 
-#: Beginnings of names of case folders with a robot's file and a table: short name, files, answer.
+#: Prefixes of case folders with a robot's file and a table: short name, files, answer.
 CASES: dict[str, tuple[str, str, str, Answer]] = {
     "real-01": ("real-01", "rig.toml", "runs.csv", Answer("outside", (), ("loss torque that changes with speed",))),
     "real-02": ("real-02", "rig.toml", "runs.csv", Answer("outside", (), ("loss torque that changes with speed",))),
@@ -255,13 +255,13 @@ def names(public: Path | None, cases: Path | None, rigs: int = RIGS) -> dict[str
 
 
 def record(name: str, folder: Path, public: Path | None, cases: Path | None, seed: int) -> Record:
-    """A record by its name, its files written into `folder`.
+    """A record by its name, with its files written into `folder`.
 
     Args:
-        public: folder of the records of others; cases: folder of cases; seed: of the synthetic rigs.
+        public: folder of the public records; cases: folder of cases; seed: of the synthetic rigs.
 
     Raises:
-        NoRecord: a file that is not there, a folder that is not given, or a rig that cannot be drawn.
+        NoRecord: a missing file, a folder that is not given, or a rig that cannot be drawn.
     """
     if name == "packaged":
         table = ROOT / "calibration" / "data" / "measured.csv"
@@ -283,7 +283,7 @@ def record(name: str, folder: Path, public: Path | None, cases: Path | None, see
 
 
 def _synthetic(number: int, name: str, folder: Path, seed: int) -> Record:
-    """A synthetic rig of `tests/worlds/rigs.py`, as `benchmarks/rigs.py` draws them."""
+    """A synthetic rig of `tests/worlds/rigs.py`, drawn as in `benchmarks/rigs.py`."""
     import rigs
 
     kind = TURN[number % len(TURN)]
@@ -296,7 +296,7 @@ def _synthetic(number: int, name: str, folder: Path, seed: int) -> Record:
 
 
 def labelled(label: dict[str, Any]) -> Answer:
-    """The answer that a synthetic case's label states."""
+    """The answer stated in a synthetic case's label."""
     if not label["effects"]:
         return Answer("clean")
     from loop_scores import MIMIC
@@ -326,10 +326,10 @@ def _place(effect: dict[str, Any]) -> str:
 
 
 def judged(level: str, claims: list[list[str]], families: list[str], answer: Answer) -> bool | None:
-    """True for a wrong claim; None where the answer is not known.
+    """True for a wrong claim; None if the answer is not known.
 
     Args:
-        level: word of the verdict; claims: classes of effects that are established.
+        level: word of the verdict; claims: classes of established effects.
         families: mechanisms, or the place.
     """
     if answer.kind == "unknown":
@@ -340,7 +340,7 @@ def judged(level: str, claims: list[list[str]], families: list[str], answer: Ans
 
 
 def _off(level: str, claims: list[list[str]], families: list[str], answer: Answer) -> bool:
-    """True where a claim about something that is missing is not right."""
+    """True if a claim about a missing effect is wrong."""
     if level in ("named", "class") and answer.names:
         return not all(set(members) & set(answer.names) for members in claims)
     if level in ("named", "class") and answer.kind == "outside":
@@ -351,6 +351,6 @@ def _off(level: str, claims: list[list[str]], families: list[str], answer: Answe
 
 
 def _equation(family: str) -> str:
-    """The equation of a family in words; losses, weights and inertias act on the same."""
+    """The equation of a family in words; losses, weights and inertias act on the same one."""
     what = family.partition(" that ")[0]
     return "torque" if what in ("loss torque", "resistance to travel", "mass", "inertia") else what

@@ -1,13 +1,13 @@
-"""What every command leaves, kept in `tests/record/commands` as digests: nothing of it may change unsaid.
+"""Digests of the results of every command, in `tests/record/commands`, so that no result changes unnoticed.
 
-    python benchmarks/record.py --check             # to the tolerance of each case; ends with 1 where one differs
-    python benchmarks/record.py --check --exact     # to the last digit, where only code was moved
-    python benchmarks/record.py --write --only size # what was corrected on purpose, with a line in CHANGELOG.md
+    python benchmarks/record.py --check             # to the tolerance of each case; exits with 1 for a difference
+    python benchmarks/record.py --check --exact     # to the last digit, if only code was moved
+    python benchmarks/record.py --write --only size # after a correction, with a line in CHANGELOG.md
 
-A case is a command with few points, rows or searches, and takes a folder of inputs for its own. Of the CSV, JSON and
-TOML that it leaves, and of its exit code, text is kept as a hash, each list of numbers that lie under one name as
-count, norm and two weighted sums (short ones as they are). What says when, where and by which versions is left out.
-`tests/test_record_commands.py` checks all of them, and a few quick ones with every `make test`.
+A case is a command with few points, rows or searches, and takes a folder of inputs. The digest covers the exit code
+and the CSV, JSON and TOML files of the result. Text is stored as a hash. Each list of numbers under one name is
+stored as count, norm and two weighted sums (short ones as they are). Times, places and versions are left out.
+`tests/test_record_commands.py` checks all cases, and a few quick ones with every `make test`.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from calibration.data.input_errors import is_number
 
 RECORD = Path(__file__).resolve().parents[1] / "tests" / "record" / "commands"
 ROBOTINO = Path(__file__).resolve().parents[1] / "docs" / "rigs" / "robotino"
-#: Largest relative difference of numbers: of what is solved, and of what is searched for until little is gained.
+#: Largest relative difference of numbers: of solutions, and of searches that end at a small gain.
 SOLVED, SEARCHED = 1e-6, 1e-3
-#: Below so much a number is rounding, in whatever unit.
+#: Size below which a number counts as rounding, in any unit.
 NOTHING = 1e-12
-#: Keys that say when, where and by which program.
+#: Keys with time, place or program version.
 PROVENANCE = frozenset(
     ("program", "arguments", "python", "versions", "devices", "float", "started", "seconds", "hashes")
 )
-#: Lists of numbers up to this long are kept as they are.
+#: Longest list of numbers that is stored as it is.
 SHORT = 6
 
 
@@ -94,14 +94,14 @@ CASES = {
     "rig_check_robotino": Case("rig check robotino.toml settled.csv --json"),
     **{f"rig_new_{kind}": Case(f"rig new new_{kind}.toml --kind {kind}") for kind in KINDS},
 }
-#: Cases that take little, those of `make test`: a rig solved, and files written.
+#: Quick cases, those of `make test`: a rig solved, and files written.
 QUICK = ("simulate_rig", "sweep_rig", "rig_new_bench", "rig_new_tracked")
 
 
 def run(name: str, folder: Path) -> dict[str, Any]:
-    """Run a case in `folder`, which has its inputs; what it leaves, as digests.
+    """Runs a case in `folder`, which has its inputs, and returns digests of its results.
 
-    A folder of `--out` is named as the case. Run in this process, so that cases share compiled programs.
+    A folder of `--out` has the case's name. The case runs in this process, so that cases share compiled programs.
     """
     from sweeps import cli
 
@@ -130,7 +130,7 @@ def run(name: str, folder: Path) -> dict[str, Any]:
 
 
 def inputs(folder: Path) -> None:
-    """Put what cases read into a folder."""
+    """Copies the inputs of the cases into a folder."""
     for path in (*RECORD.glob("*.toml"), *RECORD.glob("*.csv"), *ROBOTINO.glob("*.toml"), *ROBOTINO.glob("*.csv")):
         shutil.copy(path, folder)
 
@@ -141,7 +141,7 @@ Leaf = tuple[str, Any]
 
 
 def _read(path: Path) -> Iterator[Leaf]:
-    """What a file holds, as names and values in order; of a store, its identity or a picture nothing."""
+    """Yields names and values of a file in order; nothing for a store's identity or a picture."""
     if path.suffix == ".csv":
         with path.open(encoding="utf-8", newline="") as stream:
             rows = csv.reader(stream)
@@ -178,7 +178,7 @@ def _flat(value: Any, name: str = "") -> Iterator[Leaf]:
 
 
 def digest(leaves: list[Leaf]) -> dict[str, Any]:
-    """Values by name: numbers as a list, or count, norm and two weighted sums; all else as a hash; of all a hash."""
+    """Values by name: numbers as a list, or as count, norm and two weighted sums; others and the whole as a hash."""
     groups: dict[str, list[Any]] = {}
     for name, value in leaves:
         groups.setdefault(name, []).append(value)
@@ -198,7 +198,7 @@ def _hash(values: Any) -> str:
 
 
 def _sums(x: list[float]) -> dict[str, float]:
-    """Count, norm and two sums whose weights, in [-1, 1], depend on the place in the list."""
+    """Count, norm and two sums with weights in [-1, 1] that depend on the position in the list."""
     return {
         "count": len(x),
         "norm": math.sqrt(math.fsum(v * v for v in x)),
@@ -211,11 +211,11 @@ def _sums(x: list[float]) -> dict[str, float]:
 
 
 def differences(was: dict[str, Any], now: dict[str, Any], rtol: float, exact: bool = False) -> list[str]:
-    """Where two records of a case differ, a line each.
+    """Differences of two records of a case, one line each.
 
     Args:
         rtol: largest difference of numbers relative to the largest of their list, or to their norm.
-        exact: whether every digit is compared too.
+        exact: True to compare every digit too.
     """
     found = [f"{key}: {now[key]} (was {was[key]})" for key in ("words", "code") if was[key] != now[key]]
     old, new = was["files"], now["files"]
@@ -246,12 +246,12 @@ def _close(a: Any, b: Any, rtol: float) -> bool:
 
 
 def record(name: str) -> dict[str, Any]:
-    """What is kept of a case."""
+    """The stored record of a case."""
     return json.loads((RECORD / f"{name}.json").read_text(encoding="utf-8"))
 
 
 def as_text(kept: dict[str, Any]) -> str:
-    """A record as JSON, a line for each name."""
+    """A record as JSON, with a line for each name."""
 
     def line(value: Any) -> str:
         return json.dumps(value, ensure_ascii=False)
@@ -271,15 +271,15 @@ def with_needed(names: list[str]) -> list[str]:
 
 
 def main() -> int:
-    # Compiled by the older emitters, in half of the time; traced, as programs on disk may be of another source.
+    # Compiled by the older emitters, in half of the time; traced, because programs on disk may be of another source.
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
     os.environ["MMRJAX_PROGRAMS"] = ""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--check", action="store_true", help="compare with the record")
-    what.add_argument("--write", action="store_true", help="write the record anew")
+    what.add_argument("--write", action="store_true", help="write the record again")
     parser.add_argument("--exact", action="store_true", help="compare every digit")
-    parser.add_argument("--only", action="append", choices=list(CASES), help="a case, repeatable; default: all")
+    parser.add_argument("--only", action="append", choices=list(CASES), help="one case, repeatable; default: all")
     options = parser.parse_args()
     failed = 0
     with tempfile.TemporaryDirectory() as folder:

@@ -1,13 +1,15 @@
-"""The closed loop on logs over time of random rigs: false findings, right classes, wrong names, robots read again,
-and errors held out against least squares of one's own.
+"""The closed loop on logs over time of random rigs.
+
+Figures: false findings, right classes, wrong names, written robots that can be read again, and hold-out errors
+compared with independent least squares.
 
     python benchmarks/rig_logs.py --clean 80 --library 80 --outside 40 --jobs 16 --cache runs/cache --limit 3000
 
-Logs come from `tests/worlds/logs.py`, which shares nothing with the simulator: four runs of 200 rows, 50 to
-200 Hz, of one drive and a load on a shaft; voltage, current or speed imposed by turns; some read late, which no file
-states. What the loop gets is `rig.toml` and `table.csv`; labels are read by the scorer alone. Every log is one line
-of `--out` as it ends, and a campaign that is started again goes on where it ended. With `--brief` nothing is
-held out.
+Logs come from `tests/worlds/logs.py`, which shares no code with the simulator: four runs of 200 rows, 50 to
+200 Hz, of one drive and a load on a shaft; voltage, current or speed imposed in turn; some with a delay that no file
+states. The loop reads only `rig.toml` and `table.csv`; only the scorer reads the labels. Every log is one line
+of `--out`, and a restarted campaign continues where it ended. With `--brief` there is no
+hold-out.
 """
 
 from __future__ import annotations
@@ -27,23 +29,23 @@ from campaign import Task, campaign, looped, refused
 from worlds import laws, logs
 
 KINDS = ("clean", "library", "outside")
-#: Sigmas of each effect, least and most.
+#: Least and greatest sigmas of each effect.
 SIGMAS = {"library": (5.0, 15.0), "outside": (8.0, 15.0)}
-#: Rigs that are drawn until one can have an effect of the wanted strength.
+#: Rigs drawn until one can have an effect of the wanted strength.
 TRIES = 6
-#: Of the error of one's own least squares, by how much the loop's may be larger.
+#: Allowed excess of the loop's error over that of independent least squares.
 TENTH = 0.1
 
 
 def inputs(seed: int) -> tuple[str, float]:
-    """What is imposed and how often it is sampled [s], by turns; with each effect each step comes up."""
+    """Imposed quantity and sampling interval [s], in turn; each step occurs with each effect."""
     turn = seed // len(logs.IMPOSED)
     return logs.IMPOSED[seed % len(logs.IMPOSED)], logs.EVERY[(turn + turn // 9) % len(logs.EVERY)]
 
 
 @functools.lru_cache(maxsize=2)
 def attempt(kind: str, seed: int) -> logs.Case | str:
-    """The case of a kind and a seed, or why there is none."""
+    """The case of a kind and a seed, or the reason why it is invalid."""
     rng = np.random.default_rng([41, KINDS.index(kind), seed])
     imposed, every = inputs(seed)
     if kind == "clean":
@@ -58,7 +60,7 @@ def attempt(kind: str, seed: int) -> logs.Case | str:
 
 
 def work(task: Task) -> dict:
-    """A log made, looped over and scored against its label."""
+    """Makes a log, runs the loop on it and scores it against its label."""
     case = attempt(task.kind, task.seed)
     if isinstance(case, str):
         return {"skipped": case}
@@ -78,8 +80,10 @@ def work(task: Task) -> dict:
 
 
 def held_out(whole, case: logs.Case) -> dict:
-    """Errors of runs held out [sds, rms]: of the refit, of what is proposed, of least squares of one's own without
-    and with the true term; and the gain of what is proposed over the refit."""
+    """Errors of held-out runs [sds, rms], and the gain of the proposed model over the refit.
+
+    Errors of the refit, of the proposed model, and of independent least squares without and with the true term.
+    """
     seen = whole.readings_of_rows
     off = [None, None]
     if "run" in seen.held_out:
@@ -96,7 +100,7 @@ def held_out(whole, case: logs.Case) -> dict:
 
 
 def program(task: Task) -> tuple[str, float]:
-    """What logs have in common that share what is compiled: what is imposed, and how often it is sampled."""
+    """Properties that logs with the same programs share: the imposed quantity and the sampling interval."""
     return inputs(task.seed)
 
 
@@ -121,7 +125,7 @@ def summary(lines: list[dict]) -> list[str]:
     compared = [x for x in every if x.get("held_out") and x["held_out"]["found"] is not None]
     f.say("held out: not below the refit's (goal >= 98 %)", compared,
           lambda x: x["held_out"]["found"] <= 1.001 * x["held_out"]["refit"] or not x["written"])  # fmt: skip
-    f.say("held out within a tenth of one's own with the true term (goal >= 90 %)", compared,
+    f.say("held out within a tenth of least squares with the true term (goal >= 90 %)", compared,
           lambda x: x["held_out"]["found"] <= (1 + TENTH) * x["held_out"]["own_with_term"])  # fmt: skip
     f.say("  without it", compared, lambda x: x["held_out"]["found"] <= (1 + TENTH) * x["held_out"]["own"])
     late = [x for x in every if x.get("delay")]
@@ -134,7 +138,7 @@ def summary(lines: list[dict]) -> list[str]:
 
 
 def right(x: dict) -> bool:
-    """Whether a verdict is the right one of its kind."""
+    """True if a verdict is the right one of its kind."""
     if x["kind"] == "library":
         return scores.contains(x)
     return x["verdict"] == "none" if x["kind"] == "clean" else not x["classes"]

@@ -1,11 +1,11 @@
-"""The closed loop on random rigs: false findings, right classes, wrong names, and what is held by its prior.
+"""The closed loop on random rigs: false findings, right classes, wrong names, and parameters held by their priors.
 
     python benchmarks/rigs.py --clean 500 --library 400 --outside 200 --jobs 16 --cache runs/cache
 
-Rigs come from `tests/worlds/rigs.py`, which shares nothing with the simulator: one drive to six on wheels, tracks,
-a bench, a winch or a linear unit; voltage, duty or motor speed imposed; one to three channels. What the loop gets is
-`rig.toml` and `table.csv`; labels are read by the scorer alone. Every rig is one line of `--out`, and a campaign that
-is started again goes on where it ended.
+Rigs come from `tests/worlds/rigs.py`, which shares no code with the simulator: one to six drives on wheels, tracks,
+a bench, a winch or a linear unit; voltage, duty or motor speed imposed; one to three channels. The loop reads only
+`rig.toml` and `table.csv`; only the scorer reads the labels. Every rig is one line of `--out`, and a restarted
+campaign continues where it ended.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from worlds import laws
 from worlds import rigs as gr
 
 KINDS = ("clean", "library", "outside")
-#: Sigmas of each effect, least and most.
+#: Least and greatest sigmas of each effect.
 SIGMAS = {"library": (5.0, 15.0), "outside": (8.0, 15.0)}
-#: Rigs that are drawn until one can have an effect of the wanted strength: first of one effect, then of any.
+#: Rigs drawn until one can have an effect of the wanted strength: first of one effect, then of any.
 TRIES = (15, 30)
 #: Posterior sd over the prior's above which a parameter has to be reported as held by its prior. The generator's own
-#: figure is linear at the truth and of the file's tolerances alone, so more of it is asked for.
+#: figure is linear at the truth and uses only the file's tolerances; its threshold is therefore higher.
 HELD, SURE = 0.9, 0.97
-#: So many rigs one after the other have their equations, channels, directions and about their number of rows in
-#: common, so that their loops are the same programs: compiling takes a minute and judging a second.
+#: Number of consecutive rigs with the same equations, channels, directions and about the same number of rows, so
+#: that their loops share programs: compiling takes a minute and judging a second.
 ALIKE = 10
 
 
@@ -42,7 +42,7 @@ ALIKE = 10
 
 @functools.lru_cache(maxsize=2)
 def shape(kind: str, number: int) -> tuple[gr.Rig, tuple[int, int]]:
-    """What `ALIKE` rigs have in common: those like a random one, and between how many rows."""
+    """Properties that `ALIKE` rigs share: those of a random one, and limits of the number of rows."""
     from calibration.inference.observers.settled import SettledRuns
 
     world = gr.world(np.random.default_rng([32, KINDS.index(kind), number]))
@@ -54,7 +54,7 @@ def shape(kind: str, number: int) -> tuple[gr.Rig, tuple[int, int]]:
 
 @functools.lru_cache(maxsize=2)
 def attempt(kind: str, seed: int) -> gr.Case | str:
-    """The case of a kind and a seed, or why there is none."""
+    """The case of a kind and a seed, or the reason why it is invalid."""
     like, rows = shape(kind, seed // ALIKE)
     rng = np.random.default_rng([31, KINDS.index(kind), seed])
     if kind == "clean":
@@ -81,7 +81,7 @@ def attempt(kind: str, seed: int) -> gr.Case | str:
 
 
 def work(task: Task) -> dict:
-    """A rig made, looped over and scored against its label."""
+    """Makes a rig, runs the loop on it and scores it against its label."""
     case = attempt(task.kind, task.seed)
     if isinstance(case, str):
         return {"skipped": case}
@@ -90,8 +90,11 @@ def work(task: Task) -> dict:
 
 
 def identified(found, case: gr.Case) -> dict[str, dict]:
-    """Of each free parameter: posterior sd over the prior's, whether it is reported as held by its prior, and that
-    ratio by the generator's own analysis of the rig without its effect."""
+    """Identifiability of each free parameter.
+
+    Posterior sd over the prior's, whether it is reported as held by its prior, and that ratio by the generator's own
+    analysis of the rig without its effect.
+    """
     from calibration.discovery import findings
 
     space, best = found.screened.base.space, found.screened.base.candidate
@@ -104,7 +107,7 @@ def identified(found, case: gr.Case) -> dict[str, dict]:
 
 
 def program(task: Task) -> tuple[str, int]:
-    """What rigs have alike that share what is compiled, see `shape`."""
+    """Properties that rigs with the same programs share, see `shape`."""
     return task.kind, task.seed // ALIKE
 
 
@@ -124,7 +127,7 @@ def summary(lines: list[dict]) -> list[str]:
     return f.out
 
 
-#: By what clean rigs are looked at again.
+#: Properties for a breakdown of clean rigs.
 STRATA = {
     "load": lambda m: m["load"],
     "imposed": lambda m: m["imposed"],

@@ -1,4 +1,4 @@
-"""Ways to predict runs that were not seen, all with the same folds: our fits, SciPy, MuJoCo, PySINDy, regressions.
+"""Methods that predict unseen runs, all with the same folds: our fits, SciPy, MuJoCo, PySINDy, regressions.
 
 Each method gets the same problem (`Posed`): a table, a robot whose constants have the tolerances of its file, and the
 folds, which are the blocks of `blocks.predictable`. It returns readings of every fold by a fit without its rows.
@@ -17,7 +17,7 @@ import numpy as np
 import plain_drives
 from plain_drives import Unable
 
-#: Ridge: penalties that are tried; rows before a row of a log that it sees.
+#: Ridge: penalties, and number of earlier rows of a log among the features.
 PENALTIES = np.geomspace(1e-2, 1e4, 25)
 WINDOW = 8
 #: Boosted trees: number, depth, learning rate, share of the rows of each.
@@ -30,7 +30,7 @@ class Fold:
 
     Attributes:
         kind: of the block; out: mask of its rows, shape (rows,); z: our fit without it.
-        reading: of that fit in every row [SI], NaN where it reaches none, shape (rows, channels).
+        reading: of that fit in every row [SI], NaN for rows it does not reach, shape (rows, channels).
     """
 
     kind: str
@@ -41,11 +41,11 @@ class Fold:
 
 @dataclasses.dataclass(frozen=True)
 class Posed:
-    """A record as every method gets it.
+    """A record in the form that every method gets.
 
     Attributes:
         given: `discover.prepared`; fitted: our base fit, `candidates.BaseFit`; folds: the blocks left out.
-        measured, sd: [SI], shape (rows, channels); counts: True for a reading that is fitted; case: see `Record`.
+        measured, sd: [SI], shape (rows, channels); counts: True for a fitted reading; case: see `Record`.
     """
 
     given: Any
@@ -59,7 +59,7 @@ class Posed:
 
     @property
     def space(self) -> Any:
-        """What can be fitted, `active_set.CandidateSpace`."""
+        """The space of fits, `active_set.CandidateSpace`."""
         return self.fitted.space
 
     @property
@@ -73,10 +73,10 @@ class Found:
     """Readings of a method.
 
     Attributes:
-        unseen: of each fold's rows by a fit without them [SI], one array of shape (rows, channels) a fold; rows of
-            other folds are not read.
-        level: what is claimed, a word for verdicts; claims: classes of effects; families: mechanisms, or the place.
-        seconds: of the claim alone, where that is a part; note: to print next to the record.
+        unseen: readings of each fold's rows by a fit without them [SI], one array of shape (rows, channels) per fold;
+            rows of other folds are not read.
+        level: the claim, a word for verdicts; claims: classes of effects; families: mechanisms, or the place.
+        seconds: of the claim alone, if that is a part; note: to print next to the record.
     """
 
     unseen: list[np.ndarray]
@@ -88,13 +88,13 @@ class Found:
 
 
 def posed(robot: str, table: Any, seed: int, replicates: int, case: Any = None) -> Posed:
-    """A record prepared as `mmrjax loop` does, its base fitted to all rows and without each block.
+    """A record prepared as in `mmrjax loop`, its base fitted to all rows and without each block.
 
     Args:
         robot: file, or name of a packaged robot; table: file of the runs; case: of a synthetic rig.
 
     Raises:
-        Unable: a table with a column that nothing reads.
+        Unable: a table with an unused column.
     """
     from campaign import ready
 
@@ -108,7 +108,7 @@ def posed(robot: str, table: Any, seed: int, replicates: int, case: Any = None) 
     rig = robot_file.load(robot)
     runs = records.read(table, robot=rig)
     if runs.unknown:
-        raise Unable(f"column {runs.unknown[0]} of the record is not read")
+        raise Unable(f"column {runs.unknown[0]} of the record is not used")
     given = prepared(runs, rig, replicates=replicates, seed=seed)
     fitted = loop_baselines.base_of(given)
     space, rows = fitted.space, len(given.runs)
@@ -132,7 +132,7 @@ def posed(robot: str, table: Any, seed: int, replicates: int, case: Any = None) 
 
 
 def refit(p: Posed) -> Found:
-    """Our model with nothing added, fitted anew without each block."""
+    """Our model without additions, fitted again without each block."""
     return Found([fold.reading for fold in p.folds])
 
 
@@ -165,7 +165,7 @@ def scipy_fit(p: Posed) -> Found:
 
 
 def true_fit(p: Posed) -> Found:
-    """The same with the true term of a synthetic rig, its amplitude one more unknown."""
+    """Same as `scipy_fit` with the true term of a synthetic rig, its amplitude one more unknown."""
     if p.case is None or not p.case.terms:
         raise Unable("the true term is not known")
     drive = plain_drives.drive(p.given.runs, p.space.bare.base, p.space.bare.coordinates, p.case.terms[0])
@@ -196,7 +196,7 @@ def mujoco_fit(p: Posed) -> Found:
     """MuJoCo's identification toolbox on the same base: a hinge with damping, frictionloss and actuators."""
     from mujoco import sysid
 
-    if not hasattr(sysid, "ParameterDict"):  # which imports without what it needs
+    if not hasattr(sysid, "ParameterDict"):  # it imports even without its requirements
         raise Unable("not installed")
     import mujoco_rig
 
@@ -213,7 +213,7 @@ def mujoco_fit(p: Posed) -> Found:
 
 
 def sindy(p: Posed) -> Found:
-    """PySINDy on the defects: sparse selection over the library's terms, constants refitted, in each fold anew.
+    """PySINDy on the defects: sparse selection over the library's terms, constants refitted, for each fold.
 
     Fits are linear at our base fit, by its Jacobian and the library's signatures.
     """
@@ -298,8 +298,10 @@ def _regressed(p: Posed, regression: Regression) -> Found:
 
 
 def _features(p: Posed, reading: np.ndarray) -> np.ndarray:
-    """Conditions of every row, its direction, its place in the table and the base's readings; of a log those of the
-    rows before it too; shape (rows, features), each within -1 and 1."""
+    """Features of every row, shape (rows, features), each within -1 and 1.
+
+    Conditions, direction, position in the table and the base's readings; in a log also those of the rows before.
+    """
     runs, conditions = p.given.runs, p.given.runs.conditions(p.given.robot)
     names = ("voltage", "slope_deg", "payload", "duty", "motor_speed", "motor_current", "total_mass")
     columns = [np.asarray(x, float) for n in names if (x := getattr(conditions, n)) is not None]
@@ -325,7 +327,7 @@ def _scaled(columns: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 
 def _before(runs: Any, x: np.ndarray, back: int) -> np.ndarray:
-    """A column so many rows earlier in the run of each row; the run's first row before that."""
+    """A column shifted by `back` rows within the run of each row; before that the run's first row."""
     found = np.empty_like(x)
     for name in dict.fromkeys(runs.run_names.tolist()):
         rows = runs.in_order(name)
@@ -334,11 +336,11 @@ def _before(runs: Any, x: np.ndarray, back: int) -> np.ndarray:
 
 
 def _ridge(x: np.ndarray, y: np.ndarray, there: np.ndarray, blocks: np.ndarray) -> np.ndarray:
-    """Ridge regression at the penalty that predicts blocks of the rows seen best, one left out after the other.
+    """Ridge regression with the penalty that predicts blocks of the seen rows best, by leave-one-block-out.
 
-    Without any gain nothing is predicted.
+    Predicts 0 if there is no gain.
 
-    Features outside what was seen are held at its ends.
+    Features beyond the range of the seen rows are limited to it.
     """
     groups = [blocks == k for k in np.unique(blocks)]
     if len(groups) < 3:
@@ -362,7 +364,7 @@ def _ridges(x: np.ndarray, y: np.ndarray, there: np.ndarray) -> np.ndarray:
     return y.mean() + shrunk @ right @ there.T
 
 
-#: Methods in the order in which they run: cheap ones first, so that one that takes too long costs no other.
+#: Methods in their order: cheap ones first, so that a slow one does not block others.
 METHODS: dict[str, Callable[[Posed], Found]] = {
     "refit": refit,
     "ridge": ridge,
@@ -376,7 +378,7 @@ METHODS: dict[str, Callable[[Posed], Found]] = {
 
 
 def quietly(method: Callable[[Posed], Found], p: Posed) -> Found:
-    """A method without its warnings."""
+    """Calls a method without its warnings."""
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         return method(p)

@@ -1,11 +1,11 @@
-"""Sensitivity studies: how often intervals hold the indices, and how fast a study's model evaluations are.
+"""Sensitivity studies: coverage of the indices by their intervals, and speed of a study's model evaluations.
 
     python benchmarks/sensitivity.py coverage       # 200 seeds: Ishigami, and the steady model against SciPy
     python benchmarks/sensitivity.py speed          # model evaluations of a study: SciPy loop, NumPy, ours
     python benchmarks/sensitivity.py table8         # derivative-based indices of the whole of Table 8
 
 The SciPy implementation is `tests/worlds/paper.py`, a loop of `scipy.optimize.root` over points; the NumPy one is the
-closed form of the same balances without effects, vectorised. `--json FILE` keeps every number.
+closed form of the same balances without effects, vectorised. `--json FILE` writes every number.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ NAMES = (
 )
 OUTPUTS = ("total_current", "motor_speed", "speed")
 VOLTAGE, SLOPE, PAYLOAD = 24.0, 5.0, 3.0
-#: The adhesion of the reference study, at which no draw slides.
+#: The adhesion of the reference study, without sliding draws.
 ADHESION = {"6T2A.ground.friction.static": 0.6}
 
 
@@ -63,7 +63,7 @@ def ishigami(u: np.ndarray, a: float = 7.0, b: float = 0.1) -> np.ndarray:
 
 
 def ishigami_indices(a: float = 7.0, b: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
-    """Its first-order and total indices, exactly."""
+    """Its exact first-order and total indices."""
     one, two = (1 + b * np.pi**4 / 5) ** 2 / 2, a**2 / 8
     both = b**2 * np.pi**8 * (1 / 18 - 1 / 50)
     whole = one + two + both
@@ -74,7 +74,7 @@ def ishigami_indices(a: float = 7.0, b: float = 0.1) -> tuple[np.ndarray, np.nda
 
 
 def by_scipy(values: np.ndarray) -> np.ndarray:
-    """Current of both motors, motor speed and speed [SI] at rows of parameters, a root at a time."""
+    """Current of both motors, motor speed and speed [SI] at rows of parameters, one root at a time."""
     found = np.empty((len(values), 3))
     for k, row in enumerate(values):
         p = {**paper.NOMINAL, **ADHESION, **dict(zip(NAMES, row, strict=True))}
@@ -84,7 +84,7 @@ def by_scipy(values: np.ndarray) -> np.ndarray:
 
 
 def by_numpy(values: np.ndarray) -> np.ndarray:
-    """The same by the closed form, vectorised over rows: two linear balances, then the creep."""
+    """Same as `by_scipy` by the closed form, vectorised over rows: two linear balances, then the creep."""
     p: dict[str, Any] = {**paper.NOMINAL, **ADHESION}
     p |= {name: values[:, k] for k, name in enumerate(NAMES)}
     c, alpha = "6T2A.", math.radians(SLOPE)
@@ -109,7 +109,7 @@ def by_numpy(values: np.ndarray) -> np.ndarray:
 
 
 def ours() -> tuple[room.Inputs, Model, Conditions]:
-    """Inputs, model and operating point of the same study here."""
+    """Inputs, model and operating point of the same study in this project."""
     from mmrjax.model import params
 
     robot = params.replace(nominal(), {k: jax.numpy.asarray(v) for k, v in ADHESION.items()})
@@ -122,7 +122,7 @@ def ours() -> tuple[room.Inputs, Model, Conditions]:
 
 
 def coverage(seeds: int, size: int, reference_size: int) -> dict[str, Any]:
-    """How often 95 % intervals hold the true indices, for Ishigami and for the steady model."""
+    """Coverage of the true indices by 95 % intervals, for Ishigami and for the steady model."""
     record: dict[str, Any] = {"seeds": seeds, "evaluations": {}}
     exact = ishigami_indices()
     held = np.zeros((2, 3))
@@ -174,7 +174,7 @@ def coverage(seeds: int, size: int, reference_size: int) -> dict[str, Any]:
 
 
 def speed(points: int, repeats: int) -> dict[str, Any]:
-    """Evaluations of the model a second over the points of a Sobol design: a loop of SciPy, NumPy, ours."""
+    """Rate of model evaluations over the points of a Sobol design [1/s]: a loop of SciPy, NumPy, ours."""
     inputs, model, conditions = ours()
     blocks = 2 * len(NAMES) + 2
     design = sobol.design(len(NAMES), 2 ** int(np.log2(points / 32 / blocks)), 0)
@@ -189,7 +189,7 @@ def speed(points: int, repeats: int) -> dict[str, Any]:
     variation, there = Variation(model.robot, model.columns), jax.numpy.asarray(values)
     model(values, conditions)
     evaluate(variation, "steady", there, conditions, {}, OUTPUTS)
-    for _ in range(repeats):  # side by side
+    for _ in range(repeats):  # in turn
         began = time.perf_counter()
         fast = by_numpy(own)
         best["numpy"] = min(best["numpy"], time.perf_counter() - began)
@@ -197,7 +197,7 @@ def speed(points: int, repeats: int) -> dict[str, Any]:
         jax.block_until_ready(evaluate(variation, "steady", there, conditions, {}, OUTPUTS))
         best["ours"] = min(best["ours"], time.perf_counter() - began)
         began = time.perf_counter()
-        answer = model(values, conditions)  # with the way there and back between NumPy and the device
+        answer = model(values, conditions)  # including transfers between NumPy and the device
         best["ours_in_study"] = min(best["ours_in_study"], time.perf_counter() - began)
     mine = np.stack([answer.values[name] for name in OUTPUTS], -1)
     record |= {f"{who}_per_s": len(values) / s for who, s in best.items()}
@@ -211,7 +211,7 @@ def speed(points: int, repeats: int) -> dict[str, Any]:
 
 
 def table8(repeats: int) -> dict[str, Any]:
-    """Seconds for the derivative-based indices of the whole of Table 8, every configuration, all parameters."""
+    """Time for the derivative-based indices of the whole of Table 8 [s], every configuration, all parameters."""
     robot = nominal()
     inputs = room.of_priors(robot, room.default_names(robot, robot.configurations.names, False), {})
     axes = np.meshgrid(range(2), VOLTAGES_V, PAYLOADS_KG, SLOPES_DEG, indexing="ij")
@@ -232,15 +232,15 @@ def table8(repeats: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Run one part."""
+    """Runs one part."""
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("part", choices=("coverage", "speed", "table8"))
-    options.add_argument("--seeds", type=int, default=200, help="seeds of the coverage")
+    options.add_argument("--seeds", type=int, default=200, help="number of seeds for the coverage")
     options.add_argument("--size", type=int, default=32, help="base points of a replicate, a power of 2")
-    options.add_argument("--reference-size", type=int, default=512, help="the same of the reference by SciPy")
-    options.add_argument("--points", type=int, default=500_000, help="evaluations whose rate is measured")
+    options.add_argument("--reference-size", type=int, default=512, help="base points of the reference by SciPy")
+    options.add_argument("--points", type=int, default=500_000, help="evaluations for the rate")
     options.add_argument("--repeats", type=int, default=10)
-    options.add_argument("--json", type=Path, metavar="FILE", help="write every number there too")
+    options.add_argument("--json", type=Path, metavar="FILE", help="write every number to this file too")
     a = options.parse_args()
     record: dict[str, Any] = machine()
     if a.part == "coverage":

@@ -1,10 +1,10 @@
-"""A running gear that shakes (set S of docs/vibration.md): the paper's findings at it, and C MuJoCo beside it.
+"""The paper's findings at a shaking running gear (set S of docs/explanation/vibration.md), and C MuJoCo.
 
     python benchmarks/shaking.py            # findings: twenty rows at two steps, a minute on two cores
     python benchmarks/shaking.py --native   # C MuJoCo stepped with the same forces, two points; two minutes
 
-Findings: ripple of speed, current and reaction; whether it repeats with eq. (34); where in the pitch, from the
-landing of a grouser, current and reaction are highest, Figs. 26, 27. Prints lines of JSON.
+Findings: ripple of speed, current and reaction; repetition with eq. (34); position of the maxima of current and
+reaction within the pitch, from the landing of a grouser, Figs. 26, 27. Prints lines of JSON.
 """
 
 from __future__ import annotations
@@ -48,20 +48,20 @@ SET_S = {
     "running_gear.contact_stiffness": 3.816e7, "running_gear.contact_damping": 649.2,
     "running_gear.centre_offset": 0.00011, "running_gear.payload_height": 0.0595,
 }  # fmt: skip
-#: Adhesion on which the wheeled robot climbs 20 deg, Table 5: smooth concrete.
+#: Adhesion for the wheeled robot on 20 deg, Table 5: smooth concrete.
 WHEELED = {"4W2T.ground.friction.static": 0.60, "4W2T.ground.friction.dynamic": 0.48}
-DURATION, SAMPLE, LAST = 2.0, 2e-4, 0.8  # of a run, of its record, of the part that is read [s]
+DURATION, SAMPLE, LAST = 2.0, 2e-4, 0.8  # of a run, of its record, of the evaluated part [s]
 #: 15 V without payload and 33 V with 8 kg, at 0 to 20 deg, on tracks and on wheels.
 WHEELS = np.repeat([0.0, 1.0], 10)
 VOLTAGE = np.tile(np.repeat([15.0, 33.0], 5), 2)
 PAYLOAD = np.tile(np.repeat([0.0, 8.0], 5), 2)
 SLOPE = np.tile([0.0, 5.0, 10.0, 15.0, 20.0], 4)
-#: Operating points of the second opinion: (voltage, slope, payload), and its length [steps].
+#: Operating points of the comparison: (voltage, slope, payload), and its length [steps].
 POINTS, STEPS = ((15.0, 10.0, 0.0), (33.0, 5.0, 8.0)), 12_000
 
 
 def shaking(changed: dict[str, float] | None = None) -> Robot:
-    """Nominal with set S."""
+    """Nominal robot with set S."""
     values = SET_S | WHEELED | (changed or {})
     return params.replace(paper_robots.nominal(), {name: jnp.asarray(value) for name, value in values.items()})
 
@@ -83,7 +83,7 @@ def recorded(robot: Robot, step: float) -> dict[str, jax.Array]:
 
 
 def repeats(time: np.ndarray, values: np.ndarray, period: float) -> dict[str, float]:
-    """How a record agrees with itself a period on, and the best lag near that period, over it [-]."""
+    """Autocorrelation of a record after a period, and the best lag near that period, over it [-]."""
     rest = values - np.polyval(np.polyfit(time, values, 1), time)
     step = time[1] - time[0]
 
@@ -97,15 +97,17 @@ def repeats(time: np.ndarray, values: np.ndarray, period: float) -> dict[str, fl
 
 
 def passes(time: np.ndarray, grouser: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times at which a grouser first comes to bear in front, and last bears at the rear, however often it bounces
-    between [s]."""
+    """Times of first touchdown in front and of last contact at the rear of each grouser [s].
+
+    Bounces in between do not count.
+    """
     lands, lifts = [], []
     for k in range(grouser.shape[1]):
         bears = time[grouser[:, k] > 0]
         gaps = np.flatnonzero(np.diff(bears) > 4 * period)  # once round the pulleys and over the top
         lands += list(bears[gaps + 1])
         lifts += list(bears[gaps])
-        # Those that were up as the record began, or are up as it ends.
+        # Grousers that are up at the start or end of the record.
         if len(bears) and bears[0] - time[0] > 4 * period:
             lands.append(bears[0])
         if len(bears) and time[-1] - bears[-1] > 4 * period:
@@ -114,26 +116,26 @@ def passes(time: np.ndarray, grouser: np.ndarray, period: float) -> tuple[np.nda
 
 
 def phases(times: np.ndarray, since: float, period: float) -> np.ndarray:
-    """Where in the pitch times are, about their circular mean [of a pitch]."""
+    """Position of times within the pitch, about their circular mean [of a pitch]."""
     turns = np.exp(2j * np.pi * (times - since) / period)
     mean = np.angle(turns.mean())
     return (np.angle(turns * np.exp(-1j * mean)) + mean) / (2 * np.pi)
 
 
 def folded(time: np.ndarray, values: np.ndarray, since: float, period: float) -> np.ndarray:
-    """Mean over each twentieth of the period that begins `since`."""
+    """Mean over each twentieth of the period, starting at `since`."""
     bins = ((((time - since) / period) % 1) * 20).astype(int)
     return np.array([values[bins == k].mean() for k in range(20)])
 
 
 def peaks(mean: np.ndarray) -> list[float]:
-    """Where in the period a folded record is highest of its neighbours, and above its mean."""
+    """Positions in the period of local maxima of a folded record above its mean."""
     higher = (mean > np.roll(mean, 1)) & (mean >= np.roll(mean, -1)) & (mean > mean.mean())
     return [int(k) / len(mean) for k in np.flatnonzero(higher)]
 
 
 def findings(step: float) -> list[dict[str, Any]]:
-    """What each row shows."""
+    """Findings of each row."""
     robot, rows = shaking(), []
     record = jax.device_get(recorded(robot, step))
     pulley = float(robot.radius_pulley)
@@ -209,7 +211,7 @@ def native(voltage: float, slope: float, payload: float) -> dict[str, Any]:
         mujoco.mj_fullM(model, data, full)
         data.qvel[:] += np.linalg.solve(full + STEP * np.asarray(damping), STEP * full @ data.qacc)
         mujoco.mj_integratePos(model, data.qpos, data.qvel, STEP)
-        # Its current is ours: the next value depends on this instant alone.
+        # Its current is ours: the next value depends only on this instant.
         motion = Motion(jnp.asarray(data.qpos), jnp.asarray(data.qvel), after.current, after.discharge)
     last = slice(STEPS // 2, None)
     apart = np.abs(theirs - normal) > 0.01 * normal.mean()
@@ -225,7 +227,7 @@ def native(voltage: float, slope: float, payload: float) -> dict[str, Any]:
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument(
-        "--native", action="store_true", help="C MuJoCo with the same forces in place of the findings"
+        "--native", action="store_true", help="C MuJoCo with the same forces instead of the findings"
     )
     options.add_argument("--parts", type=int, nargs="+", default=[1, 2], help="of the step")
     arguments = options.parse_args()

@@ -1,8 +1,8 @@
-"""Sizing: seconds of a search once compiled, and its optimum against a grid of designs of the same choices.
+"""Sizing: time of a search after compilation, and its optimum compared with a grid of designs of the same choices.
 
     python benchmarks/sizing.py --starts 256 --grid 1000000
 
-The grid takes every drive, cell and number of cells with as many ratios, radii and cells in parallel as fit.
+The grid has every drive, cell and number of cells, with as many ratios, radii and parallel cells as fit.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mmrjax.model import paper_robots  # noqa: E402
 
 
 def grid(objective: str, points: int, kept: np.ndarray) -> tuple[float, int, float]:
-    """The best feasible objective of a grid, how many designs it has, and seconds."""
+    """The best feasible objective of a grid, its number of designs, and seconds."""
     robot, asked = paper_robots.nominal(), requirements_file.load(None)
     chosen = options(robot)
     of = task(robot, asked, chosen)

@@ -1,4 +1,4 @@
-"""Points a second of `steady`, against a loop of scipy.optimize.root on the plain reference model.
+"""Rate of `steady` in points per second, compared with scipy.optimize.root on the plain reference model.
 
 python benchmarks/steady.py
 python benchmarks/steady.py --no-baseline --batches 4096,65536,1048576,16777216
@@ -17,7 +17,7 @@ options.add_argument("--baseline-points", type=int, default=4000, help="points t
 
 
 def conditions(size: int) -> np.ndarray:
-    """Rows (wheeled, slope [rad], payload [kg], voltage [V]) that the nominal adhesion holds, Table 8's ranges."""
+    """Rows (wheeled, slope [rad], payload [kg], voltage [V]) of Table 8's ranges that the nominal adhesion holds."""
     rng = np.random.default_rng(8)
     return rng.uniform((0, 0, 0, 15), (1, np.radians(12), 8, 33), (size, 4))
 

@@ -1,15 +1,15 @@
 # ruff: noqa: E402 (cores and platform are chosen before jax starts)
-"""`steady` against vectorised NumPy of the same balances, side by side: the yardstick of whoever sweeps.
+"""`steady` compared with vectorised NumPy of the same balances, the natural alternative for a large sweep.
 
 python benchmarks/steady_yardstick.py
 python benchmarks/steady_yardstick.py --platform gpu --batches 4194304,67108864
 
-On a CPU: a closed form without effects (currents and speeds alone; every output), and Newton's method with four
-effects, as NumPy runs them, on one core; `steady` on two. All sides of a ratio are timed in turn, round after round,
-so that other work on the machine meets all alike; the ratios are of the best times, of the medians, and of processor
-times spread evenly over the cores that each side uses, which other work hardly touches. The last line is of JSON.
-On a GPU: points a second, the bytes a point moves, and the shares of the device's bandwidth and arithmetic that is,
-of what XLA counts in the compiled program (the loop's body as one turn).
+On a CPU: a closed form without effects (only currents and speeds; every output), and Newton's method with four
+effects, in NumPy on one core; `steady` on two. All sides of a ratio are timed in turn, in rounds, so that other work
+on the machine affects all equally. Ratios are of the best times, of the medians, and of processor times divided by
+the cores that each side uses, which other work barely affects. The last line is JSON.
+On a GPU: points per second, bytes per point, and the shares of the device's bandwidth and arithmetic, from XLA's
+counts for the compiled program (the loop's body as one turn).
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 options.add_argument("--platform", choices=("cpu", "gpu"), default="cpu")
 options.add_argument("--batches", default="", help="points, comma separated (cpu 262144; gpu 2^22 to 2^26)")
 options.add_argument("--rounds", type=int, default=40, help="timed calls of each side")
-options.add_argument("--cores", type=int, default=2, help="cores that the process may use (cpu)")
+options.add_argument("--cores", type=int, default=2, help="number of cores that the process may use (cpu)")
 options.add_argument("--bandwidth", type=float, default=4.8e12, help="of the GPU [bytes/s] (H200: 4.8e12)")
 options.add_argument(
     "--arithmetic", type=float, default=34e12, help="of the GPU, double precision [1/s] (H200: 34e12)"
 )
 arguments = options.parse_args()
 if arguments.platform == "cpu":
-    # Before anything starts a thread.
+    # Before any thread starts.
     os.environ["JAX_PLATFORMS"] = "cpu"
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: arguments.cores])
 
@@ -63,7 +63,7 @@ PARAMETERS = (
 
 
 def conditions(size: int) -> Conditions:
-    """The same, on the device."""
+    """The points as conditions on the device."""
     return jax.block_until_ready(Conditions(*yardstick_points(size)))
 
 
@@ -73,13 +73,13 @@ def with_effects(robot: Robot) -> Robot:
 
 
 def largest_difference(ours: dict[str, Any], theirs: dict[str, np.ndarray]) -> float:
-    """Of any output, over its largest value."""
+    """Largest difference of any output, over its largest value."""
     return max(float(np.max(np.abs(np.asarray(ours[k]) - v)) / np.max(np.abs(v))) for k, v in theirs.items())
 
 
 @jax.jit
 def derivatives(robot: Robot, runs: Conditions, values: dict[str, jax.Array]) -> dict[str, dict[str, jax.Array]]:
-    """Derivatives of the three outputs by parameters at each point, in reverse, one output after another."""
+    """Derivatives of the three outputs with respect to parameters at each point, in reverse, one output at a time."""
 
     def total(values: dict[str, jax.Array], name: str) -> jax.Array:
         return steady_outputs(params.replace(robot, values), runs, (name,))[name].sum()
@@ -146,7 +146,7 @@ def compared(size: int, rounds: int) -> dict[str, Any]:
 
 
 def counted(size: int, rounds: int) -> dict[str, Any]:
-    """Points a second on a GPU, and what XLA counts of the compiled program."""
+    """Points per second on a GPU, and XLA's counts for the compiled program."""
     robot, runs = paper_robots.nominal(), conditions(size)
     rows = {}
     for name, one, wanted in (

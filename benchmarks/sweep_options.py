@@ -1,10 +1,10 @@
-"""A large sweep by the ordinary options, as a user runs it: time, processor time, peak memory and bytes on disk.
+"""A large sweep with ordinary options, as a user runs it: time, processor time, peak memory and bytes on disk.
 
-python benchmarks/sweep_options.py            # 2.4e6 points: nothing kept, programs kept, and with runs.csv
+python benchmarks/sweep_options.py            # 2.4e6 points: without stored programs, with them, and with runs.csv
 python benchmarks/sweep_options.py --repeats 5
 
-Each run is a process of its own, with an empty folder of compiled programs before the first of them. Prints a line a
-run; the last line is of JSON.
+Each run is a separate process, with an empty folder of compiled programs before the first of them. Prints a line per
+run; the last line is JSON.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ COMMAND = "import sys; sys.argv[0] = 'mmrjax'; from sweeps.cli import main; main
 
 
 def run(words: list[str], folder: Path) -> dict[str, Any]:
-    """One command in a process of its own, in a folder whose size is what it leaves."""
+    """Runs one command in a separate process, in a folder whose size is that of its results."""
     environment = {**os.environ, "MMRJAX_CACHE": str(folder / "programs")}
     begin = time.perf_counter()
     command = [sys.executable, "-c", COMMAND, *words]
@@ -51,10 +51,10 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--slopes", default="0:19.98:0.02")
     options.add_argument("--payloads", default="0:7.98:0.02")
-    options.add_argument("--repeats", type=int, default=3, help="runs with programs kept")
+    options.add_argument("--repeats", type=int, default=3, help="number of runs with stored programs")
     options.add_argument("--cores", type=int, default=2)
     arguments = options.parse_args()
-    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: arguments.cores])  # the commands' too
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: arguments.cores])  # applies to the commands too
     set_precision(single=False)
     grid = ["sweep", "--slopes", arguments.slopes, "--payloads", arguments.payloads, "--out", "found"]
     record: dict[str, Any] = {"benchmark": "sweep_options", "machine": machine(), "command": grid, "runs": []}
@@ -62,7 +62,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         for kind in kinds:
             folder = Path(name)
-            shutil.rmtree(folder / "found", ignore_errors=True)  # of a whole sweep nothing would be simulated
+            shutil.rmtree(folder / "found", ignore_errors=True)  # a complete sweep would not be simulated again
             row = run([*grid, *(["--export", "csv"] if "csv" in kind else [])], folder)
             record["runs"].append({"kind": kind, **row})
             print(

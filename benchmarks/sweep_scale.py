@@ -1,4 +1,4 @@
-"""Sweeps at scale: points a second into a Zarr store, where the time goes, peak memory, and how devices share work.
+"""Sweeps at scale: rate of points into a Zarr store, its time budget, peak memory, and scaling over devices.
 
     python benchmarks/sweep_scale.py                                  # 1e6 steady points on two cores
     python benchmarks/sweep_scale.py --memory 100000,1000000,10000000 # peak memory by number of points
@@ -9,7 +9,7 @@
     python benchmarks/sweep_scale.py --against-cpu --points 200000    # largest difference of GPU and CPU results
     python benchmarks/sweep_scale.py --designs                        # points a second of the sampled designs
 
-Prints one line of JSON: machine, versions, times. Programs are compiled before the time is taken, unless said.
+Prints one line of JSON: machine, versions, times. Programs are compiled before the time is taken, unless stated.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from typing import Any
 import numpy as np
 from measure import machine, set_precision
 
-#: What varies, and how far: Table 8's ranges, on a surface that holds most of it.
+#: Ranges of the varied inputs: Table 8's, on a surface that holds most of it.
 AXES = {"slope_deg": (0.0, 20.0), "voltage": (15.0, 33.0), "payload": (0.0, 8.0)}
 
 
 def plan_of(points: int, sampled: bool) -> dict[str, Any]:
-    """Tables of a configuration with so many points, an even number: a grid, or a Latin hypercube."""
+    """Tables of a configuration with this even number of points: a grid, or a Latin hypercube."""
     surface = {"surface": "asphalt"}
     if sampled:
         over = {name: {"distribution": "uniform", "low": a, "high": b} for name, (a, b) in AXES.items()}
@@ -100,7 +100,7 @@ def against_cpu(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None = None) -> dict[str, Any]:
-    """One sweep into a store on disk; its times."""
+    """Runs one sweep into a store on disk and returns its times."""
     import jax
 
     from sweeps.commands import sweep as command
@@ -138,8 +138,8 @@ def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None 
         "seconds": total,
         "points_per_s": job.plan.design.points / total,
         "first_chunk_with_compiling_s": first,
-        # three threads: one makes points; one waits for them and starts to compute (on processors, that is all of
-        # computing); one waits for what is computed, fetches and writes
+        # three threads: one makes points; one waits for them and starts to compute (on processors, that includes all
+        # of the computing); one waits for results, fetches and writes
         "points_s": times.points,
         "compute_s": times.start + times.compute,
         "transfer_s": times.transfer,
@@ -150,7 +150,7 @@ def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None 
 
 
 def memory(arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """Peak memory by number of points, a process each."""
+    """Peak memory by number of points, one process for each."""
     rows = []
     for points in arguments.memory.split(","):
         words = [
@@ -172,9 +172,9 @@ def memory(arguments: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def weak(arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """The same number of runs a device, on more and more devices; the second of two sweeps is timed.
+    """The same number of runs per device, for increasing numbers of devices; the second of two sweeps is timed.
 
-    Samples, so that each device has its share of easy and of hard runs.
+    The points are samples, so that each device has its share of easy and hard runs.
     """
     import jax
 
@@ -183,7 +183,7 @@ def weak(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     for count in map(int, arguments.weak.split(",")):
         devices = jax.local_devices()[:count]
         if len(devices) < count:
-            print(f"only {len(devices)} devices, {count} asked for", file=sys.stderr)
+            print(f"only {len(devices)} devices, {count} requested", file=sys.stderr)
             break
         chunk, arguments.chunk = arguments.chunk, arguments.per_device * count
         sweep(arguments, arguments.per_device * count * arguments.rounds, devices)
@@ -195,7 +195,7 @@ def weak(arguments: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def designs() -> list[dict[str, Any]]:
-    """Points a second of each sampled design of four dimensions, out of the middle of 1e9 points."""
+    """Points per second of each sampled design of four dimensions, from the middle of 1e9 points."""
     from sweeps.points.sampled_design import DESIGNS
 
     rows = []
@@ -216,12 +216,12 @@ def main() -> None:
     options.add_argument("--duration", type=float, help="of a run of drive or track [s]")
     options.add_argument("--chunk", type=int, help="points in one call, over all devices")
     options.add_argument("--storage", default="float64")
-    options.add_argument("--sampled", action="store_true", help="a Latin hypercube in place of a grid")
+    options.add_argument("--sampled", action="store_true", help="a Latin hypercube instead of a grid")
     options.add_argument("--out", help="folder on the disk to write to")
     options.add_argument("--repeats", type=int, default=1)
-    options.add_argument("--memory", help="numbers of points, a process each")
+    options.add_argument("--memory", help="numbers of points, one process for each")
     options.add_argument("--weak", help="numbers of devices, such as 1,2,4")
-    options.add_argument("--per-device", type=int, default=16_384, help="runs a device and chunk of --weak")
+    options.add_argument("--per-device", type=int, default=16_384, help="runs per device and chunk of --weak")
     options.add_argument("--rounds", type=int, default=2, help="chunks of --weak")
     options.add_argument("--against-cpu", action="store_true")
     options.add_argument("--designs", action="store_true")

@@ -1,11 +1,11 @@
-"""A drive that both can express, fitted by mmrjax and by the system-identification toolbox of MuJoCo, side by side.
+"""A drive that both can express, fitted by mmrjax and by the system-identification toolbox of MuJoCo.
 
 python benchmarks/sysid.py            needs the toolbox's own requirements: pip install "mmrjax[bench]"
 
 The tracked robot lifted off the ground, driven at two voltages from standstill: one shaft with the inertia of
-rotor and pulley, viscous and dry losses, a motor whose torque falls with speed. In mmrjax it is `drive` without
+rotor and pulley, viscous and dry losses, a motor whose torque decreases with speed. In mmrjax it is `drive` without
 adhesion; in MuJoCo a hinge with armature, damping and frictionloss. The truth is the exact solution
-ω = A/B (1 - exp(-B t / J)), with noise; three parameters are fitted from starts 1.5 to 2 times off.
+ω = A/B (1 - exp(-B t / J)), with noise; three parameters are fitted from starts that are wrong by a factor 1.5 to 2.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from mmrjax.model.conditions import Conditions  # noqa: E402
 
 VOLTAGES = (12.0, 24.0)
 STEP, SAMPLES = 5e-4, 200  # [s]
-NOISE = 0.01  # sd of the shaft's speed [rad/s], 0.05-0.1 % of what it settles at
+NOISE = 0.01  # sd of the shaft's speed [rad/s], 0.05-0.1 % of its final value
 NAMES = ("motor.inertia", "6T2A.track.loss_viscous", "6T2A.track.loss_coulomb")
 OFF = (2.0, 0.5, 1.5)  # start over truth
 
@@ -54,8 +54,10 @@ MODEL = """
 
 
 def lifted() -> Any:
-    """The robot: nominal, its gearbox without load-proportional loss, its windings without inductance to speak of
-    (a hinge has neither), and nothing that rubs under its weight."""
+    """The nominal robot without load-proportional gearbox loss, with negligible inductance and no friction by weight.
+
+    A hinge has none of these.
+    """
     changes = {
         "gearbox.efficiency_load": 1.0, "motor.inductance": 1e-7, "6T2A.track.guide_share": 0.0,
         "6T2A.ground.rolling_resistance": 0.0,
@@ -64,7 +66,7 @@ def lifted() -> Any:
 
 
 def constants(robot: Any) -> dict[str, float]:
-    """What is known of the shaft: all but the three parameters, at the pulley."""
+    """Known quantities of the shaft, at the pulley: all but the three parameters."""
     motor, gear = robot.motor, robot.gearbox
     ratio = float(gear.ratio)
     return {
@@ -86,7 +88,7 @@ def exact(known: dict[str, float], theta: np.ndarray, times: np.ndarray) -> np.n
 
 
 def ours(robot: Any, start: np.ndarray, times: np.ndarray, ratio: float) -> Any:
-    """A compiled fit, speeds (voltages, times) → Optimum, and the coordinates of what it finds."""
+    """A compiled fit, speeds (voltages, times) → Optimum, and the coordinates of its result."""
     coordinates = priors.coordinates(
         robot, NAMES, {n: (float(s), float(s)) for n, s in zip(NAMES, start, strict=True)}
     )
@@ -139,13 +141,13 @@ def toolbox(known: dict[str, float], start: np.ndarray, times: np.ndarray) -> An
         clock = np.r_[0.0, times]
         for volts, seen in zip(VOLTAGES, speeds, strict=True):
             torque = np.full((len(clock), 1), known["torque_per_volt"] * volts)
-            # Its sensor values are those from before a step, labelled with the time after it.
+            # Its sensor values are those before a step, labelled with the time after it.
             late = np.r_[0.0, seen[:-1]][:, None]
             sensor = sysid.TimeSeries.from_names(times, late, model)
             control = sysid.TimeSeries(clock, torque)
             runs.append(sysid.ModelSequences("shaft", spec, f"{volts:g} V", state, control, sensor))
         residual = sysid.build_residual_fn(models_sequences=runs)
-        with contextlib.redirect_stdout(io.StringIO()):  # each optimizer's own table of iterations
+        with contextlib.redirect_stdout(io.StringIO()):  # suppresses each optimizer's table of iterations
             found, _ = sysid.optimize(free, residual, optimizer=optimizer, verbose=False)
         return found.as_vector()
 
@@ -153,7 +155,7 @@ def toolbox(known: dict[str, float], start: np.ndarray, times: np.ndarray) -> An
 
 
 def main() -> None:
-    """Both, in one run."""
+    """Runs both fits."""
     options = measure.parser(__doc__ or "", batches="1")
     options.add_argument("--draws", type=int, default=20, help="noise draws")
     chosen = options.parse_args()

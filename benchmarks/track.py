@@ -1,5 +1,5 @@
 # ruff: noqa: E402 (double precision is set before anything is imported)
-"""The track model: compile and run time of Table 8, derivatives beside the run, and how its assumptions act.
+"""The track model: compile and run time of Table 8, derivatives compared with the run, influence of its assumptions.
 
 python benchmarks/track.py
 python benchmarks/track.py --only speed --batches 180,1024
@@ -27,7 +27,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import STATUSES
 from mmrjax.undercarriage.stability import largest_step
 
-#: By which a run is differentiated: the first four, or all twelve, of which five are of the contacts themselves.
+#: Parameters of the derivatives: the first four, or all twelve, five of them of the contacts.
 DERIVED = (
     "motor.resistance",
     "6T2A.track.guide_friction",
@@ -92,9 +92,9 @@ def speed(batches: list[int]) -> dict:
 
 
 def derivatives(size: int = 30) -> dict:
-    """Forward Jacobians of the settled readings by 1, 4 and 12 parameters, and a gradient by 4, beside the run.
+    """Times of forward Jacobians of the settled readings by 1, 4 and 12 parameters, a gradient by 4, and the run.
 
-    30 runs of 0.6 s from Table 8, rolling; each call in turn, five times over: the least processor time.
+    30 runs of 0.6 s from Table 8, rolling; least processor time of five rounds, with each call in turn.
     """
     robot = paper_robots.nominal()
     values = {p.name: p.value for p in params.walk(robot)}
@@ -132,7 +132,7 @@ def derivatives(size: int = 30) -> dict:
 
 
 def assumptions() -> dict:
-    """Guide share, current, speed and ripple of 6T2A at 33 V over each constant that the paper does not print."""
+    """Guide share, current, speed and ripple of 6T2A at 33 V over each constant that the paper does not state."""
     robot, found = paper_robots.nominal(), {}
     runs = Conditions(voltage=33.0, slope_deg=[0.0, 5.0], payload=jnp.asarray([0.0, 8.0]))
 

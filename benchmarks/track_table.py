@@ -1,21 +1,21 @@
-"""Measured rows held out by slope and by voltage through the track model with its running gear free.
+"""Measured rows held out by slope and by voltage, for the track model with a free running gear.
 
     python benchmarks/track_table.py slip --seconds 480      # slip of the tracked rows, nine constants
     python benchmarks/track_table.py table --seconds 480     # all readings of all twenty rows
-    python benchmarks/track_table.py slip --simulated        # with the paper's simulated slip as a prior of what is
-                                                             # held out, and searches for that slip alone; table too
+    python benchmarks/track_table.py slip --simulated        # with the paper's simulated slip as a prior of the
+                                                             # held-out rows, and searches for that slip only
     python benchmarks/track_table.py lumped                  # slip of the tracked rows by `steady`, for comparison
     python benchmarks/track_table.py time --population 4096  # gears x 20 rows x 1.5 s by the track model
 
-All searches (of all rows, and without each block of rows) go on side by side: one batch runs a generation of each. A
-search judges and uses only members that it drew itself, so that none knows the rows it leaves out. Rows that wander
+All searches (of all rows, and without each block of rows) run together: one batch runs a generation of each. A
+search judges and uses only members that it drew itself, so that none knows its held-out rows. Rows that change
 between regimes run three times, at voltages 0.1 % apart, and count by their mean square. The best members of each
-search run again at half and a quarter of the step, and the one with the lowest mean cost of the three steps, on the
-rows that its search saw, is its answer.
+search run again at half and a quarter of the step. Its answer is the member with the lowest mean cost of the three
+steps, on the rows that its search saw.
 
-With `--simulated` the paper's simulated slip of all ten tracked rows counts too, also where the measured one is
+With `--simulated` the paper's simulated slip of all ten tracked rows counts too, also for rows whose measured slip is
 left out; its sd is the rms of simulated less measured slip over the tracked rows that the search sees. With
-`--state FILE` the searches are kept, and the same command goes on from there. Prints lines of JSON.
+`--state FILE` the searches are stored, and the same command continues them. Prints lines of JSON.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ GEAR = tuple(
         "payload_height",
     )
 )
-#: What makes currents and motor speeds, and the friction of the wheeled rows.
+#: Constants that determine currents and motor speeds, and the friction of the wheeled rows.
 DRIVE = (
     "motor.torque_constant",
     "motor.friction_coulomb",
@@ -93,30 +93,30 @@ DRIVE = (
     "4W2T.ground.friction.static",
     "4W2T.ground.friction.speed_static",
 )
-#: What the lumped model has in place of the running gear.
+#: Constants of the lumped model in place of the running gear.
 LUMPED = (
     "6T2A.ground.friction.static",
     "6T2A.ground.friction.speed_static",
     "effects.vibration_slip.amplitude",
     "effects.vibration_slip.exponent",
 )
-#: Sets of docs/vibration.md: S found on the simulated slip, which no measured row made; N on the measured slip.
+#: Sets of docs/explanation/vibration.md: S was fitted to the simulated slip, N to the measured slip.
 SET_S = (0.6093, 0.5331, 0.00961, 3.648e-4, 0.01066, 3.816e7, 649.2, 0.00011, 0.0595)
 SET_N = (0.5353, 0.4847, 0.00766, 3.841e-4, 0.01465, 1.969e7, 347.5, 0.00536, 0.0912)
 NEAR = 0.25  # spread of the first generation about a set [prior sd]
 SD_SLIP = {"slip": 0.4, "table": 0.8}  # [percentage points]
 SD_CURRENT, SD_MOTOR, SD_SPEED = 2.0, 0.5, 1.0  # [%]
-REPEATS = (1.0, 1.001, 0.999)  # of the voltage of rows that wander
-WANDERS = (20.0, 9.0)  # above this voltage [V] and slope [deg]
+REPEATS = (1.0, 1.001, 0.999)  # of the voltage of rows that change between regimes
+WANDERS = (20.0, 9.0)  # rows above this voltage [V] and slope [deg]
 FINALISTS = 40
-APART = 0.1  # least distance of half of them from one another [prior sd]
+APART = 0.1  # least distance between members of one half [prior sd]
 LOST = 1e3  # cost of a row that slides away, tips or leaves the ground
 
 
 class Resolved(SettledRuns):
-    """Tracked rows by the track model, those that wander repeatedly, and wheeled rows by `steady`.
+    """Tracked rows by the track model, with repeats for changing ones, and wheeled rows by `steady`.
 
-    Wheels have no grousers: the track model puts out the same numbers for them (docs/track-model.md).
+    Wheels have no grousers: the track model returns the same numbers for them (docs/explanation/track-model.md).
     """
 
     wheeled: Conditions = eqx.field(kw_only=True)
@@ -140,11 +140,11 @@ class Resolved(SettledRuns):
 
 @dataclasses.dataclass
 class Search:
-    """One search: which rows it sees, and what it drew and found.
+    """One search: the rows that it sees, and the members that it drew and found.
 
     Attributes:
-        name; seen: rows that count; together: whether speeds share an error, so that slip has one of its own.
-        prior: sd of the paper's simulated slip [points], inf where that counts nothing.
+        name; seen: rows that count; together: True if speeds share an error, so that slip has a separate one.
+        prior: sd of the paper's simulated slip [points], inf if it does not count.
         cma: draws; z: members drawn; cost: of each.
     """
 
@@ -157,7 +157,7 @@ class Search:
     cost: list[np.ndarray] = dataclasses.field(default_factory=list)
 
     def best(self, count: int) -> np.ndarray:
-        """Members drawn: half of them those of lowest cost, half of low cost and apart from one another."""
+        """Members drawn: half of them the best ones, half good ones at a distance from one another."""
         z, cost = np.concatenate(self.z), np.concatenate(self.cost)
         order = np.argsort(cost, kind="stable")
         chosen = [*order[: count // 2]]
@@ -169,7 +169,7 @@ class Search:
         return z[[*chosen, *order[count // 2 :]][:count]]
 
     def begin_again(self) -> None:
-        """Where the search has come to rest, a new one near its best."""
+        """Replaces a converged search by a new one near its best member."""
         if self.cma.should_stop():
             z, cost = np.concatenate(self.z), np.concatenate(self.cost)
             size, seed = self.cma.population_size, 1000 + len(self.z)
@@ -184,7 +184,7 @@ class Posed:
     Attributes:
         problem: of runs (rows with their repeats); row: of each run; measured: of each row, (rows, channels).
         slope, voltage, tracked: of each row; what: `slip` or `table`.
-        simulated: slip of the paper's simulation [%], NaN of wheeled rows.
+        simulated: slip of the paper's simulation [%], NaN for wheeled rows.
     """
 
     problem: Problem
@@ -212,7 +212,7 @@ class Posed:
             return 100 * (1 - speed * ratio / (motor * radius))
 
     def cost(self, z: np.ndarray, found: Rows, search: Search) -> np.ndarray:
-        """Half the sum of squares of members, by the rows that a search sees."""
+        """Half the sum of squares of members, over the rows that a search sees."""
         current, motor, speed = (channels.USUAL.index(n) for n in ("total_current", "motor_speed", "speed"))
         error = self.percent(found.reading)
         weight = (search.seen / np.bincount(self.row))[self.row]
@@ -281,7 +281,7 @@ def pose(what: str) -> tuple[Posed, Robot, Runs]:
 
 
 def lumped(posed: Posed, robot: Robot, table: Runs, seen: list[np.ndarray]) -> tuple[Problem, np.ndarray, np.ndarray]:
-    """`steady` with vibration_slip fitted to what each search sees: the problem, z and the covariance of each."""
+    """`steady` with vibration_slip fitted to the rows of each search: the problem, z and the covariance of each."""
     names = DRIVE + LUMPED
     zero = VibrationSlip(amplitude=jnp.asarray(0.0))
     robot = dataclasses.replace(robot, effects=(*robot.effects, zero))
@@ -358,7 +358,7 @@ def begun(posed: Posed, arguments: argparse.Namespace, robot: Robot, table: Runs
 
 
 def generations(posed: Posed, searches: list[Search], members: Members, arguments: argparse.Namespace) -> int:
-    """Generations of all searches side by side; how many there were."""
+    """Runs generations of all searches together; returns their number."""
     start = time.perf_counter()
     for number in range(arguments.generations):
         if time.perf_counter() - start > arguments.seconds:
@@ -385,14 +385,14 @@ def _again(problem: Problem, points: Array) -> Observation:
 
 
 def finer(posed: Posed, points: np.ndarray, parts: int) -> Rows:
-    """What members say at a part of the step."""
+    """Readings of members at a fraction of the step."""
     observe = dataclasses.replace(posed.problem.observe, parts=parts)
     seen = jax.device_get(_again(dataclasses.replace(posed.problem, observe=observe), jnp.asarray(points)))
     return Rows(*(np.asarray(getattr(seen, name)) for name in Rows._fields))
 
 
 def lumped_slip(arguments: argparse.Namespace) -> None:
-    """Slip of the tracked rows by `steady`, Fig. 7 alone and with vibration_slip, fitted to what each search sees."""
+    """Slip of the tracked rows by `steady`, with Fig. 7 alone and with vibration_slip, fitted to the rows seen."""
     posed, robot, table = pose("slip")
     rows = np.arange(len(table)) > 0
     seen = {"all rows": rows} | {f"without {s:g} deg": rows & (posed.slope != s) for s in np.unique(posed.slope)}
@@ -432,7 +432,7 @@ def lumped_slip(arguments: argparse.Namespace) -> None:
 
 
 def timed(arguments: argparse.Namespace) -> dict[str, Any]:
-    """How long one generation of gears over all twenty rows takes, wheeled ones by the track model too."""
+    """Time of one generation of gears over all twenty rows, with wheeled ones also by the track model."""
     table = read("measured")
     robot = own_mass.with_table_mass(
         params.replace(paper_robots.nominal(), {"6T2A.track.guide_friction": 0.06}), table
@@ -459,7 +459,7 @@ def timed(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def rms(error: np.ndarray) -> list[float]:
-    """Of each column."""
+    """Root mean square of each column."""
     return np.sqrt(np.mean(error**2, 0)).round(3).tolist()
 
 
@@ -477,15 +477,15 @@ def main() -> None:
     options.add_argument("what", choices=("slip", "table", "lumped", "time"))
     options.add_argument("--population", type=int, default=56, help="members of a generation of each search")
     options.add_argument("--generations", type=int, default=60)
-    options.add_argument("--seconds", type=float, default=np.inf, help="after which no generation is begun")
-    options.add_argument("--simulated", action="store_true", help="the paper's simulated slip counts too, as a prior")
+    options.add_argument("--seconds", type=float, default=np.inf, help="time after which no generation is started")
+    options.add_argument("--simulated", action="store_true", help="use the paper's simulated slip too, as a prior")
     options.add_argument("--only", help="regular expression of the names of searches to run")
     options.add_argument(
-        "--parts", type=int, nargs="+", default=[1, 2, 4], help="of the step, at which finalists run"
+        "--parts", type=int, nargs="+", default=[1, 2, 4], help="divisors of the step for the finalists"
     )
     options.add_argument("--seed", type=int, default=1)
-    options.add_argument("--state", type=Path, help="file of the searches, from which they go on; only your own")
-    options.add_argument("--members", type=Path, help="of `time`: file that keeps what was run")
+    options.add_argument("--state", type=Path, help="file to store and continue the searches; use only your own")
+    options.add_argument("--members", type=Path, help="for `time`: file for the members of the run")
     arguments = options.parse_args()
     if arguments.what == "time":
         print(json.dumps({"machine": machine(), **timed(arguments)}), flush=True)

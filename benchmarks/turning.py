@@ -1,9 +1,10 @@
-"""The paper's robot on the spot: on each surface of Table 5, what turning takes, and from which voltage it turns.
+"""The paper's robot turning on the spot: power on each surface of Table 5, and least voltage of a turn.
 
     python benchmarks/turning.py [--speed] [--track]
 
-With --speed: settled turns a second in one batch, and runs of 2 s that turn beside runs that travel straight. With
---track: turns of the track model beside settled ones, and of these on a contact as long as an even load would be.
+With --speed: settled turns per second in one batch, and the time of turning runs of 2 s compared with straight ones.
+With --track: turns of the track model compared with settled ones, and with settled ones on an equivalent even
+contact.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ from mmrjax.undercarriage.belt import Path, tips
 jax.config.update("jax_enable_x64", True)
 
 VOLTAGES = np.concatenate([np.arange(0.5, 8.0, 0.25), [15.0, 24.0, 33.0]])
-#: Yaw rate from which a robot turns [rad/s].
+#: Yaw rate above which a robot turns [rad/s].
 TURNS = 0.05
 
 
 def surfaces() -> None:
-    """Print the table of docs/turning.md."""
+    """Prints the table of docs/explanation/turning.md."""
     robot = mm.nominal()
     names = [(c, s, p) for c in robot.configurations for s in SURFACES for p in (0.0, 8.0)]
     rows = [(c, s, p, float(u)) for c, s, p in names for u in VOLTAGES]
@@ -59,7 +60,7 @@ def surfaces() -> None:
 
 
 def speed(points: int) -> None:
-    """Print settled turns a second, and the time of runs that turn over that of straight ones."""
+    """Prints settled turns per second, and the time of turning runs over that of straight ones."""
     robot = mm.nominal()
     rng = np.random.default_rng(0)
     duties = rng.uniform(-1, 1, (2, points))
@@ -85,7 +86,7 @@ def speed(points: int) -> None:
 
 
 def tracks() -> None:
-    """Print the table of docs/turning.md, Beside the track model."""
+    """Prints the table of docs/explanation/turning.md, "Against the track model"."""
     robot = mm.nominal()
     rows = [(24, 24, 10), (15, 15, -15), (33, 33, 14.85), (15, 10.5, 15), (24, -24, 24), (24, 24, 12)]
     names = ["6T2A"] * 4 + ["4W2T"] * 2
@@ -117,7 +118,7 @@ def tracks() -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--speed", action="store_true", help="turns a second")
-    parser.add_argument("--track", action="store_true", help="beside the track model")
+    parser.add_argument("--track", action="store_true", help="compare with the track model")
     parser.add_argument("--points", type=int, default=16_384, help="turns of --speed")
     chosen = parser.parse_args()
     if chosen.speed:

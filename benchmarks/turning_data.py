@@ -1,13 +1,13 @@
-"""Robots of others that turn: currents of a Husky by side, slips of a tracked robot, against force balances.
+"""Turning robots of other groups: currents of a Husky by side, slips of a tracked robot, against force balances.
 
     python benchmarks/turning_data.py FOLDER           # with husky_turning.csv and tracked_turning.csv
     python benchmarks/turning_data.py FOLDER --brief   # without the variants of the balance
 
-The force balance is that of tests/worlds/turning.py with both sides' speeds imposed: v_x and ω such that forces and
-yaw moments of ground and rolling resistance vanish; centripetal accelerations (below 0.1 m/s²) are left out, so the
-instantaneous centre is amidships. The current of a side is |Q|, Q = k F_x + I_0 σ, times `returned` where the ground
-drives it. Held out by run (Husky) or by sixths of the left side's speeds (tracked). Percents are rms errors over the
-rms of what is predicted. NumPy and SciPy only.
+The force balance is that of tests/worlds/turning.py with both sides' speeds imposed: v_x and ω for which forces and
+yaw moments of ground and rolling resistance vanish. Centripetal accelerations (below 0.1 m/s²) are left out, so the
+instantaneous centre is amidships. The current of a side is |Q|, Q = k F_x + I_0 σ, times `returned` if the ground
+drives it. Held out by run (Husky) or by sixths of the left side's speeds (tracked). Percentages are rms errors over
+the rms of the predicted quantity. NumPy and SciPy only.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from worlds.turning import friction_share, spot_coulomb
 
 Table = dict[str, np.ndarray]
 SURFACES = ("flooring", "asphalt", "ice")
-HUSKY = SimpleNamespace(length=0.512, width=0.555)  # wheelbase and track of its maker [m]
-TRACKED = SimpleNamespace(width=0.606, radius=0.0856, gear=34.45)  # by its repository
+HUSKY = SimpleNamespace(length=0.512, width=0.555)  # wheelbase and track, from its maker [m]
+TRACKED = SimpleNamespace(width=0.606, radius=0.0856, gear=34.45)  # from its repository
 WINDOW, SAMPLE = 2.0, 0.1538  # [s]
-SMALL = 0.02  # speed within which a friction changes its sign [m/s]
-WHEELS = np.array([-0.5, 0.5]), np.array([0.5, 0.5])  # places over the length, shares of the load
+SMALL = 0.02  # speed within which friction changes its sign [m/s]
+WHEELS = np.array([-0.5, 0.5]), np.array([0.5, 0.5])  # positions over the length, shares of the load
 _NODES = np.polynomial.legendre.leggauss(10)
 TRACK = _NODES[0] / 2, _NODES[1] / 2
 
 
 def read(path: Path, words: tuple[str, ...] = ("surface", "run_id")) -> Table:
-    """Columns of a table; text in those that hold words."""
+    """Columns of a table; text in the columns `words`."""
     with path.open() as lines:
         rows = list(csv.DictReader(lines))
     return {c: np.array([r[c] if c in words else float(r[c]) for r in rows]) for c in rows[0]}
 
 
 def percent(error: np.ndarray, size: np.ndarray) -> float:
-    """rms of the error over rms of the size [%]."""
+    """Rms of the error over rms of the size [%]."""
     return round(100 * float(np.sqrt((error**2).mean() / (size**2).mean())), 1)
 
 
@@ -56,11 +56,11 @@ def by_surface(error: np.ndarray, size: np.ndarray, surface: np.ndarray) -> list
 
 
 def balance(v, ratio, V_s, f, length, width, contacts=WHEELS, rule=1.0, fall=1.0, left=0.5):
-    """Traction of both sides over φ_x W, v_x, ω and what is left over, at speeds v (2, n) of the movers.
+    """Traction of both sides over φ_x W, v_x, ω and the residual, at speeds v (2, n) of the movers.
 
     Args:
         v: left and right [m/s]; ratio: φ_y/φ_x; V_s: of Fig. 7 [m/s]; f: rolling resistance over φ_x.
-        contacts: places over the length and shares; rule: a of the direction rule; fall: μ_d/μ_s.
+        contacts: positions over the length and shares; rule: a of the direction rule; fall: μ_d/μ_s.
         left: share of the weight on the left side.
     """
     y = np.array([width / 2, -width / 2])[:, None, None]
@@ -126,7 +126,7 @@ def sides(d: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def features(own, other, yaw, basis: str) -> np.ndarray:
-    """Inputs of a regression of a side's current; yaw is positive where it asks more of this side."""
+    """Inputs of a regression of a side's current; yaw is positive if it loads this side more."""
     one, total, apart = np.ones_like(own), own + other, own - other
     f = [one, abs(own), abs(total)]
     if basis == "linear":
@@ -144,7 +144,7 @@ def features(own, other, yaw, basis: str) -> np.ndarray:
 
 
 def regressed(d: Table, basis: str, ridge: float = 1e-3) -> np.ndarray:
-    """Currents (2, samples) held out by run, each surface and side by itself."""
+    """Currents (2, samples) held out by run, each surface and side separately."""
     v, current, yaw = sides(d)
     out = np.zeros_like(current)
     for s in range(2):
@@ -179,7 +179,7 @@ def kind(fixed: dict[str, float | None] | None = None, **changes) -> SimpleNames
         fixed: parameters with their values, None for free ones.
         changes: `rule`, `fall`, `width` of the balance; `yaw`: weight of yaw rates against currents [A s/rad];
             `tied`: one creep stiffness k φ_x W / V_s [A s/m] and `one_ratio`: one φ_y/φ_x for all surfaces;
-            `by_speed`: V_s grows in proportion to the rolling speed; `every`: see `fit`.
+            `by_speed`: V_s is proportional to the rolling speed; `every`: see `fit`.
     """
     base = {"rule": 1.0, "fall": 1.0, "width": HUSKY.width, "yaw": 30.0}
     base |= {"tied": False, "one_ratio": False, "by_speed": False, "every": 0}
@@ -194,7 +194,7 @@ def predicted(
     if of.one_ratio:
         own[1] = p[NAMES.index("flooring.ratio")]
     V_s = own[0] / np.exp(p[5]) if of.tied else np.exp(own[2])
-    if of.by_speed:  # creep in proportion to rolling, as tyres
+    if of.by_speed:  # creep proportional to rolling, as for tyres
         V_s = V_s * (np.abs(v) + 0.03) / 0.236
     share, _, yaw, _ = balance(
         v, own[1], V_s, own[3] / own[0], HUSKY.length, of.width, WHEELS, of.rule, of.fall, p[6]
@@ -208,11 +208,11 @@ def predicted(
 def fit(d: Table, m: Table, use: np.ndarray, of: SimpleNamespace, start: np.ndarray = START):
     """All parameters by least squares on the means of currents [A] and, times `of.yaw`, of yaw rates.
 
-    What is compared with a window's mean is the balance at its mean speeds or, with `of.every`, the mean of the
-    balances at every so many of its samples: magnitudes and saturation make that another number.
+    A window's mean is compared with the balance at its mean speeds or, with `of.every`, with the mean of the
+    balances at every n-th of its samples; magnitudes and saturation make the two different.
 
     Returns:
-        Parameters, what `least_squares` found, which of them are free.
+        Parameters, result of `least_squares`, mask of the free parameters.
     """
     v, current, yaw = (c[..., use] for c in sides(m))
     surface, count = m["surface"][use], np.ones(use.sum(), int)
@@ -314,7 +314,7 @@ def husky(path: Path, brief: bool) -> None:
 
 
 def trades(found, free: np.ndarray) -> None:
-    """Standard deviations if the windows were independent, and pairs of parameters that trade."""
+    """Prints standard deviations for independent windows, and strongly correlated pairs of parameters."""
     J = found.jac
     inner = np.array(found.active_mask) == 0
     names = np.array(NAMES)[free][inner]
@@ -340,8 +340,8 @@ TRACKED_START = {
 def slips(p: np.ndarray, v: np.ndarray, ratio: float, rule: float) -> np.ndarray:
     """Slip of left and right and lateral speed (3, n) [m/s] at nominal track speeds v (2, n).
 
-    `left`, `right`: true over nominal speed; `ahead`: of the instantaneous centre before the point that was measured;
-    `askew`: angle of what measured it [rad]; `by_speed`: growth of V_s with the rolling speed [per 0.2 m/s].
+    `left`, `right`: true over nominal speed; `ahead`: distance of the instantaneous centre before the measured point;
+    `askew`: angle of the instrument [rad]; `by_speed`: growth of V_s with the rolling speed [per 0.2 m/s].
     """
     true = v * p[3:5, None]
     V_s = np.exp(p[1]) * (1 + p[7] * np.abs(true).mean(0) / 0.2)
@@ -362,7 +362,7 @@ def tracked(path: Path) -> None:
         print(json.dumps({"tracked": unit, "effective_width_m": np.percentile(width, [5, 50, 95]).round(3).tolist()}))
     v_x = body.mean(0)
     seen = np.stack([*(v - body), v_x * np.tan(d["side_slip_rad"])])
-    steep = np.abs(np.cos(d["side_slip_rad"])) > 0.3  # elsewhere the lateral speed is not to be had from the angle
+    steep = np.abs(np.cos(d["side_slip_rad"])) > 0.3  # otherwise the angle does not give the lateral speed
     level = d["wheel_left"]
     low, high = np.array(list(TRACKED_START.values())).T[1:]
     begin = np.array([s[0] for s in TRACKED_START.values()])

@@ -1,13 +1,14 @@
 # ruff: noqa: E402 (double precision is set before anything is imported)
-"""Slip of contacts that shake: the law of Fig. 7 averaged over their oscillation, against the track model.
+"""Slip of shaking contacts: the law of Fig. 7 averaged over their oscillation, compared with the track model.
 
     python benchmarks/vibration.py            # 24 running gears drawn at random, ten rows each
 
-A track that runs over its grousers shakes: reaction and sliding speed of each contact swing about their means.
-Friction does not average, so a robot may slip far more than Fig. 7 says of its mean demand (Section 3.2.4, ref. [46];
-Blekhman, Vibrational Mechanics, 2000: dry friction turns into an apparent viscous one). docs/vibration.md derives it.
-Of each run the ripple of its contacts is measured and the slip that follows from it compared with the run's own,
-beside that of Fig. 7 without ripple. Prints a line of JSON.
+A track that runs over its grousers shakes: reaction and sliding speed of each contact oscillate about their means.
+Friction is nonlinear, so a robot may slip far more than Fig. 7 gives for its mean demand (Section 3.2.4, ref. [46];
+Blekhman, Vibrational Mechanics, 2000: dry friction becomes an apparent viscous one).
+docs/explanation/vibration.md derives it.
+For each run the slip computed from the measured ripple of its contacts is compared with the run's own slip
+and with that of Fig. 7 without ripple. Prints a line of JSON.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ VOLTAGE, SLOPE, PAYLOAD = (
     np.tile([0.0, 5.0, 10.0, 15.0, 20.0], 2),
     np.repeat([0.0, 8.0], 5),
 )
-#: Least and greatest value of each constant; of those in LOG the logarithm is drawn evenly.
+#: Least and greatest value of each constant; constants in LOG are drawn uniformly in their logarithm.
 DRAWN = {
     "6T2A.ground.friction.static": (0.5, 0.75),
     "6T2A.ground.friction.dynamic": (0.8, 0.98),  # of μ_s
@@ -57,10 +58,10 @@ DRAWN = {
 LOG = ("6T2A.ground.friction.speed_static", "running_gear.contact_stiffness", "running_gear.contact_damping")
 #: Upper ends of the classes of slip [%].
 CLASSES = (3.0, 6.0, 10.0, 100.0)
-#: Second harmonic of the sliding speed over the first: two events a pitch, a grouser landing in front and one lifting
-#: at the rear. Bursts of sliding are short and steep with it, as in the track model (docs/vibration.md).
+#: Second harmonic of the sliding speed over the first: two events per pitch, a grouser landing in front and one
+#: lifting at the rear. With it bursts of sliding are short and steep, as in the track model.
 SECOND = 0.5
-#: Phases over which is averaged.
+#: Number of phases for the average.
 PHASES = 128
 _BISECTIONS = 40
 
@@ -71,20 +72,22 @@ def _wave() -> Float[np.ndarray, " phases"]:
     return np.asarray(wave / np.mean(np.abs(wave)))
 
 
-#: Sliding speed less its mean, over its mean size: mean 0, mean size 1.
+#: Deviation of the sliding speed from its mean, over its mean size: mean 0, mean size 1.
 WAVE = _wave()
 
 
 def coefficient(friction: Friction, speed: Scalar, swing: Scalar) -> Scalar:
-    """Mean friction coefficient [-] of contacts that slide at `speed` on average and swing about it by `swing`, the
-    mean size of the difference [m/s]: (1/2π) ∫ μ(v + s ξ(φ)) dφ. Without swing that of Fig. 7."""
+    """Mean friction coefficient [-] of contacts with sliding speeds that oscillate about `speed`.
+
+    (1/2π) ∫ μ(v + s ξ(φ)) dφ, with s = `swing`, the mean size of the deviation [m/s]. With s = 0 that of Fig. 7.
+    """
     return jnp.mean(friction.coefficient(speed + swing * jnp.asarray(WAVE)))
 
 
 def speed_sliding(friction: Friction, demanded: Scalar, swing: Scalar) -> Scalar:
-    """Mean sliding speed [m/s] at which shaking contacts carry the coefficient `demanded` [-], scalars.
+    """Mean sliding speed [m/s] that shaking contacts need for the coefficient `demanded` [-], scalars.
 
-    The inverse of `coefficient`; without swing `Friction.speed_creep`. NaN where they carry it at no speed.
+    The inverse of `coefficient`; without swing `Friction.speed_creep`. NaN if no speed suffices.
     """
     furthest = friction.speed_static + swing * float(np.abs(WAVE).max())
 
@@ -98,17 +101,18 @@ def speed_sliding(friction: Friction, demanded: Scalar, swing: Scalar) -> Scalar
     root = jax.lax.stop_gradient((low + high) / 2)
     value, slope = jax.jvp(lambda v: coefficient(friction, v, swing), (root,), (jnp.ones_like(root),))
     carried = coefficient(friction, furthest, swing) >= demanded
-    # One step of Newton leaves the root where it is and gives it its derivatives.
+    # A Newton step does not change the root and gives it its derivatives.
     return jnp.where(carried, root - (value - demanded) / jnp.where(slope > 0, slope, 1.0), jnp.nan)
 
 
 class Ripple(eqx.Module):
-    """How the contacts of one run shake, over its averaging window. The speed lost that follows is the mean sliding
-    that carries the demand (`speed_sliding`), less the lead.
+    """Oscillation of the contacts of one run, over its averaging window.
+
+    The resulting loss of speed is the mean sliding speed for the demand (`speed_sliding`), less the lead.
 
     Attributes:
         swing: mean size of the sliding speed less its mean [m/s]; lead: mean less plain mean of the sliding speed
-            [m/s], positive where contacts slide faster while they bear more. Means are weighted by load.
+            [m/s], positive if contacts slide faster while their load is larger. Means are weighted by load.
         normal: sd over mean of the ground's reaction [-].
         demanded: mean traction over mean reaction and adhesion [-].
     """
@@ -120,7 +124,7 @@ class Ripple(eqx.Module):
 
 
 def ripple(robot: Robot, conditions: Conditions, run: Trajectory, window: float = 0.8) -> Ripple:
-    """Ripple of one run on tracks (scalar fields) over its last `window` [s]; samples of 0.2 ms or less tell it."""
+    """Ripple of one run on tracks (scalar fields) over its last `window` [s], from samples of at most 0.2 ms."""
     half = system(robot, conditions, STEP)
 
     def contacts(q: Float[Array, " 5"], v: Float[Array, " 5"]) -> tuple[Array, Array]:
@@ -145,7 +149,7 @@ def ripple(robot: Robot, conditions: Conditions, run: Trajectory, window: float 
 
 
 def gear(rng: np.random.Generator) -> Robot:
-    """A robot whose running gear and friction are drawn."""
+    """A robot with random running gear and friction."""
     values = {
         name: float(np.exp(rng.uniform(*np.log(ends))) if name in LOG else rng.uniform(*ends))
         for name, ends in DRAWN.items()

@@ -1,31 +1,36 @@
-"""Pages of the docs that are made and not written: the public names from their docstrings, the glossary, and the loop
-by an example of its run folder.
+"""Writes the pages of `docs/reference` that follow from the code, and the tutorial that follows from a run folder.
 
-    python docs/site.py            # docs/api.md, docs/glossary.md
-    python docs/site.py found      # docs/example.md too, of the run folder of `mmrjax loop measured --out found`
+python docs/site.py            # the pages of PAGES
+python docs/site.py found      # docs/start/table.md too, from the folder of `mmrjax loop measured --out found`
 """
 
 from __future__ import annotations
 
+import ast
 import inspect
 import json
+import re
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 DOCS = Path(__file__).parent
 FIGURES = ("before_after", "laws", "errors")
 PACKAGES = ("mmrjax", "calibration", "sweeps")
+#: Second paragraph of every page that this program writes.
+MADE = "*`python docs/site.py` writes this page from the code.*"
 
 
 def api() -> str:
-    """Every public name with its signature, what it returns and its docstring; then the types that they return."""
+    """Page of the public names: signature, docstring, and the types that they return."""
     import mmrjax as mm
 
     parts = [
         "# The public names",
-        "`import mmrjax as mm` gives every public name; SI units unless a name says otherwise. This page is made from the docstrings.",
+        "`import mmrjax as mm` gives every public name. Units are SI unless a name states another.",
+        MADE,
     ]
     names = sorted((n for n in mm.__all__ if not n.startswith("_")), key=str.lower)
     for name in names:
@@ -36,14 +41,14 @@ def api() -> str:
         signature = "" if inspect.isclass(thing) and issubclass(thing, BaseException) else _signature(thing)
         parts.append(f"## `mm.{name}{signature}`\n\n{_text(thing)}")
         parts += _members(thing, name)
-    parts.append("# What they return")
+    parts.append("# Types that they return")
     for kind in returned_types():
         parts += [f"## `{kind.__name__}`\n\n{_text(kind)}", *_members(kind, kind.__name__)]
     return "\n\n".join(parts) + "\n"
 
 
 def returned_types() -> list[type]:
-    """Types of this project that public functions return and that are no public names themselves."""
+    """Types that public functions return and that are not public names themselves."""
     import mmrjax as mm
 
     public = [getattr(mm, name) for name in mm.__all__ if not name.startswith("_")]
@@ -59,7 +64,7 @@ def _returned(function: Any) -> tuple[str, Any]:
 
 
 def _text(thing: Any) -> str:
-    """A docstring; of a function with what it returns, where the docstring has no section on that."""
+    """Docstring of a public name; for a function it ends with a section `Returns`."""
     doc = inspect.getdoc(thing) or ""
     if inspect.isroutine(thing) and "Returns:" not in doc:
         stated, kind = _returned(thing)
@@ -75,7 +80,7 @@ def _signature(thing: Any) -> str:
 
 
 def _members(thing: Any, name: str) -> list[str]:
-    """Sections of the methods and properties of a class, with what they return."""
+    """Sections of the methods and properties of a class."""
     if not inspect.isclass(thing) or issubclass(thing, BaseException):
         return []
     parts = []
@@ -90,97 +95,300 @@ def _members(thing: Any, name: str) -> list[str]:
 
 
 def glossary() -> str:
-    """The words of pages and terminal."""
+    """Page of the words that reports and the terminal use."""
     from sweeps.pages.words import GLOSSARY
 
     lines = [f"**{word}**\n: {meaning}\n" for word, meaning in GLOSSARY.items()]
-    return "# Words\n\nWhat pages and terminal say; `mmrjax explain NAME` explains every other name.\n\n" + "\n".join(
-        lines
+    opening = "Words of the reports and the terminal. `mmrjax explain NAME` explains every other name."
+    return "\n\n".join(["# Glossary", opening, MADE, "\n".join(lines)])
+
+
+def statuses() -> str:
+    """Page of the statuses of a run, its flags and the verdicts of `loop` and `climb`."""
+    from sweeps.pages import words
+    from sweeps.results.climb_results import VERDICTS
+
+    parts = {
+        "Statuses": {name: _sentence(status.meaning) for name, status in words.STATUSES.items()},
+        "Flags": {name: _sentence(meaning) for name, meaning in words.FLAGS.items()},
+        "Verdicts of the loop": {name: _sentence(meaning) for name, meaning in words.LOOP_VERDICTS.items()},
+        "Verdicts of a climb": {name: _sentence(verdict[1]) for name, verdict in VERDICTS.items()},
+        "Files of a run folder": {name: _sentence(meaning) for name, meaning in words.FILES.items()},
+    }
+    opening = (
+        "Every run has one status and any number of flags; `runs.csv` has a column for each. A run that stalls or "
+        "slides is an answer, with [exit code](exit-codes.md) 0."
+    )
+    tables = [f"## {heading}\n\n" + _table(("name", "meaning"), _named(rows)) for heading, rows in parts.items()]
+    return "\n\n".join(["# Statuses, flags, verdicts and files", opening, MADE, *tables]) + "\n"
+
+
+def exit_codes() -> str:
+    """Page of the exit codes, with the meaning of 3 for each command."""
+    groups: dict[str, list[str]] = {}
+    for name, command in _commands():
+        if meaning := (command.epilog or "").partition("Exit code 3: ")[2].removesuffix("."):
+            groups.setdefault(meaning, []).append(name)
+    rows = [(", ".join(f"`{name}`" for name in names), meaning) for meaning, names in groups.items()]
+    codes = (
+        ("0", "done, whatever the answer: runs that stall or slide, requirements that are missed, every verdict"),
+        ("1", "internal error; `doctor`: a part of the installation does not work"),
+        ("2", "usage or configuration, a folder that cannot be written or is in use, or not enough memory"),
+        ("3", "done, but a solver failed or the time ran out; the results state where"),
+        ("4", "bad data, or a finished sweep with damaged files"),
+        ("130", "interrupted; the same command with the same `--out` continues"),
+    )
+    tables = [_table(("code", "meaning"), codes), "## Exit code 3", _table(("command", "exit code 3"), rows)]
+    return "\n\n".join(["# Exit codes", MADE, *tables]) + "\n"
+
+
+def commands() -> str:
+    """Page of the commands: help, example, arguments and options."""
+    parts = [
+        "# Commands",
+        "Each command writes a run folder and prints its path on the last line. `mmrjax COMMAND --help` prints the "
+        "common options, `--help-all` every option. Options marked `*` appear in `--help-all` only.",
+        MADE,
+    ]
+    for name, command in _commands():
+        example = (command.epilog or "").partition("Exit code 3")[0].strip().removeprefix("Example: ")
+        parts += [f"## `mmrjax {name}`", _plain(command.help or "")]
+        parts += [f"Example: {' · '.join(f'`{one}`' for one in re.split('; | · ', example.rstrip('.')))}"] * bool(
+            example
+        )
+        rows = [
+            (f"`{_called(option)}`", _plain(option.help or "")) for option in command.params if option.name != "help"
+        ]
+        parts += [_table(("option", "meaning"), rows)] * bool(rows)
+    return "\n\n".join(parts) + "\n"
+
+
+def _commands() -> list[tuple[str, Any]]:
+    """Commands of the command line by name, those of a group with the group's name in front."""
+    from typer.main import get_command
+
+    from sweeps import cli
+
+    def flat(name: str, command: Any) -> Iterator[tuple[str, Any]]:
+        if not hasattr(command, "commands"):
+            yield name, command
+        for word, one in getattr(command, "commands", {}).items():
+            yield from flat(f"{name} {word}".strip(), one)
+
+    return list(flat("", get_command(cli.app)))
+
+
+def _called(option: Any) -> str:
+    """Name of an option as people type it, an argument in capitals."""
+    names = [name for name in (*option.opts, *option.secondary_opts) if name.startswith("-")]
+    return (" / ".join(names) or option.metavar or option.name.upper()) + " *" * bool(
+        getattr(option, "hidden", False)
+    )
+
+
+def _plain(text: str) -> str:
+    """Help without the marks of the terminal, as one cell of a table or some paragraphs."""
+    text = re.sub(r"\[/?bold\]", "", text).replace("\\[", "[")
+    return "\n\n".join(" ".join(part.split()) for part in text.split("\n\n")).replace("[[", "\\[[")
+
+
+def schemas() -> str:
+    """Page of the JSON Schemas, one for each command that has one."""
+    rows = [
+        (f"`{path.name.split('.')[0]}`", f"[{path.name}](../schemas/{path.name})")
+        for path in sorted((DOCS / "schemas").glob("*.json"))
+    ]
+    opening = "Every `result.json` names its schema in `schema`, and is valid by the JSON Schema of that command."
+    return "\n\n".join(["# Schemas", opening, MADE, _table(("command", "schema"), rows)]) + "\n"
+
+
+def quantities() -> str:
+    """Page of the conditions, channels and outputs: column, unit, range."""
+    from mmrjax import derived
+    from mmrjax.fidelities import outputs
+    from mmrjax.model import channels, quantities
+
+    conditions = [
+        (f"`{c.column}`", c.label, c.unit_shown or "-", _range(c), ", ".join(u for u, _ in c.other_units) or "-")
+        for c in quantities.SET
+    ]
+    shown = [
+        (
+            f"`{c.column}`", c.label, c.unit_shown or "-", _range(c), f"{100 * c.sd_share:g} %",
+            " and ".join(["settled runs"] * c.settled + ["histories"] * c.over_time),
+        )
+        for c in channels.EVERY
+    ]  # fmt: skip
+    further = [(f"`{o.column}`", o.label, o.unit) for o in (*outputs.FURTHER, *derived.TABLE)]
+    parts = [
+        "# Conditions, channels and outputs",
+        "A condition is set before a run, a channel is read from an instrument, an output is computed. The column "
+        "of a standard deviation has `_sd` before its unit: `speed_sd_mm_s`.",
+        MADE,
+        "## Conditions",
+        _table(("column", "meaning", "unit", "range", "other units"), conditions),
+        "## Channels",
+        _table(("column", "meaning", "unit", "range", "assumed noise", "in"), shown),
+        "## Outputs",
+        _table(("column", "meaning", "unit"), further),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _range(quantity: Any) -> str:
+    return " to ".join(f"{x:g}" for x in quantity.range)
+
+
+def parameters() -> str:
+    """Page of the parameters of the paper's robot: value, prior, bounds, source."""
+    from mmrjax.model import paper_robots, params
+
+    entries = []
+    for p in params.walk(paper_robots.nominal()):
+        spec, (low, high) = p.spec, p.spec.bounds
+        value = f"{float(p.value):.4g} ± {spec.prior_sd(float(p.value)):.2g} {spec.unit}"
+        entries.append(
+            f"**`{p.name}`** {value}\n: {spec.meaning}. Bounds: {low:g} to {high:g}. Source: {spec.source}\n"
+        )
+    opening = (
+        "Parameters of the packaged robot: nominal value ± standard deviation of the prior, SI unit, meaning, bounds "
+        "of a fit, source. `mmrjax explain NAME` prints the equation too. `--set NAME=VALUE` changes one."
+    )
+    return "\n\n".join(["# Parameters", opening, MADE, "\n".join(entries)])
+
+
+def modules() -> str:
+    """Page of the modules, each with the first sentence of its docstring."""
+    parts = [
+        "# Modules",
+        "[The structure of the code](../explanation/code.md) explains the order of the packages.",
+        MADE,
+    ]
+    for package in PACKAGES:
+        folders: dict[str, list[tuple[str, str]]] = {}
+        for path in sorted((DOCS.parent / package).rglob("*.py")):
+            doc = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
+            first = re.split(r"(?<=[.:;])\s", " ".join(doc.partition("\n\n")[0].split()), maxsplit=1)[0]
+            if first:
+                folder = str(path.parent.relative_to(DOCS.parent))
+                folders.setdefault(folder, []).append((f"`{path.name}`", first))
+        parts += [f"## `{folder}`\n\n" + _table(("module", "contents"), rows) for folder, rows in folders.items()]
+    return "\n\n".join(parts) + "\n"
+
+
+def _sentence(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}."
+
+
+def _named(rows: dict[str, str]) -> list[tuple[str, str]]:
+    return [(f"`{name}`", meaning) for name, meaning in rows.items()]
+
+
+def _table(heads: tuple[str, ...], rows: Any) -> str:
+    """Table in Markdown."""
+    lines = [heads, ("---",) * len(heads), *rows]
+    return "\n".join(
+        "| " + " | ".join(str(cell).replace("|", "∣").replace("\n", " ") for cell in line) + " |" for line in lines
     )
 
 
 def example(folder: Path) -> str:
-    """The loop on the packaged runs, told from its `result.json`."""
+    """Tutorial about the loop on the packaged runs, from the `result.json` of a run folder."""
     d = json.loads((folder / "result.json").read_text("utf-8"))
     labels = {"total_current": "current", "motor_speed": "motor speed", "speed": "speed"}
     cells = lambda errors: " | ".join(f"{errors[c]['rms_percent']:.1f}" for c in labels)  # noqa: E731
     reached = lambda errors: f"{max(e['rows'] for e in errors.values())}/{d['rows']}"  # noqa: E731
     lines = [("as stated", d["errors"]["as_stated"]["fitted"])]
     lines += [
-        (what, d["errors"][when]["fitted"])
-        for what, when in (("refitted", "before"), ("with what was found", "after"))
+        (what, d["errors"][when]["fitted"]) for what, when in (("refitted", "before"), ("with the effects", "after"))
     ]
     table = "\n".join(f"| {what} | {cells(errors)} | {reached(errors)} |" for what, errors in lines)
     unseen = "\n".join(
-        f"| another {kind.replace('_', ' and ')} | {cells(by['before'])} | {reached(by['before'])} | {cells(by['after'])} | {reached(by['after'])} |"
+        f"| another {kind.replace('_', ' and ')} | {when} | {cells(by[key])} | {reached(by[key])} |"
         for kind, by in d["held_out_by"].items()
+        for when, key in (("refitted", "before"), ("with the effects", "after"))
     )
-    found = "\n".join(
-        f"* **{', or '.join(e['families'])}** (`{e['name']}`, {e['standing']}): {e['parameters']['amplitude']['value']:.3g} ± "
-        f"{e['parameters']['amplitude']['sd']:.2g} {e['parameters']['amplitude']['unit']}; {e['equation'].rstrip('.')}."
+    effects = "\n".join(
+        f"* **{', or '.join(e['families'])}** (`{e['name']}`, {e['standing']}).\n  Equation: {e['equation'].rstrip('.')}.\n"
+        f"  Size: {e['parameters']['amplitude']['value']:.3g} ± {e['parameters']['amplitude']['sd']:.2g} "
+        f"{e['parameters']['amplitude']['unit']}."
         for e in d["effects"]
     )
     after = d["next_experiment"]
-    return f"""# The loop by an example
+    return f"""# A table of runs
 
-Twenty settled runs of the robot were measured: two configurations, 15 and 33 V, slopes of 0 to 20°. Is the paper's model
-of it complete? One command asks, in a minute on two cores:
+Twenty settled runs of the robot were measured: two configurations, 15 and 33 V, slopes from 0 to 20°. Does the paper's
+model describe them? One command answers, in a minute on two cores:
 
 ```sh
 mmrjax loop measured --out found
 ```
 
-All figures below come from `found/result.json`; `found/report.html` shows them with everything behind them.
+All figures below are from `found/result.json`; `found/report.html` shows them with more detail. For your own runs, write a
+[table](../reference/tables.md) and replace `measured` by its path.
 
 ## Is it complete?
+
 {d["statement"]}
 
-{found}
+{effects}
 
 | rms error [%] | {" | ".join(labels.values())} | runs reached |
 |---|---|---|---|---|
 {table}
 
-![Residuals of every reading, before and after](example/before_after.svg)
+A run is *reached* if the robot has a steady state there; otherwise it slides or stands.
 
-Each dot is one reading: simulated less measured, in standard deviations of the instrument. Orange: the model with its
-parameters fitted again; blue: with what was found. Noise stays in the grey band.
+![Residuals of every reading, before and after](figures/before_after.svg)
 
-![What each effect explains, on its readings](example/laws.svg)
+Each dot is one reading: simulated minus measured, in standard deviations of the instrument. Orange is the model with its
+parameters fitted again, blue the model with the effects. The grey band is noise.
 
-For each effect, the reading that it changes most, less that of the same robot without it: dots measured, dashes simulated.
-If an effect is real, its dashes follow the dots along the whole axis.
+![Influence of each effect on its readings](figures/laws.svg)
 
-## May I use the robot it wrote?
-| rms error [%] of runs that the fit has not seen | refitted: {" | ".join(labels.values())} | reached | with what was found: {" | ".join(labels.values())} | reached |
-|---|---|---|---|---|---|---|---|---|
+For each effect, the figure shows the reading that it changes most, minus the same reading of the robot without it. Dots
+are measured, dashes simulated. If an effect is real, its dashes follow the dots along the whole axis.
+
+## May I use the robot?
+
+Each kind of block is left out in turn and predicted by a fit that has not seen it. Use the robot where these errors are
+small:
+
+| rms error of unseen runs [%] | model | {" | ".join(labels.values())} | reached |
+|---|---|---|---|---|---|
 {unseen}
 
-![Errors of runs that the fit has seen and has not](example/errors.svg)
-
-Each kind of block is left out in turn, and predicted by a fit that has not seen it. Use the robot for the kinds of
-step that have small errors here, and not for those that have large ones.
+![Errors of runs that the fit has seen and has not seen](figures/errors.svg)
 
 ## What next?
+
 **{after["name"].capitalize()}.** {after["description"]}.
 
 ```sh
-mmrjax sweep --robot found/robot.toml      # what it does over voltages, payloads and slopes
-mmrjax explain {d["effects"][0]["name"]}            # the effect: equation, size, how to test for it
+mmrjax sweep --robot found/robot.toml
+mmrjax explain {d["effects"][0]["name"]}
 ```
-[How the loop decides](loop.md), [its words](glossary.md).
+
+The first command simulates the new robot over voltages, payloads and slopes. The second prints the equation and the size
+of an effect, and a test for it. [Read a verdict](../howto/read-a-verdict.md) explains the other verdicts.
 """
+
+
+#: Pages of `docs/reference` that follow from the code.
+PAGES = {
+    "api": api, "commands": commands, "exit-codes": exit_codes, "glossary": glossary, "modules": modules,
+    "parameters": parameters, "quantities": quantities, "schemas": schemas, "statuses": statuses,
+}  # fmt: skip
 
 
 def main() -> None:
     """Write the pages."""
-    (DOCS / "api.md").write_text(api(), encoding="utf-8")
-    (DOCS / "glossary.md").write_text(glossary(), encoding="utf-8")
+    for name, page in PAGES.items():
+        (DOCS / "reference" / f"{name}.md").write_text(page(), encoding="utf-8")
     for folder in map(Path, sys.argv[1:]):
-        (DOCS / "example.md").write_text(example(folder), encoding="utf-8")
-        (DOCS / "example").mkdir(exist_ok=True)
+        (DOCS / "start" / "table.md").write_text(example(folder), encoding="utf-8")
         for name in FIGURES:
-            shutil.copy(folder / "figures" / f"{name}.svg", DOCS / "example")
+            shutil.copy(folder / "figures" / f"{name}.svg", DOCS / "start" / "figures")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""A differentiable, batched simulator of a small tracked or wheeled robot's drive and running gear.
+"""A differentiable, batched simulator of the drive and running gear of a small tracked or wheeled robot.
 
     import mmrjax as mm
 
     robot = mm.nominal()
     one = mm.simulate(robot, mm.Conditions(configuration="6T2A", voltage=24.0, slope_deg=10.0, payload=3.0))
 
-Importing it imports no jax, which comes with the first name that is used, and changes no setting of it. The functions
-compute in double precision where they are called outside a trace, and within one in JAX's own precision.
+Importing the package does not import jax; jax is imported when a name is first used. No setting of jax changes.
+Called outside a trace, the functions compute in double precision; within a trace, in JAX's own precision.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from sweeps.compilation_cache import keep_programs as keep_programs
     from sweeps.export.drive_export import export as export
 
-#: Where each public name lives.
+#: Module of each public name.
 _HOME = {
     "Conditions": "model.conditions",
     "Effect": "effects",
@@ -57,7 +57,7 @@ _HOME = {
     "step": "fidelities.stepping",
 }
 
-#: Names of the layers above, which one door gives too; they are imported when they are asked for, and never before.
+#: Names of the layers above `mmrjax`; each is imported when it is first used.
 _ABOVE = {
     "calibrate": "calibration",
     "discover": "calibration",
@@ -93,8 +93,8 @@ __all__ = [
     "sweep",
 ]
 
-#: For XLA_FLAGS, before JAX is imported. Without LLVM's quick selection of instructions, which acts at level 0 of its
-#: optimizations and makes wrong programs of some derivatives there (NaN, or zero; jaxlib 0.10.2).
+#: Value for XLA_FLAGS, to be set before JAX is imported. It turns off LLVM's fast instruction selection, which acts
+#: at optimization level 0 and compiles some derivatives wrongly (NaN or zero; jaxlib 0.10.2).
 SOUND_AT_LEVEL_0 = "--xla_backend_extra_options=-fast-isel=false"
 
 

@@ -157,7 +157,7 @@ def simulate(
     time; with track, reactions.csv holds every load inside the running gear too. With --profile it follows a mission:
     energy (Wh, Wh/m), distance, peaks, temperatures and charge, of the whole and in segments.csv of each segment.
     With --left and --right the sides are driven apart: how the robot circles on level ground, and what each motor
-    takes; with --model drive its path over time, on slopes too (docs/turning.md).
+    takes; with --model drive its path over time, on slopes too (docs/howto/turn.md).
     """
     cells = told.beside.model_dump()
     stated = {column for column, value in cells.items() if value is not None}
@@ -192,7 +192,9 @@ def sweep(
     told: Told,
     plan: Annotated[
         Path | None,
-        typer.Argument(metavar="[CONFIG.toml]", help="TOML file with \\[axes] or \\[samples] (docs/sweeps.md)."),
+        typer.Argument(
+            metavar="[CONFIG.toml]", help="TOML file with \\[axes] or \\[samples] (docs/reference/plans.md)."
+        ),
     ] = None,
     zarr: Annotated[
         bool, typer.Option("--zarr", help="Write a Zarr store, also of a small grid of options.")
@@ -216,8 +218,8 @@ def sweep(
 
     An axis is 0,5,10 or first:last:step as 0:20:0.5. Up to 100 000 runs leave runs.csv; results of more go to a Zarr
     store, and to runs.csv too with --export csv. So do those of a CONFIG.toml, where any parameter or condition
-    varies, as a grid or sampled (docs/sweeps.md). An interrupted sweep goes on with the same command and the same
-    --out.
+    varies, as a grid or sampled (docs/reference/plans.md). An interrupted sweep continues with the same command and
+    the same --out.
     """
     how = config_campaign.how(told.beside.shard, told.beside.scheduler, export, dry_run, zarr, outputs)
     from sweeps.commands import sweep as room
@@ -424,7 +426,7 @@ def climb(told: Told, out: _Out = None, force: _Force = False) -> int:
 
     It begins on level ground before the obstacle. Levers stay at their angles, or follow a --sequence. With --find
     the largest obstacle is searched for by bisection. Writes result.json, report.html and history.csv: posture,
-    currents of all four drives, margin of tipping and energy over time (docs/climb.md).
+    currents of all four drives, margin of tipping and energy over time (docs/howto/climb.md).
     """
     from sweeps.commands import climb as room
 
@@ -465,7 +467,7 @@ def size(told: Told, out: _Out = None, force: _Force = False) -> int:
 
 rig = typer.Typer(
     no_args_is_help=True, rich_markup_mode="rich",
-    help="A rig of your own, bench or robot: a file to fill in, and what the program makes of it (docs/rigs).",
+    help="Describe a bench or robot of your own in a file, and check it (docs/howto/describe-a-rig.md).",
 )  # fmt: skip
 app.add_typer(rig, name="rig")
 
@@ -542,7 +544,7 @@ def _prepared(resolved: Any, no_cache: bool = False) -> Any:
     """A command's configuration, once the environment is ready for the jax that the command will import.
 
     Runs of the track model have hung for good, one sweep in seven on two cores, with every thread asleep in
-    XLA's CPU executor (jax 0.10.2); with one thread none of twelve did (docs/benchmarks.md). Whoever sets
+    XLA's CPU executor (jax 0.10.2); with one thread none of twelve did (docs/lab/figures.md). Whoever sets
     XLA_FLAGS, be it to nothing, is heeded.
     """
     model = getattr(resolved, "model", None)  # None: of a calibration, whose data decide

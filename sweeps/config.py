@@ -376,7 +376,7 @@ class ProfilePart(FidelityPart):
         "supply_voltage_V, slope_deg, payload_kg, load_torque_Nm, surface, current_other_A; with sides duty_left and "
         "duty_right, "
         "voltage_left_V and voltage_right_V, or yaw_rate_rad_s beside speed; or stair, stop_and_go, shuttle, patrol "
-        "(docs/missions.md)",
+        "(docs/reference/profiles.md)",
     )
 
     @model_validator(mode="before")
@@ -637,7 +637,7 @@ class RequirementsPart(Part):
 
     requirements: str = about(
         "paper",
-        "TOML file (docs/requirements.md)",
+        "TOML file (docs/reference/requirements.md)",
         usual="the paper's aims",
         metavar="[REQUIREMENTS.toml]",
         format="path",

@@ -52,8 +52,11 @@ SMALL = {
     "draw_mutants.py": "--number 1",
     "drive.py": "--batches 2 --repeats 1",
     "effects.py": "--check",
+    "fastsim_comparison.py": None,  # tests/test_fastsim_comparison.py
+    "free_chain.py": None,  # a chain of 168 masses takes half a minute
     "head_to_head.py": "--quick --out lines.jsonl",
     "loop.py": _ONE,
+    "loop_baselines.py": None,  # PySINDy, of the extra bench
     "loop_series.py": "--clean-wide 1 --replicates 20 --jobs 1 --out cases.jsonl",
     "missions.py": "--robots 10 --rounds 1",
     "mutants.py": "--only electrical_adds_back_emf",
@@ -69,8 +72,10 @@ SMALL = {
     "steady_yardstick.py": "--platform cpu --batches 64 --rounds 1",
     "sweep_options.py": "--slopes 0:1:1 --payloads 0,1 --repeats 1",
     "sweep_scale.py": "--points 1000",
+    "track.py": None,  # minutes of compiling
     "track_table.py": "--population 4 --generations 1 --parts 1",
     "turning.py": "--points 64",
+    "turning_data.py": None,  # records of others, and an hour
     "vibration.py": "--gears 2",
 }
 #: Words that stand for a value in a cited command.
@@ -79,7 +84,7 @@ VALUES = {"N": "2", "FILE": "members.npz", "NAME": "electrical_adds_back_emf"}
 
 def cited():
     """Commands `python benchmarks/...` in the documents, once each."""
-    files = [*sorted((ROOT / "docs").glob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+    files = [*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
     text = "\n".join(f.read_text(encoding="utf-8") for f in files)
     found = re.findall(r"python (benchmarks/\w+\.py[^`\n#|]*)", text)
     return list(dict.fromkeys(" ".join(command.split()).rstrip(".,)") for command in found))

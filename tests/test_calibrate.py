@@ -95,7 +95,7 @@ def test_packaged_data_calibrate_and_the_report_says_what_it_must(found, documen
 
 
 def test_packaged_data_figures_are_what_they_were(found, document):
-    """rms of (35) on the 20 rows, friction only, datasheet electrics, masses as printed: docs/benchmarks.md."""
+    """rms of (35) on the 20 rows, friction only, datasheet electrics, masses as printed: docs/lab/figures.md."""
     for name, rms in {"total_current": 9.1, "motor_speed": 5.6, "speed": 3.7}.items():
         r = found.readings[name]
         assert root_mean_square(relative_error(r.after, r.measured)) == pytest.approx(rms, abs=0.1)
@@ -344,7 +344,7 @@ def test_infeasible_starts_are_refused_with_the_rows(measured):
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_drive_reads_settled_rows_rolling_and_agrees_with_steady(measured):
-    """Among them one on which the calibrated robot could not start: docs/benchmarks.md."""
+    """Among them one on which the calibrated robot could not start: docs/lab/figures.md."""
     rows = measured.where(np.array([1, 3, 4]))
     free = ["6T2A.ground.friction.static", "6T2A.track.guide_share"]
     made = quick(rows, model="drive", free=free, noise="current=10%,motor_speed=6%,speed=4%")
@@ -352,7 +352,7 @@ def test_drive_reads_settled_rows_rolling_and_agrees_with_steady(measured):
     assert made.adhesion_used[2] > 0.9
     assert all(abs(p.with_steady.apart_in_sd) < 0.01 for p in made.parameters.values())
     jsonschema.validate(made.to_json(), SCHEMA)
-    assert any(note.startswith("rows 3: read from a rolling start; from standstill") for note in made.notes)
+    assert any(note.startswith("rows 3: computed from a rolling start; from standstill") for note in made.notes)
 
 
 @pytest.mark.slow

@@ -393,7 +393,7 @@ def test_polyline_of_constant_slope_is_tilted_gravity():
 def test_level_ground_is_travelled_as_settled_balances_have_it():
     """With the share of its load on the guide that its belt has: the same laws, but for the ripple of its grousers.
 
-    `track`, whose belt yields, has another share and another ripple, and so other means (docs/climb.md).
+    `track`, whose belt yields, has another share and another ripple, and so other means (docs/explanation/climbing.md).
     """
     conditions = Conditions(0, voltage=15.0, slope_deg=5.0).resolved(ROBOT)
     run = system(ROBOT, conditions, terrain.flat(), still(np.pi, np.pi))

@@ -1,4 +1,4 @@
-"""The docs: pages that are made are what makes them, every page is in the site, every schema is one."""
+"""The docs: made pages follow from the code, every page is on its shelf and in the site, every schema is valid."""
 
 import importlib.util
 import inspect
@@ -24,10 +24,38 @@ def site():
     return module
 
 
-@pytest.mark.parametrize("name", ["api", "glossary"])
+SITE = site()
+#: Pages that programs write: they count as reference and not as prose.
+MADE = {f"reference/{name}.md" for name in (*SITE.PAGES, "effects")}
+
+
+@pytest.mark.parametrize("name", SITE.PAGES)
 def test_a_page_that_is_made_is_what_makes_it(name):
     """Else: python docs/site.py."""
-    assert (DOCS / f"{name}.md").read_text("utf-8") == getattr(site(), name)()
+    assert (DOCS / "reference" / f"{name}.md").read_text("utf-8") == SITE.PAGES[name]()
+
+
+def test_pages_are_on_four_shelves_and_in_the_lab():
+    pages = {str(p.relative_to(DOCS)) for p in DOCS.rglob("*.md")}
+    shelves = {page.split("/")[0] for page in pages}
+    assert shelves == {"index.md", "start", "howto", "explanation", "reference", "rigs", "lab"}
+    assert pages > MADE
+
+
+def test_the_written_docs_can_be_read():
+    """Words of everything that people wrote, and of a task: a screen."""
+    words = {p: len(re.findall(r"\S*\w\S*", p.read_text("utf-8"))) for p in DOCS.rglob("*.md")}
+    assert sum(n for p, n in words.items() if str(p.relative_to(DOCS)) not in MADE) <= 30_000
+    assert all(n <= 600 for p, n in words.items() if p.parent.name == "howto")
+    assert words[DOCS / "explanation" / "loop.md"] <= 1300
+
+
+def test_every_page_that_code_names_exists():
+    """A path under docs that sources, tests or templates write out."""
+    folders = ("mmrjax", "calibration", "sweeps", "tests", "benchmarks", "notebooks", "docs")
+    files = [f for folder in folders for kind in ("py", "toml", "j2") for f in (ROOT / folder).rglob(f"*.{kind}")]
+    named = {m for f in files for m in re.findall(r"docs/[\w/.-]+\.(?:md|csv|json|toml|py)\b", f.read_text("utf-8"))}
+    assert len(named) > 20 and {path for path in named if not (ROOT / path).exists()} == set()
 
 
 def test_every_public_name_has_a_docstring_with_what_it_takes():
@@ -40,11 +68,11 @@ def test_every_public_name_has_a_docstring_with_what_it_takes():
 
 
 def test_the_page_of_public_names_says_what_every_function_returns():
-    text = (DOCS / "api.md").read_text("utf-8")
+    text = (DOCS / "reference" / "api.md").read_text("utf-8")
     for name in (n for n in mm.__all__ if n.islower() and not n.startswith("_")):
         (section,) = re.findall(rf"^## `mm\.{name}\([^`]* → ([^`]+)`\n\n```text\n(.*?)```", text, re.M | re.S)
         assert section[0] not in ("None", "Any", "<class 'inspect._empty'>") and "Returns" in section[1], name
-    assert [kind.__name__ for kind in site().returned_types()] == [
+    assert [kind.__name__ for kind in SITE.returned_types()] == [
         "CalibrationResult",
         "DiscoveryResult",
         "Export",
@@ -70,17 +98,19 @@ def test_the_site_asks_nothing_of_a_network():
 @pytest.mark.parametrize("path", sorted((DOCS / "schemas").glob("*.json")), ids=lambda path: path.stem)
 def test_every_schema_is_one_and_is_listed(path):
     jsonschema.validators.validator_for(schema := json.loads(path.read_text("utf-8"))).check_schema(schema)
-    assert f"schemas/{path.name}" in (DOCS / "schemas.md").read_text("utf-8")
+    assert f"schemas/{path.name}" in (DOCS / "reference" / "schemas.md").read_text("utf-8")
 
 
-def test_twenty_questions_are_answered_somewhere():
+def test_questions_are_answered_somewhere():
+    """Twenty of a reader, and the one of each page."""
     lines = re.findall(r"^\| (\d+) \| (.*?\?) \| (.+) \|$", (DOCS / "lab" / "questions.md").read_text("utf-8"), re.M)
     assert [int(number) for number, _, _ in lines] == list(range(1, 21))
 
 
 def test_figures_have_claim_machine_command_and_date():
-    claims = (DOCS / "benchmarks.md").read_text("utf-8").partition("\n## ")[0]
-    lines = [line for line in claims.splitlines() if line.startswith("| ")]
+    claims = (DOCS / "reference" / "benchmarks.md").read_text("utf-8").splitlines()
+    lines = [line for line in claims if line.startswith("| ")]
+    assert len(claims) <= 25
     head, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
     assert head == ["claim", "figure", "goal", "machine", "command", "date"] and len(rows) >= 20
     for row in rows:
@@ -100,7 +130,7 @@ def test_the_example_is_what_the_loop_says_today(tmp_path, mmrjax):
     """Else: mmrjax loop measured --out found; python docs/site.py found."""
     assert mmrjax("loop", "measured", "--out", "found", "--no-report")[0] == 0
     numbers = r"[-+−]?\d+(?:\.\d+)?"
-    said, made = (DOCS / "example.md").read_text("utf-8"), site().example(tmp_path / "found")
+    said, made = (DOCS / "start" / "table.md").read_text("utf-8"), SITE.example(tmp_path / "found")
     assert re.sub(numbers, "N", said) == re.sub(numbers, "N", made)
     for a, b in zip(re.findall(numbers, said), re.findall(numbers, made), strict=True):
         assert float(a) == pytest.approx(float(b), rel=0.02, abs=0.11), (a, b)

@@ -1,4 +1,4 @@
-"""docs/effects.md is what the library gives."""
+"""docs/reference/effects.md is what the library gives."""
 
 import importlib.util
 import re
@@ -29,7 +29,7 @@ def same(page, other):
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_effects_page_is_what_the_library_gives(written):
-    same((ROOT / "docs" / "effects.md").read_text(encoding="utf-8"), written)
+    same((ROOT / "docs" / "reference" / "effects.md").read_text(encoding="utf-8"), written)
 
 
 @pytest.mark.slow

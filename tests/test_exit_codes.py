@@ -43,7 +43,7 @@ def test_a_reader_that_has_had_enough_is_no_fault_of_a_file_of_effects(monkeypat
 
 
 def test_every_command_says_what_3_means_and_the_docs_have_its_words():
-    text = (DOCS / "exit-codes.md").read_text(encoding="utf-8")
+    text = (DOCS / "reference" / "exit-codes.md").read_text(encoding="utf-8")
     documented = {}
     for line in text.splitlines():
         if line.startswith("| `"):

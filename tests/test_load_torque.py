@@ -234,8 +234,8 @@ def test_a_table_of_a_vehicle_with_a_brake_is_refused(tmp_path):
     with pytest.raises(BadData) as error:
         records.read(path, robot=mm.nominal())
     assert str(error.value) == (
-        "runs.csv row 2, load_torque_mNm: got 20; the robot is a vehicle, whose load is its ground, and a brake's torque "
-        "acts on a shaft; state slope_deg or payload_kg, or describe the load as a shaft"
+        "runs.csv row 2, load_torque_mNm: got 20; the robot is a vehicle; the torque of a brake acts only "
+        "on a shaft; state slope_deg or payload_kg, or describe the load as a shaft"
     )
 
 

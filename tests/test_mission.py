@@ -467,7 +467,7 @@ WRONG = {
     "duty: got 1.5; expected -1 to 1": dict(time=[0, 1], duty=1.5),
     "mode: got 1 value; expected 2": dict(time=[0, 1], mode=["brake"]),
     "got duty_left without duty_right; expected both": dict(time=[0, 1], duty_left=1.0),
-    "got duty_left beside voltage_left; expected one": dict(
+    "got duty_left together with voltage_left; expected one": dict(
         time=[0, 1], duty_left=1.0, duty_right=1.0, voltage_left=9.0, voltage_right=9.0
     ),
     "duty_right: got 1.5; expected -1 to 1": dict(time=[0, 1], duty_left=1.0, duty_right=1.5),

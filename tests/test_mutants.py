@@ -57,7 +57,7 @@ def test_mutants_apply_once_and_parse(command):
     for mutant in command.mutants():
         source = sources[mutant.file]
         assert ast.dump(ast.parse(mutant.applied(source))) != trees[mutant.file], mutant.name
-    with pytest.raises(ValueError, match=rf"{mutant.name}: its text stands 2 times in .*; expected once"):
+    with pytest.raises(ValueError, match=rf"{mutant.name}: its text occurs 2 times in .*; expected once"):
         mutant.applied(2 * source)
 
 

@@ -2,12 +2,17 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
+import sysconfig
 import tomllib
+import venv
 from pathlib import Path
 
 import pytest
+
+import mmrjax as mm
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
@@ -18,6 +23,16 @@ def test_citation_is_complete_and_of_this_version():
     known = dict(re.findall(r"^([\w-]+): *(.*)$", text, re.M))
     assert {"cff-version", "title", "message", "abstract", "authors", "date-released", "keywords"} <= set(known)
     assert (known["version"], known["license"]) == (PROJECT["version"], PROJECT["license"])
+
+
+def test_the_release_has_one_version_one_date_and_a_tag(mmrjax):
+    """In the package, the citation, the changelog and the command of CONTRIBUTING."""
+    changes = (ROOT / "CHANGELOG.md").read_text("utf-8")
+    (date,) = re.findall(r"^date-released: (.*)$", (ROOT / "CITATION.cff").read_text("utf-8"), re.M)
+    assert mm.__version__ == PROJECT["version"] and mmrjax("--version")[:2] == (0, f"mmrjax {mm.__version__}\n")
+    assert re.findall(r"^## (.*)$", changes, re.M)[0] in (f"{PROJECT['version']} ({date})", "Unreleased")
+    assert f"## {PROJECT['version']} ({date})" in changes
+    assert f"git tag -a v{PROJECT['version']} " in (ROOT / "CONTRIBUTING.md").read_text("utf-8")
 
 
 def test_dockerfile_has_the_program_s_python_and_copies_what_it_needs():
@@ -40,24 +55,45 @@ def test_hosted_checks_run_targets_that_there_are_and_name_no_address():
     assert not any("://" in path.read_text("utf-8") for path in hosted)
 
 
+def copied(target):
+    """Sources of the distributions, without what is kept next to them."""
+    away = shutil.ignore_patterns("__pycache__", "*.egg-info", "build")
+    for name in ("mmrjax", "calibration", "sweeps"):
+        shutil.copytree(ROOT / name, target / name, ignore=away)
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, target)
+    return target
+
+
 @pytest.mark.slow
-def test_a_wheel_works_outside_of_the_repository(tmp_path):
-    """With its templates, tables, rigs, parts and profiles."""
+def test_wheel_and_sdist_install_in_a_clean_environment(tmp_path):
+    """With templates, tables, rigs, parts and profiles; libraries come from this environment, no network is needed."""
 
     def run(*words, **options):
-        done = subprocess.run(
-            [sys.executable, *words], capture_output=True, text=True, timeout=600, check=False, **options
-        )
+        done = subprocess.run(words, capture_output=True, text=True, timeout=600, check=False, **options)
         assert done.returncode == 0, done.stderr[-2000:]
         return done.stdout
 
-    run("-m", "pip", "wheel", ".", "--no-deps", "--no-build-isolation", "--quiet", "-w", tmp_path, cwd=ROOT)
-    (wheel,) = tmp_path.glob("*.whl")
-    run("-m", "pip", "install", "--no-deps", "--no-index", "--quiet", "--target", tmp_path / "there", wheel)
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "there")}
-    main = "import sys; from sweeps.cli import main; sys.argv[0] = 'mmrjax'; sys.exit(main())"
-    where = run("-c", "import sweeps; print(sweeps.__file__)", cwd=tmp_path, env=environment)
-    assert where.startswith(str(tmp_path))
+    source = copied(tmp_path / "source")
+    build = "import setuptools.build_meta as b; b.build_sdist('dist'); b.build_wheel('dist')"
+    run(sys.executable, "-c", build, cwd=source)
+    (wheel,), (sdist,) = (source / "dist").glob("*.whl"), (source / "dist").glob("*.tar.gz")
+    assert (
+        wheel.name.startswith(f"mmrjax-{PROJECT['version']}-") and sdist.name == f"mmrjax-{PROJECT['version']}.tar.gz"
+    )
+    libraries = sysconfig.get_path("purelib")
+    for file in (wheel, sdist):
+        place = tmp_path / file.suffix.strip(".")
+        venv.create(place, symlinks=True)
+        python = place / "bin" / "python"
+        pip = (sys.executable, "-m", "pip", "--python", python, "install", "--no-deps", "--no-index", "--quiet")
+        isolation = () if file is wheel else ("--no-build-isolation",)
+        environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"PYTHONPATH": libraries}
+        run(*pip, *isolation, file, env=environment)
+        where = run(python, "-c", "import mmrjax, sweeps; print(sweeps.__file__)", cwd=tmp_path, env=environment)
+        assert Path(where.strip()).is_relative_to(place)
+        command = place / "bin" / "mmrjax"
+        assert run(command, "--version", cwd=tmp_path, env=environment) == f"mmrjax {PROJECT['version']}\n"
     for words in ("simulate --out a", "compare measured --out b", "rig new r.toml --kind bench", "explain windage"):
-        run("-c", main, *words.split(), cwd=tmp_path, env=environment)
+        run(command, *words.split(), cwd=tmp_path, env=environment)
     assert "<svg" in (tmp_path / "a" / "report.html").read_text("utf-8")

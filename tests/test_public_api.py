@@ -130,7 +130,7 @@ def test_package_states_its_names_version_and_types():
 
 def test_type_checkers_see_every_public_name():
     text = (ROOT / "mmrjax" / "__init__.py").read_text(encoding="utf-8")
-    block = text[text.index("if TYPE_CHECKING:") : text.index("#: Where")]
+    block = text[text.index("if TYPE_CHECKING:") : text.index("#: Module of")]
     assert set(re.findall(r"import (\w+) as \1", block)) == set(mm.__all__) - {"__version__"}
 
 
@@ -422,11 +422,11 @@ WRONG_ROBOT = {
 WRONG_CALL = {
     "model: got fast; allowed: steady, drive, track": dict(model="fast"),
     "model: got stedy; did you mean steady? allowed: steady, drive, track": dict(model="stedy"),
-    "model steady, duration: got 5.0; this fidelity has no such option, its options: none": dict(duration=5.0),
-    "model drive, step: got 0.001; this fidelity has no such option, its options: duration": dict(
+    "model steady, duration: got 5.0; this fidelity has no such option; its options: none": dict(duration=5.0),
+    "model drive, step: got 0.001; this fidelity has no such option; its options: duration": dict(
         model="drive", step=1e-3
     ),
-    "model drive, patience: got 3; this fidelity has no such option, its options: duration": dict(
+    "model drive, patience: got 3; this fidelity has no such option; its options: duration": dict(
         model="drive", patience=3
     ),
     "model drive, duration: got -1; expected more than 0, at most 86400 s": dict(model="drive", duration=-1.0),
@@ -461,7 +461,7 @@ def test_wrong_calls_are_said(message, robot):
 def test_other_wrong_use_is_said(robot):
     assert refused(robot, {"voltage": 3.0}) == "conditions: got dict; expected mmrjax.Conditions(...)"
     said = refused(robot, mm.Conditions(voltage=np.full(1001, 24.0)), model="drive")
-    assert said == "history: got 1001 runs; at most 1000 are kept over time; expected history=False"
+    assert said == "history: got 1001 runs; at most 1000 can be kept over time; state history=False"
     with pytest.raises(ValueError, match="shapes do not broadcast"):
         mm.Conditions(voltage=[1.0, 2.0], payload=[1.0, 2.0, 3.0])
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
+from calibration.data import profiles, requirements_file, robot_file
 from sweeps import cli
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -24,7 +25,7 @@ def commands(text):
 def unknown(words):
     """What of a command line the program does not know."""
     command = get_command(cli.app)
-    while hasattr(command, "commands"):
+    while hasattr(command, "commands") and not words[0].startswith("--"):
         if words[0] not in command.commands:
             return words[0]
         command, words = command.commands[words[0]], words[1:]
@@ -40,7 +41,8 @@ def test_every_command_of_a_page_and_its_options_exist(page):
 
 def test_a_command_that_does_not_exist_is_found():
     assert unknown(["simulat"]) == "simulat" and unknown(["simulate", "--slop", "3"]) == "--slop"
-    assert unknown(["rig", "check", "a.toml"]) is None
+    assert unknown(["rig", "check", "a.toml"]) is None and unknown(["--version"]) is None
+    assert unknown(["--versio"]) == "--versio"
 
 
 def anchor(heading):
@@ -73,3 +75,17 @@ def test_python_of_the_readme_runs():
     names = {}
     exec(code, names)
     assert names["found"].converged
+
+
+def block(page, kind):
+    """The first block of code of a kind in a page of the docs."""
+    return re.search(rf"```{kind}\n(.*?)```", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.S)[1]
+
+
+def test_files_of_the_how_to_pages_are_read(tmp_path):
+    assert requirements_file.read(block("howto/requirements.md", "toml"), "x.toml")
+    for page in ("howto/describe-a-rig.md", "howto/turn.md"):
+        (tmp_path / "robot.toml").write_text(block(page, "toml"), encoding="utf-8")
+        assert robot_file.read(tmp_path / "robot.toml").sides == 2
+    (tmp_path / "mission.csv").write_text(block("howto/mission.md", "csv"), encoding="utf-8")
+    assert profiles.read(tmp_path / "mission.csv").cycles == 40

@@ -592,9 +592,8 @@ def test_surfaces_of_a_calibrated_rig_are_written_and_read(tmp_path):
         read(tmp_path, ROVER + '[grass]\nlike = "rover"\n[surfaces]\ngras = "rover"\n')
 
 
-EXAMPLES = (
-    (Path(__file__).parents[1] / "docs" / "rigs" / "README.md").read_text(encoding="utf-8").split("```toml\n")[1:]
-)
+PAGE = (Path(__file__).parents[1] / "docs" / "reference" / "robot-files.md").read_text(encoding="utf-8")
+EXAMPLES = PAGE.split("```toml\n")[1:]
 
 
 @pytest.mark.parametrize("text", [e.split("```")[0] for e in EXAMPLES], ids=lambda text: text[2:].split(":")[0])

@@ -506,7 +506,7 @@ def test_an_arm_has_no_steady_state(tmp_path):
         tmp_path, "supply_voltage_V,motor_speed_rpm\n" + "".join(f"{v},{v * 100}\n" for v in range(4, 14)), robot
     )
     with pytest.raises(
-        BadConfiguration, match=r"rig is an arm on which gravity acts .*; follow it over time"
+        BadConfiguration, match=r"rig has a torque of gravity that depends on its angle .*; follow it over time"
     ) as refusal:
         calibrate(runs, robot, noise="motor_speed=1%")
     assert "\n" not in str(refusal.value)

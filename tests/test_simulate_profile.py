@@ -323,8 +323,8 @@ def test_energy_has_forward_derivatives_by_the_robot_and_by_the_profile(robot):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"profile": SHORT, "model": "steady"}, r"model: got steady beside a profile; expected drive"),
-        ({"profile": SHORT, "duration": 3.0}, r"duration: got 3.0 beside a profile"),
+        ({"profile": SHORT, "model": "steady"}, r"model: got steady with a profile; expected drive"),
+        ({"profile": SHORT, "duration": 3.0}, r"duration: got 3.0 with a profile"),
         ({"profile": "patrol"}, r"profile: got str; expected mmrjax.profile"),
         ({"start": missions.Start()}, r"start: got one without a profile"),
     ],

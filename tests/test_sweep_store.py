@@ -949,7 +949,7 @@ def test_layout_counts_its_bytes_without_writing(whole):
 
 @pytest.mark.slow
 def test_plan_of_the_page_is_accepted(mmrjax, tmp_path):
-    page = (Path(__file__).resolve().parents[1] / "docs" / "sweeps.md").read_text(encoding="utf-8")
+    page = (Path(__file__).resolve().parents[1] / "docs" / "reference" / "plans.md").read_text(encoding="utf-8")
     (tmp_path / "plan.toml").write_text(page.split("```toml\n")[1].split("```")[0])
     code, out, err = mmrjax("sweep", "plan.toml", "--dry-run", "--chunk", "1000")
     assert code == 0, err

@@ -168,7 +168,7 @@ def test_step_that_a_later_chunk_cannot_bear_is_refused_before_the_first(robot):
     assert told == []
 
 
-#: Set S of docs/vibration.md.
+#: Set S of docs/explanation/vibration.md.
 SHAKING = {
     "6T2A.ground.friction.static": 0.6093, "6T2A.ground.friction.dynamic": 0.5331,
     "6T2A.ground.friction.speed_static": 0.00961, "6T2A.ground.friction.speed_dynamic": 0.0961,

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from mmrjax.fidelities.track import track
-from mmrjax.model import params
+from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.signals import CONVERGED
+from mmrjax.model.signals import CONVERGED, GRAVITY
+from mmrjax.undercarriage import half_robot
 
 PARAMETERS = (
     "track.guide_friction",
@@ -105,3 +106,22 @@ def test_reverse_derivatives_are_forward_ones(averages, commands, at, forward):
     slope = jax.jit(jax.vmap(jax.jacrev(averages, has_aux=True), in_axes=(None, 0)))
     reverse = np.asarray(slope(at, commands)[0])
     np.testing.assert_allclose(reverse, forward, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_robot_at_rest_is_borne_with_exact_derivatives():
+    robot = paper_robots.nominal()
+
+    def borne(payload, slope_deg, configuration):
+        conditions = Conditions(configuration, voltage=24.0, slope_deg=slope_deg, payload=payload)
+        run = half_robot.system(robot, conditions, 1e-4)
+        q = half_robot.stand(run, 0.1).q
+        at = half_robot.undercarriage.touch(run.path, run.chassis, q, jnp.zeros(5))
+        return q[1:3], at.normal / (half_robot.centre(run)[2] * GRAVITY * jnp.cos(run.conditions.slope))
+
+    both = jax.jit(jax.vmap(lambda *given: (*borne(*given), jax.jacrev(borne)(*given)[0])))
+    cases = jnp.asarray([3.0, 6.0]), jnp.asarray([12.0, -5.0]), jnp.asarray([0.0, 1.0])
+    _, share, slope = both(*cases)
+    np.testing.assert_allclose(share, 1.0, rtol=1e-10)
+    higher, lower = (both(cases[0] + step, *cases[1:])[0] for step in (0.01, -0.01))
+    np.testing.assert_allclose(slope, (higher - lower) / 0.02, rtol=1e-4)

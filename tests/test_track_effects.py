@@ -24,6 +24,7 @@ RUNS = Conditions(
     payload=jnp.asarray([3.0, 0.0, 3.0]),
     configuration=jnp.asarray([0.0, 1.0, 1.0]),
     battery=jnp.asarray([0.0, 1.0, 0.0]),  # 4W2T on its battery, whose effects act there alone
+    duty=jnp.asarray([1.0, 1.0, 0.9]),  # effects of the driver act below 1
 )
 
 

@@ -64,7 +64,7 @@ def test_broken_member_withholds_its_numbers_and_harms_no_other(runs):
 
 
 def test_robot_that_slips_on_average_and_goes_on_steadily_has_settled(robot):
-    """Set S of docs/vibration.md, guides recessed by 0.36 mm: the robot shakes and slides beyond V_s on 20°."""
+    """Set S of docs/explanation/vibration.md, guides recessed by 0.36 mm: it shakes and slides beyond V_s on 20°."""
     shaking = params.replace(
         robot,
         {

@@ -277,7 +277,7 @@ def test_a_turn_is_seen_from_above(contacts):
 
 @pytest.mark.slow
 def test_wheels_turn_as_the_steady_fidelity_says_and_tracks_faster(robot):
-    """On the spot; the track does not bear along all of its wheelbase (docs/turning.md)."""
+    """On the spot; the track does not bear along all of its wheelbase (docs/explanation/turning.md)."""
     turns = Conditions(["6T2A", "4W2T"], voltage=[15.0, 24.0], duty_left=-1.0, duty_right=1.0).resolved(robot)
     found = track_batch(robot, turns, duration=0.6, rolling=True)
     settled = steady_batch(robot, turns)

@@ -1,7 +1,7 @@
 """Derivatives of the track model of both sides, forward, against central differences: averages and path of a turn.
 
 Differences by a voltage need a small step: it moves the instants at which grousers begin to bear, and one that does
-so within the step leaves an error in proportion to it (docs/track-model.md).
+so within the step leaves an error in proportion to it (docs/explanation/track-model.md).
 """
 
 import dataclasses

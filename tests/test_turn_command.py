@@ -170,7 +170,7 @@ REFUSED = {
     "track, one side": (("--left", "3", "--model", "track"), "--left acts with --right only"),
     "profile": (("--left", "3", "--right", "1", "--profile", "patrol"), "--left acts without --profile only"),
     "supply too low": (("--left", "33", "--right", "1", "--voltage", "20"), "expected at least 33 V"),
-    "slope": (("--left", "33", "--right", "1", "--slope", "5"), "its heading changes there all the time"),
+    "slope": (("--left", "33", "--right", "1", "--slope", "5"), "its heading changes there continuously"),
     "one motor": (("--left", "3", "--right", "1", "--robot", "ONE"), "expected sides = 2"),
     "shaft": (("--left", "3", "--right", "1", "--robot", "SHAFT"), "the robot's load is a shaft"),
 }
@@ -258,7 +258,7 @@ def test_options_of_one_run_are_refused_beside_a_table(tmp_path, mmrjax):
     ("told", "said"),
     [
         ("motor_speed_left = 800", "motor_speed_left: got it without motor_speed_right; state both"),
-        ("duty = 0.5", "duty: got it beside duty_left and duty_right"),
+        ("duty = 0.5", "duty: got it together with duty_left and duty_right"),
     ],
 )
 def test_a_sweep_refuses_what_leaves_open_what_drives_a_side(tmp_path, mmrjax, told, said):
@@ -273,7 +273,7 @@ def test_a_robot_that_cannot_turn_is_refused_wherever_it_is_asked_to(tmp_path, m
     told = ("sweep", "plan.toml"), ("sensitivity", "--configurations", "6T2A", "--vary", "duty_left=0.5:1")
     for words in told:
         code, _, err = mmrjax(*words, *narrow)
-        assert code == 2 and "duty_left: 6T2A.turning.width [m] missing" in err
+        assert code == 2 and "duty_left: the robot's file lacks 6T2A.turning.width [m]" in err
 
 
 def test_results_of_turns_show_both_sides():
@@ -391,13 +391,15 @@ def test_simulate_in_python_refuses_turns_as_the_command_line_does():
     alone = dataclasses.replace(mm.nominal(), sides=jnp.asarray(1.0))
     with pytest.raises(UsageError, match="duty_left: got a robot of 1 side"):
         mm.simulate(alone, mm.Conditions("6T2A", duty_left=1, duty_right=0.5))
-    with pytest.raises(UsageError, match="duty: got it beside duty_left and duty_right"):
+    with pytest.raises(UsageError, match="duty: got it together with duty_left and duty_right"):
         mm.simulate(mm.nominal(), mm.Conditions("6T2A", duty=jnp.asarray(0.5), duty_left=1, duty_right=0.5))
 
 
 @pytest.mark.parametrize("duty", [1, 1.0, 0.5, [1.0, 1.0]])
 def test_a_duty_written_beside_both_sides_is_refused_whatever_it_is(duty):
-    with pytest.raises(UsageError, match=r"^duty: got it beside duty_left and duty_right; expected one of the two"):
+    with pytest.raises(
+        UsageError, match=r"^duty: got it together with duty_left and duty_right; expected one of the two"
+    ):
         mm.Conditions("6T2A", duty=duty, duty_left=1, duty_right=0.5)
     alone = mm.Conditions(0, duty=duty, duty_left=0.5)  # of the right side
     again = dataclasses.replace(alone, duty_right=jnp.asarray(0.5))
@@ -415,8 +417,8 @@ ONE_SIDE = dataclasses.replace(paper_robots.nominal(), sides=jnp.asarray(1.0))
     [
         (ONE_SIDE, {"profile": TURNING}, "profile: got a robot of 1 side; expected sides = 2"),
         (mm.nominal(), {"profile": "patrol"}, "profile: got str; expected mmrjax.profile"),
-        (mm.nominal(), {"profile": TURNING, "model": "steady"}, "model: got steady beside a profile; expected drive"),
-        (mm.nominal(), {"profile": TURNING, "duration": 3.0}, "duration: got 3.0 beside a profile, whose last row"),
+        (mm.nominal(), {"profile": TURNING, "model": "steady"}, "model: got steady with a profile; expected drive"),
+        (mm.nominal(), {"profile": TURNING, "duration": 3.0}, "duration: got 3.0 with a profile; its last row"),
         (mm.nominal(), {"start": "rest"}, "start: got one without a profile"),
     ],
 )

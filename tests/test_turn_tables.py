@@ -300,7 +300,7 @@ REFUSED = {
                          [(24, b / 2000, a / 2000, a, b) for a, b, *_ in SOUND],
                          "motor_speed_left_rpm and motor_speed_right_rpm: .* the sides of one pair of columns are"),
     "no width": (KINEMATIC.replace('width = "0.555 ± 5 %"\n', ""), f"{SPEEDS},{READ}", SOUND,
-                 r"rover.turning.width \[m\] missing in the robot's file, which a turn needs"),
+                 r"the robot's file lacks rover.turning.width \[m\], needed for a turn"),
     "one motor": (KINEMATIC.replace("sides = 2", "sides = 1"), f"{SPEEDS},{READ}", SOUND,
                   "got a robot of 1 side; expected sides = 2"),
 }  # fmt: skip

@@ -76,8 +76,8 @@ def test_a_file_of_unlike_sides_is_said_to_turn_and_by_how_much(tmp_path, capsys
     assert inputs.load_robot(config.Simulate(robot=file.source, left_V=9.0, right_V=9.0)).remarks == ()
     assert of_file(tmp_path, SIDE_RADIUS.replace("0.01", "0.0")).remarks == ()
     (narrow,) = of_file(tmp_path, SIDE_RADIUS, set={"4W2T.turning.width": 0.0}).remarks
-    assert narrow.endswith("how it would turn is not known: 4W2T.turning.width [m] missing in the robot's file, which "
-                           "a turn needs")  # fmt: skip
+    assert narrow.endswith("how it would turn is not known: the robot's file lacks 4W2T.turning.width [m], needed for "
+                           "a turn")  # fmt: skip
     warned = page._with_contents("<h1>a</h1><h2>b</h2>", {"robot-warning": remark})
     assert f'id="robot-warning"><span>{remark}' in warned
     found.reading["yaw_rate"] = [0.0, 0.0]

@@ -30,7 +30,9 @@ def fig7(speed):
     return np.sign(speed) * np.where(size < 0.01, rising, 0.6 - 0.1 * y**2 * (3 - 2 * y))
 
 
-@pytest.mark.parametrize("place", ["docs/vibration.md", "docs/effects.md", "mmrjax/effects/slip_effects.py"])
+@pytest.mark.parametrize(
+    "place", ["docs/explanation/vibration.md", "docs/reference/effects.md", "mmrjax/effects/slip_effects.py"]
+)
 def test_the_equation_that_is_written_is_the_one_that_runs(place):
     """The equation of vibration_slip, read off the page and evaluated, up to the limit and beyond."""
     text = (Path(__file__).parents[1] / place).read_text("utf-8")

@@ -1,7 +1,7 @@
 """Packaged sheets of parts for sizing: motors, gearboxes and cells, each value from a sheet that its row names.
 
 The tables are in `parts/*.csv` in the units of the sheets; the reader gives SI. What a sheet does not state is NaN.
-`docs/parts.md` says where the sheets come from and how consistent they are.
+`docs/reference/parts.md` says where the sheets come from and how consistent they are.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Profiles from outside: missions as CSV with units in the column names, checked cell by cell (docs/missions.md)."""
+"""Profiles of missions from CSV files, checked cell by cell (docs/reference/profiles.md)."""
 
 from __future__ import annotations
 

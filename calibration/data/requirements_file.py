@@ -137,7 +137,9 @@ def load(path: Path | None) -> Requirements:
         packaged = resources.files("calibration") / "data" / "aims" / f"{PAPER}.toml"
         return read(packaged.read_text("utf-8"), f"{PAPER}.toml")
     if not path.is_file():
-        raise BadConfiguration(f"{path}: no such file; expected a TOML file of requirements (docs/requirements.md)")
+        raise BadConfiguration(
+            f"{path}: no such file; expected a TOML file of requirements (see docs/howto/requirements.md)"
+        )
     return read(toml_text(path, path), path.name)
 
 

@@ -22,6 +22,7 @@ from mmrjax import effects
 from mmrjax.compile.precision import in_double
 from mmrjax.effects import Effect
 from mmrjax.effects.scaled import scaled
+from mmrjax.errors import some
 from mmrjax.model import paper_robots, params, power
 from mmrjax.model.driver import DECAYS
 from mmrjax.model.paper_tables import TRACKED, WHEELED
@@ -330,9 +331,13 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
     ratings |= {name: _switch(where, name, stated.pop(name)) for name in SWITCHES if name in stated}
     ratings |= {name: _choice(where, name, stated.pop(name)) for name in CHOICES if name in stated}
     known = {p.name: p for p in params.walk(robot)}
-    refused = [f"{name}: {why}" for name, value in stated.items() if (why := _refused(name, value, known))]
+    refused: dict[str, list[str]] = {}
+    for name, value in stated.items():
+        if why := _refused(name, value, known):
+            refused.setdefault(why, []).append(name)
     if refused:
-        raise BadConfiguration(f"{where}, {'; also '.join(refused)}")
+        sentences = [f"{some(names, 80)}: {why}" for why, names in refused.items()]
+        raise BadConfiguration(f"{where}, {'; also '.join(sentences)}")
     robot = params.replace(robot, {name: jnp.asarray(value, float) for name, value in stated.items()})
     robot = rig_file.moved_priors(robot, stated)
     robot = dataclasses.replace(

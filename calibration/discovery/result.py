@@ -618,12 +618,6 @@ class DiscoveryResult:
 
     def to_json(self) -> dict[str, Any]:
         """Everything as JSON-able data, as docs/schemas/loop.schema.json describes it."""
-        held = {
-            kind: {"before": before, "after": after, "blocks": list(self.readings_of_rows.blocks[kind])}
-            for kind, (before, after) in self.errors_held_out.items()
-        }
-        main = next(iter(self.errors_held_out.values()), (None, None))
-        whens = ("before", "after")
         proposal = self.next_experiment
         return {
             "schema": SCHEMA,
@@ -650,16 +644,7 @@ class DiscoveryResult:
             "standing": self.standing,
             "cluster": None if self.cluster is None else dataclasses.asdict(self.cluster),
             "residual_clusters": [c.to_json() for c in self.residual_clusters],
-            "errors": {
-                # nothing is fitted as stated, so both are the same
-                "as_stated": {"fitted": self.errors_as_stated, "held_out": self.errors_as_stated},
-                **{w: {"fitted": self.errors[k], "held_out": main[k]} for k, w in enumerate(whens)},
-            },
-            "errors_percent_of": OF_SIZE,
-            "held_out_by": held,
-            "held_out_unpredictable": list(self.held_out_unpredictable),
-            "held_out_worse": [dataclasses.asdict(w) for w in self.held_out_worse],
-            "alternatives_held_out": [dataclasses.asdict(a) for a in self.alternatives_held_out],
+            **self._errors_to_json(),
             "prediction": {
                 "gain": None if self.gain is None else self.gain.mean,
                 "se": None if self.gain is None or not np.isfinite(self.gain.se) else self.gain.se,
@@ -689,6 +674,25 @@ class DiscoveryResult:
             "noise_sensitivity": [s.to_json() for s in self.sensitivity],
             "notes": list(self.notes),
             "resolved": None if self.resolved is None else self.resolved.to_json(),
+        }
+
+    def _errors_to_json(self) -> dict[str, Any]:
+        """Errors of the fits and of data held out, as in `to_json`."""
+        main = next(iter(self.errors_held_out.values()), (None, None))
+        return {
+            "errors": {
+                # nothing is fitted as stated, so both are the same
+                "as_stated": {"fitted": self.errors_as_stated, "held_out": self.errors_as_stated},
+                **{w: {"fitted": self.errors[k], "held_out": main[k]} for k, w in enumerate(("before", "after"))},
+            },
+            "errors_percent_of": OF_SIZE,
+            "held_out_by": {
+                kind: {"before": before, "after": after, "blocks": list(self.readings_of_rows.blocks[kind])}
+                for kind, (before, after) in self.errors_held_out.items()
+            },
+            "held_out_unpredictable": list(self.held_out_unpredictable),
+            "held_out_worse": [dataclasses.asdict(w) for w in self.held_out_worse],
+            "alternatives_held_out": [dataclasses.asdict(a) for a in self.alternatives_held_out],
         }
 
     def rows_table(self) -> dict[str, np.ndarray]:

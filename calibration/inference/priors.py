@@ -37,7 +37,7 @@ OVER_TIME = (".inertia", ".inductance", ".backlash")
 #: And of configurations on tracks, after the losses; guide friction μ_t stays at Table 4 because only its product
 #: with the share of the guides acts.
 GUIDE_SHARE, GUIDE_FRICTION = "track.guide_share", "track.guide_friction"
-#: Share of the weight that the guides carry in the track model, where it is an output (docs/track-model.md).
+#: Share of the weight on the guides in the track model, where it is an output (docs/explanation/track-model.md).
 GUIDED = 0.98
 #: Of configurations whose sides are driven apart; the rule of direction trades with the ratio of frictions, and the
 #: moment of inertia shows over time alone.

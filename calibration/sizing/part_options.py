@@ -1,6 +1,6 @@
 """What a search may choose from: drives (motor and gearbox) and cells, from the packaged sheets, as arrays.
 
-Where a sheet is silent about what the model needs, the paper's robot stands in, in proportion (docs/requirements.md):
+Where a sheet lacks a number that the model needs, the paper's robot is scaled (docs/howto/size.md):
 friction of a motor by its no-load torque, efficiency of a gearbox by the sheet's largest, resistance and mass of a
 cell by its capacity, and its own ratings of winding and speeds.
 """
@@ -18,7 +18,7 @@ from mmrjax.model.robot import Robot
 
 #: The paper's parts among the sheets.
 MOTOR, GEARBOX, CELL = "RE 30 24 V", "GP 32 C 23:1", "XP2200SL"
-#: Ratio of the belt stage between gearbox and driving wheel, which is kept (docs/paper-notes.md).
+#: Ratio of the belt stage between gearbox and driving wheel, which is kept (docs/explanation/paper-notes.md).
 BELT_STAGE = 25 / 12
 #: A current that limits nothing [A].
 FREE = 1e9

@@ -1,4 +1,7 @@
-"""The gallery: the first screen of each page, by a headless browser; python docs/gallery/make.py NAME=RUNFOLDER ..."""
+"""Writes the first screen of report pages as pictures, by a headless browser.
+
+python docs/gallery/make.py NAME=RUNFOLDER ...
+"""
 
 import io
 import sys

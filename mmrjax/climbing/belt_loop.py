@@ -1,8 +1,8 @@
-"""A belt round two pulleys of unlike radius: where its points are, how its grousers stand, what it does to corners.
+"""A belt round two pulleys of different radius: position of its points, tilt of its grousers, contact with corners.
 
 The frame has its origin on the first pulley's axle and its first axis towards the second pulley. The belt runs
-clockwise: along the lower run to the first pulley, up, along the upper run to the second, down. A point of it is
-told by how far it is along the path from the middle of the lower run.
+clockwise: along the lower run to the first pulley, up, along the upper run to the second, down. The coordinate of a
+point is its distance along the path from the middle of the lower run.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class Loop(eqx.Module):
     """A closed belt with grousers.
 
     Attributes:
-        first, second: pitch radii of the pulleys [m], the first not the smaller; distance: of their axles [m].
+        first, second: pitch radii of the pulleys [m], first >= second; distance: of their axles [m].
         grouser_height, grouser_length: over the pitch line, and along it [m].
         grousers: their number.
     """
@@ -44,7 +44,7 @@ class Loop(eqx.Module):
 
     @property
     def marks(self) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-        """Where the first arc begins and ends, and the second [m along the path]."""
+        """Start and end of the first arc, and of the second [m along the path]."""
         begin = self.run / 2
         end = begin + self.first * (jnp.pi + 2 * self.taper)
         return begin, end, end + self.run, end + self.run + self.second * (jnp.pi - 2 * self.taper)
@@ -60,16 +60,16 @@ class Loop(eqx.Module):
         return self.length / self.grousers
 
     def normal(self, turned: Array) -> Float[Array, "n 2"]:
-        """Outward normal of a belt that has `turned` by so much since its lower run [rad]."""
+        """Outward normal of a belt that has `turned` by this angle since its lower run [rad]."""
         return jnp.stack([-jnp.sin(turned - self.taper), -jnp.cos(turned - self.taper)], axis=-1)
 
     def turned(self, place: Array) -> Array:
-        """Angle by which the belt has turned since its lower run [rad], at `place` [m], also beyond an end."""
+        """Turning angle of the belt since its lower run [rad], at `place` [m], also beyond an end."""
         a, b, c, d = self.marks
         return jnp.clip(place - a, 0.0, b - a) / self.first + jnp.clip(place - c, 0.0, d - c) / self.second
 
     def tilt(self, place: Array) -> tuple[Array, Array]:
-        """Angle [rad] of a grouser on its rigid base, the mean of the path's under it, and how it rises [rad/m]."""
+        """Tilt [rad] of a grouser on its rigid base, the mean of the path below it, and its derivative [rad/m]."""
         half = self.grouser_length / 2
 
         def integral(s: Array) -> Array:
@@ -98,7 +98,7 @@ class Loop(eqx.Module):
         return centre + radius[..., None] * normal + along[..., None] * tangent(normal)
 
     def places(self, drawn: Scalar) -> Float[Array, " grousers"]:
-        """Where the grousers are once the belt has run on by `drawn` [m]."""
+        """Positions of the grousers after the belt has moved by `drawn` [m]."""
         return jnp.mod(jnp.arange(self.grousers) * self.pitch + drawn, self.length)
 
     def project(self, at: Float[Array, "n 2"]) -> tuple[Array, Array]:
@@ -124,7 +124,7 @@ class Loop(eqx.Module):
         return height, place
 
     def _angle(self, arm: Array) -> Array:
-        """By how much a belt with its normal along `arm` has turned since its lower run [rad]."""
+        """Turning angle since the lower run of a belt with its normal along `arm` [rad]."""
         return jnp.mod(jnp.arctan2(-arm[..., 0], -arm[..., 1]) + self.taper, 2 * jnp.pi)
 
 
@@ -136,7 +136,7 @@ class Tips(NamedTuple):
 
 
 def tips(loop: Loop, place: Float[Array, " n"]) -> Tips:
-    """Tips of the grousers at `place` [m along the path]; see `belt.tips` on their rigid bases."""
+    """Tips of the grousers at `place` [m along the path]; see `belt.tips` for their rigid bases."""
     tilt, rise = loop.tilt(place)
     normal = loop.normal(tilt)
     height = loop.grouser_height
@@ -145,10 +145,10 @@ def tips(loop: Loop, place: Float[Array, " n"]) -> Tips:
 
 
 class Corners(NamedTuple):
-    """How near a belt is to points beside it.
+    """Distance of a belt from points.
 
     Attributes:
-        gap: between them [m]; normal: out of the belt, (n, 2); rate: displacement of the belt's material there per
+        gap: distance [m]; normal: out of the belt, (n, 2); rate: displacement of the belt's material there per
             displacement of the belt, (n, 2); place: on the path [m].
     """
 
@@ -159,14 +159,14 @@ class Corners(NamedTuple):
 
 
 def surface(loop: Loop, at: Float[Array, "n 2"]) -> Corners:
-    """The belt between its grousers beside points."""
+    """Distance of points from the belt between its grousers."""
     height, place = loop.project(at)
     normal = loop.normal(loop.turned(place))
     return Corners(height, normal, tangent(normal), place)
 
 
 def teeth(loop: Loop, drawn: Scalar, at: Float[Array, "n 2"]) -> Corners:
-    """The grouser nearest to each of some points, a rigid tooth with flanks across its base."""
+    """Distance of points from the nearest grouser, a rigid tooth with flanks across its base."""
     under = loop.project(at)[1]
     ahead = jnp.mod(under - drawn + loop.pitch / 2, loop.pitch) - loop.pitch / 2
     place = jnp.mod(under - ahead, loop.length)
@@ -183,7 +183,7 @@ def teeth(loop: Loop, drawn: Scalar, at: Float[Array, "n 2"]) -> Corners:
 
 
 def tangent(normal: Array) -> Array:
-    """Direction of running where the belt's outward normal is `normal`."""
+    """Running direction of the belt at its outward `normal`."""
     return jnp.stack([normal[..., 1], -normal[..., 0]], axis=-1)
 
 

@@ -1,7 +1,8 @@
-"""Margins of one climb, that of its success among them, and their derivatives forward through its simulation.
+"""Margins of one climb, including that of its success, and their forward derivatives through its simulation.
 
-Derivatives are those of the computed run, with contacts that open and close at their instants. They do not know that
-with another robot another grouser meets the edge: slopes over a stretch of each value, of runs side by side, do.
+The derivatives belong to the computed run, with its contacts opening and closing. They do not include that a
+different robot may meet the edge with another grouser. Slopes over a range of each value, from several runs, include
+it.
 """
 
 from __future__ import annotations
@@ -25,24 +26,27 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 
-#: Margins within so much of the least one count beside it, and so do instants [-].
+#: Margins (and instants) within this distance of the smallest one count as well [-].
 SMOOTH = 0.05
-#: Runs of which a slope is made.
+#: Number of runs for a slope.
 BESIDE = 8
-#: What a climb comes to: unit and words. Of a robot that gets over all are taken up to the crest, where its centre of
-#: mass is past the obstacle: how it falls on its nose then is another matter. Margins are shares.
+#: Outputs of a climb: unit and words. For a robot that gets over, they are computed up to the crest, where its centre
+#: of mass passes the obstacle, because its fall afterwards is a different question. Margins are shares.
 OUTPUTS: dict[str, tuple[str, str]] = {
-    "margin_success": ("-", "smoothed least of the four margins: above 0 where it gets over, else below"),
-    "margin_reach": ("-", "how far its centre of mass ends beyond the obstacle, of half the wheelbase; 1 if over"),
-    "margin_upright": ("-", "what was left to the pitch at which it tips, of that pitch"),
-    "margin_grip": ("-", "what the friction of the ground had left, of all that it could hold"),
-    "margin_torque": ("-", "what the traction motors had left, of their torque at stall"),
+    "margin_success": ("-", "smoothed smallest of the four margins: above 0 if it gets over, else below"),
+    "margin_reach": (
+        "-",
+        "final distance of its centre of mass past the obstacle, over half the wheelbase; 1 if over",
+    ),
+    "margin_upright": ("-", "margin to the tipping pitch, of that pitch"),
+    "margin_grip": ("-", "unused share of the ground's friction limit"),
+    "margin_torque": ("-", "unused share of the traction motors' stall torque"),
     "crest_time_s": ("s", "time to the crest, or to the verdict"),
     "crest_energy_J": ("J", "energy of all motors until then"),
     "crest_current_rms_A": ("A", "root mean square of the current of each traction motor until then"),
     "crest_current_most_A": ("A", "largest current of each traction motor until then"),
-    "crest_front_current_most_A": ("A", "the same of the front levers' motor"),
-    "crest_rear_current_most_A": ("A", "the same of the rear levers' motor"),
+    "crest_front_current_most_A": ("A", "largest current of the front levers' motor until then"),
+    "crest_rear_current_most_A": ("A", "largest current of the rear levers' motor until then"),
 }
 
 
@@ -56,13 +60,13 @@ class Given(NamedTuple):
 
 
 def least(values: Float[Array, " n"]) -> Scalar:
-    """Smoothed least of values, -τ log mean exp(-x / τ) with τ = `SMOOTH`: between the least and the mean."""
+    """Smoothed minimum of values, -τ log mean exp(-x / τ) with τ = `SMOOTH`: between the minimum and the mean."""
     lowest = jax.lax.stop_gradient(jnp.min(values))
     return lowest - SMOOTH * jnp.log(jnp.mean(jnp.exp(-(values - lowest) / SMOOTH)))
 
 
 def crest(terrain: Terrain, record: Passed, over: bool) -> int | None:
-    """The first sample at which the centre of mass of a robot that gets over is past the obstacle; else None."""
+    """The first sample with the centre of mass past the obstacle, for a robot that gets over; else None."""
     return int(jnp.argmax(record.centre > terrain.finish)) if over else None
 
 
@@ -99,11 +103,11 @@ def outputs(robot: Robot, terrain: Terrain, record: Passed, crest: int | None) -
 
 
 class Derivatives(NamedTuple):
-    """What a climb comes to, by the names of `OUTPUTS`, and its derivatives by values.
+    """Outputs of a climb, by the names of `OUTPUTS`, and their derivatives.
 
     Attributes:
         climb: the run; found: its outputs; by: their derivatives, of shape (values,).
-        slope, slope_sd: of straight lines through `BESIDE` runs along each value, and how well these determine it.
+        slope, slope_sd: of straight lines through `BESIDE` runs along each value, and their standard deviations.
     """
 
     climb: Climb
@@ -124,8 +128,11 @@ def climb_derivatives(
     part: float = 1.0,
     progress: Callable[[float], None] | None = None,
 ) -> Derivatives:
-    """One climb and the derivatives of `OUTPUTS` by the `values` of which its robot, conditions, terrain and sequence
-    are made, with slopes over `widths` to both sides. The other arguments are those of `climb_batch`."""
+    """Outputs of one climb, their derivatives with respect to `values`, and slopes over `widths` to both sides.
+
+    `given` makes robot, conditions, terrain and sequence from the values. The other arguments are those of
+    `climb_batch`.
+    """
     directions = jnp.eye(len(values))
     parts, samples, steps = climb.divided(duration, step, sample, part)
     interval, each = jnp.asarray(step, float), jnp.asarray(steps)
@@ -182,7 +189,7 @@ def outputs_of_run(robot: Robot, terrain: Terrain, ended: Climb, k: int) -> dict
 
 
 def _along(function: Callable[[Any], Any], at: Any, directions: Any) -> tuple[Any, Any]:
-    """A function and how its numbers change along `directions`, leaves with a leading axis (None: not at all)."""
+    """A function's value and its derivatives along `directions`, leaves with a leading axis (None: zero)."""
     numbers, rest = eqx.partition(at, eqx.is_inexact_array)
     further: list[Any] = []
 

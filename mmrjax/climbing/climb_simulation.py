@@ -1,8 +1,8 @@
-"""Half a robot with levers over a terrain in its plane of travel: its state, one step, and how a run ends.
+"""Half a robot with levers on a terrain in its plane of travel: its state, one step, and the verdict of a run.
 
 The bodies are the chassis with payload, two pulleys and two levers; the belts run rigidly with the pulleys. The
-levers' drives follow a sequence of angles at most at the levers' rate, or have its voltages. Contacts are of
-`footing`, the drive of the tracks of `balances`, those of the levers of `lever_drives`.
+levers' drives follow a sequence of angles, limited by the levers' rate, or have given voltages. `footing` computes
+the contacts, `balances` the drive of the tracks, `lever_drives` that of the levers.
 """
 
 from __future__ import annotations
@@ -35,39 +35,41 @@ from mmrjax.numerics.linear_equations import factorise, solution
 from mmrjax.undercarriage.half_robot import contacts_resist, current_after
 from mmrjax.undercarriage.running_gear import RunningGear
 
-#: How a climb ends; the last two: its time was over while it still went on, numbers that mean nothing.
+#: Verdicts of a climb; the last two: its time ended while it was still moving, and numbers that are not finite.
 VERDICTS = OVER, TIPS, STALLS, SLIDES, HANGS, UNFINISHED, FAILED = range(7)
 NAMES = ("over", "tips", "stalls", "slides", "hangs", "unfinished", "failed")
 _RUNNING = -1
 
 STEP, SAMPLE, DURATION = 1e-4, 2e-2, 20.0  # [s]
-SETTLES, RISES = 0.3, 0.1  # before the motors are switched on, and until they have their voltage [s]
+SETTLES, RISES = 0.3, 0.1  # time before the motors are switched on, and until they have full voltage [s]
 #: Pitch beyond which a robot has turned over [rad].
 TURNED_OVER = np.radians(100.0)
-#: A robot that gains less than this way [m] in this time [s] is stuck.
+#: A robot that advances less than this distance [m] in this time [s] is stuck.
 GAIN, PATIENCE = 5e-3, 2.0
-#: How far a lever may begin below the ground [m], which is on it then.
+#: Largest depth of a lever below the ground at the start [m]; it then rests on the ground.
 ON_GROUND = 4e-4
-#: A belt slower than this [m/s] stands; a body that bears more than this share of the weight hangs.
+#: A belt slower than this [m/s] stands; a body that carries more than this share of the weight hangs.
 STANDS, BEARS = 5e-3, 0.1
-#: Contacts that bear less than this share of the weight do not carry the robot: it falls or bounces.
+#: Contacts with less than this share of the weight do not carry the robot: it falls or bounces.
 CARRIED = 0.5
-#: Time in which levers come to their rate and near their angle [s], and rate below which they are let stand [rad/s].
+#: Time for levers to reach their rate and come near their angle [s], and rate below which they may stand [rad/s].
 _SWINGS, _STILL = 0.03, 5e-3
 LED = np.array([FRONT, REAR])
-#: What the pulleys of both levers' tracks turn by on their levers, per velocity of `COORDINATES`.
+#: Rotation of the pulleys of both levers' tracks relative to their levers, per velocity of `COORDINATES`.
 _ON_BELTS = np.eye(COORDINATES)[LED] + np.eye(COORDINATES)[SHAFT]
 
 
 class Sequence(eqx.Module):
-    """Angles of the levers, or voltages of their motors, over distance or time, straight between knots and constant
-    beyond them.
+    """Angles of the levers, or voltages of their motors, over distance or time; linear between knots.
+
+    Values beyond the first and last knot are constant.
 
     Attributes:
-        at: knots, of the middle of the wheelbase from where the obstacle begins [m], or times [s].
-        front, rear: angles at them, 0 along the wheelbase outward, positive up [rad]; or voltages, positive up [V].
-        begins: angles of front and rear at which levers that have voltages begin [rad]; None: angles are asked for.
-        over_time: whether knots are times.
+        at: knots, of the middle of the wheelbase from the start of the obstacle [m], or times [s].
+        front, rear: angles at the knots, 0 along the wheelbase outward, positive up [rad]; or voltages, positive up
+            [V].
+        begins: initial angles of front and rear levers driven by voltages [rad]; None: the sequence states angles.
+        over_time: True if knots are times.
         supply: highest voltage of the levers' motors [V]; None: that of the supply.
     """
 
@@ -80,17 +82,17 @@ class Sequence(eqx.Module):
 
     @property
     def first(self) -> Float[Array, " 2"]:
-        """ψ of both levers in the beginning [rad]."""
+        """Initial ψ of both levers [rad]."""
         return _turned(*(self.asked(-jnp.inf, 0.0) if self.begins is None else self.begins))
 
     def asked(self, place: Scalar, time: Scalar) -> tuple[Array, Array]:
-        """Angles of front and rear that are asked for [rad], or voltages of their motors, positive up [V]."""
+        """Demanded angles of front and rear [rad], or voltages of their motors, positive up [V]."""
         at = time if self.over_time else place
         return jnp.interp(at, self.at, self.front), jnp.interp(at, self.at, self.rear)
 
 
 def _turned(front: Array, rear: Array) -> Float[Array, " 2"]:
-    """ψ of both levers at their angles, or their angles at ψ, see `footing` [rad]."""
+    """Converts between ψ of both levers and their angles, see `footing` [rad]."""
     return jnp.stack([front, jnp.pi - rear])
 
 
@@ -101,8 +103,11 @@ def still(front: Scalar, rear: Scalar) -> Sequence:
 
 
 class Motion(eqx.Module):
-    """State of half a robot: coordinates and velocities (see `footing`), current of one motor [A], charge taken from
-    the battery [C], current that the levers' motors take from the supply [A]."""
+    """State of half a robot: coordinates, velocities (see `footing`), and three electrical quantities.
+
+    They are the current of one motor [A], the charge taken from the battery [C], and the current of the levers'
+    motors from the supply [A].
+    """
 
     q: Float[Array, " 6"]
     v: Float[Array, " 6"]
@@ -111,7 +116,7 @@ class Motion(eqx.Module):
     drawn: Scalar
 
 
-#: Where energy goes: what the motors of tracks and of levers take, then what is lost.
+#: Sources and sinks of energy: input of the motors of tracks and of levers, then losses.
 SOURCES = ("supply", "levers")
 LOSSES = ("winding", "motor", "gearbox", "track", "sliding", "contact", "rolling", "lever_winding", "lever_gears")
 
@@ -120,19 +125,19 @@ Energy = dict[str, Any]
 
 
 class Passed(eqx.Module):
-    """What an instant or a sample has: means over it, and energy since the start of the run.
+    """An instant or a sample: means over it, and energy since the start of the run.
 
     Attributes:
         current: of one motor [A]; total_current: of all motors, from the supply, I_s of (10) [A].
         torque: of each drive on its pair of levers [N·m], lever_current [A] and lever_voltage [V] of its motor, up.
-        holds: 1 where a pair stands by its worm alone, without current [-].
+        holds: 1 if only its worm holds a pair, without current [-].
         energy: in and lost, by the names of `SOURCES` and `LOSSES`, of the whole robot [J].
         stored: in motion, height, contacts and windings, of the whole robot [J].
-        body: share of all normal force that the body bears [-].
-        grip: share of what its friction could hold that the ground gives to all that rolls [-].
-        carried: share of the weight that all contacts bear [-].
-        centre: x of the centre of mass [m]; base: how far the outermost contacts are behind and ahead of it [m], of
-            a sample the furthest, as contacts that leave the ground for some steps bear nevertheless.
+        body: share of all normal force that the body carries [-].
+        grip: traction of all rolling contacts over the limit of their friction [-].
+        carried: share of the weight that all contacts carry [-].
+        centre: x of the centre of mass [m]; base: distances of the outermost contacts behind and ahead of it [m]. For
+            a sample the largest, because contacts that open for a few steps still carry the robot.
     """
 
     time: Scalar
@@ -155,16 +160,16 @@ class Passed(eqx.Module):
 
     @property
     def margin(self) -> Scalar:
-        """Distance from gravity's line through the centre of mass to the nearer of the outermost contacts [m].
+        """Distance of gravity's line through the centre of mass from the nearer of the outermost contacts [m].
 
-        Negative where the line is beyond them, NaN of a robot that falls or bounces.
+        Negative if the line is beyond them, NaN for a robot that falls or bounces.
         """
         least = jnp.min(self.base, axis=-1)
         return jnp.where(jnp.isfinite(least) & (self.carried >= CARRIED), least, jnp.nan)
 
 
 class System(eqx.Module):
-    """One run's constants; robot and chassis have the main tracks' losses alone, the levers' tracks their own."""
+    """Constants of one run; robot and chassis have only the main tracks' losses, the levers' tracks their own."""
 
     robot: Robot
     conditions: Conditions
@@ -218,7 +223,7 @@ def inertia(run: System, q: Array, v: Array) -> tuple[Float[Array, "6 6"], Float
     zero, one = jnp.zeros(()), jnp.ones(())
 
     def across(arm: Array) -> Array:
-        """Velocity of a point at `arm` that turns nose down, per angular speed."""
+        """Velocity of a point at `arm` that rotates nose down, per angular speed."""
         return jnp.stack([arm[1], -arm[0]])
 
     matrix, bias, height = jnp.zeros((COORDINATES, COORDINATES)), jnp.zeros(COORDINATES), zero
@@ -250,7 +255,7 @@ def inertia(run: System, q: Array, v: Array) -> tuple[Float[Array, "6 6"], Float
 
 
 class _Pull(eqx.Module):
-    """What the contacts do, as `balances.resolved` asks for it."""
+    """Forces of the contacts, in the form that `balances.resolved` expects."""
 
     traction: Scalar
     guide: Scalar
@@ -262,11 +267,11 @@ class _Mover(eqx.Module):
     at: Footing
     v: Array
     radius: Scalar
-    levers: Scalar  # what the levers' tracks lose, on the shaft [N·m]
+    levers: Scalar  # losses of the levers' tracks, at the shaft [N·m]
 
     @property
     def normal(self) -> Scalar:
-        """Normal load of one side, of all that rolls [N]."""
+        """Normal load of one side, of all rolling contacts [N]."""
         return jnp.sum(self.at.force * self.at.rolls)
 
     def pull(self, chassis: Chassis, signals: Signals) -> _Pull:
@@ -283,15 +288,14 @@ def _sliding(at: Footing, v: Array, signals: Signals) -> Array:
 
 
 def carried(at: Footing, v: Array) -> tuple[Array, Scalar]:
-    """Share of the load of each contact that rolls, and the robot's speed along the ground, their mean by load."""
+    """Share of each rolling contact in the load, and the robot's speed along the ground, their load-weighted mean."""
     bears = at.force * at.rolls
     share = bears / jnp.maximum(jnp.sum(bears), 1e-9)
     return share, share @ (at.carried @ v)
 
 
 def instant(run: System, motion: Motion, on: Scalar) -> tuple[Signals, Footing, _Pull, Array]:
-    """All signals, contacts, forces and the shares of the load of an instant; `on`: share of their
-    voltage that the motors have."""
+    """All signals, contacts, forces and load shares of an instant; `on`: share of their voltage at the motors."""
     at = footing.footing(run.shape, run.terrain, motion.q, motion.v)
     share, speed = carried(at, motion.v)
     conditions = _driven(run, on)
@@ -314,15 +318,17 @@ def _lever_loss(run: System, speed: Array) -> Array:
 
 
 def _loaded(run: System, motion: Motion) -> System:
-    """The run with what the levers' motors take from the battery beside the others, I_s of eq. (10)."""
+    """The run with the current of the levers' motors added to the battery's other consumers, I_s of eq. (10)."""
     battery = run.robot.battery
     battery = dataclasses.replace(battery, current_other=battery.current_other + motion.drawn)
     return dataclasses.replace(run, robot=dataclasses.replace(run.robot, battery=battery))
 
 
 def asked(run: System, motion: Motion, time: Scalar) -> Float[Array, " 2"]:
-    """Angular speeds of the levers after a step that are asked for [rad/s]: towards the sequence's angles, at most at
-    their rate; levers that have come there stand."""
+    """Demanded angular speeds of the levers after a step [rad/s].
+
+    They lead to the sequence's angles, limited by the levers' rate; levers at their angle stand.
+    """
     rate = run.robot.running_gear.levers.rate
     toward = (_turned(*run.sequence.asked(motion.q[0], time)) - motion.q[LED]) / (4 * _SWINGS)
     speed = motion.v[LED] + run.step / _SWINGS * (jnp.clip(toward, -rate, rate) - motion.v[LED])
@@ -330,7 +336,7 @@ def asked(run: System, motion: Motion, time: Scalar) -> Float[Array, " 2"]:
 
 
 def _swung(run: System, motion: Motion, time: Scalar, source: Scalar, free: Array, yields: Array) -> Swing:
-    """What the drives do to the levers in a step, which without them are at the rates `free` after it [rad/s]."""
+    """Action of the drives on the levers in a step; without it they have the rates `free` afterwards [rad/s]."""
     levers, sequence = run.robot.running_gear.levers, run.sequence
     most = jnp.abs(source) if sequence.supply is None else sequence.supply
     high = jnp.stack([most, most])
@@ -340,7 +346,7 @@ def _swung(run: System, motion: Motion, time: Scalar, source: Scalar, free: Arra
         aims = jnp.zeros_like(aims)
         front, rear = sequence.asked(motion.q[0], time)
         low = high = jnp.clip(jnp.stack([front, -rear]), low, high)
-    # beyond its range nothing drives a lever on
+    # beyond its range a lever is not driven further
     angles = _turned(*motion.q[LED])
     above, below = angles > levers.angle_most + 1e-3, angles < levers.angle_least - 1e-3
     up, down = jnp.stack([above[0], below[1]]), jnp.stack([below[0], above[1]])
@@ -349,14 +355,14 @@ def _swung(run: System, motion: Motion, time: Scalar, source: Scalar, free: Arra
 
 
 def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[Motion, Energy, Passed]:
-    """One step, linearly implicit in what contacts and drive resist by as `half_robot.advance` is.
+    """One step, linearly implicit in the forces of contacts and drive, as `half_robot.advance`.
 
-    (M + Δt K) Δv = Δt (Q - c), with the drives' torques on the levers as those and the levers' rates answer each
-    other within the step. Energy is that of the step's impulses at the mean of its velocities, and of a current of
-    the tracks' motors that changes evenly.
+    (M + Δt K) Δv = Δt (Q - c). The drives' torques on the levers and the levers' rates are solved together within
+    the step. Energy is that of the step's impulses at its mean velocities, with a motor current that changes
+    linearly.
 
     Returns:
-        Motion and energy after it, and what was before it.
+        Motion and energy after the step, and the record of the instant before it.
     """
     run, on = _loaded(run, motion), jnp.clip((time - SETTLES) / RISES, 0.0, 1.0)
     signals, at, pulled, share = instant(run, motion, on)
@@ -379,7 +385,7 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
     damping = contacts_resist(at.along, at.off, pulled.force, at.force, rises, at.damped)
     damping = damping.at[SHAFT, SHAFT].add(shaft) + (_ON_BELTS.T * stiffens) @ _ON_BELTS
     whole = matrix.at[SHAFT, SHAFT].add(armature) + step * damping
-    # of wheels, whose levers weigh nothing
+    # of wheels, with massless levers
     whole = whole.at[LED, LED].add(1 - run.chassis.on_tracks)
     pushed = step * (force - bias)
     factors = factorise(whole[:4, :4])
@@ -402,7 +408,7 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
     after = Motion(motion.q + step * v, v, current, motion.discharge + step * charge, drawn)
 
     pair = run.drive
-    # (1 / step) is what a compiler makes of a division by a constant: a step that is an argument gives the same bits
+    # (1 / step) is the compiler's form of a division by a constant: a step passed as an argument gives the same bits
     geared = (pair.constant * swung.current - pair.inertia * led * (1 / step) - swung.torque) @ middle[LED]
     off, along = at.off @ gained, at.along @ gained
     normal = at.force - at.damped * off
@@ -430,7 +436,7 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
     spent = {name: energy[name] + added[k] for k, name in enumerate((*SOURCES, *LOSSES))}
     kinetic = motion.v @ matrix @ motion.v + (signals.inertia_added + rotor * ratio**2) * motion.v[SHAFT] ** 2
     stored = kinetic / 2 + signals.inductance * motion.current**2 / 2 + height + jnp.sum(at.energy)
-    up = jnp.array([1.0, -1.0])  # of a rear lever that is where ψ falls
+    up = jnp.array([1.0, -1.0])  # for a rear lever, upward is decreasing ψ
     total = jnp.sum(at.force)
     held = run.chassis.ground.force_adhesion(jnp.sum(at.force * at.rolls), signals.adhesion)
     centre = motion.q[0] - matrix[1, PITCH] / matrix[0, 0]
@@ -457,14 +463,16 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
 
 
 def _base(centre: Scalar, at: Footing) -> Float[Array, " 2"]:
-    """How far the outermost contacts are behind and ahead of the centre of mass [m], level ground assumed below."""
+    """Distances of the outermost contacts behind and ahead of the centre of mass [m], assuming level ground below."""
     bears, ahead = at.force > 0, at.place - centre
     return jnp.stack([jnp.max(jnp.where(bears, way, -jnp.inf)) for way in (-ahead, ahead)])
 
 
 def _shaft_loss(run: System, motion: Motion, signals: Signals, at: Footing) -> Scalar:
-    """How the drive's losses rise with the speed of the shaft [N·m·s], as they do steeply from rest; contacts and
-    winding apart, which are resolved. Where they fall: nothing."""
+    """Derivative of the drive's losses with respect to the shaft speed [N·m·s], at least 0; it is large at rest.
+
+    Contacts and winding are excluded, because they are resolved.
+    """
     one = jnp.ones_like(motion.v[SHAFT])
     force = jnp.sum(run.chassis.track.guide_friction * at.guided * at.force) * run.shape.main.first
 
@@ -479,8 +487,7 @@ def _shaft_loss(run: System, motion: Motion, signals: Signals, at: Footing) -> S
 
 
 class Progress(eqx.Module):
-    """Where a run stands: its verdict or that it goes on, when that was given, the furthest it came and when, angle
-    of its shafts since."""
+    """State of a run's verdict: verdict, its time, furthest position, time of that, and shaft angle since."""
 
     verdict: Array
     ended: Scalar
@@ -490,7 +497,7 @@ class Progress(eqx.Module):
 
 
 def stand(run: System, clear: float = 0.1) -> Motion:
-    """At rest on the ground before the obstacle, its foremost point `clear` [m] from it."""
+    """At rest on the ground before the obstacle, with its foremost point `clear` [m] from it."""
     shape = run.shape
     angles = run.sequence.first
     outer = shape.main.first + shape.gear.grouser_height
@@ -509,7 +516,7 @@ def stand(run: System, clear: float = 0.1) -> Motion:
 def _judged(
     run: System, before: Motion, passed: Passed, motion: Motion, progress: Progress
 ) -> tuple[Motion, Progress]:
-    """Whether a run has ended by now, after a sample; one that has stays as it is."""
+    """Updates the verdict of a run after a sample; a run that has ended keeps its state."""
     q, v = motion.q, motion.v
     outer = run.shape.main.first + run.shape.gear.grouser_height
     finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v)) & jnp.isfinite(motion.current)
@@ -541,8 +548,10 @@ def _judged(
 
 
 def begin(run: System, motion: Motion | None = None) -> tuple[Motion, Energy, Progress]:
-    """What a run begins with: motion (None: at rest before the obstacle), no energy yet, and that it goes on, or that
-    it failed, as its levers would begin below the ground."""
+    """Initial motion (None: at rest before the obstacle), zero energy, and the initial verdict.
+
+    The verdict is `failed` if the levers would begin below the ground, else the run goes on.
+    """
     angles, gear = _turned(*run.sequence.first), run.shape.gear
     under = clearance(run.shape.main.first + gear.grouser_height, gear, angles) < -ON_GROUND
     buried = jnp.any(under & (run.shape.on_tracks > 0.5)) & (motion is None)
@@ -553,12 +562,12 @@ def begin(run: System, motion: Motion | None = None) -> tuple[Motion, Energy, Pr
 
 
 def clearance(axle: Scalar, gear: RunningGear, angles: Float[Array, " levers"]) -> Float[Array, " levers"]:
-    """How far the rollers of levers at `angles` [rad] are above level ground [m], the axles `axle` above it [m]."""
+    """Height of the rollers of levers at `angles` [rad] above level ground [m], for axles at height `axle` [m]."""
     return axle + gear.lever_length * jnp.sin(angles) - gear.levers.roller
 
 
 def sampled(run: System, state: Any, first: Scalar, steps: Scalar, samples: int) -> tuple[Any, Passed]:
-    """A part of a run of so many `samples` of so many `steps`, from time `first` [s]: its end and its record."""
+    """A part of a run with `samples` samples of `steps` steps each, from time `first` [s]: its end and its record."""
 
     def sample(state: Any, k: Array) -> tuple[Any, Passed]:
         motion, energy, progress = state
@@ -580,16 +589,16 @@ def sampled(run: System, state: Any, first: Scalar, steps: Scalar, samples: int)
 
 
 def divided(duration: float, step: float, sample: float, part: float) -> tuple[int, int, int]:
-    """How a run of a `duration` is divided: into parts no longer than `part`, samples of a part, steps of a sample.
+    """Division of a run of a `duration`: parts no longer than `part`, samples per part, steps per sample.
 
-    A sample is of whole steps and all parts are alike, so the run may be longer by some samples.
+    A sample has a whole number of steps and all parts are equal, so the run may be a few samples longer.
     """
     steps, parts = max(round(sample / step), 1), math.ceil(duration / part - 1e-9)
     return parts, math.ceil(duration / (parts * steps * step) - 1e-9), steps
 
 
 class Climb(eqx.Module):
-    """Runs: verdicts as indices into `NAMES`, when they were given [s], and records of shape (runs, samples)."""
+    """Runs: verdicts as indices into `NAMES`, their times [s], and records of shape (runs, samples)."""
 
     verdict: np.ndarray
     ended: np.ndarray
@@ -603,7 +612,7 @@ class Climb(eqx.Module):
 
     @property
     def during(self) -> np.ndarray:
-        """Which samples are before a run's verdict, after which it stays as it ended; shape (runs, samples)."""
+        """Mask of the samples before a run's verdict, after which its state is constant; shape (runs, samples)."""
         return np.asarray(self.record.time) <= np.asarray(self.ended)[:, None] + 1e-9
 
     def run(self, k: int) -> Passed:
@@ -613,7 +622,7 @@ class Climb(eqx.Module):
 
 
 def _alike(robot: Robot) -> int | None:
-    """Axis of the runs in a robot's parameters; None where one robot runs them all."""
+    """Axis of the runs in a robot's parameters; None if all runs have one robot."""
     return 0 if jnp.ndim(robot.sides) else None
 
 
@@ -656,15 +665,15 @@ def climb_batch(
     start: Motion | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Climb:
-    """Climb over a batch of conditions, terrains and sequences (leading axis of every field), until all have ended.
+    """Climbs over a batch of conditions, terrains and sequences (leading axis of every field), until all have ended.
 
     Args:
-        robot: of all runs, or every parameter of it with a leading axis too.
+        robot: of all runs, or with a leading axis in every parameter too.
         duration: of the longest run [s]; step, sample: intervals of integration and of the record [s].
-        part: length of run between two looks at whether all have ended [s].
-        record: whether samples are kept; else the record is the last sample.
-        start: motions with which the runs begin; None: at rest before the obstacle.
-        progress: told the share of the time that is done.
+        part: length of run between two checks for the end of all runs [s].
+        record: True to return all samples; False: only the last one.
+        start: initial motions; None: at rest before the obstacle.
+        progress: called with the finished share of the time.
     """
     parts, samples, steps = divided(duration, step, sample, part)
     interval, each = jnp.asarray(step, float), jnp.asarray(steps)  # arrays: one program for all lengths of a step

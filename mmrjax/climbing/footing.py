@@ -1,9 +1,9 @@
-"""Contacts of half a robot with a terrain, both ways: its grousers and wheels on the ground, corners on its belts.
+"""Contacts of half a robot with a terrain: grousers and wheels on the ground, and corners of the ground on belts.
 
 Coordinates q of half a robot with levers: x, z [m] of the middle of the wheelbase, pitch θ [rad] nose down, angle φ
-[rad] of the pulleys relative to the chassis (the belts are rigid here: all turn alike), angles ψ_1, ψ_2 [rad] of
-front and rear lever from the chassis' forward axis, positive upward. Velocities v alike. A lever's belt runs on its
-lever at r (φ̇ + ψ̇).
+[rad] of the pulleys relative to the chassis (belts are rigid here: all pulleys have one angle), angles ψ_1, ψ_2 [rad]
+of front and rear lever from the chassis' forward axis, positive upward. Velocities v are their rates. A lever's belt
+runs on its lever at r (φ̇ + ψ̇).
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ PITCH, SHAFT, FRONT, REAR = 2, 3, 4, 5
 
 
 class Shape(eqx.Module):
-    """What of half a robot meets the ground.
+    """Parts of half a robot that can touch the ground.
 
     Attributes:
-        main, lever: the belts of one side, those of both levers alike.
+        main, lever: the belts of one side; both levers have equal ones.
         gear: the running gear.
-        on_tracks: 1 where levers bear, 0 where wheels do [-]; wheel: their radius [m].
+        on_tracks: 1 if levers carry load, 0 if wheels do [-]; wheel: their radius [m].
         belly: height of the body's underside over the axles [m].
     """
 
@@ -54,7 +54,7 @@ class Shape(eqx.Module):
 
 
 class Frame(NamedTuple):
-    """Where a part is: its origin in the world [m], the angle of its first axis [rad], which coordinate turns it."""
+    """Frame of a part: origin in the world [m], angle of its first axis [rad], and the coordinate that turns it."""
 
     origin: Array
     angle: Scalar
@@ -76,14 +76,14 @@ class Frame(NamedTuple):
 
 
 class Footing(eqx.Module):
-    """All pairs that may touch, and what they bear at an instant.
+    """All pairs that may touch, and their forces at an instant.
 
     Attributes:
         gap: distance [m]; gap_rate [m/s]; normal: of the robot's contact, out of the ground.
-        off, along: change of the contact's speed off the ground and along it (forward where the ground is level) per
-            velocity of `COORDINATES`; carried: along it where the belts stand.
-        force: normal force [N]; damped: how fast it falls with the gap's rate [N·s/m]; elastic: what of it is stored
-            again [N]; energy: stored in it [J].
+        off, along: change of the contact's speed off the ground and along it (forward on level ground) per
+            velocity of `COORDINATES`; carried: along it with the belts at rest.
+        force: normal force [N]; damped: its decrease with the gap's rate [N·s/m]; elastic: its recoverable part [N];
+            energy: stored in it [J].
         guided: share that passes to the lower guide [-]; rolls: 1 but for the body [-].
         place: x of the contact [m].
     """
@@ -104,8 +104,11 @@ class Footing(eqx.Module):
 
 
 class _Group(NamedTuple):
-    """Pairs of one part: contact points in the world, gaps, normals, displacement of the belt per angle of the
-    pulleys (0 on the body), shares on the guide, whether they bear."""
+    """Pairs of one part.
+
+    Fields: contact points in the world, gaps, normals, displacement of the belt per angle of the pulleys (0 on the
+    body), shares on the guide, and whether they carry load.
+    """
 
     at: Array
     gap: Array
@@ -135,7 +138,7 @@ def _guided(shape: Shape, place: Array) -> Array:
 
 
 def _belt(shape: Shape, terrain: Terrain, belt: Loop, frame: Frame, drawn: Scalar, bears: Scalar) -> list[_Group]:
-    """Grousers on the ground, and corners on the belt between grousers and on their flanks."""
+    """Grousers on the ground, and corners of the ground on the belt between grousers and on their flanks."""
     radius, main = shape.main.first, frame.turns is None
     place = belt.places(drawn)
     tips = loop.tips(belt, place)
@@ -180,7 +183,7 @@ def _wheels(shape: Shape, terrain: Terrain, body: Frame) -> list[_Group]:
     return groups
 
 
-#: Distance of what can't touch [m].
+#: Gap of pairs that cannot touch [m].
 FAR_OFF = 1e3
 
 
@@ -198,7 +201,7 @@ def footing(shape: Shape, terrain: Terrain, q: Array, v: Array) -> Footing:
     """Pairs that may touch and their normal forces (27) at coordinates `q`, velocities `v`."""
     body, front, rear = frames(shape, q)
     radius = shape.main.first
-    rear_axle = body._replace(origin=rear.origin)  # from which the main belt's loop is told
+    rear_axle = body._replace(origin=rear.origin)  # origin of the main belt's loop
     groups = _belt(shape, terrain, shape.main, rear_axle, radius * q[SHAFT], jnp.ones(()))
     for lever in (front, rear):
         assert lever.turns is not None
@@ -247,7 +250,7 @@ def footing(shape: Shape, terrain: Terrain, q: Array, v: Array) -> Footing:
 
 
 def _turned(direction: Array, arm: Array) -> Array:
-    """Speed along directions of points at `arm` that turn about an axle nose down, per angular speed [m]."""
+    """Speed along directions of points at `arm` that rotate about an axle nose down, per angular speed [m]."""
     return direction[:, 0] * arm[:, 1] - direction[:, 1] * arm[:, 0]
 
 

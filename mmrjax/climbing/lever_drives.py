@@ -1,7 +1,7 @@
-"""Drives of the levers, Fig. 5b: what a pair of levers and its motor do to each other in one step.
+"""Drives of the levers, Fig. 5b: interaction of a pair of levers and its motor in one step.
 
-Each pair has a motor, a planetary gear and a worm. All is referred to the levers' shaft: torques are multiplied by
-the ratio i = i_p i_w of both gears, speeds are divided by it.
+Each pair has a motor, a planetary gear and a worm. All quantities refer to the levers' shaft: torques are multiplied
+by the ratio i = i_p i_w of both gears, speeds are divided by it.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from mmrjax.model.gearbox import Gearbox
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 
-#: Pieces of a drive's law: the voltage is at its least (-1) or most (1), or such that the rate is what is asked (0);
-#: the way in which the levers move, 0 where they stand; the sign of T where they move.
+#: Pieces of a drive's law: the voltage is at its minimum (-1), its maximum (1), or follows from the demanded rate
+#: (0); direction of motion of the levers, 0 at rest; sign of T in motion.
 _PIECES = np.array([
     (0, 0, 0),
     *((end, way, sign) for end in (-1, 1) for way, sign in ((0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))),
 ])  # fmt: skip
-#: Current below which a motor counts as without [A].
+#: Current below which a motor counts as currentless [A].
 _NONE = 1e-9
 
 
@@ -34,15 +34,15 @@ class LeverDrive(eqx.Module):
 
         e - i² J_d ω' - i M_df = c T,
 
-    c = 1 / (η_p η_w) where T acts with the motion, c = (2 - 1/η_w) (2 - 1/η_p) where it acts against it (the loss in
-    a mesh is in proportion to its force, whichever way power flows: `Gearbox.efficiency_backward`). A worm of η_w up
-    to 1/2 is not turned by its load; below that the motor has to help to lower it, and its planetary gear is driven:
-    c = (2 - 1/η_w) / η_p. At rest e may be anything between the two.
+    c = 1 / (η_p η_w) if T acts with the motion, c = (2 - 1/η_w) (2 - 1/η_p) if it acts against it. The loss in
+    a mesh is proportional to its force in both directions of power (`Gearbox.efficiency_backward`). A worm with η_w
+    up to 1/2 is self-locking: the motor has to help to lower the load, and drives its planetary gear:
+    c = (2 - 1/η_w) / η_p. At rest e may have any value between the two.
 
     Attributes:
         constant: i C_m [N·m/A, V·s/rad]; resistance: of the winding [ohm]; inertia: i² J_d [kg·m²].
         dry, viscous: i M_df0 [N·m], i² K_fd [N·m·s].
-        ahead, back: c where T acts with the motion and against it [-].
+        ahead, back: c for T with the motion and against it [-].
         current_limit: of the motor [A].
     """
 
@@ -79,11 +79,11 @@ def lever_drive(robot: Robot) -> LeverDrive:
 
 
 class Swing(NamedTuple):
-    """What both pairs do in a step, each (2,).
+    """Action of both pairs in a step, each (2,).
 
     Attributes:
         torque: on the levers [N·m]; rate: after the step [rad/s]; voltage [V] and current [A] of their motors.
-        holds: whether a pair stands by its worm alone, without current.
+        holds: True if only its worm holds a pair, without current.
     """
 
     torque: Array
@@ -103,15 +103,18 @@ def swing(
     least: Float[Array, " 2"],
     most: Float[Array, " 2"],
 ) -> Swing:
-    """One step of both pairs: the rates that are asked for where the voltages allow them, else what these bring.
+    """One step of both pairs: the demanded rates if the voltages permit them, else the rates that these give.
 
-    What carries the levers gives ω = free + yields T after the step. Between the voltages `least` and `most` the
-    one is taken at which ω is what is asked; of a lever that is to stand, the least that holds it. Each drive's law
-    is of straight pieces (`_PIECES`); of all pairs of them the one is taken whose solution is on both, or least off.
+    The levers' mechanics give ω = free + yields T after the step. The voltage is chosen between `least` and `most`
+    so that ω is the demanded rate; for a lever that has to stand, the smallest voltage that holds it. Each drive's
+    law has straight pieces (`_PIECES`). Of all pairs of pieces the one whose solution is on both is taken, or the
+    one with the smallest deviation.
+    This is exact and has no iterations. A root finder cannot replace it: where a lever stands, its law allows a range
+    of torques and is no function.
 
     Args:
         step: [s]; rate: before it [rad/s]; free: after it, of levers without torque [rad/s]; yields: [rad/(N·m·s)].
-        asked: rates after it [rad/s]; least, most: voltages of the motors [V].
+        asked: demanded rates after it [rad/s]; least, most: voltages of the motors [V].
     """
     limits = drive.constant * rate + drive.resistance * drive.current_limit * jnp.array([[-1.0], [1.0]])
     least, most = jnp.maximum(least, limits[0]), jnp.minimum(most, limits[1])
@@ -136,7 +139,7 @@ def swing(
     turned = free[:, None, None] + jnp.einsum("ij,jkl->ikl", yields, torque)
 
     def motor(k: int, ways: tuple[slice | None, ...]) -> tuple[Array, Array, Array, Array]:
-        """How far the solutions are off the pieces of a pair [N·m], and least and greatest i C_m I of its motor."""
+        """Distance of the solutions from the pieces of a pair [N·m], and limits of i C_m I of its motor."""
         force, speed = torque[k], turned[k]
         turning = kept * (speed - rate[k]) + drive.viscous * speed
         up, down = drive.against(force, 1.0) + drive.dry + turning, drive.against(force, -1.0) - drive.dry + turning

@@ -1,4 +1,4 @@
-"""Levers: what they have beyond their masses and length, their tracks' losses, the gears of their drives, Fig. 5b."""
+"""Levers: parameters of their rollers, their tracks' losses and the gears of their drives, Fig. 5b."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import equinox as eqx
 from mmrjax.model.params import Scalar, parameter
 from mmrjax.model.track_friction import Track
 
-_UNSTATED = "the paper prints none"
+_UNSTATED = "not stated in the paper"
 
 
 class Levers(eqx.Module):
     """Roller at the tip of a lever, and drive of a pair: motor, planetary gear, worm (Fig. A1: 11-14).
 
-    Length, mass, centre and inertia of a lever, and the angles at which it stands where a run states none, are the
-    running gear's. Angles here: 0 along the wheelbase outward, positive up, π folded.
+    Length, mass, centre and inertia of a lever belong to the running gear, as does its angle if a run states none.
+    Angles here: 0 along the wheelbase outward, positive up, π folded.
     """
 
     roller: Scalar = parameter(
@@ -26,7 +26,7 @@ class Levers(eqx.Module):
         meaning="radius of the roller at a lever's tip over the grousers of its track",
         bounds=(1e-3, 0.5),
         relative_sd=0.05,
-        source="Table 6, d/2; with the pitch radius of 8 mm that it leaves, the track of 112 teeth closes to 0.4 mm",
+        source="Table 6, d/2; with the resulting pitch radius of 8 mm, the track of 112 teeth closes to 0.4 mm",
     )
     worm_ratio: Scalar = parameter(
         30.0,
@@ -39,10 +39,10 @@ class Levers(eqx.Module):
     worm_efficiency: Scalar = parameter(
         0.5,
         unit="-",
-        meaning="efficiency of the worm gear, driven by its worm; up to 0.5 it holds by itself",
+        meaning="efficiency of the worm gear, driven by its worm; self-locking up to 0.5",
         bounds=(0.05, 0.99),
         sd=0.15,
-        source="Fig. 5b, which no table resolves; a worm of one start: 0.4-0.6",
+        source="Fig. 5b, without a table; a worm of one start: 0.4-0.6",
     )
     planetary_ratio: Scalar = parameter(
         23.04,
@@ -50,7 +50,7 @@ class Levers(eqx.Module):
         meaning="ratio of the planetary gear between motor and worm",
         bounds=(1.0, 1e4),
         relative_sd=0.8,
-        source=f"that of the traction drive, Fig. A1: 12 beside 2; {_UNSTATED}",
+        source=f"that of the traction drive, Fig. A1: 12 next to 2; {_UNSTATED}",
     )
     planetary_efficiency: Scalar = parameter(
         0.75,
@@ -63,7 +63,7 @@ class Levers(eqx.Module):
     rate: Scalar = parameter(
         1.0,
         unit="rad/s",
-        meaning="rate at which a pair of levers swings where its angle is imposed",
+        meaning="rate of a pair of levers with an imposed angle",
         bounds=(1e-3, 100.0),
         relative_sd=0.5,
         source=f"8810 rpm over the two gears' ratios: 1.3 rad/s without load; {_UNSTATED}",
@@ -74,7 +74,7 @@ class Levers(eqx.Module):
         meaning="least angle of a lever, straight back under the belt",
         bounds=(-2 * math.pi, 0.0),
         sd=0.5,
-        source=f"nothing in Fig. A2 stops a lever; {_UNSTATED}",
+        source=f"no stop for a lever in Fig. A2; {_UNSTATED}",
     )
     angle_most: Scalar = parameter(
         math.pi,
@@ -87,10 +87,10 @@ class Levers(eqx.Module):
     current_limit: Scalar = parameter(
         1000.0,
         unit="A",
-        meaning="largest current of a motor of the levers that its driver lets flow",
+        meaning="largest current of a motor of the levers that its driver permits",
         bounds=(0.01, 1e4),
         relative_sd=0.1,
-        source="none on the bench: above any current",
+        source="no limit on the bench: above any current",
     )
     share_coulomb: Scalar = parameter(
         0.4,
@@ -110,7 +110,7 @@ class Levers(eqx.Module):
     )
 
     def tracks(self, side: Track) -> tuple[Track, Track]:
-        """Of the tracks of a side, the main one and that of one lever."""
+        """Tracks of a side split into the main one and that of one lever."""
 
         def share(coulomb: Scalar, viscous: Scalar) -> Track:
             return dataclasses.replace(

@@ -1,10 +1,10 @@
-"""Posture: how a robot rests on its one-sided supports, main belts and the rollers of its levers, on a plane.
+"""Posture: rest of a robot on its one-sided supports, main belts and the rollers of its levers, on a plane.
 
 Frame of the robot, its origin the middle of the wheelbase: forward along it, up across it. Seen from the side a robot
 is two axles and two rollers, circles over the grousers, with a belt around each pair: the main one around the axles,
-a lever's between its axle and its roller. On a plane it rests on the lower hull of the circles, on an edge between
-two of them, and that gives height, pitch and loads in closed form. All are smooth in angles, lengths and masses
-as long as the same two circles carry; where another takes over, pitch and height go on, but their derivatives and the
+a lever's between its axle and its roller. It rests on the lower hull of the circles, on an edge between two of them,
+which gives height, pitch and loads in closed form. All are smooth in angles, lengths and masses while the same two
+circles carry the load. If another circle takes over, pitch and height are continuous, but their derivatives and the
 contact jump.
 """
 
@@ -25,13 +25,13 @@ from mmrjax.model.robot import Robot
 
 #: Circles of an outline, from tail to nose.
 CIRCLES = REAR_ROLLER, REAR_AXLE, FRONT_AXLE, FRONT_ROLLER = range(4)
-#: Pairs of circles around which a belt runs.
+#: Pairs of circles with a belt around them.
 BELTS = ((REAR_ROLLER, REAR_AXLE), (REAR_AXLE, FRONT_AXLE), (FRONT_AXLE, FRONT_ROLLER))
-#: What may carry: tail and nose of an edge of the hull.
+#: Possible contacts: tail and nose of an edge of the hull.
 EDGES = np.array(list(itertools.permutations(CIRCLES, 2)))
-#: How far a belt may hang over the ground and still bear [m]: grousers and ground yield by about as much.
+#: Largest gap between belt and ground that still carries load [m]: about the compliance of grousers and ground.
 TOUCH = 5e-4
-#: Pitch beyond which a robot has tipped over, whatever it comes to lie on [rad].
+#: Pitch beyond which a robot counts as tipped over, whatever it rests on [rad].
 UPRIGHT = np.pi / 3
 #: Rounding of heights [m].
 _ROUNDING = 1e-9
@@ -42,10 +42,10 @@ class Outline(eqx.Module):
 
     Attributes:
         forward, up: centres of the circles, in the order of `CIRCLES` [m].
-        radius: of the circles, what rolls on the ground: wheels or belts over the grousers [m].
+        radius: of the circles as they roll on the ground: wheels, or belts over the grousers [m].
         belt: radius of the main belt over its grousers [m].
-        tracked: 1 on tracks; on wheels there are no levers: their rollers lie on the axles, without radius [-].
-        centre_forward, centre_up: centre of mass of all [m].
+        tracked: 1 on tracks; on wheels there are no levers: their rollers are on the axles, with radius 0 [-].
+        centre_forward, centre_up: centre of mass of all parts [m].
     """
 
     forward: Float[Array, "... 4"]
@@ -57,7 +57,7 @@ class Outline(eqx.Module):
     centre_up: Scalar
 
     def pitched(self, pitch: Scalar) -> Outline:
-        """The same with its nose raised by `pitch` [rad], about the middle of the wheelbase."""
+        """Same outline with its nose raised by `pitch` [rad], about the middle of the wheelbase."""
         forward, up = turned(self.forward, self.up, jnp.asarray(pitch)[..., None])
         at, high = turned(self.centre_forward, self.centre_up, pitch)
         return dataclasses.replace(self, forward=forward, up=up, centre_forward=at, centre_up=high)
@@ -74,14 +74,17 @@ class Outline(eqx.Module):
 
 
 def turned(forward: Scalar, up: Scalar, pitch: Scalar) -> tuple[Array, Array]:
-    """A point of the frame of the robot along the ground and above it, about the middle of the wheelbase [m]."""
+    """Coordinates of a point of the robot's frame along and above the ground, about mid-wheelbase [m]."""
     sine, cosine = jnp.sin(pitch), jnp.cos(pitch)
     return jnp.asarray(forward * cosine - up * sine), jnp.asarray(forward * sine + up * cosine)
 
 
 def parts(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> masses.Masses:
-    """Masses of half a robot of this mass with its payload [kg], None: as stated; its levers as the conditions state
-    them."""
+    """Masses of half a robot with the levers at the angles of the conditions.
+
+    Args:
+        mass: total with payload [kg]; None: as stated.
+    """
     if mass is None:
         stated = robot.chassis(conditions.configuration).mass + conditions.payload
         mass = stated if conditions.total_mass is None else conditions.total_mass
@@ -89,10 +92,10 @@ def parts(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> m
 
 
 def outline(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> Outline:
-    """A robot of this mass with its payload [kg] from the side, its levers as the conditions state them.
+    """Side view of a robot with the levers at the angles of the conditions.
 
     Args:
-        mass: None: as stated.
+        mass: total with payload [kg]; None: as stated.
     """
     chassis, gear = robot.chassis(conditions.configuration), robot.running_gear
     tracked = jnp.asarray(chassis.on_tracks)
@@ -111,19 +114,19 @@ def outline(robot: Robot, conditions: Conditions, mass: Scalar | None = None) ->
 
 
 class Posture(eqx.Module):
-    """How a robot rests on a plane.
+    """Posture of a robot at rest on a plane.
 
     Attributes:
         pitch: nose up [rad]; height: of the middle of the wheelbase above the plane [m].
-        rear, front: where it is carried, ahead of the middle of the wheelbase along the plane [m].
-        line: 1 where a belt bears all along between them, 0 where they bear alone [-].
+        rear, front: ends of the contact, ahead of the middle of the wheelbase along the plane [m].
+        line: 1 if a belt carries load all along between them, 0 if only the ends do [-].
         centre_ahead: centre of mass ahead of the middle of the wheelbase, along the plane [m]; centre_height: above
             the plane [m].
-        load_front: share of the load normal to the plane at its front, were it carried at both ends alone; beyond
-            0..1 the robot tips [-].
-        margin: distance along the plane from where gravity's line through the centre of mass meets it to the nearer
-            end of the contact; negative where the robot tips [m].
-        tips_back, tips_forward: slopes on which it would, uphill and downhill [rad].
+        load_front: share of the normal load at its front if only both ends carried it; outside 0..1 the robot
+            tips [-].
+        margin: distance along the plane from the intersection of gravity's line through the centre of mass to the
+            nearer end of the contact; negative if the robot tips [m].
+        tips_back, tips_forward: tipping slopes, uphill and downhill [rad].
         inertia: in pitch about the centre of mass [kg·m²].
     """
 
@@ -142,20 +145,20 @@ class Posture(eqx.Module):
 
     @property
     def length(self) -> Scalar:
-        """Distance of the ends of the contact [m]."""
+        """Distance between the ends of the contact [m]."""
         return self.front - self.rear
 
 
 def posture(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> Posture:
-    """The posture in which a robot rests on a slope, for one run; of several that hold, the one with least pitch.
+    """The posture of a robot at rest on a slope, for one run; if several are possible, the one with least pitch.
 
     Two circles i (tail) and j (nose), d apart in the direction β of the frame, touch a plane at the pitch
 
         θ = asin((r_j - r_i) / d) - β,
 
     and carry the robot if no other circle is below and gravity's line through the centre of mass passes between them.
-    The slope is that of the conditions, uphill ahead. Where no edge holds, the one that lacks least is returned, with
-    a negative `margin`; a pitch beyond `UPRIGHT` is none.
+    The slope is that of the conditions, uphill ahead. If no edge holds, the nearest to holding is returned, with
+    a negative `margin`; postures with a pitch beyond `UPRIGHT` are excluded.
 
     Args:
         mass: with payload [kg]; None: as stated.
@@ -165,7 +168,7 @@ def posture(robot: Robot, conditions: Conditions, mass: Scalar | None = None) ->
 
 
 def level(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> Posture:
-    """The same on level ground."""
+    """The posture of a robot at rest on level ground, see `posture`."""
     return posture(robot, dataclasses.replace(conditions, slope_deg=jnp.zeros_like(conditions.slope_deg)), mass)
 
 
@@ -190,7 +193,7 @@ def rest(side: Outline, slope: Scalar, inertia: Scalar) -> Posture:
 
     upright = jnp.abs(pitch) < UPRIGHT
     lowest = upright & tangent & (apart > 1e-6) & (jnp.min(gaps, -1) > -_ROUNDING)
-    # Circles on one line make several edges of one pitch: the longest is the contact.
+    # Circles on one line give several edges of equal pitch: the longest is the contact.
     rank = jnp.where(margin >= 0, jnp.abs(pitch) - 1e-3 * (front - rear), 10 - margin)
     best = jnp.argmin(jnp.where(lowest, rank, jnp.inf))
 

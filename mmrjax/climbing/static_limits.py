@@ -1,7 +1,7 @@
-"""Static limits: how high a step, how wide a gap a robot stands on in given postures of its levers; geometry alone.
+"""Static limits, from geometry only: the highest step and the widest gap for a robot at given lever angles.
 
-Friction and torque that bring it there are not asked about, which makes a static limit an upper bound for a robot
-that climbs slowly with its levers held.
+They ignore the friction and torque needed to get there. A static limit is therefore an upper bound for a robot that
+climbs slowly with its levers held.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 
-#: Pitches that are looked at at once, then in the best one's neighbourhood, and how often; of a posture, of any.
+#: Number of pitches searched first, then near the best one, and rounds; for one posture, and for any.
 _PITCHES, _POSTURES = (181, 33, 4), (13, 9, 1)
-#: How far beside the highest step its two sides are looked at [rad].
+#: Distance of the two evaluations on both sides of the highest step [rad].
 _BESIDE = 1e-5
 
 
 class Step(eqx.Module):
-    """The highest step on which a robot stands with its centre of mass over the edge.
+    """The highest step that carries a robot with its centre of mass over the edge.
 
     Attributes:
         height: of the step [m]; pitch: nose up [rad].
-        side: the robot there, in a frame along the ground, its middle of the wheelbase the origin; base: height of
+        side: the robot there, in a frame along the ground with the middle of its wheelbase as origin; base: height of
             that above the lower ground [m].
     """
 
@@ -43,14 +43,14 @@ class Step(eqx.Module):
 
 
 class Limits(eqx.Module):
-    """Static limits of a robot with its levers as they stand.
+    """Static limits of a robot at its lever angles.
 
     Attributes:
         step: the highest, driven onto nose first [m].
-        gap: the widest, that its contact bridges on both sides of its centre of mass [m]; 0 where no belt bears.
+        gap: the widest gap that its contact bridges on both sides of its centre of mass [m]; 0 if no belt touches.
         contact: length of the contact on level ground [m].
         tip_front, tip_rear: tops of the levers' rollers above level ground [m]; on wheels those of the wheels.
-        tips_back, tips_forward, tips_aside: slopes on which it tips over: uphill, downhill, across [rad].
+        tips_back, tips_forward, tips_aside: tipping slopes: uphill, downhill, across [rad].
         length, height: overall, on level ground [m].
     """
 
@@ -69,13 +69,13 @@ class Limits(eqx.Module):
 def lowest(side: Outline) -> tuple[Scalar, Scalar]:
     """Lowest points of a pitched outline behind the line through its centre of mass and ahead of it [m]."""
     line = side.centre_forward
-    # circles: the bottom where it lies on that side, else where the line cuts the arc
+    # circles: the bottom if it is on that side, else the intersection of the line with the arc
     apart, radius = side.forward - line, side.radius
     cut = jnp.where(jnp.abs(apart) < radius, jnp.sqrt(jnp.maximum(radius**2 - apart**2, 1e-18)), -jnp.inf)
     ahead = side.up - jnp.where(apart >= 0, radius, cut)
     behind = side.up - jnp.where(apart <= 0, radius, cut)
 
-    # belts: where the line cuts a straight run, both of each, as either may be the lower one
+    # belts: intersection of the line with a straight run, both of each, as either may be the lower one
     one, other = np.array([*BELTS, *(pair[::-1] for pair in BELTS)]).T
     around = jnp.where(np.array([True, False, False, True]), radius, side.belt)
     along, rise = side.forward[other] - side.forward[one], side.up[other] - side.up[one]
@@ -93,11 +93,11 @@ def lowest(side: Outline) -> tuple[Scalar, Scalar]:
 
 
 def step_at(side: Outline, pitch: Scalar) -> Scalar:
-    """The step [m] on which an outline stands at a pitch [rad] with its centre of mass over the edge.
+    """Height of the step [m] under an outline at a pitch [rad] with its centre of mass over the edge.
 
-    What is lowest behind the centre of mass stands on the lower ground, what is lowest ahead of it on the step:
-    H = min over x ≥ x_c of z less min over x ≤ x_c of z. Where belt and pulley alone do, with the tail turning on
-    a circle of radius R, the centre of mass ℓ ahead of that and h above the axles,
+    The lowest point behind the centre of mass stands on the lower ground, the lowest point ahead of it on the step:
+    H = min over x ≥ x_c of z less min over x ≤ x_c of z. Let only belt and pulley touch, with the tail turning on
+    a circle of radius R, the centre of mass ℓ ahead of its centre and h above the axles,
 
         H = R (1 - cos θ) + (ℓ - (h + R) tan θ) sin θ.
     """
@@ -106,7 +106,7 @@ def step_at(side: Outline, pitch: Scalar) -> Scalar:
 
 
 def _highest(height: Callable[[Scalar], Scalar], count: int, near: int, rounds: int) -> tuple[Scalar, Scalar]:
-    """The pitch of the highest step among `count`, then among `near` ever closer ones, and their distance [rad]."""
+    """The pitch of the highest step from `count` pitches, then `rounds` times from `near`, and the spacing [rad]."""
     apart = jnp.pi / 2 / (count - 1)
     grid = jnp.linspace(0.0, jnp.pi / 2, count)
     best = grid[jnp.argmax(jax.vmap(height)(grid))]
@@ -117,13 +117,13 @@ def _highest(height: Callable[[Scalar], Scalar], count: int, near: int, rounds: 
 
 
 def step(side: Outline, pitch: Scalar | None = None) -> Step:
-    """The highest of `step_at`, nose up, for one outline.
+    """The maximum of `step_at`, nose up, for one outline.
 
-    Where two parts of the outline meet at the highest step, its derivatives are those of both, weighted by their
-    rises s with pitch on the other side: dH = (s_1 dH_2 - s_2 dH_1) / (s_1 - s_2).
+    If two parts of the outline meet at the highest step, its derivatives are those of both, weighted by their
+    slopes s over pitch on the other side: dH = (s_1 dH_2 - s_2 dH_1) / (s_1 - s_2).
 
     Args:
-        pitch: of the highest step [rad]; None: it is looked for.
+        pitch: of the highest step [rad]; None: it is searched.
     """
     still = jax.lax.stop_gradient(side)
     best = _highest(lambda pitch: step_at(still, pitch), *_PITCHES)[0] if pitch is None else pitch
@@ -137,27 +137,27 @@ def step(side: Outline, pitch: Scalar | None = None) -> Step:
 
 
 def with_levers(conditions: Conditions, front: Scalar, rear: Scalar) -> Conditions:
-    """Conditions with levers at these angles [rad]."""
+    """Conditions with the levers at these angles [rad]."""
     front, rear = (jnp.broadcast_to(jnp.degrees(x), conditions.shape) for x in (front, rear))
     return dataclasses.replace(conditions, levers_front_deg=front, levers_rear_deg=rear)
 
 
 def flush(robot: Robot) -> Scalar:
-    """Angle at which a lever's lower run is in line with the main belt [rad], downward."""
+    """Lever angle for a lower run in line with the main belt [rad], downward."""
     gear = robot.running_gear
     return -jnp.arcsin((robot.radius_pulley + gear.grouser_height - gear.levers.roller) / gear.lever_length)
 
 
 def best_levers(robot: Robot, conditions: Conditions, pitch: Scalar) -> tuple[Scalar, Scalar]:
-    """The angles of front and rear levers [rad] in which one run's robot stands on its highest step at a pitch θ.
+    """The angles of front and rear levers [rad] that give one run's robot its highest step at a pitch θ.
 
-    The belt is over the edge, and the tail stands on the rollers of the rear levers. Front levers reach out level,
-    which brings their mass furthest over the step: φ_1 = -θ. Rear levers of length L stand
+    The belt is over the edge, and the tail stands on the rollers of the rear levers. Front levers extend level,
+    which brings their mass furthest over the step: φ_1 = -θ. Rear levers of length L stand at
 
-        θ - φ_2 = π/2 + atan2(μ c sin θ, L cos θ),
+        θ - φ_2 = π/2 + atan2(μ c sin θ, L cos θ).
 
-    upright but for what their mass, a share μ of all, c from their axle, is worth further ahead; both within the
-    levers' range.
+    They would be upright without their mass, a share μ of the total with its centre c from their axle, which
+    favours a position further ahead. Both angles are limited to the levers' range.
     """
     gear, half = robot.running_gear, posture.parts(robot, conditions)
     moved = gear.lever_mass * gear.lever_centre / (half.chassis + 2 * half.pulley)
@@ -167,12 +167,12 @@ def best_levers(robot: Robot, conditions: Conditions, pitch: Scalar) -> tuple[Sc
 
 
 def best_step(robot: Robot, conditions: Conditions) -> tuple[Step, Scalar, Scalar]:
-    """The highest step of one run in any posture within the levers' range, and the angles of front and rear levers
-    [rad]; its derivatives are those at these angles.
+    """The highest step of one run in any posture within the levers' range, and the angles of front and rear levers.
 
-    What a robot that climbs slowly can get over in whatever sequence of postures, where the wall of the step carries
-    nothing: as its tail leaves the lower ground, the centre of mass has to be over the step, and what is under it is
-    no higher than in the best posture. The pitch alone is searched for, the levers' angles follow (`best_levers`).
+    The derivatives are those at these angles [rad]. The step is a limit for any slow sequence of postures if the wall
+    of the step carries no load. When the tail leaves the lower ground, the centre of mass must be over the step, and
+    the step is no higher than in the best posture. Only the pitch is searched; the levers' angles follow
+    (`best_levers`).
     """
     still, run = jax.lax.stop_gradient((robot, conditions))
 
@@ -180,7 +180,7 @@ def best_step(robot: Robot, conditions: Conditions) -> tuple[Step, Scalar, Scala
         return step_at(posture.outline(still, with_levers(run, *best_levers(still, run, pitch))), pitch)
 
     best, apart = _highest(height, *_POSTURES)
-    for _ in range(2):  # smooth there: the tops of parabolas
+    for _ in range(2):  # smooth here: vertices of parabolas
         low, middle, high = jnp.asarray(jax.vmap(height)(best + apart * jnp.array([-1.0, 0.0, 1.0])))
         bend = 2 * middle - low - high
         best = (
@@ -193,14 +193,13 @@ def best_step(robot: Robot, conditions: Conditions) -> tuple[Step, Scalar, Scala
 
 
 def stairs_rise(robot: Robot, conditions: Conditions, tread: Scalar, friction: Scalar) -> Scalar:
-    """The highest rise of stairs of this tread [m] on which one run's robot stands without rocking or sliding, its
-    levers flush with the belt.
+    """The highest rise of stairs of this tread [m] that one run's robot stands on without rocking or sliding.
 
-    A belt of friction μ that holds by that alone slides where tan α = μ, with tan α = rise / tread. On noses
-    t / cos α apart it always has one behind gravity's line through its centre of mass and one ahead of it if it
-    reaches that far both ways: ℓ - h tan α ≥ t / cos α at the tail, of the centre of mass ℓ ahead of the tail and h
-    above the belt; 0 where not even noses without rise are. Grousers that catch a nose hold more, and a robot that
-    rocks may get on.
+    Its levers are flush with the belt. With friction alone, a belt of friction μ slides at tan α = μ, with
+    tan α = rise / tread. Noses are t / cos α apart. The belt always has one nose behind gravity's line through its
+    centre of mass and one ahead of it if it extends far enough both ways: ℓ - h tan α ≥ t / cos α at the tail, with
+    the centre of mass ℓ ahead of the tail and h above the belt. The result is 0 if even noses without rise are too
+    far apart. Grousers that catch a nose hold more, and a robot that rocks may still climb.
     """
     angle = flush(robot)
     rests = posture.level(robot, with_levers(conditions, angle, angle))
@@ -214,7 +213,7 @@ def stairs_rise(robot: Robot, conditions: Conditions, tread: Scalar, friction: S
 
 
 def limits(robot: Robot, conditions: Conditions) -> Limits:
-    """The static limits of a robot, for one run; slopes are level but those on which it tips."""
+    """The static limits of a robot, for one run on level ground, with its tipping slopes."""
     side, rests = posture.outline(robot, conditions), posture.level(robot, conditions)
     highest, lies = step(side), side.pitched(rests.pitch)
     tops, tracked = lies.up + lies.radius + rests.height, jnp.asarray(side.tracked) > 0.5
@@ -247,8 +246,10 @@ def _over_levers(robot: Robot, conditions: Conditions, angles: Float[Array, "n 2
 def over_levers(
     robot: Robot, conditions: Conditions, front_deg: Float[np.ndarray, " n"], rear_deg: Float[np.ndarray, " m"]
 ) -> tuple[Step, Float[Array, "n m"]]:
-    """The highest step with the levers at each pair of angles [deg], for one run, and the margin of tipping at rest
-    on its slope [m] (see `Posture`); leaves of shape (n, m, ...)."""
+    """The highest step for each pair of lever angles [deg], for one run, and the tipping margin at rest.
+
+    The margin is on the slope of the run [m] (see `Posture`). Leaves have shape (n, m, ...).
+    """
     pairs = np.stack(np.meshgrid(front_deg, rear_deg, indexing="ij"), -1)
     found = _over_levers(robot, conditions, jnp.asarray(pairs.reshape(-1, 2), float))
     return jax.tree.map(lambda x: x.reshape(*pairs.shape[:2], *x.shape[1:]), found)
@@ -256,8 +257,10 @@ def over_levers(
 
 @jax.jit
 def standing(robot: Robot, conditions: Conditions) -> tuple[Posture, Limits, Outline, Step]:
-    """How a robot stands in each run of a batch, its limits there, and its outline at rest and on its highest step;
-    leaves of shape (runs, ...)."""
+    """Posture, limits, outline at rest and highest step of the robot in each run of a batch.
+
+    Leaves have shape (runs, ...).
+    """
 
     def of_one(one: Conditions) -> tuple[Posture, Limits, Outline, Step]:
         side, rests = posture.outline(robot, one), posture.posture(robot, one)

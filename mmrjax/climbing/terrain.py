@@ -1,8 +1,8 @@
 """Terrain in the plane of travel: a polyline with its signed distance, its normal and its convex corners.
 
-All terrains are polylines that go forward (x never falls), of points [m] with the ground on their right, so flat
-ground has its free side up. The obstacle begins at x = 0. Rounded noses are the level line of the distance to a
-polyline that lies their radius deeper.
+All terrains are polylines that go forward (x never decreases), with points [m] and the ground on their right, so that
+flat ground has its free side up. The obstacle begins at x = 0. Rounded noses are a level line of the distance to a
+polyline that is deeper by their radius.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from jaxtyping import Array, Bool, Float
 
 from mmrjax.model.params import Scalar
 
-#: How far the ground goes on before and after an obstacle [m].
+#: Length of the ground before and after an obstacle [m].
 FAR = 100.0
-#: Depth of a gap [m]: nothing of a robot reaches its floor.
+#: Depth of a gap [m]; no part of a robot reaches its floor.
 DEEP = 5.0
-#: Where corners are that a polyline has not [m].
+#: Position of corners that a polyline does not have [m].
 _NOWHERE = (0.0, -1e3)
 
 
@@ -28,9 +28,9 @@ class Terrain(eqx.Module):
     """A polyline of ground.
 
     Attributes:
-        points: its vertices [m]; equal ones are one.
+        points: its vertices [m]; repeated vertices count once.
         nose: radius of its convex corners [m].
-        finish: where the obstacle ends [m].
+        finish: x of the end of the obstacle [m].
     """
 
     points: Float[Array, "points 2"]
@@ -42,22 +42,22 @@ class Terrain(eqx.Module):
         """Convex corners, centres of the noses [m]; concave ones are out of reach."""
         before, at, after = self.points[:-2], self.points[1:-1], self.points[2:]
         turn = _cross(at - before, after - at)
-        # A vertex that stands twice turns by nothing: its next one that differs is what counts.
+        # A repeated vertex has no edge; its next different vertex gives the direction.
         return jnp.where((turn < -1e-15)[:, None], at, jnp.asarray(_NOWHERE))
 
     def inside(self, at: Float[Array, "n 2"]) -> Bool[Array, " n"]:
-        """Whether points lie below the polyline."""
+        """True for points below the polyline."""
         a, b = self.points[:-1], self.points[1:]
         under = (at[:, None, 0] >= a[:, 0]) & (at[:, None, 0] < b[:, 0])
         return jnp.any(under & (_cross(b - a, at[:, None] - a) < 0), axis=1)
 
     def distance(self, at: Float[Array, "n 2"]) -> tuple[Float[Array, " n"], Float[Array, "n 2"]]:
-        """Distance of points from the ground [m], negative within it, and the ground's normal there.
+        """Distance of points from the ground [m], negative within it, and the ground's normal at the nearest point.
 
         The normal is the gradient of the distance: that of the nearest edge, or away from the nearest corner.
         """
         a, along = self.points[:-1], self.points[1:] - self.points[:-1]
-        square = jnp.maximum(jnp.sum(along**2, axis=1), 1e-30)  # of no edge where a vertex stands twice
+        square = jnp.maximum(jnp.sum(along**2, axis=1), 1e-30)  # 0 for a repeated vertex
         from_a = at[:, None] - a
         share = jnp.clip(jnp.sum(from_a * along, axis=-1) / square, 0.0, 1.0)
         off = from_a - share[..., None] * along
@@ -83,10 +83,10 @@ def _at(values: Array, which: Array) -> Array:
 
 
 def _terrain(points: Sequence[tuple[Scalar, Scalar]], finish: Scalar, nose: Scalar = 0.0, size: int = 0) -> Terrain:
-    """Of points [m] between the ground before and the ground after; padded to `size` of them."""
+    """Terrain through points [m] between the ground before and the ground after; padded to `size` points."""
     zero = jnp.zeros(())
     rows = jnp.stack([jnp.stack([x + zero, z + zero]) for x, z in points])
-    # Noses: the polyline stands their radius deeper; risers face backward.
+    # Noses: the polyline is deeper by their radius; risers face backward.
     rows = rows + jnp.asarray([1.0, -1.0]) * nose
     rows = jnp.concatenate([rows, jnp.broadcast_to(rows[-1], (max(size - len(points), 0), 2))])
     return Terrain(rows, nose + zero, finish + zero)
@@ -124,16 +124,16 @@ def gap(width: Scalar, size: int = 0) -> Terrain:
 
 
 def polyline(x: Sequence[float] | np.ndarray, z: Sequence[float] | np.ndarray, size: int = 0) -> Terrain:
-    """Level ground up to the first point (x, z) [m], the polyline, level ground from its last point on.
+    """Level ground up to the first point (x, z) [m], the polyline, then level ground from its last point on.
 
     Raises:
-        ValueError: fewer than two points, no number, x falls, or a wall goes back on itself.
+        ValueError: fewer than two points, a value that is not finite, decreasing x, or a wall that doubles back.
     """
     x, z = np.asarray(x, float), np.asarray(z, float)
     if x.ndim != 1 or x.shape != z.shape or len(x) < 2:
         raise ValueError(f"terrain: got x of shape {x.shape} and z of {z.shape}; expected two points or more")
     if not (np.isfinite(x).all() and np.isfinite(z).all()):
-        raise ValueError("terrain: got a point that is no number; expected x and z in metres")
+        raise ValueError("terrain: got a point that is not a number; expected x and z in metres")
     if (back := np.flatnonzero(np.diff(x) < 0)).size:
         k = int(back[0])
         raise ValueError(

@@ -1,1 +1,1 @@
-"""Compiled functions, and programs that are kept on disk."""
+"""Compiled functions, and programs stored on disk."""

@@ -1,8 +1,8 @@
-"""Compiled functions whose programs serve all robots that equations cannot tell apart.
+"""Compiled functions that share programs between robots with the same equations.
 
-A program belongs to the structure of its arguments, and a rig has much of that which no equation reads: priors,
-columns of files, the class of an effect whose prior is of another size. What has such things has a method
-`for_equations`, which gives it without them.
+A program belongs to the structure of its arguments. A rig has many fields that no equation reads: priors, columns of
+files, the class of an effect with other priors. Objects with such fields have a method `for_equations`, which returns
+them without these fields.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ def _has_more(x: Any) -> bool:
 
 
 def for_equations(x: T) -> T:
-    """Any arguments, with nothing in them that no equation reads."""
+    """The arguments without the fields that no equation reads."""
     return jax.tree.map(lambda leaf: leaf.for_equations() if _has_more(leaf) else leaf, x, is_leaf=_has_more)
 
 
-#: Options of XLA for programs over a few hundred points: compiled in three quarters of the time, no slower to run.
+#: Options of XLA for programs over a few hundred points: a quarter less compilation time, equal run time.
 SMALL = {"xla_cpu_use_fusion_emitters": False}
-#: The same with few optimizations, for runs over time: half of that time again, no slower to run (0.91 s for 1.06 an
-#: evaluation of two searches with the library, four runs of 3072 steps).
+#: The same with few optimizations, for runs over time: half of that compilation time, equal run time (0.91 s compared
+#: with 1.06 s per evaluation of two searches with the library, four runs of 3072 steps).
 OVER_TIME = {**SMALL, "xla_backend_optimization_level": 1}
-#: The same for programs that run a few times each, with few optimizations: none where that is sound, as from the
-#: command line (the loop on `measured` with nothing kept then takes 63 s of processor time, 78 at level 1).
+#: The same with few optimizations, for programs that run only a few times: level 0 if that is safe, as on the command
+#: line (the loop on `measured` without stored programs then takes 63 s of processor time, 78 s at level 1).
 SELDOM = {**SMALL, "xla_backend_optimization_level": 0 if SOUND_AT_LEVEL_0 in os.environ.get("XLA_FLAGS", "") else 1}
 
 
 def compiled(function: Callable[P, T], *, options: dict[str, Any] | None = None) -> Callable[P, T]:
-    """`eqx.filter_jit` of a function; one that returns a robot returns it as `for_equations` leaves it.
+    """`eqx.filter_jit` of a function; a returned robot is reduced by `for_equations`.
 
-    Where a folder for them is stated its programs are kept there (`mmrjax.compile.programs`). One thread traces at a
-    time; programs that were traced before run side by side, and those that are kept are compiled side by side.
+    If a program folder is set, programs are stored there (`mmrjax.compile.programs`). Tracing is limited to one
+    thread at a time. Programs run in parallel, and stored programs are also compiled in parallel.
 
     Args:
-        options: of XLA, by which programs that are kept are compiled: `SMALL`, `SELDOM` or None for its own.
+        options: of XLA for programs that are stored: `SMALL`, `SELDOM` or None for the defaults.
     """
     inner, kept, traced = eqx.filter_jit(function), Programs(function, options), set[Hashable]()
 

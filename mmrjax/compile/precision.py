@@ -1,8 +1,8 @@
 """Precision of the public functions: double outside a trace, JAX's own inside one.
 
 JAX computes in single precision by default, and importing this package does not change that. A public function
-switches to double precision in its own thread until it returns, if it is called outside a trace. Where JAX is single,
-robots, conditions and results contain NumPy arrays, since JAX would round its own arrays to single precision.
+switches to double precision in its own thread until it returns, if it is called outside a trace. If JAX is in single
+precision, robots, conditions and results contain NumPy arrays, because JAX would round its own arrays.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def at_once(function: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(function)
     def call(*args: P.args, **named: P.kwargs) -> T:
-        if not in_trace():  # where calls of compiled functions take half the time
+        if not in_trace():  # compiled functions then take half the time per call
             return double(*args, **named)
         with jax.ensure_compile_time_eval():
             return double(*args, **named)

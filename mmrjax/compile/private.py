@@ -1,4 +1,4 @@
-"""Folders that nobody but the user can change: native code is read from no others."""
+"""Folders that only the user can change; native code is read only from these."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def exposure(folder: Path) -> str:
-    """Reason why another user could place files in a folder; empty if nobody but the user and root can.
+    """Reason why another user could place files in a folder; empty if only the user and root can.
 
     The folder and its files have to belong to the user, and neither the group nor others may write to it. Each folder
     above it has to belong to the user or to root, and be sticky if others may write to it: they could rename it.
@@ -46,7 +46,7 @@ def _reason(part: Path, itself: bool) -> str:
 
 
 def _own_group(group: int) -> bool:
-    """True if a group has the user's name: many systems make one for each user alone."""
+    """True if a group has the user's name: many systems create one for each user."""
     import grp
     import pwd
 

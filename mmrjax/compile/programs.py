@@ -1,13 +1,13 @@
-"""Programs on disk: what was compiled for a function and arguments of one structure, kept whole.
+"""Programs on disk: compiled functions for arguments of one structure.
 
-JAX's own cache is asked for a program once it has been traced and lowered, which is most of the time of a process
-that compiles nothing. Here a program is found by a name, a hash of all that its tracing reads: the source of our
-packages, the versions of the libraries, JAX's settings, and the arguments with shapes in the place of their arrays.
-What has no such name (a class of a user's own file, an array of keys) goes the usual way. A program is native code:
-it is read from a folder that nobody but the user can change, and from no other (`mmrjax.compile.private`).
+JAX's own cache is consulted only after tracing and lowering, which is most of the time of a process that compiles
+nothing. Here a program is found by its name, a hash of all inputs of its tracing: the source of our packages, the
+versions of the libraries, JAX's settings, and the arguments with shapes in place of arrays. Arguments that cannot be
+named (a class of a user's own file, an array of keys) are compiled as usual. A program is native code: it is read
+only from a folder that nobody but the user can change (`mmrjax.compile.private`).
 
-Compared with JAX's cache alone this saves 27 % of the processor time of a warm `simulate` (5.6 s for 7.6), 23 % of a
-`sweep` and 45 % of `loop measured` (37 s for 68; docs/lab/figures.md, 2026-11-28). `jax.export` saves no more: it
+In addition to JAX's cache this saves processor time of warm commands (docs/lab/figures.md, 2026-11-28): 27 % of
+`simulate` (7.6 → 5.6 s), 23 % of a `sweep` and 45 % of `loop measured` (68 → 37 s). `jax.export` saves no more: it
 needs the same names.
 """
 
@@ -38,31 +38,31 @@ from jax.experimental import serialize_executable
 
 from mmrjax.compile.private import exposure
 
-#: Names the folder in which programs are kept; where it is not set, or empty, none are.
+#: Environment variable with the folder for programs; if it is unset or empty, none are stored.
 VARIABLE = "MMRJAX_PROGRAMS"
-#: Packages whose source is part of a name, and distributions whose version is.
+#: Packages whose source is part of a name, and distributions whose version is part of it.
 OWN = ("mmrjax", "calibration", "sweeps")
 LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "diffrax", "optax", "numpy", "scipy", "mujoco-mjx")
 _KNOWN = {*OWN, "jax", "jaxlib", "equinox", "optimistix", "lineax", "diffrax", "optax", "numpy", "mujoco"}
 _KNOWN |= {"builtins", "functools", "operator", "math", "collections", "copyreg", "types"}
-#: Settings of JAX and variables of the environment that say where and what is logged or kept, not what is computed.
-#: Nor precision: what is kept is double.
+#: Settings of JAX and environment variables for logging and storage, which do not change results. Precision is also
+#: here, because stored programs are always in double precision.
 _ASIDE = ("jax_compilation_cache", "jax_persistent_cache", "jax_log", "jax_logging", "jax_dump", "jax_enable_x64")
 _HEEDED = ("XLA_", "EQX_")
 
 
-#: Held by the thread that traces: two threads that trace one function fill the same stores of JAX and Equinox, which
+#: Lock of the thread that traces: two threads that trace one function fill the same stores of JAX and Equinox, which
 #: then fail ("Store occupied").
 TRACING = threading.RLock()
 T = TypeVar("T")
 
 
 class Unnamed(Exception):
-    """Arguments by which no other process could find a program again."""
+    """Raised for arguments that have no name in other processes."""
 
 
 class _Place:
-    """Where an array belongs in a result."""
+    """Placeholder of an array in a result."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,24 +70,24 @@ class Program:
     """One compiled program.
 
     Attributes:
-        executable: of the arrays among the arguments, in turn, to those among the results.
-        result: as the function returns it, with a `_Place` for every array.
+        executable: maps the list of arrays among the arguments to the list of arrays in the result.
+        result: result of the function, with a `_Place` for every array.
     """
 
     executable: Callable[..., list[Any]]
     result: Any
 
     def __call__(self, arguments: Any) -> Any:
-        """The function of such arguments."""
+        """Calls the function with arguments of this structure."""
         found = iter(self.executable(*_arrays(jax.tree.leaves(arguments))))
         return jax.tree.map(lambda x: next(found) if isinstance(x, _Place) else x, self.result)
 
 
 def compile_by(lowered: Any, options: dict[str, Any]) -> Any:
-    """Compile by those of these options of XLA that this version of it has.
+    """Compiles with those options that this version of XLA supports.
 
     Args:
-        lowered: what `jax.jit(function).lower` gave.
+        lowered: result of `jax.jit(function).lower`.
     """
     try:
         return lowered.compile(options)
@@ -97,26 +97,26 @@ def compile_by(lowered: Any, options: dict[str, Any]) -> Any:
 
 
 class Programs:
-    """The programs of a function by the structure of its arguments: those of this process, and those on disk."""
+    """The programs of a function by the structure of its arguments, in this process and on disk."""
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any] | None = None) -> None:
-        """Of a function, by these options of the compiler."""
+        """Stores the function and the options of the compiler."""
         self.function, self.options = function, options or {}
         self._found: dict[Any, Future[Program | None]] = {}
 
     def of(self, arguments: tuple[tuple, dict[str, Any]]) -> Program | None:
-        """The program for positional and named arguments; None where none may be kept."""
+        """The program for positional and named arguments; None if it may not be stored."""
         return self.of_structure(structure_of(arguments), arguments)
 
     def of_structure(self, structure: Hashable | None, arguments: tuple[tuple, dict[str, Any]]) -> Program | None:
-        """The program for arguments whose structure is known (`structure_of`); None where none may be kept."""
+        """The program for arguments of known structure (`structure_of`); None if it may not be stored."""
         folder = os.environ.get(VARIABLE, "")
         if structure is None or not folder or not _keeps() or not _private(folder):
             return None
         known = self._found.get(structure)
         if known is not None:
             return known.result()
-        # Whoever traces may wait for what another thread makes, which has to be past its own tracing by then.
+        # The tracing thread may wait for a program of another thread, which must have finished its own tracing.
         with TRACING:
             first = structure not in self._found
             found = self._found.setdefault(structure, Future())
@@ -128,7 +128,7 @@ class Programs:
         return found.result()
 
     def _kept(self, structure: Hashable, make: Callable[[], T]) -> T:
-        """What is made; where that fails, it is forgotten, and those who wait for it are told."""
+        """Result of `make`, stored; after an error it is forgotten, and waiting threads receive the error."""
         try:
             return make()
         except BaseException as error:
@@ -136,13 +136,13 @@ class Programs:
             raise
 
     def _obtained(self, folder: Path, leaves: list[Any], tree: Any) -> Callable[[], Program | None]:
-        """What gives it: from the folder, or compiled and kept there, once it is traced here."""
+        """Returns a function that gives the program: read from the folder, or traced here, compiled and stored."""
         try:
             name = _name(self.function, tree.unflatten([_shape(x) for x in leaves]))
         except (Unnamed, pickle.PicklingError, AttributeError, TypeError, RecursionError):
             return lambda: None
         place, known = folder / f"{name}.program", None
-        with contextlib.suppress(Exception):  # an entry that cannot be read, for whatever reason, is made again
+        with contextlib.suppress(Exception):  # an unreadable entry, for any reason, is made again
             known = pickle.loads(place.read_bytes())
         arrays = _arrays(leaves)
         if known is not None:
@@ -156,16 +156,16 @@ class Programs:
         executable = _loaded(folder, compiled, len(arrays), result)
 
         def make() -> Program:
-            """Compiled beside what other threads trace and compile."""
+            """Compiles in parallel with other threads that trace and compile."""
             found = executable
             if found is None:
                 with _read_from_cache() as read:
                     found = compile_by(lowered, self.options)
-                # One that JAX has read from its cache lacks functions when it is written again (XLA on a CPU), and
-                # one that calls back into Python holds addresses of this process.
+                # A program that JAX has read from its cache loses functions when it is written again (XLA on a CPU),
+                # and one with callbacks into Python holds addresses of this process.
                 if read or "callback" in text:
                     return Program(found, result)
-                with contextlib.suppress(Exception):  # what cannot be written, for whatever reason, is not kept
+                with contextlib.suppress(Exception):  # an unwritable program, for any reason, is not stored
                     written = serialize_executable.serialize(found)[0]
                     _write(_executable(folder, compiled), zlib.compress(written, 1))
             with contextlib.suppress(pickle.PicklingError, AttributeError, TypeError):
@@ -175,7 +175,7 @@ class Programs:
         return make
 
     def _lowered(self, leaves: list[Any], tree: Any) -> tuple[Any, Any]:
-        """What the function returns of such arguments, and itself lowered for them."""
+        """Structure of the function's result, and the function lowered for these arguments."""
         returned: list[Any] = []
 
         def flat(*arrays: Any) -> list[Any]:
@@ -186,13 +186,13 @@ class Programs:
             return _arrays(out)
 
         flat.__name__ = f"kept_{getattr(self.function, '__name__', 'function')}"
-        # The text names what is on disk: without the arguments that nothing reads, programs of others would be alike.
+        # The text names the program on disk; without unused arguments, programs of different functions could collide.
         lowered = jax.jit(flat, keep_unused=True).lower(*_arrays(leaves))
         return returned[0], lowered
 
 
 def structure_of(arguments: Any) -> Hashable | None:
-    """Returns what a program knows of its arguments; None where that cannot be hashed, or where some are traced."""
+    """Returns the structure of arguments that a program depends on; None if not hashable or if some are traced."""
     leaves, tree = jax.tree.flatten(arguments)
     if has_tracer(leaves):
         return None
@@ -205,7 +205,7 @@ def structure_of(arguments: Any) -> Hashable | None:
 
 
 def has_tracer(tree: Any) -> bool:
-    """Whether there is a tracer among the leaves."""
+    """True if a leaf is a tracer."""
     return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(tree))
 
 
@@ -215,20 +215,20 @@ def _arrays(leaves: list[Any]) -> list[Any]:
 
 @functools.cache
 def _private(folder: str) -> bool:
-    """True if nobody but the user can change a folder, and its files, as it is first used."""
+    """True if nobody but the user can change a folder and its files, as checked at first use."""
     return not exposure(Path(folder))
 
 
 def _keeps() -> bool:
-    """Whether programs of this process may be kept: double precision, on the one device of a CPU."""
+    """True if programs of this process may be stored: double precision, on the single device of a CPU."""
     return bool(jnp.result_type(float) == jnp.float64) and jax.default_backend() == "cpu" and jax.device_count() == 1
 
 
 def _shape(leaf: Any) -> Any:
-    """What a program knows of a leaf: shape and kind of an array, and anything else itself.
+    """Structure of a leaf: shape and kind of an array; any other leaf is returned unchanged.
 
     Raises:
-        Unnamed: an array of keys, or another whose kind NumPy does not have.
+        Unnamed: an array of keys, or of another kind that NumPy does not have.
     """
     if not eqx.is_array(leaf):
         return type(leaf), leaf
@@ -238,11 +238,11 @@ def _shape(leaf: Any) -> Any:
 
 
 class _Describer(pickle.Pickler):
-    """Pickles what is of known packages alone, equal things to equal bytes."""
+    """Pickles only objects of known packages, equal objects to equal bytes."""
 
     def __init__(self, file: io.BytesIO) -> None:
         super().__init__(file, protocol=5)
-        self.fast = True  # no references to what came before: these depend on which of two equal things was meant
+        self.fast = True  # no references to earlier objects: they depend on which of two equal objects was used
 
     def reducer_override(self, thing: Any) -> Any:
         by_name = isinstance(thing, type | types.FunctionType | types.BuiltinFunctionType)
@@ -255,7 +255,7 @@ class _Describer(pickle.Pickler):
 
 
 def _found(thing: type) -> Any:
-    """What a module has by the name of a class."""
+    """The object that a module holds under the name of a class."""
     at: Any = sys.modules.get(thing.__module__)
     for name in thing.__qualname__.split("."):
         at = getattr(at, name, None)
@@ -263,13 +263,13 @@ def _found(thing: type) -> Any:
 
 
 def _name(function: Callable[..., Any], arguments: Any) -> str:
-    """The name of a program: a hash of all that its tracing reads.
+    """Name of a program: a hash of all inputs of its tracing.
 
     Args:
-        arguments: with shapes in the place of arrays.
+        arguments: with shapes in place of arrays.
 
     Raises:
-        Unnamed: something is of a package that is not known.
+        Unnamed: an object belongs to an unknown package.
     """
     named = function.__module__, function.__qualname__
     if named[0].partition(".")[0] not in OWN or "<" in named[1]:
@@ -280,7 +280,7 @@ def _name(function: Callable[..., Any], arguments: Any) -> str:
 
 
 def _settings() -> tuple[tuple[str, str], ...]:
-    """JAX's settings and the variables of the environment that change what is compiled."""
+    """JAX's settings and environment variables that change compilation."""
     chosen = {k: str(v) for k, v in jax.config.values.items() if not k.startswith(_ASIDE)}
     chosen |= {k: v for k, v in os.environ.items() if k.startswith(_HEEDED)}
     return tuple(sorted(chosen.items()))
@@ -288,7 +288,7 @@ def _settings() -> tuple[tuple[str, str], ...]:
 
 @functools.cache
 def sources(root: Path = Path(__file__).resolve().parents[1]) -> str:  # noqa: B008 (a constant)
-    """A hash of the source of our packages, which lie in a folder, of the versions of the libraries and of Python."""
+    """A hash of the source of our packages in a folder, of the versions of the libraries and of Python."""
     digest = hashlib.sha256(sys.version.encode())
     for library in LIBRARIES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -305,7 +305,7 @@ def _executable(folder: Path, name: str) -> Path:
 
 
 def _loaded(folder: Path, name: str, arrays: int, result: Any) -> Callable[..., list[Any]] | None:
-    """The executable of that name for so many arrays; None where there is none that can be read."""
+    """The executable with that name for this number of arrays; None if it is missing or unreadable."""
     out = sum(isinstance(x, _Place) for x in jax.tree.leaves(result))
     try:
         written = zlib.decompress(_executable(folder, name).read_bytes())
@@ -313,19 +313,19 @@ def _loaded(folder: Path, name: str, arrays: int, result: Any) -> Callable[..., 
         return serialize_executable.deserialize_and_load(
             written, jax.tree.structure(((0,) * arrays, {})), jax.tree.structure([0] * out)
         )
-    except Exception:  # an entry that cannot be read, for whatever reason, is made again
+    except Exception:  # an unreadable entry, for any reason, is made again
         return None
 
 
 @functools.cache
 def _linear_algebra() -> None:
-    """Let JAX find LAPACK, which it does where it lowers a call of it: a program that was read calls it too."""
+    """Lets JAX find LAPACK, as it does when it lowers a call of it: programs read from disk call it too."""
     jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), float))
 
 
 @contextlib.contextmanager
 def _read_from_cache() -> Iterator[list[str]]:
-    """Fills a list if JAX reads a program from its own cache in this thread meanwhile."""
+    """Yields a list that is filled if JAX reads a program from its own cache in this thread meanwhile."""
     mine, read = threading.get_ident(), list[str]()
 
     def listen(event: str, **_: Any) -> None:
@@ -340,7 +340,7 @@ def _read_from_cache() -> Iterator[list[str]]:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all; a folder that cannot be written to is no error."""
+    """Writes a file completely or not at all; ignores a folder without write permission."""
     partial = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}")
     with contextlib.suppress(OSError):
         partial.write_bytes(content)

@@ -1,7 +1,7 @@
-"""The registry of derived outputs: what is solved for beyond one operating point. Importable without jax.
+"""Registry of derived outputs: results that need more than one operating point. Importable without jax.
 
-A new one is a module with `compute(robot, conditions)`, a pure function of one run that returns its numbers [SI] by
-name and a `status`, and a line of `TABLE`.
+A new output is a module with `compute(robot, conditions)` and a line of `TABLE`. `compute` is a pure function of one
+run that returns its numbers [SI] by name and a `status`.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ class Derived:
     Attributes:
         name: noun; column: in tables, with the unit in the name.
         unit: of the column; factor: the SI value of one such unit.
-        label: words of tables and reports.
-        module: that computes it, with others it may share a computation with.
-        resolution: digits after the point that a person wants to see [unit].
+        label: words in tables and reports.
+        module: module that computes it, possibly together with others.
+        resolution: digits after the point in reports [unit].
         ignores: conditions that it does not depend on, because it solves for them.
-        rests_on: parameters of the robot without which it is not known, by dotted name.
+        rests_on: dotted names of the parameters that it depends on; it is unknown if one of them is.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Derived:
 _SLOPE, START = "mmrjax.derived.steepest_slope", "mmrjax.derived.start_figures"
 _POSTURE, _TURN = "mmrjax.derived.pitch_and_step", "mmrjax.derived.turning_figures"
 
-#: Read through the module, so that a line more is an output more everywhere.
+#: Read through the module, so that a new line adds an output everywhere.
 TABLE: tuple[Derived, ...] = (
     Derived(
         "steepest_slope", "steepest_slope_deg", "deg", 1.0, "steepest slope held", _SLOPE, 2, ignores=("slope_deg",)
@@ -65,12 +65,12 @@ TABLE: tuple[Derived, ...] = (
     Derived("best_step", "best_step_mm", "mm", 1e-3, "highest step in any posture", _POSTURE, 1),
     Derived("turning_radius", "turning_radius_mm", "mm", 1e-3, "turning radius", _TURN, 1),
 )
-#: Those of a stance, and of a robot on a ground.
+#: Outputs of a posture at rest, and of a robot on a ground.
 OF_POSTURE = tuple(d for d in TABLE if d.module == _POSTURE)
 OF_GROUND = (*OF_POSTURE, *(d for d in TABLE if d.module in (_SLOPE, _TURN)))
-#: Those of a start from standstill.
+#: Outputs of a start from standstill.
 OF_START = tuple(d for d in TABLE if d.module == START)
-#: Those of a robot that turns alone, and of straight travel alone.
+#: Outputs of robots that turn only, and of straight travel only.
 OF_TURNS = tuple(d for d in TABLE if d.module == _TURN)
 OF_STRAIGHT = tuple(d for d in TABLE if d.module in (_SLOPE, START))
 
@@ -81,5 +81,5 @@ def names() -> tuple[str, ...]:
 
 
 def compute(module: str) -> Callable[..., dict[str, Any]]:
-    """The function of a module that computes derived outputs of one run."""
+    """The function that computes the derived outputs of one run in a module."""
     return importlib.import_module(module).compute

@@ -1,4 +1,4 @@
-"""Pitch and highest step of a run with its levers as they stand, and the highest step in any posture of them."""
+"""Pitch and highest step of a run at its lever angles, and the highest step at any lever angles."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from mmrjax.model.signals import CONVERGED
 
 @compiled
 def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
-    """How one run's robot stands and which step its geometry allows, whatever drives it.
+    """Pitch and highest steps of one run's robot, from geometry alone.
 
     Returns:
-        `pitch` [rad]; `highest_step`, of this posture, and `best_step`, of any [m]; `status`: always `converged`.
+        `pitch` [rad]; `highest_step`, in this posture, and `best_step`, in any [m]; `status`: always `converged`.
     """
     found = {
         "pitch": resting_posture.posture(robot, conditions).pitch,

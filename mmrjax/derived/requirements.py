@@ -1,4 +1,4 @@
-"""Requirements: what can be asked of a robot, as functions of the robot and a point of an envelope of use."""
+"""Requirements on a robot, as functions of the robot and a point of an envelope of use."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, CUT_OFF, Signals
 from mmrjax.turning.circling import circling
 
-#: Of an envelope: what a point of it states.
+#: Axes of an envelope, which each of its points states.
 AXES = ("payload_kg", "slope_deg", "charge", "ambient_C")
 PAYLOAD, SLOPE, CHARGE, AMBIENT = AXES
-#: What turning on level ground depends on.
+#: Axes that turning on level ground depends on.
 LEVEL = (PAYLOAD, CHARGE, AMBIENT)
 
 WATT_HOUR, MINUTE = 3600.0, 60.0
@@ -35,14 +35,14 @@ WATT_HOUR, MINUTE = 3600.0, 60.0
 
 @dataclasses.dataclass(frozen=True)
 class Quantity:
-    """What a requirement is about.
+    """A quantity that a requirement limits.
 
     Attributes:
-        name: with its unit, as files have it; unit: as people read it; factor: the SI value of one.
-        least: whether a number alone is the least that it has to be; else the most that it may be.
+        name: with its unit, as in files; unit: for display; factor: the SI value of one unit.
+        least: True if a bare number is a lower limit, False if it is an upper limit.
         label: words.
-        group: which computation it is read from, of `GROUPS`.
-        axes: of the envelope, on which it depends.
+        group: computation that gives it, one of `GROUPS`.
+        axes: axes of the envelope that it depends on.
     """
 
     name: str
@@ -54,9 +54,9 @@ class Quantity:
     axes: tuple[str, ...] = AXES
 
 
-#: Those that rest on how warm the windings become.
+#: Quantities that depend on the temperature of the windings.
 OF_HEAT = ("winding_C", "payload_kg")
-#: Everything that can be asked for, by name.
+#: All quantities that a requirement can name.
 QUANTITIES: dict[str, Quantity] = {
     q.name: q
     for q in (
@@ -73,7 +73,7 @@ QUANTITIES: dict[str, Quantity] = {
         Quantity("current_A", "A", 1.0, False, "current of all motors", "travel"),
         Quantity("energy_per_metre_Wh", "Wh/m", WATT_HOUR, False, "energy per metre", "travel"),
         Quantity("turn_in_place_rad_s", "rad/s", 1.0, True, "yaw rate on the spot", "turn", LEVEL),
-        Quantity("turning_radius_mm", "mm", MM, False, "turning radius beside a braked side", "turn", LEVEL),
+        Quantity("turning_radius_mm", "mm", MM, False, "turning radius around a braked side", "turn", LEVEL),
         Quantity("side_slope_deg", "deg", 1.0, True, "steepest slope travelled across", "across", (PAYLOAD,)),
         Quantity("step_mm", "mm", MM, True, "highest step", "posture", (PAYLOAD,)),
         Quantity("stairs_rise_mm", "mm", MM, True, "highest rise of stairs", "posture", (PAYLOAD,)),
@@ -85,11 +85,11 @@ QUANTITIES: dict[str, Quantity] = {
 
 
 class Ratings(eqx.Module):
-    """Numbers that a robot holds as constants, as numbers that can be batched.
+    """Limits and counts that a robot holds as constants, in a form that can be batched.
 
     Attributes:
-        cells: in series [-]; voltage_cutoff: of a cell [V]; temperature: permissible of the winding [°C];
-        torque: permissible of a gearbox for long [N·m], inf where not stated.
+        cells: in series [-]; voltage_cutoff: of a cell [V]; temperature: permissible winding temperature [°C];
+            torque: permissible continuous torque of a gearbox [N·m], inf if not stated.
     """
 
     cells: Scalar
@@ -99,7 +99,7 @@ class Ratings(eqx.Module):
 
 
 def ratings(robot: Robot) -> Ratings:
-    """Those of a robot."""
+    """The ratings of a robot."""
     return Ratings(
         jnp.asarray(robot.battery.cells, float),
         jnp.asarray(robot.battery.voltage_cutoff, float),
@@ -114,8 +114,8 @@ class Point(eqx.Module):
     Attributes:
         configuration: index; battery: 1 on the battery.
         adhesion, adhesion_lateral: of the surface as a ratio to the robot's own [-].
-        charge: state of charge [-], of an external supply its voltage [V]; charge_end: to which the battery is used.
-        share: of the time that the robot drives, for its endurance; 0 standing still [-].
+        charge: state of charge [-], or voltage of an external supply [V]; charge_end: state of charge at the end.
+        share: share of time in motion, for the endurance; 0: standing still [-].
         slope_deg: [deg]; payload: [kg]; ambient: [°C].
         tread: of stairs [m].
     """
@@ -134,11 +134,10 @@ class Point(eqx.Module):
 
 
 class Found(eqx.Module):
-    """What a point comes to.
+    """Value of a quantity at one point.
 
     Attributes:
-        value: [SI], with some number whatever the outcome; outcome: code into `STATUSES`, `converged` where the
-            value counts.
+        value: [SI], a number at any outcome; outcome: code into `STATUSES`; the value is valid if it is `converged`.
     """
 
     value: Float[Array, "..."]
@@ -146,7 +145,7 @@ class Found(eqx.Module):
 
 
 def packed(robot: Robot, cells: Scalar) -> Robot:
-    """The robot with so many cells in series, also where that is traced: as many volts of those that it has."""
+    """The robot with this number of cells in series, which may be traced; voltages scale with the number."""
     battery = robot.battery
     more = cells / battery.cells
     battery = dataclasses.replace(
@@ -157,7 +156,7 @@ def packed(robot: Robot, cells: Scalar) -> Robot:
 
 
 def _at(robot: Robot, point: Point, rated: Ratings) -> tuple[Robot, Conditions]:
-    """The robot with its winding at ambient temperature, as a run begins, and the conditions of a point."""
+    """The robot with its winding at ambient temperature, as at the start of a run, and the conditions of a point."""
     copper = 1 + robot.motor.temperature_coefficient * (point.ambient - TEMPERATURE_REFERENCE)
     motor = dataclasses.replace(robot.motor, resistance=robot.motor.resistance * copper)
     robot = packed(dataclasses.replace(robot, motor=motor), rated.cells)
@@ -170,19 +169,19 @@ def _at(robot: Robot, point: Point, rated: Ratings) -> tuple[Robot, Conditions]:
 
 
 def _discharge(robot: Robot, charge: Scalar) -> Scalar:
-    """Charge taken at a state of charge [C]; a hair before the end at 0, where a battery counts as empty."""
+    """Charge taken at a state of charge [C]; slightly less at 0, because a battery counts as empty there."""
     return robot.battery.capacity * (1 - jnp.maximum(charge, 1e-9))
 
 
 def _temperature(robot: Robot, point: Point, current: Scalar) -> Scalar:
-    """Of the winding after long running [°C]; `robot` as stated, not as `_at` gives it."""
+    """Winding temperature after long running [°C]; `robot` as stated, not as returned by `_at`."""
     return dataclasses.replace(robot.motor, temperature_ambient=point.ambient).temperature_settled(current)
 
 
 def heat_left(robot: Robot, point: Point, current: Scalar, limit: Scalar) -> Scalar:
-    """What is left of the loss that a winding may have for long at `current` [-]: 0 where it settles at `limit` [°C].
+    """Relative thermal margin of a winding for continuous `current` [-]: 0 if it settles at `limit` [°C].
 
-    1 - I² R_th R (1 + α (T - 25 °C)) / (T - T_a); `robot` as stated, not as `_at` gives it.
+    1 - I² R_th R (1 + α (T - 25 °C)) / (T - T_a); `robot` as stated, not as returned by `_at`.
     """
     motor = robot.motor
     hot = motor.resistance * (1 + motor.temperature_coefficient * (limit - TEMPERATURE_REFERENCE))
@@ -190,14 +189,16 @@ def heat_left(robot: Robot, point: Point, current: Scalar, limit: Scalar) -> Sca
 
 
 def _cell(rated: Ratings, signals: Signals, point: Point) -> Scalar:
-    """By how much a cell is above its cut-off voltage [V]; inf on an external supply."""
+    """Margin of a cell above its cut-off voltage [V]; inf on an external supply."""
     return jnp.where(point.battery > 0.5, signals.voltage_source / rated.cells - rated.voltage_cutoff, jnp.inf)
 
 
 def travel(robot: Robot, point: Point, rated: Ratings) -> tuple[dict[str, Array], Array]:
-    """Steady travel: every quantity of group `travel` by name [SI], and the outcome; beside them the
-    `current` of one motor and of the `battery` [A], what is `left` of traction and speed, of `adhesion` alone [-],
-    and by how much a `cell` is above its cut-off [V]."""
+    """Every quantity of group `travel` in steady travel by name [SI], and the outcome.
+
+    Further entries are the `current` of one motor and of the `battery` [A] and three margins: `left` of traction and
+    speed, `adhesion` alone [-], and `cell`, above the cut-off voltage [V].
+    """
     here, conditions = _at(robot, point, rated)
     signals, status, _ = operating(here, conditions)
     outcome = jnp.where((status == CONVERGED) & (_cell(rated, signals, point) < 0), CUT_OFF, status)
@@ -233,13 +234,16 @@ def _slope(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
     return Found(jnp.where(held, answer["steepest_slope"], 0.0), answer["status"])
 
 
-#: Halvings of a bracket, whose rest a step of Newton's method takes off.
+#: Halvings of a bracket; a Newton step removes the remaining error.
 HALVINGS = 26
 
 
 def _payload(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
-    """The largest payload that is carried for long: the robot travels, its winding settles within what is permitted,
-    its gearboxes carry the torque (where their limit is stated) and its cells stay above their cut-off."""
+    """The largest payload for continuous travel.
+
+    The robot travels, its winding settles at a permissible temperature, its gearboxes stay within their torque limit
+    (if stated) and its cells above their cut-off.
+    """
     most = CONDITIONS["payload"].range[1]
 
     def left(robot: Robot, payload: Scalar) -> Scalar:
@@ -259,8 +263,10 @@ def _payload(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
 
 
 def _edge(left, robot: Robot, low: Array, high: Array) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
-    """Where what is `left` becomes negative between low and high, `high` where it does not; and whether it is
-    positive at low. Derivatives are implicit, forward and reverse."""
+    """Point between low and high where `left` becomes negative, and whether `left` is positive at low.
+
+    `high` if it does not become negative. Derivatives are implicit, forward and reverse.
+    """
     still = jax.lax.stop_gradient(robot)
 
     def halve(bracket: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
@@ -276,7 +282,7 @@ def _edge(left, robot: Robot, low: Array, high: Array) -> tuple[Array, Array]:  
     usable = jnp.isfinite(steep) & (jnp.abs(steep) > 1e-12)
     step = left(robot, at) / jnp.where(usable, jax.lax.stop_gradient(steep), 1.0)
     found = at - jnp.where(usable & jnp.isfinite(step), step, 0.0)
-    # A margin that jumps has no root to step onto.
+    # A margin that jumps has no root for a Newton step.
     found = jnp.where(jnp.abs(found - at) < 1e-3 * (end - begin) + 1e-9, found, at)
     return jnp.where(left(still, end) > 0, high, found), left(still, begin) > 0
 
@@ -286,14 +292,15 @@ NODES = 8
 
 
 def _endurance(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
-    """How long the battery lasts [s]: t = ∫ dC / (s I_Σ(C) + I_p) over the charge that is used, Gauss-Legendre.
+    """Endurance on the battery [s]: t = ∫ dC / (s I_Σ(C) + I_p) over the usable charge, Gauss-Legendre.
 
-    It drives at full voltage for a share s of the time, else it stands; it ends where a cell meets its cut-off.
+    The robot drives at full voltage for a share s of the time and stands otherwise. It ends when a cell reaches its
+    cut-off.
     """
     first, last = (jnp.asarray(robot.battery.capacity * (1 - x)) for x in (point.charge, point.charge_end))
 
     def drawn(robot: Robot, discharge: Scalar) -> tuple[Scalar, Scalar, Array]:
-        """Mean current of the battery [A], what is left of the cut-off [V], status."""
+        """Mean battery current [A], margin above the cut-off [V], status."""
         here, conditions = _at(robot, point, rated)
         conditions = dataclasses.replace(conditions, discharge=jnp.asarray(discharge))
         signals, status, _ = operating(here, conditions)
@@ -319,12 +326,12 @@ def _mass(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
     return Found(mass, jnp.full(mass.shape, CONVERGED))
 
 
-#: Duty of the left side, the right one's being full.
+#: Duty of the left side, while the right side's is 1.
 DUTY_LEFT = {"turn_in_place_rad_s": -1.0, "turning_radius_mm": 0.0}
 
 
 def _turn(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
-    """A settled turn on level ground, at full voltage: both sides apart on the spot, or beside a side that brakes."""
+    """A settled turn on level ground at full voltage: on the spot with opposite sides, or around a braked side."""
     here, conditions = _at(robot, point, rated)
     conditions = dataclasses.replace(
         conditions, slope_deg=jnp.zeros(()), adhesion_lateral=jnp.asarray(point.adhesion_lateral),
@@ -334,16 +341,16 @@ def _turn(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
     low = jnp.any(jnp.asarray(_cell(rated, found.signals, point)) < 0)
     turns = jnp.where(jnp.abs(motion.yaw_rate) > 1e-6, motion.yaw_rate, 1e-6)
     rolls = motion.speed**2 + motion.speed_lateral**2
-    # A root of nothing has no derivative.
+    # A root of 0 has no derivative.
     value = motion.yaw_rate if name == "turn_in_place_rad_s" else jnp.sqrt(jnp.maximum(rolls, 1e-24)) / jnp.abs(turns)
     return Found(jnp.asarray(value), jnp.where((status == CONVERGED) & low, CUT_OFF, status))
 
 
 def _across(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
-    """The side slope [deg] from which a robot that travels across slides, or tips.
+    """Steepest side slope [deg] that a robot travels across without sliding or tipping.
 
     Rolling resistance takes a share f/φ_x of the friction ellipse: tan α = φ_y √(1 - (f/φ_x)²). It tips at
-    tan α = B / (2 h). Of a rigid robot whose load has not moved.
+    tan α = B / (2 h). For a rigid robot whose load does not shift.
     """
     here, conditions = _at(robot, point, rated)
     conditions = dataclasses.replace(conditions, adhesion_lateral=jnp.asarray(point.adhesion_lateral))
@@ -351,15 +358,17 @@ def _across(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
     stands = balances.stance(here, conditions, chassis, chassis.mass + point.payload)
     friction = chassis.ground.friction.static * point.adhesion
     taken = jnp.minimum(chassis.ground.rolling_resistance / friction, 1.0)
-    # A root of nothing left has no derivative.
+    # A root of 0 has no derivative.
     slides = friction * stands.lateral * jnp.sqrt(jnp.maximum(1 - taken**2, 1e-12))
     tips = stands.width / (2 * stands.height)
     return Found(jnp.degrees(jnp.arctan(jnp.minimum(slides, tips))), jnp.asarray(CONVERGED))
 
 
 def _posture(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
-    """What geometry allows a robot on level ground, see `static_limits`: the highest step in any posture of its
-    levers, stairs and gaps with its levers flush, its size with them folded."""
+    """Geometric limits of a robot on level ground, see `static_limits`.
+
+    The highest step in any posture of its levers, stairs and gaps with its levers flush, its size with them folded.
+    """
     conditions = Conditions(configuration=jnp.asarray(point.configuration), payload=point.payload)
     if name == "step_mm":
         value = static_limits.best_step(robot, conditions)[0].height
@@ -373,16 +382,16 @@ def _posture(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
     return Found(jnp.asarray(value), jnp.asarray(CONVERGED))
 
 
-#: How a group of quantities is computed: (robot, point, ratings, name) -> Found.
+#: Function of each group of quantities: (robot, point, ratings, name) -> Found.
 GROUPS = {"travel": _travel, "slope": _slope, "payload": _payload, "endurance": _endurance, "mass": _mass,
           "turn": _turn, "across": _across, "posture": _posture}  # fmt: skip
 
 
 def evaluate(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
-    """One quantity at one point.
+    """Value of one quantity at one point.
 
     Args:
-        robot: any; its parameters may be tracers; point: scalars; rated: the robot's `ratings`, or others.
+        robot: its parameters may be tracers; point: scalars; rated: the robot's `ratings`, or others.
         name: of `QUANTITIES`.
     """
     return GROUPS[QUANTITIES[name].group](robot, point, rated, name)

@@ -1,4 +1,4 @@
-"""The start from standstill: its peak current, how long it takes, and the electrical energy that it takes."""
+"""The start from standstill: its peak current, duration and electrical energy."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED
 
-#: Share of the final speed at which a start is over [-].
+#: Share of the final speed that ends a start [-].
 SHARE = 0.95
-#: Instants of the inrush, from the first to the last of it [s], and of the rest of the run.
+#: Times of the inrush, first and last [s], and of the rest of the run.
 INRUSH, EARLIEST, LATEST, REST = 250, 2e-5, 0.02, 800
-#: Error of a step of the run: a derivative of the time to speed is then right to 1e-4 (at `drive`'s 1e-6 to 6e-3).
+#: Error of a step of the run; a derivative of the time to speed is then accurate to 1e-4 (at `drive`'s 1e-6 to 6e-3).
 TOLERANCE = 1e-7
 
 
 def instants() -> np.ndarray:
-    """Times of a start [s]: each 3 % after the one before while the current rises to its peak, then 5 ms apart."""
+    """Times of a start [s]: spaced by 3 % while the current rises to its peak, then by 5 ms."""
     early = np.geomspace(EARLIEST, LATEST, INRUSH, endpoint=False)
     return np.concatenate([[0.0], early, np.linspace(LATEST, TIME_SETTLED, REST)])
 
 
 def peak(times: Float[Array, " times"], x: Float[Array, " times"]) -> Float[Array, ""]:
-    """Largest value of a sampled curve: the top of the parabola through its largest sample and the two next to it.
+    """Largest value of a sampled curve: the vertex of the parabola through its largest sample and both neighbours.
 
     Args:
-        times: not decreasing [s]; x: NaN where the curve has no value.
+        times: not decreasing [s]; x: samples, NaN if the curve has no value.
     """
     known = jnp.where(jnp.isfinite(x), x, -jnp.inf)
     k = jnp.clip(jnp.argmax(known), 1, x.shape[0] - 2)
@@ -47,9 +47,9 @@ def peak(times: Float[Array, " times"], x: Float[Array, " times"]) -> Float[Arra
 def crossing(
     times: Float[Array, " times"], x: Float[Array, " times"], rate: Float[Array, " times"], level: Array
 ) -> tuple[Array, Array]:
-    """Where a sampled curve first reaches a level: index of the sample before, and share of the way to the next.
+    """First crossing of a level by a sampled curve: index of the sample before, and share of the way to the next.
 
-    On the cubic through two samples and their rates, by Newton's method from the straight line.
+    Found on the cubic through two samples and their rates, by Newton's method from the straight line.
     """
     k = jnp.clip(jnp.argmax(x >= level), 1, x.shape[0] - 1) - 1
     width, rise = times[k + 1] - times[k], x[k + 1] - x[k]
@@ -73,9 +73,9 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     """One start from standstill by `drive`, over `TIME_SETTLED`.
 
     Returns:
-        `peak_current` of all motors [A]; `time_to_speed`, until 95 % of the speed at the end [s]; `energy_start`,
-        ∫ U_e I_s dt up to then [J]; `status` of the run. Numbers are NaN unless it is `converged`: a run that slides,
-        stalls or is not settled has no final speed. Derivatives are forward.
+        `peak_current` of all motors [A]; `time_to_speed`, until 95 % of the final speed [s]; `energy_start`,
+        ∫ U_e I_s dt until then [J]; `status` of the run. Numbers are NaN unless it is `converged`: a run that slides,
+        stalls or has not settled has no final speed. Derivatives are forward.
     """
     times = jnp.asarray(instants())
     run = drive(robot, conditions, times, TOLERANCE)

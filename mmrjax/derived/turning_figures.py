@@ -1,4 +1,4 @@
-"""What follows from how a robot turns: radius, instantaneous centre, effective width, what each side takes."""
+"""Figures of a turn: radius, instantaneous centre, effective width, power and temperature of each side."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from mmrjax.model.quantities import MM
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Result
 
-#: Yaw rate below which a robot travels straight [rad/s]; its turn would take two centuries.
+#: Yaw rate below which a robot travels straight [rad/s]; a full turn would take two centuries.
 NONE = 1e-9
 #: Channels of a motion in the plane.
 PLANE = ("speed", "lateral_speed", "yaw_rate")
-#: Columns, with what they are.
+#: Columns and their descriptions.
 COLUMNS: dict[str, str] = {
     "turning_radius_mm": "radius of the circle of the centre of mass, positive to the left; inf: straight",
     "centre_x_mm": "instantaneous centre of rotation ahead of the centre of mass",
     "centre_y_mm": "instantaneous centre of rotation to the left of the centre of mass",
     "effective_width_mm": "effective track width (V_teor,right - V_teor,left) / yaw rate",
     "power_left_W": "electrical power of the left motor", "power_right_W": "electrical power of the right motor",
-    "winding_left_C": "winding of the left motor after long running",
-    "winding_right_C": "winding of the right motor after long running",
+    "winding_left_C": "winding temperature of the left motor after long running",
+    "winding_right_C": "winding temperature of the right motor after long running",
 }  # fmt: skip
 
 
 def turning_radius(ahead: Any, aside: Any, rate: Any) -> Array:
-    """Of the circle of the centre of mass, positive to the left, inf where it travels straight [m].
+    """Radius of the circle of the centre of mass, positive to the left, inf in straight travel [m].
 
     Args:
         ahead, aside: speeds of the centre of mass [m/s]; rate: yaw rate [rad/s]; arrays of one shape.
     """
     turns = jnp.abs(rate) > NONE
-    along = jnp.sqrt(jnp.maximum(jnp.square(ahead) + jnp.square(aside), 1e-24))  # a root of nothing has no derivative
+    along = jnp.sqrt(jnp.maximum(jnp.square(ahead) + jnp.square(aside), 1e-24))  # a root of 0 has no derivative
     left = jnp.where(jnp.asarray(ahead) * rate < 0, -1.0, 1.0)
     return jnp.where(turns, left * along / jnp.where(turns, jnp.abs(rate), 1.0), jnp.inf)
 
@@ -51,7 +51,7 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     """The radius of a settled turn of one run.
 
     Returns:
-        `turning_radius` [m], NaN where nothing settles; `status` of the turn. Derivatives are implicit.
+        `turning_radius` [m], NaN if no turn settles; `status` of the turn. Derivatives are implicit.
     """
     point = steady(robot, conditions)
     found = turning_radius(*(point.reading[name] for name in PLANE))
@@ -59,11 +59,10 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
 
 
 def by_itself(robot: Robot, imposed: float) -> Result:
-    """How a robot whose sides differ turns on level ground where both are driven alike, a settled turn of each of its
-    configurations in order.
+    """Settled turns on level ground of a robot with unequal sides under equal commands, one for each configuration.
 
     Args:
-        imposed: voltage [V], or motor speed [rad/s] where that is what its rig imposes.
+        imposed: voltage [V], or motor speed [rad/s] if its rig imposes that.
     """
     both = OF_SIDES[-2:] if robot.rig.imposed == "motor_speed" else OF_SIDES[:2]
     alike = dict.fromkeys(both, imposed if robot.rig.imposed == "motor_speed" else 1.0)
@@ -72,13 +71,13 @@ def by_itself(robot: Robot, imposed: float) -> Result:
 
 
 def columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray) -> dict[str, np.ndarray]:
-    """The columns of settled turns, of what their channels read [SI]; arrays of one shape.
+    """The columns of settled turns, from the readings of their channels [SI]; arrays of one shape.
 
     Args:
         radius: of the driving wheels [m].
     """
     turn = np.asarray(reading["yaw_rate"])
-    # What is left of zero by rounding is no radius.
+    # A value within rounding of zero is no radius.
     rate = np.where(np.abs(turn) > NONE, turn, np.nan)
     shafts = {side: np.asarray(reading[f"motor_speed_{side}"]) for side in channels.SIDES}
     rolled = {side: radius * n / float(robot.gearbox.ratio) for side, n in shafts.items()}

@@ -1,4 +1,4 @@
-"""The library of effects, one file a balance: a new effect is a class in the file of its balance."""
+"""The library of effects, one file for each balance; a new effect is a class in the file of its balance."""
 
 from mmrjax.effects import (
     electrical_effects,
@@ -32,19 +32,19 @@ _FILES = (
     sensor,
 )
 
-#: Every effect of the library, balance by balance and there in the order of its file. Tables of scores and the
-#: random numbers of a bootstrap go by position: a new effect stands at the end of its file.
+#: All effects of the library by balance, in the order of each file. Tables of scores and the random numbers of a
+#: bootstrap depend on the position: add a new effect at the end of its file.
 ALL: tuple[type[Effect], ...] = tuple(effect for file in _FILES for effect in defined_in(file))
 
 BY_NAME: dict[str, type[Effect]] = {effect.name: effect for effect in ALL}
 
-#: Discrepancies without a name, which robot files know and no library holds.
+#: Unnamed discrepancies, which robot files accept but the library does not contain.
 UNNAMED: dict[str, type[Effect]] = {**CURVES, **WAVES, **CURVES_ROUND, **CURVES_SHOWN}
 
-#: Of a robot that turns: robot files know them, and the loop looks for them in tables of turns.
+#: Effects of a robot that turns; robot files accept them, and the loop tries them on tables of turns.
 OF_TURNS: dict[str, type[Effect]] = {effect.name: effect for effect in defined_in(turning_effects)}
 
-#: What robot files know beside the library. Those of channels the loop looks for where a robot has the channel.
+#: Further effects that robot files accept. The loop tries those of a channel if the robot has the channel.
 BESIDE: dict[str, type[Effect]] = {**UNNAMED, **OF_TURNS, **OF_CHANNELS}
 
 __all__ = [

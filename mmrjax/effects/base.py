@@ -1,4 +1,4 @@
-"""What an effect is: one equation that enters one balance with one linear amplitude."""
+"""Base class of effects: one equation that enters one balance with one linear amplitude."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mmrjax.model.params import Scalar, parameter
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
 
-#: What the balances of one equation add up to, in words: those of a line act alike on the readings.
+#: Quantity that the balances of one equation sum up, in words; balances with equal words change the readings equally.
 EQUATION = {
     **dict.fromkeys(("supply", "electrical"), "voltage drop"),
     **dict.fromkeys(("motor", "gearbox", "track"), "loss torque"),
@@ -31,56 +31,54 @@ EQUATION = {
     "inductance": "inductance",
     "sensor": "reading",
 }
-#: Driver of an effect that is not the same on both sides: a robot that has it does not travel straight by itself.
+#: Driver of an effect that differs between the sides: a robot that has it does not travel straight on its own.
 THE_SIDE = "the side"
 
 
 def amplitude(*, unit: str, meaning: str, bounds: tuple[float, float], sd: float, source: str) -> Any:
-    """Declare the amplitude of an effect, 0 (absent) by default; see `params.Spec` for the arguments."""
+    """Declares the amplitude of an effect, 0 (absent) by default; see `params.Spec` for the arguments."""
     return parameter(0.0, unit=unit, meaning=meaning, bounds=bounds, sd=sd, source=source, amplitude=True)
 
 
 class Effect(eqx.Module):
     """A term that the paper's model lacks.
 
-    A subclass states its equation and source in its docstring, declares its `amplitude` (see the function of
-    that name), any shape parameters beside it, and defines `term`. The class attributes that differ from their
+    A subclass states its equation and source in its docstring. It declares its `amplitude` (see the function of
+    that name) and further shape parameters, and defines `term`. Class attributes that differ from their
     defaults are stated as `dissipative = True`:
 
     Attributes:
-        name: its name in files and reports; by default that of the class, `MassError` as `mass_error`.
+        name: its name in files and reports; by default made from the class name, `MassError` as `mass_error`.
         balance: the balance it enters, one of `balances.BALANCES`, whose unit its term has; has no default. A
-            positive term takes away: a voltage drop, a loss torque, a resisting force, a lost speed; in `mass`,
-            `inertia` and `inductance` it adds, and in `sensor` it adds to what the instrument of `channel` shows,
-            which may be the magnitude alone.
-        driver: what its term changes with: `speed`, `current`, `load`, ...; `direction` if it is the way round that
-            it is about, `the side` if it is not the same on both sides. Effects
-            of one equation with one driver are a family: the forms of a law that data may not tell apart. Empty where
-            it is the same share everywhere.
-        rests_on: dotted names of parameters of the robot in proportion to which its term is, for whoever finds its
-            amplitude too large.
-        dissipative: whether a positive amplitude may only take power out; in `slip` that of the demand, which is the
-            traction in steady travel.
-        channel: for `sensor` alone: the channel that it changes, one of `channels.EVERY`.
-        transient: whether settled travel shows nothing of it, so that only histories can.
-        settles_to: name of the effect from which settled travel cannot tell it, so that only histories can.
-        needs_battery: whether it acts with the on-board battery alone, so that no run on an external supply
-            shows it.
-        needs_reverse: whether runs one way alone cannot tell it from a parameter of the robot, so that no such table
-            shows it.
-        needs_duty: whether it acts at a duty below 1 alone.
-        odd_in_travel: whether it keeps its sign in space and not in the frame of travel, as a wrong slope does:
-            a robot that travels backward, looked at so that its travel is forward again, meets minus its amplitude.
-        resolved: whether the track model has by itself what it stands for.
-        movers: `tracks` or `wheels` where it acts on configurations of that kind alone.
-        needs_belt: whether it is of a belt, which no load on a shaft has.
+            positive term is a loss: a voltage drop, a loss torque, a resisting force, a lost speed. In `mass`,
+            `inertia` and `inductance` it adds; in `sensor` it adds to the reading of `channel`, which may be a
+            magnitude.
+        driver: the quantity that its term changes with: `speed`, `current`, `load`, ...; `direction` for the
+            direction of rotation, `the side` if it differs between the sides. Effects of one equation with one driver
+            are a family: forms of a law that data may not distinguish. Empty if the term is a constant share.
+        rests_on: dotted names of robot parameters that its term is proportional to, as hints if its amplitude is
+            implausibly large.
+        dissipative: True if a positive amplitude can only remove power; in `slip` the power of the demand, which
+            equals the traction in steady travel.
+        channel: only for `sensor`: the channel that it changes, one of `channels.EVERY`.
+        transient: True if steady travel does not show it, so that only histories can.
+        settles_to: name of the effect that looks the same in steady travel; only histories distinguish the two.
+        needs_battery: True if it acts only with the on-board battery; runs on an external supply do not show it.
+        needs_reverse: True if runs in one direction cannot distinguish it from a parameter of the robot; such a table
+            does not show it.
+        needs_duty: True if it acts only at a duty below 1.
+        odd_in_travel: True if it keeps its sign in space and not in the frame of travel, as a wrong slope does. For a
+            robot that travels backward, its amplitude changes sign in the frame of travel.
+        resolved: True if the track model computes the phenomenon itself.
+        movers: `tracks` or `wheels` if it acts only on configurations of that kind.
+        needs_belt: True if it belongs to a belt, which a load on a shaft does not have.
         memory_size: size of its memory, for an effect whose term depends on the past of the run (a
-            temperature, a phase); None has none. A run starts with memory 0.
+            temperature, a phase); None: no memory. A run starts with memory 0.
         memory_unit: unit of its memory.
-        plain: of a class with priors of its own, the class that it differs from by these alone; factors: by what it
-            does, see `effects.scaled`.
-        configurations: names of the configurations that it acts on; none: all, or those with its `movers`. A
-            field: what a class states is the default, and a robot file may say `configurations = ["4W2T"]`.
+        plain: for a class with its own priors, the class of the library that it is made from; factors: ratios of its
+            priors to the library's, see `effects.scaled`.
+        configurations: names of the configurations that it acts on; empty: all, or those with its `movers`. A
+            field: the class states the default, and a robot file may state `configurations = ["4W2T"]`.
 
     An effect with a memory defines `rate`, and `settled` for the fidelities that keep no memory.
     """
@@ -106,7 +104,7 @@ class Effect(eqx.Module):
     factors: ClassVar[tuple[float, float, float]] = (1.0, 1.0, 1.0)
 
     if TYPE_CHECKING:
-        # Made without arguments an effect is absent.
+        # Without arguments an effect is absent.
         amplitude: Scalar = eqx.field(default=0.0, kw_only=True)
     else:
         amplitude: eqx.AbstractVar[Scalar]
@@ -116,35 +114,35 @@ class Effect(eqx.Module):
         super().__init_subclass__(**keywords)
         if "name" not in vars(cls):
             cls.name = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
-        # Stated beside the class attributes, it is the default of the field.
+        # Stated next to the class attributes, it is the default of the field.
         if isinstance(stated := vars(cls).get("configurations"), tuple):
             cls.__annotations__ = {**inspect.get_annotations(cls), "configurations": tuple[str, ...]}
             cls.configurations = eqx.field(default=stated, static=True, kw_only=True)
 
     def for_equations(self) -> Effect:
-        """The same of the class that it differs from by its priors alone."""
+        """Same effect as a class of the library, without its own priors."""
         if (plain := type(self).plain) is None:
             return self
         return plain(**{f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.init})
 
     @classmethod
     def family(cls) -> str:
-        """Its equation and its driver, in words: `loss torque that changes with speed`."""
+        """Equation and driver in words: `loss torque that changes with speed`."""
         what = f"reading of {cls.channel}".replace("_", " ") if cls.channel else EQUATION[cls.balance]
         return f"{what} that changes with {cls.driver}" if cls.driver else f"{what} that is the same share everywhere"
 
     @property
     def unlike(self) -> bool:
-        """Whether the sides of a robot that has it, its amplitude concrete, differ."""
+        """True if it makes the sides of a robot differ; needs a concrete amplitude."""
         return self.driver == THE_SIDE and bool(np.any(np.asarray(self.amplitude)))
 
     @property
     def acts_everywhere(self) -> bool:
-        """Whether it acts in every configuration of any robot."""
+        """True if it acts in every configuration of any robot."""
         return not self.movers and not self.configurations
 
     def acts(self, robot: Robot, signals: Signals) -> Scalar:
-        """1 in configurations on which it acts, else 0 [-]: those that it names, else those with its `movers`."""
+        """1 in configurations that it acts on, else 0 [-]: the named ones, else those with its `movers`."""
         if self.configurations:
             named = {robot.configurations.index(n) for n in self.configurations if n in robot.configurations}
             return sum((jnp.where(signals.configuration == k, 1.0, 0.0) for k in sorted(named)), jnp.zeros(()))
@@ -152,40 +150,40 @@ class Effect(eqx.Module):
 
     @abc.abstractmethod
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        """The term [unit of its balance], linear in `amplitude`; may read any signal computed before."""
+        """The term [unit of its balance], linear in `amplitude`; may read all signals computed before it."""
 
     def rate(self, robot: Robot, signals: Signals) -> Scalar:
-        """How fast its memory changes [unit of the memory / s]; may read every signal."""
-        raise NotImplementedError(f"{self.name} has a memory and no rate")
+        """Rate of change of its memory [unit of the memory / s]; may read every signal."""
+        raise NotImplementedError(f"{self.name} has a memory but defines no rate")
 
     def settled(self, robot: Robot, signals: Signals) -> Scalar:
-        """Its memory after long steady travel; may read any signal computed before its balance."""
-        raise NotImplementedError(f"{self.name} has a memory and no settled value")
+        """Its memory after long steady travel; may read all signals computed before its balance."""
+        raise NotImplementedError(f"{self.name} has a memory but defines no settled value")
 
     def initial(self, robot: Robot, angle: Scalar) -> Scalar:
-        """Its memory where a history begins with the output at an angle [rad]: as at rest."""
+        """Its memory at the start of a history, with the output at an angle [rad]: the value at rest."""
         return jnp.zeros_like(angle)
 
     def recall(self, robot: Robot, signals: Signals) -> Scalar:
-        """Its memory: of the run so far where one is kept (`drive`, `track`), else settled."""
+        """Its memory: the value followed along the run (`drive`, `track`), else the settled value."""
         return signals.memory[self.name] if self.name in signals.memory else self.settled(robot, signals)
 
     def step_longest(self, robot: Robot, conditions: Conditions) -> Scalar:
         """Longest integration step that resolves an effect with a memory [s].
 
-        An integrator chooses its steps by what happens in the run; for the derivative at amplitude 0 to be
-        right it has to see also what would happen.
+        An integrator chooses its steps from the solution; this limit keeps the derivative at amplitude 0 correct,
+        where the solution does not show the effect.
         """
         return math.inf
 
 
 def made(kind: type[Effect], name: str) -> type[Effect]:
-    """A class that a function has made, with its name; pickle finds it by that in `Made` of its module."""
+    """Names a class made by a function; pickle finds it by that name in `Made` of its module."""
     kind.__name__, kind.__qualname__ = name, f"Made.{name}"
     return kind
 
 
 def defined_in(module: ModuleType) -> tuple[type[Effect], ...]:
-    """The effects that a module defines, in its order; classes that lack a `term` are none."""
+    """The effects that a module defines, in its order; classes without a `term` are left out."""
     own = [v for v in vars(module).values() if inspect.isclass(v) and v.__module__ == module.__name__]
     return tuple(v for v in own if issubclass(v, Effect) and not inspect.isabstract(v))

@@ -1,4 +1,4 @@
-"""Friction through a bristle, which bends before it slides: shared by the effects that a reversal shows."""
+"""Friction through a bristle that bends before it slides; base of the effects that a reversal shows."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from mmrjax.model.signals import Signals
 
 
 def breakaway_parameter() -> Scalar:
-    """The angle θ_s over which a bristle yields: a field of every effect that has a bristle."""
+    """The breakaway angle θ_s of a bristle, a field of every effect with one."""
     return parameter(
         0.02,
         unit="rad",
-        meaning="turn of the driven shaft over which the contacts yield θ_s",
+        meaning="angle θ_s of the driven shaft until the contacts slide",
         bounds=(1e-4, 2.0),
         relative_sd=0.5,
         source="1 mm of belt, a degree of a geared shaft",
@@ -23,7 +23,7 @@ def breakaway_parameter() -> Scalar:
 
 
 class Bristle(Effect):
-    """A term of the bend z of a bristle at the driven shaft: θ_s z' = ω_k - |ω_k| z, z(0) = 0, settled z = sign ω_k.
+    """A term in the bend z of a bristle at the driven shaft: θ_s z' = ω_k - |ω_k| z, z(0) = 0, settled z = sign ω_k.
 
     Dahl, A solid friction model (1968), with exponent 1; the first order of Canudas de Wit, Olsson, Åström and
     Lischinsky (1995) with a steady curve that does not depend on speed. The memory is z [-].

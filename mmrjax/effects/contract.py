@@ -1,4 +1,4 @@
-"""What the checks of a user's effects and the tests of the library share: the signals that a term may read."""
+"""The signals that a term may read, for the checks of a user's effects and the tests of the library."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mmrjax.model.signals import Signals, State
 
 
 def _witness(place: str, whose: str, seen: list[Signals]) -> Effect:
-    """An effect that adds nothing, and keeps the signals that its balance hands to a term."""
+    """An effect with a zero term that records the signals its balance passes to it."""
 
     class Witness(Effect):
         balance = place
@@ -30,7 +30,7 @@ def _witness(place: str, whose: str, seen: list[Signals]) -> Effect:
 def readable(
     robot: Robot, conditions: Conditions, state: State, balance: str, channel: str = "", *, settled: bool = False
 ) -> Signals:
-    """The signals that an effect of this balance may read: those computed before it, every other one `UNSET`.
+    """The signals that an effect of this balance may read: those computed before it; the others are `UNSET`.
 
     Args:
         conditions, state: one run at one instant, scalars; not traced.

@@ -1,4 +1,4 @@
-"""Smooth curves in a balance, or in what an instrument shows: a discrepancy with a place, a shape and no name."""
+"""Smooth curves in a balance or in a reading: discrepancies with a place and a shape, but no name."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from mmrjax.model.params import Index, Scalar, parameter
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
 
-#: Balances that a curve may enter: unit, amplitude that is plausible, and which direction it acts along.
+#: Balances that a curve may enter: unit, plausible amplitude, and the signal of its direction.
 BALANCES = {
     "electrical": ("V", 1.0, "direction"),
     "track": ("N·m", 0.2, "direction"),
     "ground": ("N", 4.0, "direction_travel"),
     "slip": ("m/s", 0.05, "direction"),
 }
-#: The same of a robot that turns alone.
+#: The same for balances that only a robot with turns has.
 ROUND = {"yaw": ("N·m", 0.5, "direction_turn")}
-#: Channels to whose readings a curve may be added, likewise; an instrument's error of 1 % of its range is plausible.
-#: None to a heading, the channel `yaw`: that is the balance.
+#: Channels with readings that a curve may change, in the same form; 1 % of the range is a plausible instrument error.
+#: The channel `yaw`, a heading, has none: its curve is the one of the balance `yaw`.
 READINGS = {
     c.name: (
         c.unit_si or c.unit,
@@ -38,8 +38,8 @@ READINGS = {
     if c.name not in {**BALANCES, **ROUND}
 }
 PLACES = {**BALANCES, **ROUND, **READINGS}
-#: Variables of a curve, signals that every one of these balances knows, the time since the start of the run and the
-#: place of a run in the sequence: unit and ordinary range.
+#: Variables of a curve: signals that all these balances know, the time since the start of the run, and the place of a
+#: run in the sequence; each with unit and ordinary range.
 VARIABLES = {
     "voltage": ("V", 10.0, 35.0),
     "current": ("A", 0.0, 6.0),
@@ -50,37 +50,38 @@ VARIABLES = {
     "time": ("s", 0.0, 2.0),
     "order": ("-", 0.0, 100.0),
 }
-#: The same of a robot that turns alone; and which of the others its turns have.
+#: The same for a robot that turns only; and the variables above that turns have too.
 VARIABLES_ROUND = {"yaw_rate": ("rad/s", 0.0, 4.0), "side": ("-", -1.0, 1.0)}
 IN_TURNS = ("voltage", "current", "speed_motor", "payload", "speed", "order")
-#: Variables that have a sign by themselves; the others count along the motion: of the shafts, or of the turn.
+#: Variables with a sign of their own; the others count along the motion of the shafts, or of the turn.
 SIGNED = ("payload", "time", "order", "side")
-#: The variable with which a channel's reading goes, and the axes of a drift, over which its curves are.
+#: The variable of the curves of each channel, and the axes of a drift.
 READ_BY = {
     "total_current": "current", "motor_current": "current", "output_torque": "current", "motor_speed": "speed_motor",
     "output_speed": "speed_motor", "speed": "speed", "motor_voltage": "voltage", "yaw_rate": "yaw_rate",
 }  # fmt: skip
 DRIFT = ("time", "order")
 ORDINATES = tuple(f"y{k}" for k in range(6))
-#: Share of the range over which a curve levels out beyond each of its ends.
+#: Share of the range over which a curve levels out beyond each end.
 LEVEL = 0.05
 
 
-#: Signals that tell which way things go, -1 to 1.
+#: Signals of a direction, -1 to 1.
 WAYS = ("direction", "direction_travel", "direction_turn")
 
 
 def acts_along(place: str) -> str:
-    """The signal of `WAYS` along which a discrepancy in a place acts."""
+    """The signal of `WAYS` that gives the direction of a discrepancy in a place."""
     return PLACES[place][2]
 
 
 def counted_by(place: str, way: Callable[[str], Any], magnitudes: Container[str] = ()) -> Any:
-    """By what a discrepancy in a place counts: a run in mirror image shows it in mirror image; in what an instrument
-    shows of magnitudes alone, as it is.
+    """Sign factor of a discrepancy in a place: a run in mirror image shows it in mirror image.
+
+    For instruments that show only magnitudes the factor is 1.
 
     Args:
-        way: gives the signal of `WAYS` of a name; magnitudes: channels of such instruments.
+        way: returns the signal of `WAYS` of a name; magnitudes: channels of such instruments.
     """
     counts = way(acts_along(place))
     return abs(counts) if place in magnitudes else counts
@@ -89,11 +90,12 @@ def counted_by(place: str, way: Callable[[str], Any], magnitudes: Container[str]
 def in_travel(
     place: str, variable: str, x: Any, way: Callable[[str], Any], magnitudes: Container[str] = ()
 ) -> tuple[Any, Any]:
-    """A variable of a curve in the frame of travel, and by what the curve counts, see `counted_by`. What is over none
-    of `VARIABLES`, as a wave, counts as it is.
+    """A variable of a curve in the frame of travel, and its sign factor, see `counted_by`.
+
+    A variable that is not in `VARIABLES`, such as the angle of a wave, is returned unchanged.
 
     Args:
-        x: the variable [its unit], an array of either library; way, magnitudes: as of `counted_by`.
+        x: the variable [its unit], an array of NumPy or JAX; way, magnitudes: as for `counted_by`.
     """
     if variable not in VARIABLES | VARIABLES_ROUND:
         return x, 1.0
@@ -113,17 +115,17 @@ _EXTENDED[0, :3] = _EXTENDED[-1, :-4:-1] = 6.0, -8.0, 3.0
 
 
 def _level(u: Scalar) -> Float[Array, "..."]:
-    """u where it is positive; below, a parabola that is level from u = -LEVEL _LAST on, with slope 1 at 0."""
+    """u if positive; below 0 a parabola with slope 1 at 0 that is level from u = -LEVEL _LAST on."""
     width = LEVEL * _LAST
     below = jnp.clip(u, -width, 0.0)
     return jnp.maximum(u, 0.0) + below + below**2 / (2 * width)
 
 
 def weights(x: Scalar, low: Scalar, high: Scalar) -> Float[Array, "... 6"]:
-    """What each ordinate counts at x: cubic convolution, Keys (1981) eq. (15); they sum to 1.
+    """Weights of the ordinates at x: cubic convolution, Keys (1981) eq. (15); they sum to 1.
 
     Args:
-        x: the variable; low, high: where the first and the last ordinate stand [its unit].
+        x: the variable; low, high: position of the first and the last ordinate [its unit].
     """
     u = _level((x - low) / (high - low) * _LAST)
     u = _LAST - _level(_LAST - u)
@@ -145,8 +147,21 @@ def _size(unit: str, size: float) -> Scalar:
         meaning="size of the discrepancy",
         bounds=(-100 * size, 100 * size),
         sd=size,
-        source="what the fit leaves; no cause is known",
+        source="remainder of the fit; no cause is known",
     )
+
+
+def _description(place: str, over: str) -> str:
+    """Docstring of a curve: its equation with its units, and its source."""
+    where = f"the readings of `{place}`" if place in READINGS else f"the balance `{place}`"
+    unit, unit_x = PLACES[place][0], (VARIABLES | VARIABLES_ROUND)[over][0]
+    return f"""Δ = a y(x) along the travel in {where} [{unit}], x = {over} [{unit_x}].
+
+    y is smooth through six ordinates equally spaced from `low` to `high`, and levels out beyond.
+
+    Source: none, a discrepancy without a name; Keys, Cubic convolution interpolation for digital image
+    processing, IEEE Trans. ASSP 29 (1981) 1153, eqs. (15), (19), (25) of the interpolation.
+    """
 
 
 def _curve(place: str, over: str) -> type[Effect]:
@@ -196,21 +211,14 @@ def _curve(place: str, over: str) -> type[Effect]:
             return self.amplitude * jnp.sum(weights(x, self.low, self.high) * y, -1) * way
 
         def rate(self, robot: Robot, signals: Signals) -> Scalar:
-            """Time passes [s/s]; only a curve over time remembers anything."""
+            """Rate of time [s/s]; only a curve over time has a memory."""
             return jnp.ones_like(signals.speed_motor)
 
         def settled(self, robot: Robot, signals: Signals) -> Scalar:
-            """Long after the start: the curve's last value."""
+            """The memory long after the start, at the curve's last value."""
             return self.high + jnp.zeros_like(signals.speed_motor)
 
-    where = f"the readings of `{place}`" if shown else f"the balance `{place}`"
-    Curve.__doc__ = f"""Δ = a y(x) along the travel in {where} [{unit}], x = {over} [{unit_x}].
-
-    y is smooth through six ordinates equally spaced from `low` to `high`, and levels out beyond.
-
-    Source: none, a discrepancy without a name; Keys, Cubic convolution interpolation for digital image
-    processing, IEEE Trans. ASSP 29 (1981) 1153, eqs. (15), (19), (25) of the interpolation.
-    """
+    Curve.__doc__ = _description(place, over)
     return made(Curve, "".join(w.capitalize() for w in Curve.name.split("_")))
 
 
@@ -246,22 +254,22 @@ def _wave(place: str) -> type[Effect]:
 
     Wave.__doc__ = f"""Δ = a (y_s sin(k θ_k + φ) + y_c cos(k θ_k + φ)) in the balance `{place}` [{unit}].
 
-    θ_k is the angle of the driving pulley or wheel; settled travel shows nothing of it.
+    θ_k is the angle of the driving pulley or wheel; the wave does not show in steady travel.
 
     Source: none, a discrepancy without a name that repeats with the angle of a shaft.
     """
     return made(Wave, f"Wave{place.capitalize()}")
 
 
-#: The wave of every balance that carries curves: what a series shows as an order.
+#: The wave of every balance that has curves; a time series shows it as an order.
 WAVES: dict[str, type[Effect]] = {effect.name: effect for effect in map(_wave, BALANCES)}
 
-#: Every curve by its name. Robot files know them; they are no part of the library that is scored.
+#: Every curve by name. Robot files accept them; the library that is scored does not contain them.
 CURVES: dict[str, type[Effect]] = {
     effect.name: effect
     for effect in (_curve(place, over) for place in (*BALANCES, *channels.USUAL) for over in VARIABLES)
 }
-#: Those of the readings of any other channel, over what the loop looks for them.
+#: Curves of the readings of all other channels, over the variables that the loop tries for them.
 CURVES_SHOWN: dict[str, type[Effect]] = {
     effect.name: effect
     for effect in (
@@ -271,7 +279,7 @@ CURVES_SHOWN: dict[str, type[Effect]] = {
         if over is not None and place not in channels.USUAL
     )
 }
-#: Those of a robot that turns alone.
+#: Curves of a robot that turns only.
 CURVES_ROUND: dict[str, type[Effect]] = {
     effect.name: effect
     for effect in (
@@ -279,7 +287,7 @@ CURVES_ROUND: dict[str, type[Effect]] = {
         *(_curve(place, over) for place in ROUND for over in IN_TURNS),
     )
 }
-#: All of them by the names of their classes, see `made`.
+#: All of them by class name, see `made`.
 Made = SimpleNamespace(
     **{e.__name__: e for some in (WAVES, CURVES, CURVES_SHOWN, CURVES_ROUND) for e in some.values()}
 )

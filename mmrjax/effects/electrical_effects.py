@@ -17,7 +17,7 @@ class ElectricalEffect(Effect):
 
 
 class SeriesResistance(ElectricalEffect):
-    """ΔU = a I_d: Ohm's law for everything in series with one motor that its data sheet leaves out.
+    """ΔU = a I_d: Ohm's law for the resistance in series with one motor that its data sheet leaves out.
 
     Leads, ammeter and brush contacts in series with each motor.
 
@@ -42,11 +42,10 @@ class SeriesResistance(ElectricalEffect):
 class BrushDrop(ElectricalEffect):
     """ΔU = a I / √(I² + I_b²): a constant drop against the current, smooth through zero.
 
-    Contact voltage of the brushes, nearly the same at every current.
+    Contact voltage of the brushes, nearly equal at all currents.
 
     Source: IEEE Std 113-1985 takes a constant 2 V for carbon and graphite brushes of large machines; small
-    graphite brushes on copper drop tenths of a volt. The smoothing current I_b is that below which the
-    contact is ohmic.
+    graphite brushes on copper drop tenths of a volt. Below the smoothing current I_b the contact is ohmic.
     """
 
     driver = "current"
@@ -79,9 +78,9 @@ class WindingHeating(ElectricalEffect):
 
     Source: IEC 60028 for α; the maker's sheet for R_th = 7.7 K/W. A run shorter than the thermal time
     constants (16 s winding, 593 s housing) reaches only a share of the settled rise: 1 is settled, 0 cold.
-    The rise is taken at the cold resistance (first order in α) and held at the winding's limit of 125 °C, so
-    that the inrush of a start, which lasts milliseconds, is not taken for a settled current of 50 A. Where the
-    winding's temperature is followed (missions), its resistance follows that, and the effect adds nothing.
+    The rise is computed at the cold resistance (first order in α) and limited to the winding's 125 °C. Otherwise the
+    millisecond inrush of a start would count as a settled current of 50 A. If the winding's temperature is followed
+    (missions), its resistance follows that, and the effect adds 0.
     """
 
     driver = "current"
@@ -110,10 +109,10 @@ class ThermalDrift(ElectricalEffect):
 
     The winding warms up while the run lasts.
 
-    Source: IEC 60028 for α; the maker's sheet of RE30 310007 for τ and R_wh. The housing, with 593 s, stays
-    where it was during a run: its share is `winding_heating`, which settled travel cannot tell from this.
-    The memory is T [K]; where none is kept it is settled. Where the winding's temperature is followed (missions), its
-    resistance follows that, and the effect adds nothing.
+    Source: IEC 60028 for α; the maker's sheet of RE30 310007 for τ and R_wh. The housing, with 593 s, keeps its
+    temperature during a run. Its share is `winding_heating`, which steady travel cannot distinguish from this.
+    The memory is T [K]; without a memory the settled value is used. If the winding's temperature is followed
+    (missions), its resistance follows that, and the effect adds 0.
     """
 
     driver = "current"
@@ -124,10 +123,10 @@ class ThermalDrift(ElectricalEffect):
 
     amplitude: Scalar = amplitude(
         unit="-",
-        meaning="share of the sheet's temperature rise",
+        meaning="share of the data sheet's temperature rise",
         bounds=(-1.0, 10.0),
         sd=1.0,
-        source="1 by the sheet; more in still air between printed walls",
+        source="1 by the data sheet; more in still air between printed walls",
     )
     time_constant: Scalar = parameter(
         16.3,
@@ -160,14 +159,14 @@ class ThermalDrift(ElectricalEffect):
 
 
 class CoastDecay(ElectricalEffect):
-    """ΔU = -a (1 - |D|) E: between the pulses of a duty D the motors are left to coast, for a share a of the pauses.
+    """ΔU = -a (1 - |D|) E: during a share a of the pauses between the pulses of a duty D the motors coast.
 
-    A driver in fast decay, whose current ends within each period: the mean torque is in proportion to the duty, and
-    the speed without load does not depend on it.
+    A driver in fast decay, whose current ends within each period. The mean torque is proportional to the duty, and
+    the no-load speed does not depend on it.
 
     Source: Mohan, Undeland and Robbins, Power Electronics (2003), chapter 7: discontinuous conduction, with pulses
-    and pauses long against L/R (see `driver.Driver`, whose `decay = "fast"` is a = 1, and where the supply's current
-    and the heat of the pulses follow too). At full duty it is absent, as where the motors are open or shorted.
+    and pauses long compared with L/R. `driver.Driver` with `decay = "fast"` is a = 1, and also gives the supply
+    current and the heat of the pulses. The effect is 0 at full duty and if the motors are open or shorted.
     """
 
     driver = "duty"

@@ -26,10 +26,10 @@ def torque_output(robot: Robot, signals: Signals) -> Scalar:
 class GearLoadLoss(GearboxEffect):
     """ΔM_r = a |M_load|: a share of the torque at the output shaft.
 
-    Teeth lose more, or less, of the load than the catalogue says.
+    Teeth lose a larger or smaller share of the load than the catalogue states.
 
     Source: Niemann and Winter, Maschinenelemente II (2003): load-dependent mesh loss P_Z = P μ_z H_v. It is
-    eq. (19)'s η_rm in another form: look-alike of a change of η_rm by -a η_rm.
+    eq. (19)'s η_rm in another form: indistinguishable from a change of η_rm by -a η_rm.
     """
 
     driver = "load"
@@ -91,12 +91,12 @@ class StribeckGear(GearboxEffect):
         meaning="friction torque at rest, at the output",
         bounds=(-0.1, 1.0),
         sd=0.05,
-        source="some 1.5 mN·m at the input, times 48 and η_rm",
+        source="about 1.5 mN·m at the input, times 48 and η_rm",
     )
     speed_fade: Scalar = parameter(
         300.0,
         unit="rad/s",
-        meaning="input speed ω_s over which the excess fades",
+        meaning="input speed ω_s that scales the decay of the excess",
         bounds=(20.0, 3000.0),
         relative_sd=0.5,
         source="grease leaves mixed lubrication at 1000 to 5000 rpm of the input",
@@ -107,15 +107,15 @@ class StribeckGear(GearboxEffect):
 
 
 class BackdrivingLoss(GearboxEffect):
-    """ΔM_r = a |M_load| where the load drives the motor, 0 where the motor drives the load.
+    """ΔM_r = a |M_load| if the load drives the motor, 0 if the motor drives the load.
 
-    Teeth lose more of the load, or less, while power flows back through them, as down a slope.
+    Teeth lose a larger or smaller share of the load while power flows back through them, as on a descent.
 
     Source: Duclusaud, Passault, Padois and Ly, Extended friction models for the physics simulation of servo
-    actuators (2024, arXiv:2410.08650), whose directional models give motor and load a share of friction each;
-    Niemann and Winter, Maschinenelemente II (2003): the efficiency backward 2 - 1/η is below η. Of the load's
-    torque a share 1 - a gets to the gear, and of that eq. (19)'s η_b to the motor; at a = 1 the gear locks itself.
-    The load that it goes by is without the rotor's inertia; it fades at rest with the shaft's smooth sign.
+    actuators (2024, arXiv:2410.08650): directional models in which motor and load each have a share of friction.
+    Niemann and Winter, Maschinenelemente II (2003): the backward efficiency 2 - 1/η is below η. A share 1 - a of the
+    load's torque reaches the gear, and eq. (19)'s η_b of that the motor; at a = 1 the gear is self-locking.
+    The load excludes the rotor's inertia; the effect fades at rest with the shaft's smooth sign.
     """
 
     driver = "load"
@@ -137,13 +137,13 @@ class BackdrivingLoss(GearboxEffect):
 class BristleLoadLoss(Bristle, GearboxEffect):
     """ΔM_r = a |M_load| z, θ_s z' = ω_k - |ω_k| z, z(0) = 0: a share of the load lost through a bristle.
 
-    Teeth that carry a load yield over a small turn before they slide, so that their loss builds up after a reversal.
+    Loaded teeth yield over a small angle before they slide, so that their loss builds up after a reversal.
 
     Source: Duclusaud, Passault, Padois and Ly, Extended friction models for the physics simulation of servo actuators
     (2024, arXiv:2410.08650): friction in proportion to the load, here through Dahl's bristle (1968). Settled
-    z = sign ω_k: it is then `gear_load_loss`, and reversals tell the two apart. With `bristle_backdriving_loss` of
-    amplitude b it is μ_avg |M_load| z + μ_dif M_load z² with μ_avg = a + b/2 and μ_dif = -b/2. Bent teeth give
-    energy back, so it is not a pure loss.
+    z = sign ω_k: it then equals `gear_load_loss`, and reversals distinguish the two. With `bristle_backdriving_loss`
+    of amplitude b it is μ_avg |M_load| z + μ_dif M_load z² with μ_avg = a + b/2 and μ_dif = -b/2. Bent teeth return
+    energy, so it is not a pure loss.
     """
 
     driver = "load"
@@ -166,11 +166,12 @@ class BristleLoadLoss(Bristle, GearboxEffect):
 class BristleBackdrivingLoss(Bristle, GearboxEffect):
     """ΔM_r = a (|M_load| z - M_load z²) / 2, θ_s z' = ω_k - |ω_k| z, z(0) = 0.
 
-    Teeth that lose more of the load, or less, while it drives the motor, through the bristle of `bristle_load_loss`.
+    Teeth lose a larger or smaller share of the load while it drives the motor, through the bristle of
+    `bristle_load_loss`.
 
-    Source: Duclusaud, Passault, Padois and Ly (2024, arXiv:2410.08650), whose directional models give motor and load
-    a share of friction each; Dahl (1968). Settled z = sign ω_k: it is then `backdriving_loss`, 0 where the motor
-    drives the load and a |M_load| where the load drives the motor. Reversals under a load tell the two apart. See
+    Source: Duclusaud, Passault, Padois and Ly (2024, arXiv:2410.08650): directional models in which motor and load
+    each have a share of friction; Dahl (1968). Settled z = sign ω_k: it then equals `backdriving_loss`, 0 if the
+    motor drives the load and a |M_load| if the load drives the motor. Reversals under load distinguish the two. See
     `bristle_load_loss` for the sum of both.
     """
 

@@ -42,13 +42,13 @@ class SpeedRolling(GroundEffect):
 
 
 class AdhesiveDrag(GroundEffect):
-    """ΔF_f = a (1 + (V / V_p)²)^0.3 against the travel: a rest value that grows as V^0.6, whatever the load.
+    """ΔF_f = a (1 + (V / V_p)²)^0.3 against the travel: a rest value that grows as V^0.6, independent of the load.
 
     Rubber that is peeled off the ground behind the contact.
 
     Source: Roberts and Thomas, The adhesion and friction of smooth rubber surfaces, Wear 33 (1975) 45;
     Maugis and Barquins, J. Phys. D 11 (1978) 1989: energy of peeling w (1 + (V/V_p)^0.6) times the width.
-    Here rounded off at rest, so that its derivative is finite there.
+    Smoothed at rest, so that its derivative is finite.
     """
 
     driver = "speed"
@@ -59,15 +59,15 @@ class AdhesiveDrag(GroundEffect):
         meaning="peeling force of one side at a crawl",
         bounds=(-0.02, 0.3),
         sd=0.02,
-        source="0.1 J/m^2 over 0.1 m of width and more where it is soft",
+        source="0.1 J/m^2 over 0.1 m of width, and more if soft",
     )
     speed_peel: Scalar = parameter(
         1e-3,
         unit="m/s",
-        meaning="speed V_p from which peeling is rate-dependent",
+        meaning="speed V_p above which peeling is rate-dependent",
         bounds=(1e-6, 1.0),
         relative_sd=1.0,
-        source="rubber on glass at room temperature: micrometres to millimetres a second",
+        source="rubber on glass at room temperature: micrometres to millimetres per second",
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
@@ -103,10 +103,10 @@ class WeightTransfer(GroundEffect):
 class Sinkage(GroundEffect):
     """ΔF_f = a N (M / M_0)^(1/n) against the travel, M_0 the robot without payload.
 
-    Movers that sink in deeper under load meet more resistance.
+    Movers that sink deeper under load meet more resistance.
 
     Source: Bekker, Theory of Land Locomotion (1956): compaction resistance as the power (n + 1)/n of the
-    load with sinkage exponent n. Written as a change of the coefficient at the unladen robot, so that a is a
+    load with sinkage exponent n. Written as a change of the coefficient of the unladen robot, so that a is a
     coefficient.
     """
 
@@ -136,13 +136,12 @@ class Sinkage(GroundEffect):
 
 
 class SlopeBias(GroundEffect):
-    """ΔF = a N: m_i g (sin(α + a) - sin α) to first order, whichever way the robot goes.
+    """ΔF = a N: m_i g (sin(α + a) - sin α) to first order, independent of the direction of travel.
 
-    The slope is not what the inclinometer says.
+    The slope differs from the reading of the inclinometer.
 
     Source: expansion of eq. (1); the change of the normal load, second order in a on the level, is left out.
-    On the level it looks like rolling resistance while the robot goes forward; reverse travel tells them
-    apart.
+    On the level in forward travel it looks like rolling resistance; reverse travel distinguishes the two.
     """
 
     driver = "weight"
@@ -150,7 +149,7 @@ class SlopeBias(GroundEffect):
 
     amplitude: Scalar = amplitude(
         unit="rad",
-        meaning="angle by which the slope is steeper than stated",
+        meaning="excess of the true slope angle over the stated one",
         bounds=(-0.1, 0.1),
         sd=9e-3,
         source="half a degree for an inclinometer on a bench",
@@ -163,11 +162,11 @@ class SlopeBias(GroundEffect):
 class GrouserPolygon(Periodic, GroundEffect):
     """ΔF = a sin(2π r_k θ_k / p + φ) in the tracked configuration, p the pitch of the grousers.
 
-    The belt goes over its grousers as over the corners of a polygon.
+    The belt runs over its grousers as over the corners of a polygon.
 
     Source: chordal action of chain drives (Budynas and Nisbett, Shigley's Mechanical Engineering Design,
-    2011, ch. 17), grousers every 35 mm (Section 3.2.4): 6.9 passages a turn of the pulley. What is lifted
-    comes down again, so it takes no power out over a passage.
+    2011, ch. 17), grousers every 35 mm (Section 3.2.4): 6.9 passages per turn of the pulley. The robot rises and
+    falls again, so a full passage takes no power out.
     """
 
     driver = "angle"

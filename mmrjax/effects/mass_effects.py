@@ -1,4 +1,4 @@
-"""Effects on the mass [kg]: what robot and load weigh beyond what is stated."""
+"""Effects on the mass [kg]: deviations of robot and load from the stated mass."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class MassEffect(Effect):
 class MassError(MassEffect):
     """ΔM = a M: the stated mass, payload included, times 1 + a.
 
-    The robot and its load weigh more than stated, by a share.
+    The true mass of robot and load differs from the stated one by a share.
 
     Source: calibration error of the scales (OIML R 76 class IIII: a few tenths of a percent; a spring
-    balance: percents). Weight, adhesion, guide load and inertia all follow from the mass, so it enters there
-    and nowhere else.
+    balance: percents). Weight, adhesion, guide load and inertia all follow from the mass, so it enters only
+    there.
     """
 
     amplitude: Scalar = amplitude(
@@ -41,10 +41,10 @@ class MassError(MassEffect):
 class MassOffset(MassEffect):
     """M = stated mass + a in the wheeled configuration; in the tracked one M is as stated.
 
-    Kilograms that one configuration carries beyond what is stated; `configurations` may name others.
+    Additional mass of one configuration; `configurations` may name others.
 
     Source: Table A2 prints 13.1 kg for the wheeled robot, Table 7 states 11.5 kg. Weight, adhesion,
-    guide load and inertia all follow from the mass, so it enters there and nowhere else.
+    guide load and inertia all follow from the mass, so it enters only there.
     """
 
     driver = "configuration"

@@ -22,7 +22,7 @@ class MotorEffect(Effect):
 
 
 class Windage(MotorEffect):
-    """ΔM_df = a ω_m |ω_m|: turbulent drag, torque as the square of speed.
+    """ΔM_df = a ω_m |ω_m|: turbulent drag, torque proportional to the square of speed.
 
     Air drag of the rotor.
 
@@ -49,7 +49,7 @@ class Windage(MotorEffect):
 class StribeckMotor(MotorEffect):
     """ΔM_df = a exp(-|ω_m| / ω_s) sign ω_m.
 
-    Friction of brushes and bearings that falls as the shaft gains speed.
+    Friction of brushes and bearings that decreases with shaft speed.
 
     Source: Tustin, The effects of backlash and of speed-dependent friction on the stability of closed-cycle
     control systems, J. IEE 94 (1947), the exponential law; Armstrong-Hélouvry, Dupont and Canudas de Wit
@@ -69,7 +69,7 @@ class StribeckMotor(MotorEffect):
     speed_fade: Scalar = parameter(
         300.0,
         unit="rad/s",
-        meaning="motor speed ω_s over which the excess fades",
+        meaning="motor speed ω_s that scales the decay of the excess",
         bounds=(20.0, 3000.0),
         relative_sd=0.5,
         source="sleeve bearings leave mixed lubrication at 1000 to 5000 rpm",
@@ -85,8 +85,8 @@ class IronLoss(MotorEffect):
     Eddy currents in the motor's solid parts, weakened by their own field at high speed.
 
     Source: Wouterse, Critical torque and speed of eddy current brake with widely separated soft iron poles,
-    IEE Proc. B 138 (1991). Below ω_c the drag grows as the speed and is eq. (14)'s viscous term; hysteresis
-    is its dry one: what can be told from them is the bend towards ω_c.
+    IEE Proc. B 138 (1991). Below ω_c the drag is proportional to speed, as eq. (14)'s viscous term; hysteresis
+    acts as its dry term. Only the bend towards ω_c distinguishes the effect from both.
     """
 
     driver = "speed"
@@ -119,9 +119,9 @@ class TorqueConstantSaturation(MotorEffect):
     Armature reaction weakens the torque constant at high current.
 
     Source: demagnetising part of the armature reaction, even in the current (Fitzgerald, Kingsley and Umans,
-    Electric Machinery, 2003, ch. 7). It weakens torque and back-EMF alike; it stands in the motor balance
-    alone, where its share is the larger: with I R a tenth of U, the back-EMF's part is a second-order one.
-    So it is not a loss of power by itself.
+    Electric Machinery, 2003, ch. 7). It weakens torque and back-EMF by the same share. Only the motor balance
+    includes it, because its share is larger there: with I R a tenth of U, the back-EMF part is of second order.
+    The term alone is therefore not a loss of power.
     """
 
     driver = "load"
@@ -139,14 +139,14 @@ class TorqueConstantSaturation(MotorEffect):
 
 
 class Cogging(Periodic, MotorEffect):
-    """ΔM = a sin(n θ_m + φ) fade(n ω_m), with n ripples a turn; fade falls from 1 at ω_f to 0 at 2 ω_f.
+    """ΔM = a sin(n θ_m + φ) fade(n ω_m), with n ripples per turn; fade falls from 1 at ω_f to 0 at 2 ω_f.
 
     The motor's torque ripples as its commutator turns.
 
     Source: Kenjo and Nagamori, Permanent-Magnet and Brushless DC Motors (1985): ripple at twice the number
     of segments. The RE30 has an ironless rotor, hence no reluctance torque, and 13 segments. Above ω_f the
-    rotor's inertia leaves no more than a / (J_d ω_f) of speed, 0.03 rad/s at the prior's size, so the ripple
-    is faded out instead of being integrated at 5 kHz: it acts at a crawl and at the start.
+    rotor's inertia limits the speed ripple to a / (J_d ω_f), 0.03 rad/s at the prior's size. The torque ripple is
+    therefore faded out instead of integrated at 5 kHz; it acts at low speed and during starts.
     """
 
     driver = "angle"
@@ -162,7 +162,7 @@ class Cogging(Periodic, MotorEffect):
     ripples: Scalar = parameter(
         26.0,
         unit="-",
-        meaning="ripples a turn n",
+        meaning="number of ripples n per turn",
         bounds=(1.0, 100.0),
         relative_sd=0.01,
         source="twice the 13 segments of the commutator",
@@ -170,7 +170,7 @@ class Cogging(Periodic, MotorEffect):
     rate_fade: Scalar = parameter(
         1000.0,
         unit="rad/s",
-        meaning="ripple rate ω_f from which it is faded out",
+        meaning="ripple rate ω_f above which it is faded out",
         bounds=(10.0, 1e5),
         relative_sd=0.1,
         source="a choice of the model, see above",
@@ -185,5 +185,5 @@ class Cogging(Periodic, MotorEffect):
         return self.amplitude * self.wave(signals) * fade
 
     def step_longest(self, robot: Robot, conditions: Conditions) -> float:
-        """No limit: where the ripple acts, the start's own steps are shorter than its period."""
+        """No limit: while the ripple acts, the steps of a start are shorter than its period."""
         return math.inf

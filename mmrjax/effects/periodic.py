@@ -1,4 +1,4 @@
-"""What repeats with the angle of a shaft: shared by the effects that a history shows as orders."""
+"""Effects that repeat with the angle of a shaft; a history shows them as orders."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mmrjax.model.params import Index, Scalar, parameter
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
 
-STEPS = 12  # integration steps in a period: derivatives at amplitude 0 are then right to 1e-5
+STEPS = 12  # integration steps per period: derivatives at amplitude 0 are then accurate to 1e-5
 
 
 def phase_parameter() -> Scalar:
@@ -25,14 +25,14 @@ def phase_parameter() -> Scalar:
         meaning="phase φ of the wave at the start of the run",
         bounds=(-4.0, 4.0),
         sd=2.0,
-        source="how the parts stood at the start: anything",
+        source="position of the parts at the start: arbitrary",
     )
 
 
 class Periodic(Effect):
     """term = a w(signals) sin(ψ + φ), with ψ' = k ω_m and k the order per radian of the motor's shaft.
 
-    The memory is the phase ψ [rad]. Where none is kept (`steady`) the wave is its mean, zero.
+    The memory is the phase ψ [rad]. Without a memory (`steady`) the wave has its mean, zero.
     """
 
     transient = True
@@ -49,11 +49,11 @@ class Periodic(Effect):
         return self.order(robot, signals.configuration) * signals.speed_motor
 
     def settled(self, robot: Robot, signals: Signals) -> Scalar:
-        """0: a phase does not settle; `wave` is then its mean."""
+        """0: a phase has no settled value; `wave` then returns its mean."""
         return jnp.zeros_like(signals.speed_motor)
 
     def wave(self, signals: Signals) -> Scalar:
-        """sin(ψ + φ), or 0 where no phase is kept [-]."""
+        """sin(ψ + φ), or 0 if no phase is followed [-]."""
         if self.name not in signals.memory:
             return jnp.zeros_like(signals.speed_motor)
         return jnp.sin(signals.memory[self.name] + self.phase)

@@ -1,4 +1,4 @@
-"""Effects of the size of a rig: classes that differ from the library's by priors and limits alone."""
+"""Effects for other sizes of rig: classes that differ from the library's only by priors and limits."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mmrjax.effects.base import Effect
 from mmrjax.model import params
 from mmrjax.model.params import Parameter
 
-#: Factors of a class: of the sd of its amplitude, of its shape parameter, and of the limits of its amplitude.
+#: Factors of a class: for the sd of its amplitude, its shape parameter, and the limits of its amplitude.
 Factors = tuple[float, float, float]
 
 
@@ -21,7 +21,7 @@ def amplitude_of(effect: Effect) -> Parameter:
 
 
 def shape_of(effect: Effect) -> Parameter | None:
-    """The shape parameter that a fit frees: the first phase or scale beside the amplitude, if the effect has one."""
+    """The shape parameter that a fit frees: the first phase or scale after the amplitude; None without one."""
     for p in params.walk(effect):
         if not p.spec.amplitude and (p.name == "phase" or (p.spec.relative_sd and float(p.value) > 0)):
             return p
@@ -30,8 +30,10 @@ def shape_of(effect: Effect) -> Parameter | None:
 
 @functools.lru_cache(maxsize=4096)
 def scaled(kind: type[Effect], factors: Factors) -> type[Effect]:
-    """A class of the same effect whose amplitude's sd and limits and whose shape are so many times the library's; of
-    the same factors the same class."""
+    """A class of the same effect with the amplitude's sd and limits and the shape multiplied by factors.
+
+    Equal factors return the same class.
+    """
     sd, stretch, limits = factors
     effect = kind()
     fields = {amplitude_of(effect).name: _field(amplitude_of(effect), sd, limits)}
@@ -67,5 +69,5 @@ def _reduced(effect: Effect) -> tuple[Any, ...]:
 
 
 def _made(kind: type[Effect], factors: Factors, values: Mapping[str, Any]) -> Effect:
-    """An effect from what it is pickled as: its class cannot be found by name."""
+    """Restores an effect from its pickled values, because its class cannot be found by name."""
     return scaled(kind, factors)(**values)

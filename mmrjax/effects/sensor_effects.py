@@ -1,4 +1,4 @@
-"""Effects on what the instruments show, each in its channel's unit."""
+"""Effects on the readings of the instruments, each in its channel's unit."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from mmrjax.model.signals import Signals
 
 
 class SensorEffect(Effect):
-    """An error of the instrument of one channel, added to what it shows: of its scale, a x, or of its zero, a."""
+    """An error of one channel's instrument, added to its reading: of its scale, a x, or of its zero, a."""
 
     balance = "sensor"
 
     @property
     @abc.abstractmethod
     def of_zero(self) -> bool:
-        """Whether it is the same whatever is shown."""
+        """True if the error does not depend on the value shown."""
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         shown = robot.rig.instrument(self.channel).shows(channels.find(self.channel).read(robot, signals))
-        # Times one of the signals' shape, so that a batch stays a batch.
+        # A factor 1 of the signals' shape keeps a batch a batch.
         return self.amplitude * (jnp.ones_like(shown) if self.of_zero else shown)
 
 
 class AmmeterGain(SensorEffect):
     """ΔI_Σ = a I_Σ in the reading.
 
-    The ammeter's scale is off.
+    The ammeter's scale is wrong.
 
     Source: limits of error of meters by IEC 60051-2 (class 0.5 to 2.5) and tolerance of a shunt.
     """
@@ -57,7 +57,7 @@ class AmmeterOffset(SensorEffect):
 
     The ammeter does not show zero at zero.
 
-    Source: zero error of meters, IEC 60051-2; consumers beside the motors on the same line, eq. (10).
+    Source: zero error of meters, IEC 60051-2; other consumers on the same line, eq. (10).
     """
 
     channel = "total_current"
@@ -75,7 +75,7 @@ class AmmeterOffset(SensorEffect):
 class EncoderScale(SensorEffect):
     """Δω_m = a ω_m in the reading.
 
-    Counts of the motor's encoder are divided by a wrong number.
+    The divisor for the counts of the motor's encoder is wrong.
 
     Source: time base and pulses per turn of the counter; a tachometer's class by IEC 60051.
     """
@@ -95,7 +95,7 @@ class EncoderScale(SensorEffect):
 class SpeedGain(SensorEffect):
     """ΔV = a V in the reading.
 
-    The distance over which the robot is timed is not what is stated.
+    The distance that the robot is timed over differs from the stated one.
 
     Source: speed as distance over time (Section 4 of the paper): both errors are relative ones.
     """
@@ -113,7 +113,7 @@ class SpeedGain(SensorEffect):
 
 
 def _error(read: Channel, of_zero: bool) -> type[Effect]:
-    """The error of the scale of a channel's instrument, or of its zero."""
+    """The error of scale or zero of a channel's instrument."""
     largest, unit = (10 * read.zero_error, read.unit_si or read.unit) if of_zero else (0.2, "-")
     source = "limits of error of instruments, IEC 60051-2", "class of the instrument: 0.5 to 2.5 %"
     if read.unit_shown == "°C":
@@ -136,7 +136,7 @@ def _error(read: Channel, of_zero: bool) -> type[Effect]:
 
     Error.__doc__ = f"""Δx = a{"" if zero else " x"} in the reading x of {read.label}.
 
-    The {"zero" if zero else "scale"} of the instrument is off.
+    The {"zero" if zero else "scale"} of the instrument is wrong.
 
     Source: {source[0]}.
     """
@@ -144,14 +144,17 @@ def _error(read: Channel, of_zero: bool) -> type[Effect]:
 
 
 def _errors() -> Iterator[type[Effect]]:
-    """Of every channel that the classes above are not about: of its scale, but of a temperature, whose zero is a
-    convention; then of its zero. Random numbers go by position: new ones stand at the end."""
+    """Yields the errors of every channel that the classes above do not cover.
+
+    First those of scale, except of temperatures, whose zero is a convention; then those of zero. Random numbers
+    depend on the position: add new ones at the end.
+    """
     own = [c for c in channels.EVERY if c not in channels.usual()]
     yield from (_error(c, of_zero=c.unit_shown == "°C") for c in own)
     yield from (_error(c, of_zero=True) for c in own if c.misses_zero)
 
 
-#: A rig has those of its channels.
+#: A rig has the errors of its channels.
 OF_CHANNELS: dict[str, type[Effect]] = {effect.name: effect for effect in _errors()}
-#: The same by the names of their classes, see `made`.
+#: The same by class name, see `made`.
 Made = SimpleNamespace(**{effect.__name__: effect for effect in OF_CHANNELS.values()})

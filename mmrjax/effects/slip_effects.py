@@ -10,7 +10,7 @@ from mmrjax.model.params import Index, Scalar, parameter
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
 
-#: Share of V_1 and distance of the demand from its limit within which shaking contacts are rounded off [-].
+#: Share of V_1, and distance of the demand from its limit, within which the slip of shaking contacts is smoothed [-].
 SLOWEST, ROUNDED = 1e-3, 0.05
 
 
@@ -26,7 +26,7 @@ class RollingRadius(SlipEffect):
     The distance rolled per turn differs from the nominal radius.
 
     Source: kinematic rolling radius against loaded radius (Wong, Theory of Ground Vehicles, 2008, ch. 1).
-    The difference is kinematic, so it is not dissipative by itself: a > 0 lessens the loss in slip.
+    The difference is kinematic and not dissipative: a > 0 reduces the loss in slip.
     """
 
     amplitude: Scalar = amplitude(
@@ -47,7 +47,7 @@ class BeltCreep(SlipEffect):
     The belt stretches under traction and creeps on its pulley.
 
     Source: Firbank, Mechanics of the belt drive, Int. J. Mech. Sci. 12 (1970) 1053: creep = change of
-    tension over the belt's stiffness E A; so a = 1/(E A). The demand stands for the traction, equal to it in
+    tension over the belt's stiffness E A; so a = 1/(E A). The demand is used as traction, which it equals in
     steady travel.
     """
 
@@ -72,7 +72,7 @@ class NonlinearSlip(SlipEffect):
     Slip that grows steeply as the adhesion is used up.
 
     Source: Janosi and Hanamoto (1961): traction saturates over slip; the cube is the steep part of its
-    inverse. u is held within 2, beyond which the robot slides anyway.
+    inverse. u is limited to 2; the robot slides from 1 on.
     """
 
     driver = "demand"
@@ -97,7 +97,7 @@ class SpeedSlip(SlipEffect):
     Slip that grows with speed.
 
     Source: first term of an expansion of the slip in speed; treads that lift off between impacts. The loss
-    is kinematic: on a descent it does not take power out.
+    is kinematic: on a descent it removes no power.
     """
 
     driver = "speed"
@@ -117,10 +117,10 @@ class SpeedSlip(SlipEffect):
 class LoadSlip(SlipEffect):
     """ΔV = a V_teor N: radius r_k (1 - a N).
 
-    Belt and tyre that yield under load roll off less.
+    Belt and tyre yield under load, so that their rolling radius decreases.
 
     Source: effective rolling radius of a loaded tyre (Wong 2008, ch. 1; Pacejka, Tire and Vehicle Dynamics,
-    2012, ch. 1). Kinematic, so not dissipative by itself.
+    2012, ch. 1). Kinematic, so not dissipative.
     """
 
     driver = "load"
@@ -140,10 +140,10 @@ class LoadSlip(SlipEffect):
 class PulleyEccentricity(Periodic, SlipEffect):
     """ΔV = -a r_k ω_k sin(θ_k + φ): the radius that rolls off is r_k (1 + a sin) with a = e / r_k.
 
-    The driving pulley or wheel runs out of true.
+    The driving pulley or wheel is eccentric.
 
     Source: order 1 of the driving wheel's angle; total run-out by ISO 1101. The lever arm of the traction
-    changes alike, which is left out: an effect enters one balance.
+    changes by the same share, which is left out: an effect enters only one balance.
     """
 
     driver = "angle"
@@ -165,16 +165,16 @@ class PulleyEccentricity(Periodic, SlipEffect):
 
 
 class VibrationSlip(SlipEffect):
-    """ΔV = a √((V_teor / V_1)² + 0.001²)^p u / √((1 - |u|)² + 0.05²), u = demand over the adhesion limit of eq. (6);
-    on tracks alone.
+    """ΔV = a √((V_teor / V_1)² + 0.001²)^p u / √((1 - |u|)² + 0.05²), on tracks only.
 
-    Contacts that shake slide while they bear little; dry friction turns into an apparent viscous one.
+    u is the demand over the adhesion limit of eq. (6). Shaking contacts slide while their load is small; dry
+    friction becomes an apparent viscous friction.
 
-    Source: Section 3.2.4 and its ref. [46]; Blekhman, Vibrational Mechanics (2000). The law of Fig. 7 averaged over
-    contacts that swing by s (`mmrjax.vibration`), where V_s is small beside s: slip in proportion to s and, with the
-    load's lead, to u; s itself grows as 1 / (1 - u), as the track model shows (docs/vibration.md). That is rounded
-    off within 0.05 of the limit, beyond which the robot slides anyway, and the power of the speed at rest. Under a
-    demand that pulls forward the robot runs ahead of its tracks.
+    Source: Section 3.2.4 and its ref. [46]; Blekhman, Vibrational Mechanics (2000). The law of Fig. 7 is averaged
+    over contacts that oscillate by s (`mmrjax.vibration`), for V_s small compared with s. The slip is proportional to
+    s and, because the load leads, to u. s grows as 1 / (1 - u), as the track model shows
+    (docs/explanation/vibration.md). It is smoothed at rest and within 0.05 of the limit; beyond, the robot slides. If
+    the demand pulls forward, the robot runs ahead of its tracks.
     """
 
     driver = "demand"
@@ -187,23 +187,23 @@ class VibrationSlip(SlipEffect):
         meaning="speed lost at V_1 and half of the adhesion",
         bounds=(-0.05, 0.5),
         sd=0.02,
-        source="contacts of the track model swing by 1 to 4 % of the speed: running gears of docs/vibration.md",
+        source="contacts of the track model oscillate by 1 to 4 % of the speed (docs/explanation/vibration.md)",
     )
     exponent: Scalar = parameter(
         2.0,
         unit="-",
-        meaning="exponent p of the speed with which the swing grows",
+        meaning="exponent p of the growth of the oscillation with speed",
         bounds=(0.0, 5.0),
         sd=0.7,
-        source="inertia forces of what shakes grow as the square of its frequency; running gears: 2.1 to 3.4",
+        source="inertia forces grow as the square of the frequency; running gears: 2.1 to 3.4",
     )
     speed_reference: Scalar = parameter(
         1.0,
         unit="m/s",
-        meaning="speed V_1 that the amplitude is stated at",
+        meaning="speed V_1 for which the amplitude is stated",
         bounds=(1e-3, 100.0),
         relative_sd=0.01,
-        source="a choice: the amplitude is what varies",
+        source="a choice: only the amplitude is fitted",
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:

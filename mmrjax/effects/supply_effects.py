@@ -1,4 +1,4 @@
-"""Effects on the supply [V]: what is lost between the source and the motors, eqs. (8)-(13)."""
+"""Effects on the supply [V]: losses between the source and the motors, eqs. (8)-(13)."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ class SupplyEffect(Effect):
 
 
 class SupplySag(SupplyEffect):
-    """ΔU = a I_Σ: Ohm's law for what carries the current of all motors.
+    """ΔU = a I_Σ: Ohm's law for conductors that carry the current of all motors.
 
-    Leads and inner resistance that both motors share.
+    Leads and internal resistance that both motors share.
 
-    Source: Fig. 20 of the paper (supply, leads and ammeter of the bench); Ohm (1827). With sides that are
-    alike (assumption 3) it equals `series_resistance` of twice its size: only a run with one motor off tells
-    them apart.
+    Source: Fig. 20 of the paper (supply, leads and ammeter of the bench); Ohm (1827). With equal sides
+    (assumption 3) it equals `series_resistance` of twice its size: only a run with one motor off
+    distinguishes the two.
     """
 
     driver = "current"
@@ -42,12 +42,12 @@ class SupplySag(SupplyEffect):
 class BatterySag(SupplyEffect):
     """ΔU = a q on the battery, with the current's slow part q: τ q' = I_Σ - q, q(0) = 0.
 
-    The battery's voltage sinks over the first half minute of a load.
+    The battery's voltage falls over the first half minute of a load.
 
     Source: Chen and Rincón-Mora, Accurate electrical battery model capable of predicting runtime and I-V
     performance, IEEE Trans. Energy Conversion 21 (2006), the first RC pair; a is its resistance for the
-    whole battery. The memory is q [A]; where none is kept it is settled. The pair gives back what it has
-    stored, so it is not a pure loss. On an external supply it is absent.
+    whole battery. The memory is q [A]; without a memory the settled value is used. The pair returns its stored
+    energy, so it is not a pure loss. On an external supply it is absent.
     """
 
     driver = "current"

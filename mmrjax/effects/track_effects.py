@@ -24,8 +24,8 @@ class Churning(TrackEffect):
 
     Track loss that grows with the square of speed.
 
-    Source: the next term after eq. (24); impact of teeth and grousers takes a momentum that grows as the
-    speed, at a rate that grows as the speed (Merritt, The Evolution of a Tank Transmission, 1946).
+    Source: the next term after eq. (24); impact of teeth and grousers transfers a momentum proportional to the
+    speed, at a rate proportional to the speed (Merritt, The Evolution of a Tank Transmission, 1946).
     """
 
     driver = "speed"
@@ -47,7 +47,7 @@ class Churning(TrackEffect):
 class StribeckTrack(TrackEffect):
     """ΔM_t = a exp(-|ω_k| / ω_s) sign ω_k at the pulley, for a side's tracks.
 
-    Belt and pulley-bearing friction that falls as the belt gains speed.
+    Friction of belt and pulley bearings that decreases with belt speed.
 
     Source: Tustin (1947), the exponential law; Armstrong-Hélouvry, Dupont and Canudas de Wit (1994).
     """
@@ -65,7 +65,7 @@ class StribeckTrack(TrackEffect):
     speed_fade: Scalar = parameter(
         8.0,
         unit="rad/s",
-        meaning="pulley speed ω_s over which the excess fades",
+        meaning="pulley speed ω_s that scales the decay of the excess",
         bounds=(0.5, 80.0),
         relative_sd=0.5,
         source="belt speeds of 0.1 to 0.5 m/s",
@@ -109,7 +109,7 @@ class CentrifugalTension(TrackEffect):
     Source: centrifugal tension ρ v² of a running belt (Eytelwein 1808; Budynas and Nisbett, Shigley's
     Mechanical Engineering Design, 2011, ch. 17); so a = ρ / T_0. With the belts of Table 7, ρ = 0.05 kg/m,
     and T_0 of 1 to 10 N. Unlike `churning` it scales with the configuration's own M_t0. r_p is the radius of
-    the pulley, which drives the belt in both.
+    the pulley, which drives the belt in both configurations.
     """
 
     needs_belt = True
@@ -133,11 +133,11 @@ class CentrifugalTension(TrackEffect):
 class BendingLoss(TrackEffect):
     """ΔM_t = a 2x / (1 + x²), x = ω_k / ω_r: loss modulus of a standard linear solid.
 
-    Rubber that is bent round the pulleys (of a load on a shaft: of a belt drive or coupling) relaxes while it passes.
+    Rubber bent round the pulleys (or, for a load on a shaft, in a belt drive or coupling) relaxes while it passes.
 
     Source: Ferry, Viscoelastic Properties of Polymers (1980), ch. 3, the loss modulus G'' of a Maxwell
     element; Gerbert, Traction Belt Mechanics (1999), bending loss of a belt at each run on and off a pulley.
-    Far from ω_r it is like eq. (24)'s terms.
+    Far from ω_r it is similar to eq. (24)'s terms.
     """
 
     driver = "speed"
@@ -165,15 +165,15 @@ class BendingLoss(TrackEffect):
 
 
 class StickSlip(TrackEffect):
-    """ΔM_t = a z, θ_s z' = ω_k exp(-(ω_k/ω_s)²) - |ω_k| z, z(0) = 0: bristles bend over θ_s, then let go.
+    """ΔM_t = a z, θ_s z' = ω_k exp(-(ω_k/ω_s)²) - |ω_k| z, z(0) = 0: bristles bend over θ_s, then release.
 
-    Break-away: dry contacts of the track hold more before they slip.
+    Break-away: dry contacts of the track hold a larger torque before they slip.
 
     Source: Dahl (1968) with the Stribeck curve of Canudas de Wit, Olsson, Åström and Lischinsky, A new model
-    for control of systems with friction, IEEE Trans. Automatic Control 40 (1995); the curve stands with the
-    drive of z so that its rate stays finite. Settled: z = exp(-(ω_k/ω_s)²) sign ω_k, nothing at travelling
-    speed. Torque that falls with speed is what lets a crawling drive stick and slip. The memory is z [-].
-    Bent bristles give energy back, so it is not a pure loss.
+    for control of systems with friction, IEEE Trans. Automatic Control 40 (1995); the curve multiplies the drive of
+    z, so that its rate stays finite. Settled: z = exp(-(ω_k/ω_s)²) sign ω_k, zero at travelling speed. Torque that
+    decreases with speed lets a crawling drive stick and slip. The memory is z [-]. Bent bristles return energy, so
+    it is not a pure loss.
     """
 
     driver = "speed"
@@ -191,7 +191,7 @@ class StickSlip(TrackEffect):
     angle_breakaway: Scalar = parameter(
         0.01,
         unit="rad",
-        meaning="turn of the pulley over which the contacts let go θ_s",
+        meaning="angle θ_s of the pulley until the contacts release",
         bounds=(1e-4, 1.0),
         relative_sd=0.5,
         source="0.4 mm of belt: shear of teeth and seals",
@@ -199,7 +199,7 @@ class StickSlip(TrackEffect):
     speed_fade: Scalar = parameter(
         3.0,
         unit="rad/s",
-        meaning="pulley speed ω_s above which the excess is gone",
+        meaning="pulley speed ω_s above which the excess vanishes",
         bounds=(0.05, 8.0),
         relative_sd=0.5,
         source="belt speed of 0.1 m/s",
@@ -223,13 +223,13 @@ class StickSlip(TrackEffect):
 class DirectionalFriction(TrackEffect):
     """ΔM_t = a (sign ω_k)²: a dry loss of M_t0 + a forward and of M_t0 - a backward.
 
-    Dry friction that is larger one way round than the other.
+    Dry friction that is larger in one direction of rotation than in the other.
 
-    Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), who states the Coulomb friction of a drive's
-    joint for each direction by itself; seals with a lip, teeth and belts that bear on another flank. The mean of both
-    directions is eq. (24)'s M_t0, half their difference is a: runs one way alone show their sum, and this is M_t0 by
-    another name. A constant torque (`torque_offset`) is the same wherever the shaft turns. It takes power beside an
-    M_t0 that is larger, and by itself it gives it one way, so it is not dissipative.
+    Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), who states the Coulomb friction of a joint
+    separately for each direction; lip seals, teeth and belts that bear on another flank. The mean of both directions
+    is eq. (24)'s M_t0, half their difference is a. Runs in one direction show their sum, so that it cannot be
+    distinguished from M_t0. A constant torque (`torque_offset`) does not depend on the direction. The effect is
+    dissipative only together with a larger M_t0; alone it adds power in one direction, so it is not dissipative.
     """
 
     driver = "direction"
@@ -251,12 +251,12 @@ class DirectionalFriction(TrackEffect):
 class StribeckExponent(TrackEffect):
     """ΔM_t = a exp(-(|ω_k| / ω_s)^δ) sign ω_k at the driven shaft; δ = 2 unless stated.
 
-    Friction of bearings and seals that leaves mixed lubrication sooner or later than exponentially.
+    Friction of bearings and seals that leaves mixed lubrication faster or more slowly than exponentially.
 
     Source: Armstrong-Hélouvry, Dupont and Canudas de Wit, A survey of models, analysis tools and compensation
     methods for the control of machines with friction, Automatica 30 (1994) 1083: the exponential of Bo and Pavelescu
-    with δ of 1/2 to 1, of Tustin with 1 (`stribeck_track`), Armstrong's Gaussian with 2. Here |ω_k| / ω_s is
-    rounded off within a thousandth, where the sign fades too: below δ = 1 its power has no derivative at rest.
+    with δ of 1/2 to 1, of Tustin with 1 (`stribeck_track`), Armstrong's Gaussian with 2. |ω_k| / ω_s is smoothed
+    within a thousandth, as the sign is: for δ below 1 the power has no derivative at rest.
     """
 
     driver = "speed"
@@ -269,12 +269,12 @@ class StribeckExponent(TrackEffect):
         sd=0.1,
         source="a third of M_t0 of Table 3",
     )
-    # The first of two shapes is what the loop frees: of a curve with any δ from 1/2 to 2, once dry and viscous
-    # friction are fitted, δ = 1 and δ = 2 with ω_s free leave half of what δ free at one ω_s and δ = 1 do.
+    # The loop frees the first of two shapes, ω_s. For a curve with any δ from 1/2 to 2, after dry and viscous
+    # friction are fitted, δ = 1 and δ = 2 with ω_s free leave half the residual of a free δ at one ω_s and δ = 1.
     speed_fade: Scalar = parameter(
         8.0,
         unit="rad/s",
-        meaning="shaft speed ω_s over which the excess fades",
+        meaning="shaft speed ω_s that scales the decay of the excess",
         bounds=(0.05, 80.0),
         relative_sd=0.5,
         source="belt speeds of 0.1 to 0.5 m/s",
@@ -296,12 +296,12 @@ class StribeckExponent(TrackEffect):
 class DirectionalViscous(TrackEffect):
     """ΔM_t = a |ω_k|: a viscous loss of K + a forward and of K - a backward.
 
-    Friction whose growth with speed is larger one way round than the other.
+    Friction whose growth with speed is larger in one direction of rotation than in the other.
 
-    Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), who fits viscous friction of a joint for
-    each direction by itself; seals with a lip and guides that draw their lubricant in one way. Beside
-    `directional_friction`, which is even in the speed too, it is what grows with it. The mean of both directions is
-    eq. (24)'s viscous loss: runs one way alone show their sum.
+    Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), who fits viscous friction of a joint
+    separately for each direction; lip seals, and guides that draw in their lubricant in one direction. It is the part
+    that grows with speed, in addition to `directional_friction`, which is even in the speed too. The mean of both
+    directions is eq. (24)'s viscous loss: runs in one direction show their sum.
     """
 
     driver = "direction"
@@ -317,20 +317,19 @@ class DirectionalViscous(TrackEffect):
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        # With the shaft's smooth sign: |ω| alone has no derivative at rest.
+        # The shaft's smooth sign: |ω| has no derivative at rest.
         return self.amplitude * signals.speed_wheel * signals.direction
 
 
 class TorqueOffset(TrackEffect):
-    """ΔM_t = a, whichever way the shaft turns and at rest too; at its radius a force a / r_k.
+    """ΔM_t = a in both directions of rotation and at rest; at the radius a force a / r_k.
 
-    Something pulls one way all the time: a cable, a spring, a counterweight, a command or meter of torque with an
-    offset.
+    A constant pull in one direction: a cable, a spring, a counterweight, or an offset in a torque command or meter.
 
     Source: Swevers, Verdonck and De Schutter, Dynamic model identification for industrial robots, IEEE Control
-    Systems 27 (2007) 58: an offset beside dry and viscous friction of each joint. While a shaft turns it is
-    `directional_friction`, which fades at rest: histories through rest alone tell them apart. Of the motor it is
-    a i η_rm at the output. A stated torque of a load on a shaft (`torque_constant`) is the same.
+    Systems 27 (2007) 58: an offset in addition to dry and viscous friction of each joint. While a shaft turns it
+    equals `directional_friction`, which fades at rest: only histories through rest distinguish the two. An offset of
+    the motor is a i η_rm at the output. A stated torque of a load on a shaft (`torque_constant`) is the same.
     """
 
     needs_reverse = True
@@ -350,14 +349,14 @@ class TorqueOffset(TrackEffect):
 
 
 class Presliding(Bristle, TrackEffect):
-    """ΔM_t = a (z - sign ω_k), θ_s z' = ω_k - |ω_k| z, z(0) = 0: of the dry loss a share a acts through bristles.
+    """ΔM_t = a (z - sign ω_k), θ_s z' = ω_k - |ω_k| z, z(0) = 0: a share a of the dry loss acts through bristles.
 
-    Dry friction builds up over a small turn instead of at once, as contacts yield before they slide.
+    Dry friction builds up over a small angle instead of at once, as contacts yield before they slide.
 
     Source: Dahl, A solid friction model (1968), with exponent 1; it is the first order of Canudas de Wit, Olsson,
-    Åström and Lischinsky (1995) without their damping of the bristles. Settled z = sign ω_k: travel shows nothing
-    of it, reversals do. The memory is z [-]. At a = M_t0 all of the dry friction is Dahl's. `stick_slip` is what the
-    contacts hold beyond M_t0 before they let go; `bristle_load_loss` grows with the load.
+    Åström and Lischinsky (1995) without their damping of the bristles. Settled z = sign ω_k: steady travel does not
+    show it, reversals do. The memory is z [-]. At a = M_t0 all of the dry friction is Dahl's. `stick_slip` is the
+    additional torque beyond M_t0 before the contacts release; `bristle_load_loss` grows with the load.
     """
 
     driver = "direction"
@@ -379,12 +378,12 @@ class Presliding(Bristle, TrackEffect):
 class AngleFriction(Periodic, TrackEffect):
     """ΔM_t = a sin(θ_k + φ) sign ω_k: dry friction that changes over a turn of the driven shaft.
 
-    A bent shaft, a bearing or a guide that is tight at one place of each turn.
+    A bent shaft, a bearing or a guide that is tight at one place in each turn.
 
     Source: Popović and Goldenberg, Modeling of friction using spectral analysis, IEEE Trans. Robotics and Automation
-    14 (1998) 114: friction of a joint by its angle, its first order here. Where a history begins at a measured angle
-    the phase is that of the shaft, else of each run's beginning. It is friction, so that it turns round with the
-    speed; as large as M_t0 it would stop being a loss at some angle.
+    14 (1998) 114: friction of a joint over its angle, here its first order. If a history begins at a measured angle,
+    the phase is that of the shaft, else of the start of each run. As friction it reverses with the speed; an
+    amplitude as large as M_t0 would not be a loss at every angle.
     """
 
     driver = "angle"
@@ -411,11 +410,11 @@ class AngleFriction(Periodic, TrackEffect):
 class PositionFriction(TrackEffect):
     """ΔM_t = a θ sign ω_k, θ' = ω_k: dry friction that grows along the travel.
 
-    Guides or a screw that run tighter towards one end.
+    Guides or a screw that are tighter towards one end.
 
-    Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), ch. 4: friction of a joint by its position,
-    to first order. The memory is θ [rad], counted as the channel of the angle or position is, which a rig has to
-    show; without one it is 0 at the start of each run. Its mean over the travel is M_t0.
+    Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), ch. 4: friction of a joint over its
+    position, to first order. The memory is θ [rad], counted as in the channel of the angle or position, which
+    the rig must show; without one it is 0 at the start of each run. Its mean over the travel is M_t0.
     """
 
     driver = "position"
@@ -445,15 +444,15 @@ class PositionFriction(TrackEffect):
 
 
 class DirectionalStribeck(TrackEffect):
-    """ΔM_t = a exp(-|ω_k| / ω_s) (sign ω_k)²: an excess at a crawl of E + a forward and of E - a backward.
+    """ΔM_t = a exp(-|ω_k| / ω_s) (sign ω_k)²: an excess at low speed of E + a forward and of E - a backward.
 
-    Friction that falls with speed, by more one way round than the other.
+    Friction whose decrease with speed is larger in one direction of rotation than in the other.
 
     Source: Canudas de Wit, Olsson, Åström and Lischinsky, A new model for control of systems with friction, IEEE
-    Trans. Automatic Control 40 (1995): the curve g of the steady friction need not be the same both ways; here the
-    exponential of Tustin (1947). The mean E of both directions is `stribeck_track`: runs one way alone show their
-    sum. Far above ω_s it is absent, far below it is `directional_friction`; what grows with the speed is
-    `directional_viscous`. Runs both ways at a crawl tell the three apart.
+    Trans. Automatic Control 40 (1995): the curve g of the steady friction may differ between the directions; here the
+    exponential of Tustin (1947). The mean E of both directions is `stribeck_track`: runs in one direction show their
+    sum. Far above ω_s it is absent, far below it is `directional_friction`; the part that grows with the speed is
+    `directional_viscous`. Runs in both directions at low speed distinguish the three.
     """
 
     driver = "direction"
@@ -462,15 +461,15 @@ class DirectionalStribeck(TrackEffect):
 
     amplitude: Scalar = amplitude(
         unit="N·m",
-        meaning="excess at a crawl forward beyond the mean of both directions",
+        meaning="excess at low speed forward, beyond the mean of both directions",
         bounds=(-0.5, 0.5),
         sd=0.05,
-        source="half of what `stribeck_track` commonly is",
+        source="half of a common `stribeck_track`",
     )
     speed_fade: Scalar = parameter(
         8.0,
         unit="rad/s",
-        meaning="shaft speed ω_s over which the excess fades",
+        meaning="shaft speed ω_s that scales the decay of the excess",
         bounds=(0.5, 80.0),
         relative_sd=0.5,
         source="belt speeds of 0.1 to 0.5 m/s",

@@ -1,7 +1,7 @@
-"""Effects of a robot that turns: sides that are not alike, and resistance to the turn. Straight travel shows none.
+"""Effects of a robot that turns: unequal sides, and resistance to the turn. Straight travel does not show them.
 
-They are no part of the library that the loop looks through in straight travel; in tables of turns it looks for them
-beside that library. Robot files know them, and `calibrate` frees their amplitudes.
+The library for straight travel does not contain them; on tables of turns the loop tries them in addition to it.
+Robot files accept them, and `calibrate` frees their amplitudes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from mmrjax.model.signals import Signals
 class SideFriction(Effect):
     """ΔM_df = a s sign ω_m, s = 1 on the left and -1 on the right: a dry loss of M + a left and of M - a right.
 
-    Brushes, bearings and belts of one side that rub more than those of the other.
+    Brushes, bearings and belts of one side have more friction than those of the other.
 
     Source: Coulomb's friction of each side. Currents of a robot's sides differ in straight travel, by 1.4 A of 4 A in
     LaRocque et al., arXiv 2403.16877 (docs/lab/turning-data.md).
@@ -26,7 +26,7 @@ class SideFriction(Effect):
 
     amplitude: Scalar = amplitude(
         unit="N·m",
-        meaning="half the difference of the sides' dry friction at the motor, positive where the left rubs more",
+        meaning="half the difference of the sides' dry friction at the motor, positive if the left has more",
         bounds=(-1.0, 1.0),
         sd=1.5e-3,
         source="half of the dry friction of Table 2",
@@ -39,9 +39,9 @@ class SideFriction(Effect):
 class SideTorque(Effect):
     """ΔM_d = a s C_m I, s = 1 on the left and -1 on the right: C_m (1 - a) on the left and C_m (1 + a) on the right.
 
-    Motors and ammeters of two makers' tolerances, or one that has lost part of its magnets' strength.
+    Motors and ammeters within makers' tolerances, or a motor whose magnets have lost strength.
 
-    Source: eq. (17) with a constant of its own for each side.
+    Source: eq. (17) with a separate constant for each side.
     """
 
     balance = "motor"
@@ -50,7 +50,7 @@ class SideTorque(Effect):
 
     amplitude: Scalar = amplitude(
         unit="-",
-        meaning="half the relative difference of the sides' torque constants, positive where the left is weaker",
+        meaning="half the relative difference of the sides' torque constants, positive if the left is weaker",
         bounds=(-0.5, 0.5),
         sd=0.05,
         source="makers' tolerances of 5 to 10 %",
@@ -64,9 +64,9 @@ class SideVoltage(Effect):
     """ΔU = a s (E + I R), s = 1 left and -1 right: settled motors get U / (1 + a) on the left, U / (1 - a) on
     the right.
 
-    A driver or leads of one side that give its motors less: the robot turns at equal commands.
+    A driver or leads of one side give its motors less voltage: the robot turns at equal commands.
 
-    Source: eq. (15) with a voltage of its own for each side.
+    Source: eq. (15) with a separate voltage for each side.
     """
 
     balance = "electrical"
@@ -74,7 +74,7 @@ class SideVoltage(Effect):
 
     amplitude: Scalar = amplitude(
         unit="-",
-        meaning="half the relative difference of the sides' voltages, positive where the left gets less",
+        meaning="half the relative difference of the sides' voltages, positive if the left gets less",
         bounds=(-0.5, 0.5),
         sd=0.03,
         source="drivers' gains and dead times: a few percent",
@@ -86,12 +86,12 @@ class SideVoltage(Effect):
 
 
 class TurningResistance(Effect):
-    """ΔM_ψ = a N ω for the load N of each side, against the turn: a moment in proportion to load and yaw rate.
+    """ΔM_ψ = a N ω for the load N of each side, against the turn: a moment proportional to load and yaw rate.
 
-    Soil, carpet or tyres that are dragged round and yield the faster the more they resist.
+    Soil, carpet or tyres that are dragged sideways resist more at higher yaw rates.
 
-    Source: viscous drag beside Coulomb's friction; Wong and Chiang, A general theory for skid steering of tracked
-    vehicles on firm ground, Proc. IMechE D 215 (2001), for a turning moment that is no constant.
+    Source: viscous drag in addition to Coulomb's friction; Wong and Chiang, A general theory for skid steering of
+    tracked vehicles on firm ground, Proc. IMechE D 215 (2001), for a turning moment that is not constant.
     """
 
     balance = "yaw"
@@ -113,10 +113,10 @@ class TurningResistance(Effect):
 class SideRadius(Effect):
     """ΔV = a s r_k ω_k, s = 1 left and -1 right: the left side rolls on (1 - a) r_k, the right one on (1 + a) r_k.
 
-    A worn belt, a tyre of less pressure or another size on one side: the robot turns at equal shaft speeds. The lever
-    arm of the traction stays, as of `rolling_radius`.
+    A worn belt, or a tyre of lower pressure or another size on one side: the robot turns at equal shaft speeds. The
+    lever arm of the traction does not change, as for `rolling_radius`.
 
-    Source: eq. (32) with a radius of its own for each side; unequal wheel diameters are the first of odometry's
+    Source: eq. (32) with a separate radius for each side; unequal wheel diameters are the first of odometry's
     systematic errors in Borenstein and Feng, Measurement and correction of systematic odometry errors in mobile
     robots, IEEE Trans. Robotics and Automation 12 (1996) 869.
     """
@@ -126,7 +126,7 @@ class SideRadius(Effect):
 
     amplitude: Scalar = amplitude(
         unit="-",
-        meaning="half the relative difference of the sides' rolling radii, positive where the left's is smaller",
+        meaning="half the relative difference of the sides' rolling radii, positive if the left's is smaller",
         bounds=(-0.2, 0.2),
         sd=0.01,
         source="wear and pressure: a percent or two",
@@ -139,11 +139,11 @@ class SideRadius(Effect):
 class LateralGrip(Effect):
     """ΔM_ψ = a |ω| M_y against the turn, M_y the moment of each side's lateral forces: φ_y (1 + a |ω|) in the turn.
 
-    Grousers that dig in, or loose ground that piles up beside the tracks, the more the faster they are dragged aside.
-    What it changes of the lateral force, which a settled turn needs for its path alone, is left to the sliding.
+    Grousers dig in, or loose ground piles up at the tracks, more at higher lateral speed. The change of the lateral
+    force, which matters only for the path in a settled turn, is left to the sliding.
 
-    Source: a ratio of frictions linear in the yaw rate; that the coefficient of lateral resistance is no constant of
-    the ground, Wong, Theory of Ground Vehicles, chapter 6. From `turning_resistance` it differs where contacts creep.
+    Source: a ratio of frictions linear in the yaw rate; Wong, Theory of Ground Vehicles, chapter 6: the coefficient
+    of lateral resistance is not constant. It differs from `turning_resistance` where contacts creep.
     """
 
     balance = "yaw"

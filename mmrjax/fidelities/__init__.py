@@ -1,4 +1,4 @@
-"""The registry of fidelities: what each simulates, its options, how it is chunked, what effort it is worth.
+"""Registry of fidelities: description, options, chunk size and calibration effort of each.
 
 Importable without jax. A new fidelity is a file that ends with `FIDELITY = Fidelity(...)`, and a line of `TABLE`.
 """
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Option:
-    """A number that a user may state for a fidelity.
+    """A number that a user may set for a fidelity.
 
     Attributes:
-        default: where none is stated [unit]; most: largest allowed; the least is anything above 0.
+        default: value if not set [unit]; most: largest allowed; all values above 0 up to it are allowed.
     """
 
     name: str
@@ -32,13 +32,13 @@ class Option:
 
 @dataclasses.dataclass(frozen=True)
 class Effort:
-    """What a calibration does where nobody states it.
+    """Default effort of a calibration.
 
-    A profile is some twenty refits a parameter, and blocks are a dozen: seconds with `steady`, many minutes of
+    A profile costs about twenty refits per parameter, and blocks a dozen: seconds with `steady`, many minutes of
     rollouts.
 
     Attributes:
-        starts: searches from different places; profiles: whether to profile every parameter; blocks: whether to fit
+        starts: searches from different start points; profiles: True to profile every parameter; blocks: True to refit
             without each block of runs.
     """
 
@@ -47,27 +47,27 @@ class Effort:
     blocks: bool
 
 
-#: Settled runs that make one program for all batches of fewer.
+#: Number of steady runs up to which all batches share a program.
 FEW = 256
 
 
 @dataclasses.dataclass(frozen=True)
 class Facts:
-    """What is known of a fidelity before it is imported.
+    """Facts about a fidelity that are known without importing it.
 
     Attributes:
-        module: that holds its `FIDELITY`.
+        module: module that holds its `FIDELITY`.
         description: one line.
-        chunk: runs in one call where there are many; a pair where it is another on an accelerator.
-        effort: of a calibration through it.
-        options: that it has.
-        rollout: whether it integrates over time; searches through it then run one by one, and end sooner.
-        histories: whether it can keep a run over time.
-        computes: parameters of a configuration that are results here and not read, such as `track.guide_share`.
-        resolves: beginnings of names of parameters that it reads and fidelities without them do not.
-        reverse: whether derivatives by reverse mode (`jax.grad`) go through, next to forward ones.
-        slow: whether a batch takes long enough for a bar that shows its progress.
-        one_thread: whether XLA has to run on one thread: on two, runs have hung for good (docs/benchmarks.md).
+        chunk: largest number of runs in one call; a pair if it differs on an accelerator.
+        effort: of a calibration with it.
+        options: its options.
+        rollout: True if it integrates over time; searches with it run one at a time and end sooner.
+        histories: True if it can return a run over time.
+        computes: parameters of a configuration that it computes instead of reads, such as `track.guide_share`.
+        resolves: prefixes of parameter names that only fidelities of this kind read.
+        reverse: True if it supports derivatives in reverse mode (`jax.grad`) in addition to forward mode.
+        slow: True if a batch takes long enough for a progress bar.
+        one_thread: True if XLA has to run on one thread; with two, runs have hung (docs/lab/figures.md).
     """
 
     module: str
@@ -84,16 +84,18 @@ class Facts:
     one_thread: bool = False
 
     def at_once(self, accelerator: bool) -> int:
-        """Runs in one call where there are many, on processors or on an accelerator."""
+        """Largest number of runs in one call, on processors or on an accelerator."""
         return self.chunk if isinstance(self.chunk, int) else self.chunk[accelerator]
 
     def filled(self, runs: int) -> int:
-        """How many runs a batch is filled up to, so that small ones share a program: settled runs take less time than
-        that does to compile."""
+        """Number of runs that a batch is padded to, so that small batches share a program.
+
+        Computing padded steady runs takes less time than compiling another program.
+        """
         return runs if self.rollout else max(runs, FEW)
 
     def resolved(self, **given: float | None) -> dict[str, float]:
-        """Every option by name: as given, else (absent or None) its default.
+        """Every option by name: the given value, or its default if absent or None.
 
         Raises:
             ValueError: an option that this fidelity does not have, or a number out of range.
@@ -104,7 +106,7 @@ class Facts:
                 continue
             if name not in values:
                 known = ", ".join(values) or "none"
-                raise ValueError(f"{name}: got {value!r}; this fidelity has no such option, its options: {known}")
+                raise ValueError(f"{name}: got {value!r}; this fidelity has no such option; its options: {known}")
             values[name] = float(value)
         for option in self.options:
             value = values[option.name]
@@ -121,7 +123,7 @@ def _duration(default: float, most: float) -> Option:
 
 _STEP = Option("step", "s", 1e-4, 0.01, "integration step")
 
-#: By name, the cheapest first. Read through the module, so that a line more is a fidelity more everywhere.
+#: By name, the cheapest first. Read through the module, so that a new line adds a fidelity everywhere.
 TABLE: dict[str, Facts] = {
     "steady": Facts(
         "mmrjax.fidelities.steady",
@@ -141,7 +143,7 @@ TABLE: dict[str, Facts] = {
     ),
     "track": Facts(
         "mmrjax.fidelities.track",
-        "half a robot as multibody dynamics in MuJoCo MJX, its contacts resolved one by one",
+        "half a robot as multibody dynamics in MuJoCo MJX, with individual contacts",
         chunk=(512, 16_384),
         effort=Effort(starts=1, profiles=False, blocks=False),
         options=(_duration(1.5, 3600.0), _STEP),
@@ -158,30 +160,30 @@ NAMES: tuple[str, ...] = tuple(TABLE)
 
 
 def facts(name: str) -> Facts:
-    """What is known of a fidelity before it is imported.
+    """Facts about a fidelity that are known without importing it.
 
     Raises:
-        KeyError: no such fidelity; the message lists those that there are.
+        KeyError: no such fidelity; the message lists the valid names.
     """
     if name not in TABLE:
         raise KeyError(f"no fidelity {name}; there are {', '.join(TABLE)}")
     return TABLE[name]
 
 
-#: What names of parameters have in them that straight travel does not read, in any fidelity.
+#: Parts of parameter names that no fidelity reads in straight travel.
 OF_TURNS = ".turning."
 
 
 def unread(name: str, parameters: Iterable[str], turns: bool = False) -> tuple[str, ...]:
-    """Those of some parameters, by dotted name, that a fidelity does not read in straight travel, or in turns."""
+    """Parameters among `parameters` (dotted) that a fidelity does not read in straight travel, or in turns."""
     of_others = {head for other in TABLE.values() for head in other.resolves} - set(facts(name).resolves)
     return tuple(p for p in parameters if p.startswith(tuple(of_others)) or (OF_TURNS in p and not turns))
 
 
 def get(name: str) -> Fidelity:
-    """A fidelity by its name; what it needs is imported now.
+    """Imports and returns a fidelity by its name.
 
     Raises:
-        KeyError: no such fidelity; the message lists those that there are.
+        KeyError: no such fidelity; the message lists the valid names.
     """
     return importlib.import_module(facts(name).module).FIDELITY

@@ -1,4 +1,4 @@
-"""What a fidelity is: functions from a robot and conditions to results, the same for all."""
+"""Interface of a fidelity: functions from a robot and conditions to results."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mmrjax.undercarriage.side_contacts import Reactions
 
 T = TypeVar("T")
 
-#: Is called now and then with the share of the work that is done, 0..1.
+#: Callback for progress; receives the finished share of the work, 0..1.
 Progress = Callable[[float], None]
 
 
@@ -32,10 +32,10 @@ class History(eqx.Module):
     """Runs over time; fields have shape (runs, samples).
 
     Attributes:
-        time: by the clock of tables, on which what is imposed acts the rig's `delay` later than its column says [s].
+        time: in the clock of tables [s]; the imposed quantity acts the rig's `delay` later than its column states.
         distance: travelled along the slope [m].
-        signals: every signal; reading: what the instruments show [SI], by channel, of those that change in a history.
-        reactions: loads inside the running gear of one side, where the fidelity resolves them.
+        signals: every signal; reading: readings [SI] by channel, of the channels that change in a history.
+        reactions: loads inside the running gear of one side, if the fidelity computes them.
     """
 
     time: Float[Array, "runs samples"]
@@ -52,8 +52,10 @@ class History(eqx.Module):
         signals: Signals,
         reactions: Reactions | None = None,
     ) -> History:
-        """A history with its readings, of runs known at `time` since what is imposed acts; of signals with a further
-        axis for left and right side their means."""
+        """A history with its readings, from runs known at `time` since the imposed quantity acts.
+
+        Signals with a further axis of left and right side are averaged over it.
+        """
         if jnp.ndim(signals.current) > jnp.ndim(time):
             reading, signals = _shown(robot, signals, apart=True), balances.together(signals)
         else:
@@ -70,13 +72,13 @@ class History(eqx.Module):
 
 
 def as_tables(rig: Rig, time: Float[Array, "runs samples"], values: T) -> tuple[Float[Array, "runs samples"], T]:
-    """Runs over time by the clock of tables, which the rig's `delay` sets.
+    """Runs over time in the clock of tables, which the rig's `delay` shifts.
 
     Args:
-        time: since what is imposed acts [s]; values: at those instants, a tree of shape (runs, samples, ...).
+        time: since the imposed quantity acts [s]; values: at those instants, a tree of shape (runs, samples, ...).
 
     Returns:
-        Instants of the tables' clock and values at those (`Rig.clock`, `Rig.before`).
+        Instants of the tables' clock, and the values there (`Rig.clock`, `Rig.before`).
     """
     if rig.prompt:
         return time, values
@@ -88,7 +90,7 @@ def as_tables(rig: Rig, time: Float[Array, "runs samples"], values: T) -> tuple[
 
 @compiled
 def _shown(robot: Robot, signals: Signals, apart: bool = False) -> dict[str, Scalar]:
-    """Readings of the channels that change in a history; `apart`: of signals of left and right side."""
+    """Readings of the channels that change in a history; `apart`: from signals of left and right side."""
     every = balances.shown(robot, signals) if apart else balances.sensor(robot, signals)
     return {c.name: every[c.name] for c in channels.EVERY if c.over_time}
 
@@ -100,7 +102,7 @@ def _before(rig: Rig, time: Array, clock: Array) -> tuple[Array, Array]:
 
 @compiled
 def _between(values: Array, k: Array, share: Array) -> Array:
-    """One program for all that has a shape."""
+    """`Rig.between` for a batch, compiled once for each shape."""
     return jax.vmap(Rig.between)(values, k, share)
 
 
@@ -109,8 +111,8 @@ class Run(eqx.Module):
 
     Attributes:
         result: of each run, shape (runs,).
-        columns: what this fidelity alone knows, by the column of `runs.csv`, in the column's unit; shape (runs,).
-        history: of the runs over time, where it was asked for.
+        columns: outputs that only this fidelity has, by column of `runs.csv`, in the column's unit; shape (runs,).
+        history: the runs over time, if requested.
     """
 
     result: Result
@@ -124,15 +126,15 @@ class Simulate(Protocol):
     def __call__(
         self, robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None, /
     ) -> Run:
-        """Simulate a batch in one call.
+        """Simulates a batch in one call.
 
         Args:
             conditions: shape (runs,), names of configurations resolved.
-            options: all of the fidelity's, from `Facts.resolved`.
-            progress: called by those that take long.
+            options: all options of the fidelity, from `Facts.resolved`.
+            progress: called by fidelities that take long.
 
         Raises:
-            ValueError: what `Fidelity.check` refuses.
+            ValueError: a run that `Fidelity.check` refuses.
         """
         ...
 
@@ -147,13 +149,13 @@ def _nothing_to_say(robot: Robot, conditions: Conditions) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class Implicit:
-    """Settled travel of one run, straight or turning, in two halves: one evaluation serves all derivatives of a fit.
+    """Steady travel of one run, straight or turning, in two halves; a fit takes all derivatives from one evaluation.
 
     Attributes:
-        solve: the unknowns, shape (unknowns,), and whether they were found; no derivatives.
-        shown: result and signals at some unknowns (differentiable in them and in the robot), and what the equations
-            leave there, shape (unknowns,). What asks more of the ground than it holds is said to slide: in a fit
-            it is out of reach, slide or stand.
+        solve: returns the unknowns, shape (unknowns,), and whether they were found; has no derivatives.
+        shown: returns result and signals for given unknowns (differentiable in them and in the robot) and the
+            residuals of the equations, shape (unknowns,). A demand above the ground's limit counts as sliding; for a
+            fit it is out of reach in any case.
     """
 
     solve: Callable[[Robot, Conditions], tuple[Array, Array]]
@@ -162,20 +164,20 @@ class Implicit:
 
 @dataclasses.dataclass(frozen=True)
 class Fidelity:
-    """One way to simulate a robot. Each module of a fidelity ends with its own.
+    """One way to simulate a robot. Each module of a fidelity ends with one.
 
     Attributes:
         name: its line in `fidelities.TABLE`.
-        settled: a batch of conditions to results, pure and traceable, with numbers wherever it can give some,
-            whatever the status: what calibrations differentiate (forward).
-        implicit: the same in two halves; None where it is not the root of equations.
-        run: results of a batch, as sweeps make them.
-        outputs: those of a batch that are named alone [SI], of `outputs.table`, and `status`, which is quicker than
-            `run`; None where it would not be. A fidelity that has it has no options.
-        columns: names of what its runs have beside (`Run.columns`).
-        histories: a batch from standstill, kept over time; None where there is no time.
-        check: refuses, with ValueError, what some run of any batch could not bear; before the first is simulated.
-        cautions: what to know before the settled readings of a calibrated robot are trusted, a sentence each.
+        settled: batch of conditions to results; pure, traceable, with numbers at any status if possible. Calibrations
+            differentiate it (forward).
+        implicit: the same in two halves; None if it is not the root of equations.
+        run: results of a batch, as in a sweep.
+        outputs: only the named outputs of a batch [SI], of `outputs.table`, and `status`; quicker than `run`. None if
+            it would not be. A fidelity with it has no options.
+        columns: names of further columns of its runs (`Run.columns`).
+        histories: a batch from standstill over time; None for a fidelity without time.
+        check: raises ValueError before the first simulation if it cannot compute some run of a batch.
+        cautions: warnings about the steady readings of a calibrated robot, one sentence each.
     """
 
     name: str
@@ -190,5 +192,5 @@ class Fidelity:
 
     @property
     def facts(self) -> Facts:
-        """What was known of it before it was imported."""
+        """Facts about it that are known without importing it."""
         return fidelities.facts(self.name)

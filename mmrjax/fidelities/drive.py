@@ -33,18 +33,18 @@ from mmrjax.model.signals import (
 from mmrjax.numerics.rosenbrock import norm, step_longest
 from mmrjax.turning import circling
 
-# Units of the unknowns (current, motor speed, speed, distance, discharge), all then of the order of one.
-# The memories of those effects that have one follow, each in its own unit.
+# Units of the unknowns (current, motor speed, speed, distance, discharge), which scale them to the order of one.
+# The memories of effects follow, each in its own unit.
 _UNITS = (10.0, 1000.0, 1.0, 1.0, 10.0)
 CURRENT, MOTOR, GROUND = 0, 1, 2
-_GAP = 0.01  # of the gap within a backlash, the last unknown where there is one [rad]
+_GAP = 0.01  # of the gap within a backlash, the last unknown if there is one [rad]
 
-#: Time after which a run is read as settled [s].
+#: Time after which a run counts as settled [s].
 TIME_SETTLED = 4.0
 #: Instants of a history.
 SAMPLES = 1001
-TIME_INRUSH, SAMPLES_INRUSH = 0.04, 160  # its first instants [s], and how many of them are kept besides
-TIME_RISE, SAMPLES_RISE = 0.002, 40  # and of these the first, in which the current rises to its peak
+TIME_INRUSH, SAMPLES_INRUSH = 0.04, 160  # first part of a history [s], and its additional samples
+TIME_RISE, SAMPLES_RISE = 0.002, 40  # first part of the inrush, in which the current rises to its peak
 
 
 class Trajectory(eqx.Module):
@@ -52,7 +52,7 @@ class Trajectory(eqx.Module):
 
     Attributes:
         time: [s], shape (times,).
-        distance: travelled along the slope; of a robot that turns from where it started [m], shape (times,).
+        distance: travelled along the slope; for a robot that turns, from its start [m], shape (times,).
         signals: every signal at those times; each field has shape (times,).
         result: the state at the end, with the run's status.
     """
@@ -64,18 +64,18 @@ class Trajectory(eqx.Module):
 
 
 def units(robot: Robot) -> tuple[float, ...]:
-    """What the unknowns are measured in."""
+    """Units of the unknowns."""
     return _UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering) + (_GAP,) * robot.loose
 
 
 def state_of(robot: Robot, y: Float[Array, " unknowns"]) -> State:
-    """The state that a vector of unknowns stands for."""
+    """The state of a vector of unknowns."""
     y = y * jnp.asarray(units(robot), y.dtype)
     memory = {effect.name: y[len(_UNITS) + k] for k, effect in enumerate(robot.remembering)}
     return State(y[0], y[1], y[2], y[4], memory, distance=y[3], gap=y[-1] if robot.loose else None)
 
 
-#: The signals of an instant, traced once for each kind of robot however often a program asks for them.
+#: The signals of an instant, traced once for each kind of robot and shared within a program.
 moving = compiled(balances.moving)
 
 
@@ -83,7 +83,7 @@ moving = compiled(balances.moving)
 def rates(
     robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"], way: Scalar | None = None
 ) -> Float[Array, " unknowns"]:
-    """Rates of the unknowns, in their units [1/s]; `way` as of `balances.moving`, or `HELD`."""
+    """Rates of the unknowns, in their units [1/s]; `way` as in `balances.moving`, or `HELD`."""
     held = jnp.asarray(False if way is None else way == HELD)
     signals = moving(robot, conditions, state_of(robot, y), None if way is None else jnp.where(held, 0.0, way))
     winding = signals.voltage_left / signals.inductance
@@ -91,7 +91,7 @@ def rates(
         jnp.where(held, 0.0, x)
         for x in (signals.acceleration_wheel * robot.gearbox.ratio, jnp.asarray(signals.acceleration))
     )
-    if conditions.motor_speed is not None:  # the current follows from torque, the shaft from what is imposed
+    if conditions.motor_speed is not None:  # the current follows from torque, the shaft from the imposed speed
         imposed = conditions.motor_acceleration
         winding, shaft = jnp.zeros_like(winding), jnp.zeros_like(shaft) if imposed is None else imposed
     rates = [
@@ -107,7 +107,7 @@ def rates(
 
 
 def winding(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) -> Array:
-    """Rate of the current alone, in its unit, where no speed is imposed [1/s]."""
+    """Rate of the current only, in its unit, without an imposed speed [1/s]."""
     state = state_of(robot, y)
     signals = balances.driven(robot, conditions, state, None)
     return jnp.asarray(signals.voltage_left / signals.inductance / _UNITS[CURRENT])
@@ -117,12 +117,15 @@ _norm = functools.partial(norm, own=len(_UNITS))
 
 
 def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[Array, " unknowns"]:
-    """At rest; or as the steady fidelity travels, what effects remember settled too, at rest where it has no root."""
+    """Unknowns at rest, or for `rolling` those of the steady fidelity with settled memories of effects.
+
+    At rest too if the steady fidelity has no root.
+    """
     size = jnp.asarray(units(robot), jnp.result_type(conditions.voltage))
     rest = jnp.zeros_like(size).at[4].set(conditions.discharge / size[4])
     if conditions.motor_speed is not None:
         rest = rest.at[1].set(conditions.motor_speed / size[1])
-        if not robot.has_ground:  # which it would have to grip first
+        if not robot.has_ground:  # only a ground has a speed of grip
             radius = robot.chassis(conditions.configuration).radius / robot.gearbox.ratio
             rest = rest.at[2].set(radius * conditions.motor_speed / size[2])
     if robot.rig.begins is not None and conditions.begin is not None:
@@ -142,9 +145,9 @@ def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[
 
 
 def _initial(robot: Robot, conditions: Conditions) -> Array:
-    """Current, motor speed, speed and distance [SI] at the beginning of a history that does not begin at rest.
+    """Current, motor speed, speed and distance [SI] at the start of a history that does not begin at rest.
 
-    The load rolls with the shafts, and the current is that at which the voltage balances: it follows within
+    The load rolls with the shafts. The current is in equilibrium with the voltage, which it reaches within
     milliseconds.
     """
     assert robot.rig.begins is not None and conditions.begin is not None
@@ -153,7 +156,7 @@ def _initial(robot: Robot, conditions: Conditions) -> Array:
     turning = begin.motor_speed if conditions.motor_speed is None else conditions.motor_speed
     rolling = radius * turning / robot.gearbox.ratio
     left = voltage_at_rest(robot, conditions)
-    if conditions.motor_current is None:  # whose amplifier makes up for it
+    if conditions.motor_current is None:  # an amplifier compensates it
         share = jnp.abs(conditions.duty) if robot.driver.decay == FAST else 1.0
         left = left - share * robot.motor.voltage_back(turning)
     open_circuit = (conditions.open > 0.5) | (conditions.motor_speed is not None)
@@ -170,7 +173,7 @@ def drive(
     *,
     rolling: bool = False,
 ) -> Trajectory:
-    """Run one robot from standstill (or rolling) under a constant conditions and keep the given times.
+    """Runs one robot from standstill (or rolling) under constant conditions and returns the given times.
 
     Args:
         robot: any robot; its parameters may be tracers.
@@ -178,18 +181,17 @@ def drive(
         times: increasing, from 0 [s]; the last one ends the run.
         tolerance: relative and (in units of 10 A, 1000 rad/s, 1 m/s) absolute error of a step.
         max_steps: integration steps after which a run has `failed`.
-        rolling: start at the operating point of the steady fidelity, or with the contact held at V_s where it
-            would slide; derivatives pass through it. Else from standstill.
+        rolling: True to start at the operating point of the steady fidelity, or with the sliding speed at V_s if it
+            would slide; derivatives pass through it. False: from standstill.
 
     Returns:
-        The trajectory. Its status is `converged` when at the end the speed changes by less than 0.1 % a
-        tenth of a second, else `not_settled`; `reverses` and `rolls_back` where it then travels backward as a
-        negative voltage asks, or as gravity does against the motors; `stalled` when it does not travel, and from
-        standstill exactly at rest where friction holds it; `slides`
-        when the movers slide beyond V_s and the robot loses speed or stands (one that holds its speed has
-        `converged`, flagged `slips`); `battery_empty` when the charge has
-        run out: signals after that and the result's numbers are NaN; `failed` when
-        the integrator gave up, its numbers NaN too. Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
+        The trajectory, with a status for the end of the run. `converged`: the speed changes by less than 0.1 % in a
+        tenth of a second; else `not_settled`. `reverses`, `rolls_back`: the same, with backward travel due to a
+        negative voltage or to gravity against the motors. `stalled`: the robot does not travel; from standstill it is
+        exactly at rest if friction holds it. `slides`: the movers slide beyond V_s and the robot loses speed or
+        stands; a robot that keeps its speed has `converged`, flagged `slips`. `battery_empty`: the charge is used up;
+        signals after that and the result's numbers are NaN. `failed`: the integrator gave up; the numbers are NaN.
+        Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
     """
     if conditions.turns:
         return _turning(robot, conditions, times, tolerance, max_steps, rolling)
@@ -212,8 +214,10 @@ def drive(
 def _kept(
     robot: Robot, conditions: Conditions, times: Array, away: Array, signals: Signals, discharge: Scalar, end: Result
 ) -> Trajectory:
-    """What is kept of a run: the battery's parabola goes on past empty, the run does not: a clear end, and no numbers
-    after it."""
+    """The recorded part of a run: it ends with an empty battery, and all later numbers are NaN.
+
+    The parabola of the battery alone would continue.
+    """
     going = jnp.asarray((conditions.battery < 0.5) | ~robot.battery.empty(discharge))
     signals, away = jax.tree.map(
         lambda x: jnp.where(going.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan), (signals, away)
@@ -234,12 +238,12 @@ def _integrated(
     tolerance: float,
     max_steps: int,
 ) -> tuple[Float[Array, "times unknowns"], Array]:
-    """The unknowns at those times, and whether the integrator got to the last of them.
+    """The unknowns at those times, and whether the integrator reached the last of them.
 
     Args:
-        law: rates of the unknowns; size: of an error of them; moves: 0 for those that stand, else 1.
+        law: rates of the unknowns; size: norm of their error; moves: 0 for robots at rest, else 1.
     """
-    import diffrax  # only now: it takes half a second
+    import diffrax  # only here: the import takes half a second
 
     from mmrjax.numerics.rodas import Rodas4
 
@@ -266,7 +270,7 @@ def _integrated(
 def _turning(
     robot: Robot, conditions: Conditions, times: Array, tolerance: float, max_steps: int, rolling: bool
 ) -> Trajectory:
-    """`drive` of a robot whose sides are driven apart; its signals have a last axis of left and right side."""
+    """`drive` for a robot with independently driven sides; its signals have a last axis of left and right side."""
     y0 = circling.start(robot, conditions, rolling)
     parked = jnp.asarray(False) if rolling else circling.holds(robot, conditions)
     moves = jnp.where(parked, circling.at_rest(y0), 1.0)
@@ -302,8 +306,8 @@ def drive_batch(
 
 
 def _settled(robot: Robot, conditions: Conditions) -> Result:
-    # A settled row does not say how its run was started. One from standstill starts by sliding at μ_d, and on
-    # a slope between μ_d and μ_s it never grips, though it was measured there: so from a rolling start, as `track`.
+    # A table of settled runs does not record their starts. A start from standstill slides first, at μ_d; on a slope
+    # between μ_d and μ_s it never grips, although it was measured there. Hence a rolling start, as in `track`.
     times = jnp.asarray([0.0, TIME_SETTLED])
     return jax.vmap(lambda c: drive(robot, c, times, rolling=True).result)(conditions)
 
@@ -313,7 +317,7 @@ def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], pro
 
 
 def _instants(duration: float) -> np.ndarray:
-    """Times of a history [s] from 0 to `duration`, close together while the current rises to its peak."""
+    """Times of a history [s] from 0 to `duration`, denser while the current rises to its peak."""
     early = np.linspace(0.0, min(TIME_INRUSH, duration), SAMPLES_INRUSH, endpoint=False)
     first = np.linspace(0.0, min(TIME_RISE, duration), SAMPLES_RISE, endpoint=False)
     return np.unique(np.round(np.concatenate([first, early, np.linspace(0.0, duration, SAMPLES)]), 9))
@@ -332,8 +336,8 @@ def _from_standstill(robot: Robot, conditions: Conditions) -> list[str]:
     if not rows:
         return []
     return [
-        f"rows {rows}: read from a rolling start; from standstill the calibrated robot does not settle there within "
-        f"{TIME_SETTLED:g} s, since it starts by sliding at μ_d"
+        f"rows {rows}: computed from a rolling start; from standstill the calibrated robot does not settle there "
+        f"within {TIME_SETTLED:g} s, because it starts by sliding at μ_d"
     ]
 
 

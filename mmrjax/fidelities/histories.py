@@ -1,17 +1,17 @@
-"""Fidelity `drive` on a grid of time that is given, cheap to differentiate in many directions at once.
+"""Fidelity `drive` on a given time grid, with cheap derivatives in many directions at once.
 
-The same rates as `drive`, by an implicit method of fixed steps: SDIRK2, two stages, order 2, L-stable and
+The rates are those of `drive`. The method is implicit with fixed steps: SDIRK2, two stages, order 2, L-stable and
 stiffly accurate (Alexander, Diagonally implicit Runge-Kutta methods for stiff O.D.E.'s, SIAM J. Numer. Anal. 14
-(1977)). A derivative follows from the implicit function theorem stage by stage: linear equations with the matrix
-of Newton's method at the solution, so that a direction more costs one tangent of the rates a stage, instead of a
-rollout. The Rodas4 of `drive` on the same grid takes two thirds of the time for a run. But a direction costs it six
-stages and the derivative of a Jacobian, and where friction has a kink no control of an error shortens its steps
-(measured in docs/lab/figures.md).
+(1977)). Derivatives follow from the implicit function theorem, stage by stage: linear equations with the matrix
+of Newton's method at the solution. A further direction costs one tangent of the rates per stage, instead of a
+rollout. The Rodas4 of `drive` takes two thirds of the time for a run on the same grid. For each direction, however,
+it needs six stages and the derivative of a Jacobian. On a fixed grid no error control shortens its steps at kinks of
+friction (measured in docs/lab/figures.md).
 
 After a jump of the voltage the current lags by L / R, often much less than a step. SDIRK2 leaves up to a fifth of the
-jump to the end of such a step. So the lag of the last jump decays exponentially in every step, and the method follows
-the rest (an integrating factor; Lawson, Generalized Runge-Kutta processes for stable systems with large Lipschitz
-constants, SIAM J. Numer. Anal. 4 (1967)).
+jump at the end of such a step. The lag of the last jump therefore decays exponentially in every step, and the method
+solves for the rest (an integrating factor; Lawson, Generalized Runge-Kutta processes for stable systems with large
+Lipschitz constants, SIAM J. Numer. Anal. 4 (1967)).
 """
 
 from __future__ import annotations
@@ -39,23 +39,23 @@ from mmrjax.numerics.rarely import rarely
 T = TypeVar("T")
 
 _GAMMA = 1 - 0.5**0.5
-#: Most Newton steps of a stage, which starts where the last one ended, and what its equations may leave in the
+#: Most Newton steps of a stage, which starts from the solution of the last one, and the residual allowed, in the
 #: units of the unknowns (10 A, 1000 rad/s, 1 m/s).
 NEWTON, SOLVED = 30, 1e-9
-#: The first step [s] and the growth of steps with the time since [1/s · s]: after the start of a robot that may slide
-#: on its ground, and after what drives a run changes by its largest value, or a shaft starts.
+#: First step [s] and growth of the steps with time [1/s · s]: after the start of a robot that may slide on its
+#: ground, and after a change of the input by its largest value or the start of a shaft.
 START, CHANGE = (1e-5, 0.02), (1e-4, 0.25)
-#: The latter where a backlash is crossed; and the longest step [s].
+#: The second pair for a load with backlash; and the longest step [s].
 LOOSE, LONGEST = (1e-5, 0.08), 2.5e-3
-#: Most steps of a run that LONGEST may ask for; a longer run has longer steps.
+#: Most steps of a run at a step of LONGEST; a longer run has longer steps.
 STEPS = 8000
 #: Conditions that drive the current.
 DRIVING = ("voltage", "duty", "open", "motor_current")
-#: More current at which its rate shows how soon it follows its voltage [10 A].
+#: Increase of the current for the slope of its rate, which gives its time constant [10 A].
 MORE = 1e-3
-#: Looks for the moment at which a shaft comes to rest, each on a line from where the step begins.
+#: Number of searches for the moment at which a shaft comes to rest, each on a line from the start of the step.
 TURNS = 2
-#: Steps of a run whose equations are made linear side by side.
+#: Number of steps whose linearised equations are computed together.
 BLOCK = 32
 
 
@@ -67,13 +67,13 @@ def grid(
     start: tuple[float, float] = START,
     change: tuple[float, float] = CHANGE,
 ) -> np.ndarray:
-    """Instants from 0 to the last of `times` [s], `times` and `changes` among them.
+    """Instants from 0 to the last of `times` [s], including `times` and `changes`.
 
     Args:
-        changes: instants at which what drives the motors changes [s]; sizes: by what share of its largest value, of
-            which 1 is usual: the smaller a change, the longer is the first step after it.
-        longest: step, where `STEPS` allow it [s]; an array: of each interval between `times`.
-        start, change: the first step and the growth of steps after the start and after changes.
+        changes: instants of changes of the motors' input [s]; sizes: their size relative to a usual change.
+            The first step after a smaller change is longer.
+        longest: longest step, if `STEPS` permit it [s]; an array: for each interval between `times`.
+        start, change: first step and growth of the steps after the start and after changes.
     """
     last = float(np.max(times, initial=0.0))
     changes = np.zeros(0) if changes is None else np.asarray(changes, float)
@@ -85,11 +85,11 @@ def grid(
     longest = np.maximum(longest, last / STEPS) if np.size(longest) else LONGEST  # one row has no interval
     longest = np.broadcast_to(longest, max(len(given) - 1, 1))
     longest = longest[np.clip(np.searchsorted(given, times[:-1], side="right") - 1, 0, len(longest) - 1)]
-    which = np.searchsorted(begins, times[:-1], side="right") - 1  # the change that acts from each instant on
+    which = np.searchsorted(begins, times[:-1], side="right") - 1  # the last change before each instant
     since, first, grows = begins[which], first[which], grows[which]
     knee = np.maximum((longest - first) / grows, 0.0)
 
-    def clock(t: np.ndarray) -> np.ndarray:  # steps taken up to t: ∫ dt / min(longest, first + grows t)
+    def clock(t: np.ndarray) -> np.ndarray:  # number of steps up to t: ∫ dt / min(longest, first + grows t)
         young = np.log1p(grows * np.minimum(t, knee) / first) / grows
         return young + np.maximum(t - knee, 0.0) / longest
 
@@ -105,7 +105,7 @@ def grid(
 
 
 def _in_time(conditions: Conditions) -> tuple[Conditions, Conditions]:
-    """What of the conditions changes from instant to instant, and what does not; None elsewhere in both."""
+    """The conditions that change between instants, and the constant ones, each with None in the other fields."""
     return eqx.partition(conditions, lambda x: jnp.ndim(x) > 0)
 
 
@@ -117,15 +117,16 @@ def at_first(robot: Robot, conditions: Conditions) -> tuple[Conditions, Float[Ar
 
 
 class Followed(eqx.Module):
-    """A run that is known, and its equations made linear along it: what a change of its rates does to it.
+    """A solved run and its equations linearised along it: the response of the run to a change of its rates.
 
-    A change at the end of a step is `carries` times the change before it, `gains` times the change of the rates at
-    each stage, and `lags` times the changes of the rates of the current that its lag follows from.
+    The change at the end of a step has three parts: `carries` times the change before the step, `gains` times the
+    change of the rates at each stage, and `lags` times the change of the current's rates at its start.
 
     Attributes:
         begins, ends: unknowns at the beginning and end of every step, shape (steps, unknowns).
-        places: where the equations are made linear, at both stages, shape (steps, 2, unknowns); sides: see `States`.
-        clock: when a step begins, and when it is there [s], shape (steps, 3).
+        places: unknowns at both stages, where the equations are linearised, shape (steps, 2, unknowns); sides: see
+            `States`.
+        clock: start of a step, and the times of its stages [s], shape (steps, 3).
     """
 
     begins: Float[Array, "steps unknowns"]
@@ -139,16 +140,16 @@ class Followed(eqx.Module):
 
 
 def _current(y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
-    """A unit of the current among the unknowns."""
+    """Unit vector of the current among the unknowns."""
     return jnp.eye(len(y), dtype=y.dtype)[CURRENT]
 
 
 class Lag(eqx.Module):
-    """What a current has in excess after its voltage has jumped, which decays within a step.
+    """Excess of a current after a jump of its voltage; it decays within a step.
 
     Attributes:
         begin, end: of a step; decay: rate of the decay [1/s].
-        means: over those parts of a step, one after the other, that its stages weigh.
+        means: over the consecutive parts of a step that its stages weigh.
     """
 
     begin: Float[Array, ""]
@@ -158,13 +159,13 @@ class Lag(eqx.Module):
 
 
 class Step(eqx.Module):
-    """A step of a run; or all of them, fields of shape (steps, ...).
+    """A step of a run; or all of them, with fields of shape (steps, ...).
 
     Attributes:
-        length: [s]; since: time from the last jump of what drives the current to its begin [s].
+        length: [s]; since: time from the last jump of the current's input to the start of the step [s].
         begun: 0 before the first jump of a run from rest, which begins with one; else 1.
-        before, now: what changes of the conditions, before that jump and in the step; before: None where no lag
-            follows a jump.
+        before, now: the changing conditions before that jump and in the step; before: None if no lag follows a
+            jump.
     """
 
     length: Array
@@ -174,14 +175,17 @@ class Step(eqx.Module):
     now: Conditions
 
     def held(self, constant: Conditions) -> Conditions:
-        """All conditions in it."""
+        """All conditions during the step."""
         return eqx.combine(self.now, constant)
 
     def rates_at_start(
         self, constant: Conditions, rate: Callable[[Array, Conditions], Array], y: Float[Array, " unknowns"]
     ) -> Float[Array, "rates ..."]:
-        """Rates of the current at its start: as driven before the last jump, as driven now, and with a little more
-        current, which tells how soon it follows. None where no lag follows. Before a run nothing drives it."""
+        """Rates of the current at the start of the step, for the input before and after the last jump.
+
+        The third is for the new input and a slightly larger current, which gives the time constant. None if no lag
+        follows. Before a run the input is 0.
+        """
         if self.before is None:
             return jnp.zeros((0, *rate(y, self.held(constant)).shape))
         now = self.held(constant)
@@ -194,7 +198,7 @@ class Step(eqx.Module):
 
 
 def steps_of(conditions: Conditions, times: Float[Array, " times"]) -> tuple[Step, Conditions]:
-    """Every step of a run, and what of its conditions does not change."""
+    """Every step of a run, and the conditions that do not change."""
     changing, constant = _in_time(conditions)
     now = jax.tree.map(lambda x: x[:-1], changing)
     jumped = jnp.zeros(len(times) - 1, bool)
@@ -210,14 +214,14 @@ def steps_of(conditions: Conditions, times: Float[Array, " times"]) -> tuple[Ste
 
 
 def _lag(rate: Float[Array, " rates"], step: Step, current: Scalar, limit: Scalar) -> Lag:
-    """Of a step, by the rates at its start: what is left by then of the lag after the last jump.
+    """Lag of a step after the last jump, from the rates at its start: the remainder of its decay.
 
-    None where the driver's limit keeps the `current` from where it would go, for it follows the limit at once.
+    None if the driver's limit acts on the `current`, which then follows the limit at once.
     """
     if not len(rate):
         return _decaying(jnp.zeros(()), jnp.zeros(()), step.length)
     slope = (rate[1] - rate[2]) / MORE
-    follows = slope > 0  # but where a diode begins to block
+    follows = slope > 0  # except when a diode begins to block
     decay = jnp.where(follows, slope, 1.0)
     left = (rate[0] - rate[1]) / decay * jnp.exp(-decay * step.since)
     follows &= jax.lax.stop_gradient(jnp.abs(current - left)) <= limit
@@ -225,7 +229,7 @@ def _lag(rate: Float[Array, " rates"], step: Step, current: Scalar, limit: Scala
 
 
 def _decaying(begin: Array, decay: Array, h: Array) -> Lag:
-    """Of a part of a step, by what there is of it at its start."""
+    """Lag in a part of a step, from its value at the start."""
     parts = jnp.array([1 - _GAMMA, _GAMMA]) * h
     at = begin * jnp.exp(-decay * jnp.stack([jnp.zeros(()), parts[0]]))
     z = decay * parts
@@ -234,7 +238,7 @@ def _decaying(begin: Array, decay: Array, h: Array) -> Lag:
 
 
 def _windings(robot: Robot, constant: Conditions, step: Step, y: Float[Array, " unknowns"]) -> Float[Array, " rates"]:
-    """What the lag of a step follows from."""
+    """Rates that determine the lag of a step, see `Step.rates_at_start`."""
     return step.rates_at_start(constant, lambda y, held: winding(robot, held, y), y)
 
 
@@ -243,12 +247,12 @@ def _lag_of(robot: Robot, constant: Conditions, step: Step, y: Float[Array, " un
 
 
 def _limit(robot: Robot) -> Scalar:
-    """The driver's limit of a current in its unit."""
+    """The driver's current limit in the unit of the current."""
     return robot.driver.current_limit / units(robot)[CURRENT]
 
 
 def _stage(law: Callable[[Array], Array], known: Array, guess: Array, h: Array, mean: Array, decay: Array) -> Array:
-    """Y = known + γ h f(Y) of the unknowns without a lag, which acts by its mean."""
+    """Solves Y = known + γ h f(Y) for the unknowns without the lag; the lag acts by its mean."""
     known = known + _GAMMA * h * decay * mean
 
     def left(y: Array) -> Array:
@@ -258,7 +262,7 @@ def _stage(law: Callable[[Array], Array], known: Array, guess: Array, h: Array, 
         count, y, _ = state
         matrix, value = jax.jacfwd(lambda y: (left(y),) * 2, has_aux=True)(y)
         step = solved(matrix, value)
-        # Over a kink of the friction law full steps can swing to and fro for ever.
+        # Over a kink of the friction law full steps can alternate without end.
         tried = y - jnp.array([0.1, 0.4, 1.0], y.dtype)[:, None] * step
         over = jnp.max(jnp.abs(jax.vmap(left)(tried)), 1)
         best = jnp.where(over[0] < over[1], tried[0], tried[1])
@@ -272,12 +276,12 @@ def _stage(law: Callable[[Array], Array], known: Array, guess: Array, h: Array, 
 
 
 class States(eqx.Module):
-    """What is known of a run, step by step.
+    """A solved run, step by step.
 
     Attributes:
         stages: unknowns at both stages of every step, without lags; ends: at its end.
-        sides: the way of a shaft (see `turning_way`) to begin with, and at last; these differ where it comes to rest
-            within the step; before: time in such a step until it does [s].
+        sides: direction of a shaft (see `turning_way`) at the start and end of a step; they differ if it stops
+            within the step; before: time in such a step until rest [s].
     """
 
     stages: Float[Array, "steps 2 unknowns"]
@@ -287,12 +291,12 @@ class States(eqx.Module):
 
 
 class _Part(eqx.Module):
-    """A step, or as much of it as there is before a shaft comes to rest, or after that.
+    """A step, or its part before or after a shaft stops.
 
     Attributes:
-        turn: 0 of the whole step; 1 to `TURNS` of the part before rest, each closer to its moment; then the rest.
-        begin: unknowns where it begins; lag: that of the current there; length: [s].
-        side: the way in which a shaft turns.
+        turn: 0 for the whole step; 1 to `TURNS` for iterations of the part before rest; then the remaining part.
+        begin: unknowns at its start; lag: of the current there; length: [s].
+        side: direction in which a shaft turns.
         stages, end: see `States`.
     """
 
@@ -306,13 +310,13 @@ class _Part(eqx.Module):
 
 
 def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) -> States:
-    """One run from standstill.
+    """Solves one run from standstill.
 
-    Friction jumps where a shaft turns through rest. So within a step it is that of one way, and a step in which the
-    shaft comes to rest is taken in two, to that moment and from it (Filippov systems; Leine and Nijmeijer, Dynamics
+    Friction jumps when a shaft turns through rest. Each step therefore uses the friction of one direction. A step in
+    which the shaft stops is split at that moment (Filippov systems; Leine and Nijmeijer, Dynamics
     and Bifurcations of Non-Smooth Mechanical Systems, 2004).
 
-    Args: as of `histories`.
+    Args: as for `histories`.
     """
     steps, constant = steps_of(conditions, times)
     of_first, first_state = at_first(robot, conditions)
@@ -336,7 +340,7 @@ def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) 
             before, after = part.begin[MOTOR], end[MOTOR]
             nears = jnp.where(part.turn == 0, part.side * after < 0, part.turn < TURNS)
             rests, rest = part.turn == TURNS, end - after * along
-            lost = before - after  # nothing in a part of no length, of a step that begins at rest
+            lost = before - after  # 0 in a part of no length, of a step that begins at rest
             to_rest = part.length * jnp.clip(before / jnp.where(lost == 0, 1.0, lost), 0.0, 1.0)
             return _Part(
                 jnp.where(nears | rests, part.turn + 1, TURNS + 2),
@@ -357,23 +361,23 @@ def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) 
 
 
 def _side(robot: Robot, conditions: Conditions, y: Array) -> Array:
-    """`turning_way` of a step; 0 where shafts and load do not move as one: their moments of rest are apart."""
+    """`turning_way` of a step; 0 if shafts and load stop separately."""
     return turning_way(robot, conditions, state_of(robot, y)) if robot.moves_as_one else jnp.zeros(())
 
 
 def followed(
     robot: Robot, conditions: Conditions, times: Float[Array, " times"], known: States | None = None
 ) -> Followed:
-    """A run and its equations made linear along it.
+    """A run and its equations linearised along it.
 
-    Args: as of `histories`; known: its states, where they are.
+    Args: as for `histories`; known: its states, if computed.
     """
     run = states(robot, conditions, times) if known is None else known
     steps, constant = steps_of(conditions, times)
     first_state = at_first(robot, conditions)[1]
     begins = jnp.concatenate([first_state[None], run.ends[:-1]])
-    # A step to rest and from it, both by an approximant of the exponential: of what a current forgets that lags by a
-    # quarter of such a part, Euler's implicit one keeps a fifth.
+    # A step to rest and the one from it use an approximant of the exponential. For a current that lags by a quarter
+    # of such a part, implicit Euler would keep a fifth of the decayed excess.
     passes = run.sides[:, 0] != run.sides[:, 1]
     h = steps.length
     spans = jnp.where(passes[:, None], jnp.stack([run.before, h - run.before], 1), _GAMMA * h[:, None])
@@ -392,16 +396,16 @@ def followed(
         places = jnp.where(passes, ends, stages) + lag.means[:, None] * current
         slopes = jax.vmap(jax.jacfwd(lambda y, way: rates(robot, held, y, way)))(places, sides)
         z = spans[:, None, None] * slopes
-        weight = jnp.where(passes, one - z / 2 + z @ z / 6, one)  # of Padé's, (0, 3): 1 / (1 - z + z²/2 - z³/6)
+        weight = jnp.where(passes, one - z / 2 + z @ z / 6, one)  # Padé (0, 3): 1 / (1 - z + z²/2 - z³/6)
         first, second = jax.vmap(inverted)(one - z @ weight)
         jump = rarely(passes, _jump, (robot, held, places[1], sides), jnp.zeros_like(end))
-        # What the second stage starts from, by the first stage and by the change before the step.
+        # The start of the second stage depends on the first stage and on the change before the step.
         by_first = jnp.where(passes, one + jump[:, None] * one[MOTOR], (1 - _GAMMA) / _GAMMA * one)
         by_before = jnp.where(passes, 0.0, 1 - (1 - _GAMMA) / _GAMMA) * one
         kept = by_first @ first
         carries = second @ (kept + by_before)
         gains = jnp.stack([spans[0] * second @ kept, spans[1] * second]) @ weight
-        # The lag shortens the current that a step starts from, acts on both stages, and is what is left at the end.
+        # The lag reduces the current at a step's start and acts on both stages; its remainder is added at the end.
         by_means = jnp.einsum("sij,sj->si", gains, slopes[:, :, CURRENT] + lag.decay * current)
         by_decay = lag.means @ gains[:, :, CURRENT]
         lags = jnp.outer(by_rate.begin, -carries[:, CURRENT]) + by_rate.means.T @ by_means
@@ -420,13 +424,13 @@ def _ends(
     times: Float[Array, " times"],
     known: States | Followed,
 ) -> Array:
-    """Unknowns at the end of every step of a run that is known, with their derivatives by the robot."""
+    """Unknowns at the end of every step of a solved run, with their derivatives with respect to the robot."""
     return known.ends
 
 
 @_ends.def_jvp
 def _response(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    """With a robot's parameters, which are moved."""
+    """Tangents with respect to the robot's parameters."""
     (robot, conditions, times, known), moved = primals, tangents[0]
     along = known if isinstance(known, Followed) else followed(robot, conditions, times, known)
 
@@ -448,20 +452,20 @@ def respond(
     seen: Callable[[Array, Array, Array, Conditions], Array],
     begin: Array,
 ) -> Array:
-    """What small changes of the rates do to a run.
+    """Response of a run to small changes of its rates.
 
     Args:
-        conditions: as of `histories`; along: the run.
+        conditions: as for `histories`; along: the run.
         source: (time, state, conditions, way of `balances.moving`) → change of the rates, shape (unknowns, ...).
-        seen: (time, state, its change, conditions) → what is kept of the change at the end of every step.
+        seen: (time, state, its change, conditions) → quantity to return at the end of every step.
         begin: change of the state at the first instant.
 
-    Sources of a block's steps are computed side by side; one after another is left only a product a step.
+    Sources within a block of steps are computed together; the sequential part is one product per step.
     """
     steps, constant = steps_of(conditions, jnp.append(along.clock[:, 0], along.clock[-1, 2]))
 
     def added(along: Followed, step: Step) -> Array:
-        """By the sources of a step, at its end."""
+        """Contribution of the sources of a step, at its end."""
         held = step.held(constant)
         both = jax.vmap(lambda t, y, way: source(t, y, held, way))(along.clock[1:], along.places, along.sides)
         found = jnp.tensordot(along.gains, both, ((0, 2), (0, 1)))
@@ -484,7 +488,7 @@ def respond(
 
 
 def _in_blocks(of_steps: T) -> T:
-    """What is known of each step, of blocks of steps; the last block is filled with the last step."""
+    """Data of each step, arranged in blocks of steps; the last block is padded with the last step."""
 
     def filled(x: Array) -> Array:
         x = jnp.concatenate([x, jnp.repeat(x[-1:], -len(x) % BLOCK, 0)])
@@ -494,12 +498,12 @@ def _in_blocks(of_steps: T) -> T:
 
 
 def _of_steps(blocks: T, count: int) -> T:
-    """The same of each of so many steps."""
+    """Inverse of `_in_blocks` for this number of steps."""
     return jax.tree.map(lambda x: x.reshape(x.shape[0] * BLOCK, *x.shape[2:])[:count], blocks)
 
 
 def _with_motor(robot: Robot, conditions: Conditions) -> Array:
-    """Change of the unknowns with the motor speed where shafts and robot move as one, in their units."""
+    """Change of the unknowns with motor speed when shafts and robot move as one, in their units."""
     size, per_speed = units(robot), robot.chassis(conditions.configuration).radius / robot.gearbox.ratio
     return jnp.zeros(len(size)).at[MOTOR].set(1.0).at[GROUND].set(per_speed * size[MOTOR] / size[GROUND])
 
@@ -507,8 +511,10 @@ def _with_motor(robot: Robot, conditions: Conditions) -> Array:
 def _jump(
     robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"], sides: Float[Array, " 2"]
 ) -> Float[Array, " unknowns"]:
-    """By what the unknowns change with the motor speed before it passes through rest: (f⁺ - f⁻) / f⁻, as the moment
-    of rest moves by -1 / f⁻ (Filippov systems; Leine and Nijmeijer 2004, Section 7.3)."""
+    """Jump of the unknowns' sensitivity at a passage through rest, per motor speed before it: (f⁺ - f⁻) / f⁻.
+
+    The moment of rest moves by -1 / f⁻ (Filippov systems; Leine and Nijmeijer 2004, Section 7.3).
+    """
     before, after = jax.vmap(lambda way: rates(robot, conditions, y, way))(sides)
     return (after - before) / before[MOTOR]
 
@@ -520,21 +526,22 @@ def histories(
     known: Followed | None = None,
     at: Int[Array, " places"] | None = None,
 ) -> Signals:
-    """Signals of one run from standstill (or as `Rig.begins` says) at instants of a grid; fields have shape (times,),
-    or (places,).
+    """Signals of one run on a time grid, from standstill or as in `Rig.begins`.
+
+    Fields have shape (times,) or (places,).
 
     Args:
-        robot: its parameters may be tracers; derivatives by them, and by nothing else, are forward and exact
-            for these steps.
-        conditions: one run; each field scalar, or of shape (times,): its value at an instant acts from there to the
-            next, and is what the signals of that instant are computed with.
-        times: from 0 on, as by `grid` [s]; repeated instants are steps of no length.
-        known: the run, from `followed`, where it is known.
-        at: indices of the instants that are wanted; None: every one.
+        robot: its parameters may be tracers. Derivatives are forward, exact for these steps, and only with respect to
+            the robot.
+        conditions: one run; each field scalar, or of shape (times,): the value of an instant acts until the next one,
+            and the signals of that instant use it.
+        times: from 0 on, as from `grid` [s]; repeated instants are steps of no length.
+        known: the run, from `followed`, if computed.
+        at: indices of the instants to return; None: all.
 
-    A run that could not be followed is not finite from there on. Shafts and a load that move as one stand where
-    friction holds them. Of others friction at rest is smooth: a robot that should stand creeps where gravity pulls,
-    below a tenth of V_s.
+    A run whose equations could not be solved is not finite from there on. Shafts and a load that move as one rest if
+    friction holds them. For others friction at rest is smooth: gravity makes a resting robot creep, below a tenth of
+    V_s.
     """
     changing, constant = _in_time(conditions)
     ys, sides = _nodes(robot, conditions, times, known)
@@ -555,7 +562,7 @@ def _nodes(
 
 
 def _shown(robot: Robot, conditions: Conditions, y: Array, way: Array) -> Signals:
-    """Signals of an instant, in static equilibrium where friction holds shafts and load."""
+    """Signals of an instant, in static equilibrium if friction holds shafts and load."""
     state = state_of(robot, y)
     signals = moving(robot, conditions, state)
     if not robot.moves_as_one or conditions.motor_speed is not None:
@@ -564,10 +571,10 @@ def _shown(robot: Robot, conditions: Conditions, y: Array, way: Array) -> Signal
 
 
 class Within(eqx.Module):
-    """What steps of a run are like between their instants; signals have fields of shape (steps,).
+    """Course of steps of a run between their instants; signals have fields of shape (steps,).
 
     Attributes:
-        first: at the beginning; begin, end: from where to where the rest goes on a line while a lag decays.
+        first: at the beginning; begin, end: ends of the line that the signals follow apart from a decaying lag.
         decays: exponent of that decay over the step, shape (steps,).
     """
 
@@ -578,7 +585,7 @@ class Within(eqx.Module):
 
     @staticmethod
     def read(steps: tuple[Array, ...], share: Float[Array, " steps"]) -> Float[Array, "steps ..."]:
-        """Readings a share of the way through steps.
+        """Readings at a share of each step.
 
         Args:
             steps: readings at `first`, `begin` and `end`, shape (steps, ...), and `decays`.
@@ -595,9 +602,9 @@ def within(
     known: Followed | None = None,
     at: Int[Array, " places"] | None = None,
 ) -> Within:
-    """One run, as `histories`, between its instants.
+    """Course of one run between its instants; the run is that of `histories`.
 
-    Args: as of `histories`; at: steps that are wanted, by the index of the instant that each begins at.
+    Args: as for `histories`; at: steps to return, by the index of the instant at the start of each.
     """
     ys, sides = _nodes(robot, conditions, times, known)
     steps, constant = steps_of(conditions, times)
@@ -608,7 +615,7 @@ def within(
 
     def one(y: Array, after: Array, step: Step, then: Conditions, sides: Array) -> Within:
         held = step.held(constant)
-        if step.before is None:  # what is imposed is on a line itself
+        if step.before is None:  # the imposed quantity is itself linear
             first = _shown(robot, held, y, sides[0])
             return Within(first, first, _shown(robot, eqx.combine(then, constant), after, sides[1]), jnp.zeros(()))
         lag, current = _lag_of(robot, constant, step, y), _current(y)

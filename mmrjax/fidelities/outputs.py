@@ -1,6 +1,6 @@
-"""The table of outputs: what a simulated run adds to a table of runs, one row each. Importable without jax.
+"""The table of outputs: the results of a simulated run, one row each. Importable without jax.
 
-Columns of `runs.csv`, of `Results.to_dict` and of printed tables are these.
+They are the columns of `runs.csv`, of `Results.to_dict` and of printed tables.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ class Output:
         name: noun; field of the result, or channel.
         column: in tables of runs, with the unit in the name.
         unit: of the column; factor: the SI value of one such unit.
-        label: words of tables and reports.
-        get: the number [SI] out of a result.
-        resolution: digits after the point that a person wants to see [unit].
-        rests_on: parameters of the robot without which it is not known, and NaN, by dotted name.
+        label: words in tables and reports.
+        get: returns the number [SI] from a result.
+        resolution: digits after the point in reports [unit].
+        rests_on: dotted names of the parameters that it depends on; it is NaN if one of them is unknown.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Output:
     rests_on: tuple[str, ...] = ()
 
 
-#: Beside the channels, which come first.
+#: Outputs in addition to the channels, which come first.
 FURTHER: tuple[Output, ...] = (
     Output(
         "theoretical_speed", "theoretical_speed_mm_s", "mm/s", MM, "theoretical speed",
@@ -78,7 +78,7 @@ def _reading(channel: str) -> Callable[[Result], Any]:
 
 
 def table(shown: Iterable[Channel]) -> tuple[Output, ...]:
-    """Every output, the channels that are shown first, in the order of columns."""
+    """Every output in the order of columns, the channels `shown` first."""
     read = tuple(
         Output(c.name, c.column, c.unit_shown, c.factor, c.label, _reading(c.name), c.resolution, c.rests_on)
         for c in shown
@@ -87,7 +87,7 @@ def table(shown: Iterable[Channel]) -> tuple[Output, ...]:
 
 
 def names(shown: Iterable[Channel]) -> tuple[str, ...]:
-    """Names of all outputs, the channels that are shown first."""
+    """Names of all outputs, the channels `shown` first."""
     return tuple(output.name for output in table(shown))
 
 
@@ -98,7 +98,7 @@ def columns(
 
     Args:
         shown: channels, of the robot.
-        further: what a fidelity adds, by column, in the column's unit (`fidelities.base.Run.columns`).
+        further: columns that a fidelity adds, in their units (`fidelities.base.Run.columns`).
     """
     found = {output.column: np.asarray(output.get(result)) / output.factor for output in table(shown)}
     return {
@@ -109,7 +109,7 @@ def columns(
 
 
 def codes(status: Any, flags: Any) -> dict[str, np.ndarray]:
-    """Statuses and flags in the words of `runs.csv`, of the codes' shape; flags separated by semicolons."""
+    """Statuses and flags as words of `runs.csv`, in the shape of the codes; flags separated by semicolons."""
     from mmrjax.model.signals import FLAGS, STATUSES
 
     bits = np.asarray(flags)

@@ -1,4 +1,4 @@
-"""Rest: whether friction holds a robot that stands, the current that flows in it then, and how runs end by that."""
+"""Rest: whether friction holds a standing robot, its current at rest, and the status of a run at its end."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from mmrjax.model.signals import NOT_SETTLED, SLIDES, STALLED, Signals, State
 from mmrjax.numerics import one_sided
 from mmrjax.numerics.rarely import rarely
 
-#: Torque at the driving wheel that counts as much as the whole weight of a side [N·m].
+#: Torque at the driving wheel equivalent to the whole weight of a side [N·m].
 TORQUE = 1.0
-#: A run has not settled while it would change its speed by more than this share in `TIME` [-], [s].
+#: A run has not settled if its speed would change by more than this share within `TIME` [-], [s].
 SHARE, TIME = 1e-3, 0.1
-#: From which a robot whose movers slide gains or loses speed [m/s²], and from which one that stands is starting.
+#: Least acceleration that counts, of a robot with sliding movers, and of a robot that starts from rest [m/s²].
 GAIN, STARTS = 1e-3, 1e-2
 
 
-#: Way of shafts that friction holds, beside ±1 and 0.
+#: Direction value of shafts that friction holds, in addition to ±1 and 0.
 HELD = 2.0
 
 
 def least(*values: Scalar) -> Array:
-    """The smallest of some numbers, its derivative that of one of them.
+    """The smallest of some numbers, with the derivative of that number.
 
-    That of `jnp.minimum` is nothing wherever XLA computes an argument twice and rounds it in two ways: it asks which
-    argument equals the answer.
+    The derivative of `jnp.minimum` is 0 if XLA computes an argument twice with different rounding, because it
+    compares each argument with the result.
     """
     found = jnp.asarray(values[0])
     for value in values[1:]:
@@ -42,10 +42,10 @@ def least(*values: Scalar) -> Array:
 
 
 def direction(robot: Robot, conditions: Conditions) -> Array:
-    """Direction in which a robot can travel, 1 forward or -1 backward: of the torque on its shafts at rest.
+    """Direction in which a robot can travel, 1 forward or -1 backward, from the torque on its shafts at rest.
 
-    That of the motors at their stall current less gravity's; friction can hold the robot, not turn it round. That of
-    the motors' speed where it is imposed.
+    The torque is that of the motors at stall current less gravity's. Friction can hold the robot but not reverse it.
+    With an imposed motor speed, the direction of that speed.
     """
     if conditions.motor_speed is not None:
         return jax.lax.stop_gradient(jnp.where(conditions.motor_speed >= 0, 1.0, -1.0))
@@ -58,8 +58,8 @@ def direction(robot: Robot, conditions: Conditions) -> Array:
 
 
 def voltage_at_rest(robot: Robot, conditions: Conditions) -> Array:
-    """Voltage that the driver gives motors at rest [V], no current flowing."""
-    if conditions.motor_speed is not None:  # that which makes for the imposed speed
+    """Voltage of the driver at motors at rest without current [V]."""
+    if conditions.motor_speed is not None:  # the voltage of the imposed speed
         return jnp.asarray(robot.motor.voltage_back(conditions.motor_speed))
     if conditions.motor_current is not None:  # an amplifier's, see `balances.electrical`
         return jnp.asarray(robot.motor.resistance * conditions.motor_current)
@@ -69,8 +69,10 @@ def voltage_at_rest(robot: Robot, conditions: Conditions) -> Array:
 
 
 def _carried(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
-    """Signals of shafts that turn in `direction`, or are about to, under a robot that stands: movers carry what the
-    robot asks for, and no more than the ground holds."""
+    """Signals of shafts that turn in `direction`, or are about to, under a standing robot.
+
+    Movers carry the robot's demand, up to the limit of the ground.
+    """
     signals = balances.settled(robot, conditions, state, direction)[0]
     limit = signals.adhesion_limit
     carried = dataclasses.replace(signals, traction=jnp.clip(signals.demand, -limit, limit))
@@ -78,21 +80,21 @@ def _carried(robot: Robot, conditions: Conditions, state: State, direction: Scal
 
 
 def standing(robot: Robot, conditions: Conditions, state: State) -> Signals:
-    """All signals of a robot that friction at rest holds, in static equilibrium.
+    """All signals of a robot that friction holds at rest, in static equilibrium.
 
-    What friction at rest carries is not determined by the loads alone. Here traction is what gravity along the slope
-    asks for; rolling resistance takes what of it neither shafts nor adhesion hold. The torque at the output is the
-    smallest with which motor side and track side both stand, so friction takes what it can nearest to its cause.
+    The loads alone do not determine static friction. Traction is the pull of gravity along the slope; rolling
+    resistance takes the part that neither shafts nor adhesion hold. The output torque is the smallest that keeps
+    both motor side and track side at rest: friction acts as near as possible to the load it balances.
 
     Args:
-        conditions: their voltage or current imposed, no speed; state: its current is that which flows at rest.
+        conditions: voltage or current imposed, no speed; state: with the current that flows at rest.
     """
     robot = robot.within(conditions.configuration)
     chassis, gear, still = robot.chassis(conditions.configuration), robot.gearbox, _still(state)
-    # About to turn forward and backward: the two ends of what friction can do.
+    # About to turn forward and backward: the two limits of friction.
     ends = [balances.settled(robot, conditions, still, way)[0] for way in (1.0, -1.0)]
     ahead, back = ends
-    # Least and most torque that comes through the gearbox, and least and most that the track's friction takes.
+    # Least and greatest torque through the gearbox, and least and greatest friction of the track.
     given = [
         gear.torque_output(end.torque_motor - end.torque_idle, end.direction)
         - (end.torque_load - end.torque_track_loss - chassis.radius * end.traction)
@@ -130,9 +132,9 @@ def _still(state: State) -> State:
 
 
 def holds(robot: Robot, conditions: Conditions) -> Array:
-    """Whether friction at rest holds a robot that stands.
+    """True if friction at rest holds a standing robot.
 
-    The ground grips, and motors and gravity can turn the shafts neither way at the motors' current at rest, which
+    The ground grips, and motors and gravity cannot turn the shafts at the motors' current at rest, which
     flows a millisecond after the start.
     """
     none = jnp.zeros_like(conditions.voltage)
@@ -143,17 +145,17 @@ def holds(robot: Robot, conditions: Conditions) -> Array:
 
 
 def _ground_margin(forward: Signals, backward: Signals) -> Scalar:
-    """Adhesion less what gravity asks of it beyond rolling resistance [-], negative where a robot slides down."""
+    """Adhesion less the pull of gravity beyond rolling resistance [-], negative if a robot slides down."""
     along = -least(-backward.demand, forward.demand)
     return (forward.adhesion_limit - along) / forward.normal
 
 
 def firmness(robot: Robot, conditions: Conditions, state: State) -> Scalar:
-    """How firmly friction would hold the robot at rest, negative where it cannot [-].
+    """Margin of the friction that holds a robot at rest, negative if it cannot hold it [-].
 
-    Its shafts stand where the motors and gravity together can turn them neither way against friction at rest, be it
-    by moving the robot or by sliding its movers under it; its movers where gravity along the slope less rolling
-    resistance is below the ground's adhesion.
+    Its shafts rest if motors and gravity together cannot turn them against static friction, either by moving the
+    robot or by sliding its movers under it. Its movers rest if gravity along the slope less rolling resistance is
+    below the ground's adhesion.
     """
     forward, backward = _about_to_turn(robot, conditions, state)
     shafts = least(-forward.torque_net, backward.torque_net) / TORQUE
@@ -161,17 +163,17 @@ def firmness(robot: Robot, conditions: Conditions, state: State) -> Scalar:
 
 
 def _about_to_turn(robot: Robot, conditions: Conditions, state: State) -> tuple[Signals, Signals]:
-    """Signals of shafts that stand and are about to turn forward, and backward."""
+    """Signals of resting shafts that are about to turn forward, and backward."""
     still = _still(state)
     return _carried(robot, conditions, still, 1.0), _carried(robot, conditions, still, -1.0)
 
 
 def turning_way(robot: Robot, conditions: Conditions, state: State) -> Array:
-    """Way in which shafts and a load that move as one turn, or leave rest, ±1 [-].
+    """Direction in which shafts and a load that move as one turn, or leave rest, ±1 [-].
 
-    `HELD` where they stand and friction holds them by the test of `firmness`, now and at the current that will flow
-    then. 0 where it would hold them now alone, so that they are about to leave, and they are slower than friction at
-    rest is resolved. Where a speed is imposed it turns them, whatever friction does: 0 where it stands.
+    `HELD` if they rest and friction holds them by the test of `firmness`, both now and at the later current at rest.
+    0 if friction holds them only now, so that they are about to leave rest, and their speed is below the resolution
+    of static friction. An imposed speed turns them in any case; 0 if it is 0.
     """
     motor_speed, load = jnp.asarray(state.speed_motor), robot.chassis(conditions.configuration)
     slow = jnp.abs(motor_speed) * load.radius / robot.gearbox.ratio < load.speed_still
@@ -191,10 +193,10 @@ def turning_way(robot: Robot, conditions: Conditions, state: State) -> Array:
 
 
 def slides_in_place(robot: Robot, conditions: Conditions) -> Array:
-    """Whether a robot that cannot travel, as the demand is above what the ground holds, slides; else it stands.
+    """True if a robot slides, whose demand exceeds the limit of the ground; False if it stands.
 
-    It slides down where gravity less rolling resistance is above the adhesion. It slides in its place where the
-    motors turn the movers faster than V_s, up to which the ground holds more the faster they slide.
+    It slides down if gravity less rolling resistance exceeds the adhesion. It slides in place if the motors turn the
+    movers faster than V_s; up to V_s the traction of the ground increases with sliding speed.
     """
     chassis, sense = robot.chassis(conditions.configuration), direction(robot, conditions)
     none = jnp.zeros_like(conditions.voltage)
@@ -211,8 +213,7 @@ def slides_in_place(robot: Robot, conditions: Conditions) -> Array:
 
 
 def current_settled(robot: Robot, conditions: Conditions, state: State) -> Scalar:
-    """Current to which that of motors at the speed of `state` settles [A], on the line through two of its voltage
-    balance."""
+    """Current [A] that settles at the motor speed of `state`, by the secant of its voltage balance."""
 
     def left(current: Scalar) -> Scalar:
         here = dataclasses.replace(state, current=current)
@@ -225,19 +226,19 @@ def current_settled(robot: Robot, conditions: Conditions, state: State) -> Scala
 
 
 def current_at_rest(robot: Robot, conditions: Conditions, state: State) -> Scalar:
-    """Current to which that of a standing robot settles [A]."""
+    """Current that settles in a standing robot [A]."""
     return current_settled(robot, conditions, _still(state))
 
 
 def creeps(sense: Array, voltage: Scalar, theoretical: Scalar, speed: Scalar, rest: Scalar) -> Array:
-    """Whether a robot rests, by its numbers: slower than friction at rest is resolved.
+    """True if a robot counts as at rest: slower than the resolution of static friction.
 
-    One that its motors drive travels where both shafts and robot move their way, since on a slope the contact's creep
-    takes back what slow shafts win. One that gravity drives travels where either of them does.
+    A robot driven by its motors travels if both shafts and robot move in the motors' direction; on a slope the creep
+    of the contact can cancel slow shafts. A robot driven by gravity travels if either of them moves.
 
     Args:
-        sense: in which it can travel, 1 or -1; voltage: at the motors at rest [V]; theoretical: r_k ω_k [m/s].
-        rest: speed within which friction at rest is not resolved [m/s].
+        sense: direction of possible travel, 1 or -1; voltage: at the motors at rest [V]; theoretical: r_k ω_k [m/s].
+        rest: speed below which friction at rest is not resolved [m/s].
     """
     shafts, travel = sense * theoretical, sense * speed
     driven = sense * voltage > 0
@@ -245,14 +246,14 @@ def creeps(sense: Array, voltage: Scalar, theoretical: Scalar, speed: Scalar, re
 
 
 def status_moving(robot: Robot, conditions: Conditions, end: Signals, voltage: Scalar) -> Array:
-    """Status of a run over time that friction does not hold at its end, by its last instant.
+    """Status of a run over time from its last instant, if friction does not hold the robot.
 
     Args:
-        conditions: that act then; voltage: that the driver gives the motors then [V].
+        conditions: at that instant; voltage: of the driver at that instant [V].
 
     Returns:
-        `not_settled` while the speed changes, or movers that slide beyond V_s win speed; `slides` where those lose
-        speed or the robot stands; `stalled` where it creeps; else the status of steady travel.
+        `not_settled` if the speed changes, or if the robot gains speed with movers sliding beyond V_s; `slides` if it
+        then loses speed or stands; `stalled` if it creeps; else the status of steady travel.
     """
     settling = jnp.abs(end.acceleration) * TIME > SHARE * jnp.abs(end.speed)
     status = jnp.where(settling, NOT_SETTLED, travels(end.speed, voltage))
@@ -266,11 +267,12 @@ def status_moving(robot: Robot, conditions: Conditions, end: Signals, voltage: S
 def unless_slipping(
     status: Array, robot: Robot, signals: Signals, gain: Scalar, least: float, stands: Array | bool
 ) -> Array:
-    """The status of a run, of one that slips by what the robot does: `not_settled` while it gains speed, `slides`
-    where it loses speed or stands, else what it is without.
+    """Status of a run with slip taken into account, else `status`.
+
+    A slipping robot is `not_settled` if it gains speed, and `slides` if it loses speed or stands.
 
     Args:
-        gain: how fast it gains speed [m/s²]; least: from which that counts; stands: whether it does not travel.
+        gain: acceleration of the robot [m/s²]; least: smallest that counts; stands: True if it does not travel.
     """
     loose = jnp.where(gain > least, NOT_SETTLED, jnp.where(jnp.asarray(gain < -least) | stands, SLIDES, status))
     return jnp.where(slips(robot, signals), loose, status)

@@ -18,12 +18,12 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, FLAGS, REVERSES, ROLLS_BACK, Result, Signals, quotient
 from mmrjax.numerics.one_sided import magnitude
 
-#: Current into a supply that is none [A]: what rounding and a settled search leave.
+#: Current into a supply that counts as 0 [A]: rounding and the remainder of a converged search.
 CURRENT_SMALL = 1e-3
 
 
 def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
-    """Readings, power chain of Fig. 4 and exceeded limits of one instant; what is not known of a rig is NaN."""
+    """Readings, power chain of Fig. 4 and warnings of one instant; numbers with unknown parameters are NaN."""
     sides = robot.sides
     power_supply = balances.power_drawn(robot, signals)
     power_motor = sides * signals.torque_motor * signals.speed_motor
@@ -58,18 +58,18 @@ def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
 
 
 def known(robot: Robot, found: Result) -> Result:
-    """`found` with NaN in what rests on parameters that are not known of a robot."""
+    """`found` with NaN in numbers that depend on unknown parameters of a robot."""
     unknown = [output.name for output in outputs.FURTHER if not robot.knows(output.rests_on)]
     nan: dict[str, Any] = {name: jnp.full_like(getattr(found, name), jnp.nan) for name in unknown}
     return dataclasses.replace(found, **nan)
 
 
 def exceeded(robot: Robot, signals: Signals) -> dict[str, Scalar]:
-    """What an instant exceeds, by the flag's name."""
+    """Limits exceeded at an instant, by the flag's name."""
     battery, on_battery = robot.battery, signals.battery > 0.5
     cell, current = signals.voltage_source / battery.cells, battery.current(signals.total_current)
     most, back = battery.current_limit or jnp.inf, battery.current_charge or jnp.inf
-    # A full cell at rest may read its charge voltage: only current that flows into it can exceed it.
+    # A full cell at rest may have its charge voltage: only a current into it can exceed the limit.
     overcharged = (cell > battery.voltage_charge) & (current < 0)
     torque = jnp.abs(signals.torque_gear)
     return {
@@ -92,31 +92,31 @@ def mask(over: Mapping[str, Scalar]) -> Array:
 
 
 def travels(speed: Scalar, voltage: Scalar) -> Array:
-    """Status of steady travel at `speed` under a `voltage` at the motors: which of the two drives it."""
+    """Status of steady travel at `speed` under a motor `voltage`: driven by the motors or by gravity."""
     backward = jnp.asarray(speed) < 0
     asked = jnp.where(backward, jnp.asarray(voltage) < 0, jnp.asarray(voltage) >= 0)
     return jnp.where(asked, jnp.where(backward, REVERSES, CONVERGED), ROLLS_BACK)
 
 
 def turned(status: Array) -> Array:
-    """Whether a run travels steadily though not forward under its motors' power."""
+    """True if a run travels steadily, but not forward under motor power."""
     return (status == REVERSES) | (status == ROLLS_BACK)
 
 
 def slips(robot: Robot, signals: Signals) -> Array:
-    """Whether the movers slide over the ground faster than V_s."""
+    """True if the movers slide over the ground faster than V_s."""
     return jnp.abs(signals.speed_sliding) > robot.chassis(signals.configuration).speed_grip
 
 
 def efficiency(out: Scalar, into: Scalar) -> Array:
-    """Power out over power in [-]; 0 at rest and where power flows the other way."""
-    # What comes back from a slope is no efficiency of the way there.
+    """Power out over power in [-]; 0 at rest and if power flows the other way."""
+    # Power returned on a descent has no efficiency of forward travel.
     forward = (out >= 0) & (into >= out)
     return jnp.where(forward, quotient(out, into), 0.0)
 
 
 def withhold(answer: Result, valid: Array, sound: Array) -> Result:
-    """NaN in every number of `answer` where `valid` is false; mass and adhesion used stand where `sound`.
+    """Sets every number of `answer` to NaN if `valid` is false; keeps mass and adhesion used if `sound`.
 
     The flags of a withheld member are cleared; its status says why it has no numbers.
     """

@@ -1,4 +1,4 @@
-"""What `simulate` returns: results with the conditions that they belong to, as a table or as arrays."""
+"""The results of `simulate`, together with their conditions, as a table or as arrays."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.signals import CODES, STATUSES, Result
 
-#: Columns of a printed table beside conditions and channels.
+#: Columns of a printed table in addition to conditions and channels.
 _SHOWN = ("slip", "adhesion_used", "power_supply_W", "winding_settled_C")
 #: Columns of conditions: heading, unit and digits after the point.
 _CONDITIONS = {
@@ -40,9 +40,9 @@ _WORDS = {"status": ("status", "", 0), "flags": ("flags", "", 0)}
 
 
 class StatusCodes(np.ndarray):
-    """Codes of how runs ended that compare with the words of `STATUSES`: `results.status == "converged"`."""
+    """Status codes that can be compared with words of `STATUSES`: `results.status == "converged"`."""
 
-    __hash__ = None  # as of every array
+    __hash__ = None  # as for every array
 
     def __eq__(self, other: Any) -> Any:
         return np.asarray(self) == _codes(other)
@@ -55,10 +55,10 @@ class StatusCodes(np.ndarray):
 
 
 def _codes(words: Any) -> Any:
-    """Codes of some words of `STATUSES`; anything else as it is.
+    """Codes of words of `STATUSES`; other values are returned unchanged.
 
     Raises:
-        UsageError: a word that is none of them.
+        UsageError: an unknown word.
     """
     asked = np.asarray(words)
     if asked.dtype.kind != "U":
@@ -69,7 +69,7 @@ def _codes(words: Any) -> Any:
 
 
 class _Numbers:
-    """Fields of `Result` and channels that `Results` shows under their own names, for type checkers and `dir`."""
+    """Fields of `Result` and channels that `Results` offers under their names, for type checkers and `dir`."""
 
     theoretical_speed: Array
     slip: Array
@@ -116,11 +116,11 @@ class _Numbers:
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Results(_Numbers):
-    """Results of one run, or of a batch, of one fidelity; a pytree.
+    """Results of one run or a batch, of one fidelity; a pytree.
 
-    Of `steady`, numbers are computed when they are first asked for and kept: what the instruments show and how the
-    runs ended by one program, everything else (and the results as a pytree) by another. The two round differently, by
-    some 1e-15 of a number; what has been asked for stays as it is.
+    For `steady`, numbers are computed at first use and kept. One program computes the readings and statuses, another
+    all other numbers (and the results as a pytree). The two differ by rounding, about 1e-15 of a number; a number
+    that has been read does not change.
 
     Every field of `Result`, every channel and every column that the fidelity adds is an attribute:
     `results.slip`, `results.total_current`, `results.guide_share`. All numbers have the shape of the conditions.
@@ -130,13 +130,13 @@ class Results(_Numbers):
         conditions: with configurations as indices.
         total_mass: of robot and payload [kg], stated or the robot's own.
         result: in SI units.
-        further: what this fidelity alone knows, by column, in the column's unit.
-        history: runs over time (`time`, `distance`, `signals`, `reading`), their last axis; None where the fidelity
-            has none or none was asked for.
+        further: outputs that only this fidelity has, by column, in the column's unit.
+        history: runs over time (`time`, `distance`, `signals`, `reading`), on their last axis; None if the fidelity
+            has none or it was not requested.
         configurations: names of the robot's configurations, in the order of their indices.
         model: the fidelity.
-        mission: of runs over a profile, totals, segments and course; None without a profile.
-        stated: conditions that the profile states, in place of those of the runs.
+        mission: for runs over a profile, totals, segments and time history; None without a profile.
+        stated: conditions that the profile states, which replace those of the runs.
         channels: of the robot, in the order of columns.
     """
 
@@ -158,7 +158,7 @@ class Results(_Numbers):
 
     @staticmethod
     def pending(batch: Pending, configurations: tuple[str, ...], model: str) -> Results:
-        """Results of which nothing has been computed yet."""
+        """Results that will be computed at first use."""
         results = object.__new__(Results)
         known = {"conditions": batch.conditions, "further": {}, "history": None, "mission": None, "stated": ()}
         results.__dict__.update(
@@ -167,14 +167,14 @@ class Results(_Numbers):
         return results
 
     def on_host(self) -> Results:
-        """The same with NumPy's arrays; what has not been computed yet is still not."""
+        """Same results with NumPy arrays; numbers not computed yet remain so."""
         batch = self.__dict__.get("_pending")
         if batch is None or "result" in self.__dict__:
             return jax.tree.map(np.asanyarray, self)
         return Results.pending(on_host(batch), self.configurations, self.model)
 
     def _compute(self, name: str) -> None:
-        """Compute what holds a name, where nothing that has been computed does."""
+        """Computes the program that holds a name, unless a computed one has it."""
         own, batch = self.__dict__, self.__dict__.get("_pending")
         if batch is None or name.startswith("_"):
             return
@@ -191,7 +191,7 @@ class Results(_Numbers):
             status = shown.get(STATUS, _compared(whole.status))
             own["result"] = dataclasses.replace(whole, reading=reading, status=status)
 
-    if not TYPE_CHECKING:  # which knows the names by `_Numbers`
+    if not TYPE_CHECKING:  # type checkers know the names from `_Numbers`
 
         def __getattr__(self, name: str) -> Any:
             self._compute(name)
@@ -222,17 +222,17 @@ class Results(_Numbers):
 
     @property
     def statuses(self) -> np.ndarray:
-        """How the runs ended, in words of `STATUSES`; `status` holds their codes."""
+        """Statuses of the runs as words of `STATUSES`; `status` holds their codes."""
         return np.array(STATUSES)[np.asarray(self.status)]
 
     def rows_table(self) -> dict[str, np.ndarray]:
-        """The same as `to_dict`, under the name that results of fits have too."""
+        """Same as `to_dict`, under the name that results of fits also have."""
         return self.to_dict()
 
     def to_dict(self) -> dict[str, np.ndarray]:
         """Conditions and outcomes by the columns of `runs.csv`, units in the names; arrays of the batch's shape.
 
-        Over a profile the outcomes are the mission's numbers; conditions that the profile states are NaN.
+        Over a profile the outcomes are those of the mission; conditions that the profile states are NaN.
         """
         conditions, nan = self.conditions, np.full(self.shape, np.nan)
         as_table = {"voltage": "supply_voltage_V", "payload": "payload_kg", "slope_deg": "slope_deg"}
@@ -255,11 +255,11 @@ class Results(_Numbers):
         }
 
     def table(self, columns: Sequence[str] | None = None, rows: int = 40) -> str:
-        """A table for people, a line a run.
+        """Text table of the results, one line per run.
 
         Args:
-            columns: of `to_dict`; None takes the conditions, what the instruments show and a few more.
-            rows: most that are shown.
+            columns: of `to_dict`; None: the conditions, the readings and a few more.
+            rows: largest number of lines.
         """
         content = {name: np.ravel(values) for name, values in self.to_dict().items()}
         rows_of: tuple[outputs.Output | mission_batch.Output, ...] = (
@@ -307,7 +307,7 @@ class Results(_Numbers):
 
 
 def _compared(status: Any) -> Any:
-    """Codes that compare with words. Tracers, and what is no array, are returned unchanged."""
+    """Codes that compare with words. Tracers and values that are not arrays are returned unchanged."""
     is_array = isinstance(status, np.ndarray | jax.Array) and not isinstance(status, jax.core.Tracer)
     return np.asarray(status).view(StatusCodes) if is_array else status
 

@@ -1,4 +1,4 @@
-"""Batches of runs of any shape: run at once or in chunks of one size, or pending until something of them is read."""
+"""Batches of runs of any shape: computed at once or in chunks of one size, or pending until a number is read."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CODES, Result
 
-#: Runs of which `simulate` keeps histories at once.
+#: Most runs of one `simulate` with histories.
 HISTORIES = 1000
 STATUS, _ = CODES
 
 
 @dataclasses.dataclass(frozen=True)
 class Pending:
-    """A batch that has been checked, and of which nothing has been computed.
+    """A checked batch that has not been computed.
 
     Attributes:
-        robot: concrete; conditions: of any shape, configurations resolved; fidelity: one that has `outputs`.
+        robot: concrete; conditions: of any shape, configurations resolved; fidelity: with `outputs`.
     """
 
     robot: Robot
@@ -41,14 +41,14 @@ class Pending:
 
     @at_once
     def shown(self) -> dict[str, jax.Array]:
-        """Readings of the robot's instruments, by channel, and the codes of how the runs ended as `status`."""
+        """Readings of the robot's instruments by channel, and the status codes as `status`."""
         outputs, names = self.fidelity.outputs, (*channels.names(self.robot.channels), STATUS)
         assert outputs is not None
         return _in_chunks(self.fidelity, lambda runs: outputs(self.robot, runs, names), self.conditions)
 
     @at_once
     def result(self) -> Result:
-        """Everything."""
+        """All numbers of the results."""
         return run_batch(self.fidelity, self.robot, self.conditions, {}, history=False).result
 
     @at_once
@@ -60,10 +60,10 @@ class Pending:
 def run_batch(
     fidelity: Fidelity, robot: Robot, conditions: Conditions, options: Mapping[str, float], history: bool
 ) -> Run:
-    """A batch of any shape."""
+    """Computes a batch of any shape."""
     runs = math.prod(conditions.shape)
     if history and runs > HISTORIES:
-        raise UsageError(f"history: got {runs} runs; at most {HISTORIES} are kept over time; expected history=False")
+        raise UsageError(f"history: got {runs} runs; at most {HISTORIES} can be kept over time; state history=False")
     simulate = fidelity.histories if history else fidelity.run
     assert simulate is not None
     if has_tracer((robot, conditions)):
@@ -77,15 +77,15 @@ T = TypeVar("T")
 def _in_chunks(fidelity: Fidelity, function: Callable[[Conditions], T], conditions: Conditions) -> T:
     """Returns the values of a function of conditions of shape (runs,), in the shape of the conditions.
 
-    More runs than a fidelity takes at once go in chunks of one size, which share a compilation; the last one ends
-    with the last run. Few are filled up (`Facts.filled`), by NumPy, for which nothing is compiled; else nothing is
-    dispatched leaf by leaf: at 262 144 runs that took twenty times as long as the equations.
+    Large batches are split into chunks of one size, which share a compilation; the last chunk ends
+    with the last run. Small batches are padded (`Facts.filled`) by NumPy, which compiles nothing. Dispatching JAX
+    operations leaf by leaf took twenty times as long as the equations at 262 144 runs.
     """
     size = fidelity.facts.at_once(jax.default_backend() != "cpu")
     runs = math.prod(conditions.shape)
     filled = min(fidelity.facts.filled(runs), size)
     if 0 < runs < filled:
-        rows = np.minimum(np.arange(filled), runs - 1)  # the last ones stand for the last run again
+        rows = np.minimum(np.arange(filled), runs - 1)  # padding repeats the last run
         found = function(jax.device_put(jax.tree.map(lambda x: np.ravel(x)[rows], conditions)))
         return jax.device_put(
             jax.tree.map(lambda x: np.asarray(x)[:runs].reshape((*conditions.shape, *x.shape[1:])), found)
@@ -108,7 +108,7 @@ def _raveled(conditions: Conditions) -> Conditions:
 
 
 def shaped(tree: T, shape: tuple[int, ...]) -> T:
-    """A tree whose leaves have a leading axis of runs, with that axis in a batch's own shape."""
+    """A tree with a leading axis of runs in its leaves, reshaped to the batch's own shape."""
     return tree if len(shape) == 1 else _reshaped(tree, shape)
 
 
@@ -119,13 +119,13 @@ def _reshaped(tree: T, shape: tuple[int, ...]) -> T:
 
 @compiled
 def _rows(conditions: Conditions, first: np.ndarray, size: int) -> Conditions:
-    """So many runs from the first on, or the last ones where there are not as many left."""
+    """`size` runs starting with `first`, or the last ones if fewer remain."""
     return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, size), conditions)
 
 
 @compiled
 def _joined(parts: list[T], runs: int) -> T:
-    """Chunks of one size one after another, the last one's beginning left out where it repeats the one before."""
+    """Joins chunks of one size; drops the part of the last chunk that repeats the previous one."""
     return jax.tree.map(lambda *x: jnp.concatenate([*x[:-1], x[-1][(len(x) * len(x[-1]) - runs) :]]), *parts)
 
 

@@ -1,4 +1,4 @@
-"""The public API's one verb: simulate a robot under conditions, in any fidelity. What is wrong is refused here."""
+"""The function `simulate`: a robot under conditions, in any fidelity, with checks of all arguments."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from mmrjax.model.quantities import CONDITIONS
 from mmrjax.model.robot import NO_BRAKE, Robot, cannot_turn
 from mmrjax.model.signals import CODES
 
-#: What is said of runs that say nothing of either side, of a robot whose sides differ.
-STRAIGHT = "the robot's sides differ, and runs that say nothing of either side travel straight, as if steered"
-#: What is said of reverse mode through a fidelity that has none.
+#: Warning about runs without data of each side, for a robot with unequal sides.
+STRAIGHT = "the robot's sides differ, but the runs state nothing for each side: they travel straight, as if steered"
+#: Error message for reverse mode through a fidelity that does not support it.
 FORWARD_ALONE = (
     "derivatives are forward (jax.jacfwd, jax.jvp); for jax.grad use model steady, or mmrjax.step for runs over time"
 )
@@ -50,29 +50,28 @@ def simulate(
     start: Start | None = None,
     **options: float | None,
 ) -> Results:
-    """Simulate one run, or a batch.
+    """Simulates one run or a batch.
 
-    Values are checked where they are concrete; tracers pass, so that `jax.grad`, `jax.jacfwd`, `jax.vmap` and
-    `jax.jit` go through (reverse mode through `steady` and `track`, forward mode through all; for reverse mode over
-    time see `step`). Of `steady`, what is
-    asked of the results is computed when it is asked (see `Results`).
+    Concrete values are checked; tracers pass, so that `jax.grad`, `jax.jacfwd`, `jax.vmap` and
+    `jax.jit` work. Forward mode works in all fidelities, reverse mode in `steady` and `track`; for reverse mode over
+    time see `step`. The results of `steady` are computed when they are read (see `Results`).
 
     Args:
         robot: any robot; its parameters may be tracers or, under `jax.vmap`, batches.
         conditions: fields of one shape, configurations by name or index.
-        model: fidelity, one of `fidelities.NAMES`; `steady` where not stated, `drive` with a profile.
-        duration: of a run [s]; `drive` 30, `track` 1.5 where not stated.
-        step: of integration [s]; `track` 1e-4 where not stated.
-        history: whether to keep runs over time, where the fidelity can; `track` then starts from standstill, else
+        model: fidelity, one of `fidelities.NAMES`; default `steady`, or `drive` with a profile.
+        duration: of a run [s]; default 30 for `drive`, 1.5 for `track`.
+        step: of integration [s]; default 1e-4 for `track`.
+        history: True to return runs over time if the fidelity can; `track` then starts from standstill, else
             rolling at the steady speed.
-        profile: a mission that every run is to follow (`mmrjax.profile`), by `drive` only; what it does not state
-            the conditions do. Results then have `mission`, and the columns of `missions.mission_batch.OUTPUTS`.
-            Derivatives are forward, by its values and times too; with tracers state `history=False`.
-        start: the state that a mission begins in; None: at rest at ambient temperature.
+        profile: a mission that every run follows (`mmrjax.profile`), only with `drive`; the conditions supply what it
+            does not state. Results then have `mission`, and the columns of `missions.mission_batch.OUTPUTS`.
+            Derivatives are forward, also with respect to its values and times; with tracers state `history=False`.
+        start: state at the start of a mission; None: at rest at ambient temperature.
         options: of a further fidelity, by name.
 
     Returns:
-        Numbers of the conditions' shape, each run with its status.
+        Results of the conditions' shape, each run with its status.
 
     Raises:
         UsageError: a value that is not allowed, an unknown name, an option that the fidelity does not have.
@@ -122,7 +121,7 @@ def simulate(
 
 
 def _forward_alone(results: Results) -> Results:
-    """The same results, which refuse reverse mode in a sentence: a loop over steps of adaptive length has none."""
+    """Same results with a clear error in reverse mode: a loop over adaptive steps does not support it."""
     if not has_tracer(results):
         return results
     kind = results.model if results.mission is None else f"{results.model} over a profile"
@@ -131,8 +130,7 @@ def _forward_alone(results: Results) -> Results:
 
 
 def _check_battery(robot: Robot, conditions: Conditions) -> None:
-    """Refuse a cut-off at which no cell gives current, and warn of one that hardly acts, where a run is on the
-    battery."""
+    """Raises if battery runs have an unreachable cut-off voltage, and warns if the cut-off rarely acts."""
     if has_tracer((robot.battery, conditions.battery)) or not (np.asarray(conditions.battery) > 0.5).any():
         return
     if any(np.ndim(x) for x in jax.tree.leaves(robot.battery)):  # a batch of robots
@@ -144,7 +142,7 @@ def _check_battery(robot: Robot, conditions: Conditions) -> None:
 
 
 def _check_turning(robot: Robot, conditions: Conditions, profile: Profile | None) -> None:
-    """Refuse to turn a robot that cannot, where its sides are driven apart."""
+    """Raises if the sides are driven independently and the robot cannot turn."""
     freed = [name for name in OF_TURNS if getattr(conditions, name) is not None]
     freed += ["profile"] if profile is not None and profile.turns else []
     if not freed or has_tracer((robot, conditions.configuration)):
@@ -156,7 +154,7 @@ def _check_turning(robot: Robot, conditions: Conditions, profile: Profile | None
 
 
 def _check_brake(robot: Robot, conditions: Conditions, profile: Profile | None) -> None:
-    """Refuse the torque of a brake on a vehicle."""
+    """Raises if a brake torque is stated for a vehicle."""
     braked = conditions.load_torque is not None or (profile is not None and profile.load_torque is not None)
     if braked and robot.has_ground:
         raise UsageError(f"load_torque: {NO_BRAKE}; state slope_deg or payload")
@@ -164,20 +162,18 @@ def _check_brake(robot: Robot, conditions: Conditions, profile: Profile | None) 
 
 def _check_profile(model: str, profile: Any, options: Mapping[str, float | None]) -> None:
     if profile is None:
-        raise UsageError("start: got one without a profile; expected profile=mmrjax.profile(...) beside it")
+        raise UsageError("start: got one without a profile; expected profile=mmrjax.profile(...) too")
     if not isinstance(profile, Profile):
         raise UsageError(f"profile: got {type(profile).__name__}; expected mmrjax.profile(...)")
     if model != mission_batch.MODEL:
-        raise UsageError(
-            f"model: got {model} beside a profile; expected {mission_batch.MODEL}, which follows profiles"
-        )
+        raise UsageError(f"model: got {model} with a profile; expected {mission_batch.MODEL}, which follows profiles")
     for name, value in options.items():
         if value is not None:
-            raise UsageError(f"{name}: got {value!r} beside a profile, whose last row ends the mission; leave it out")
+            raise UsageError(f"{name}: got {value!r} with a profile; its last row ends the mission; leave {name} out")
 
 
 def _missions(robot: Robot, conditions: Conditions, profile: Profile, start: Start | None, history: bool) -> Results:
-    """Every run of a batch over the same profile."""
+    """Runs every member of a batch over the same profile."""
     runs = flat(conditions)
     if not has_tracer((robot, runs, profile, start)):
         cell = mission_batch.begins_below(robot, runs, profile, start)
@@ -210,7 +206,7 @@ def _missions(robot: Robot, conditions: Conditions, profile: Profile, start: Sta
 
 
 def _check_robot(robot: Robot) -> None:
-    """Refuse parameters out of the bounds that their fields declare."""
+    """Raises for parameters outside the bounds of their fields."""
     concrete = [p for p in params.walk(robot) if not isinstance(p.value, jax.core.Tracer)]
     for parameter, value in zip(concrete, jax.device_get([p.value for p in concrete]), strict=True):
         spec = parameter.spec
@@ -224,7 +220,7 @@ def _check_robot(robot: Robot) -> None:
 
 
 def _resolved(robot: Robot, conditions: Conditions) -> Conditions:
-    """Conditions with indices for names, every index one that the robot has."""
+    """Conditions with configuration names replaced by indices, checked against the robot's configurations."""
     names, which = robot.configurations.names, conditions.configuration
     if isinstance(which, Named):
         try:
@@ -240,7 +236,7 @@ def _resolved(robot: Robot, conditions: Conditions) -> Conditions:
 
 
 def checked(robot: Robot, conditions: Conditions) -> Conditions:
-    """Conditions with indices of the robot's configurations for names; values are checked unless they are tracers.
+    """Conditions with configuration names replaced by indices; values are checked unless they are tracers.
 
     Raises:
         UsageError: a configuration that the robot lacks, a value out of range or NaN, or values that contradict.
@@ -252,7 +248,7 @@ def checked(robot: Robot, conditions: Conditions) -> Conditions:
 
 def _check_conditions(conditions: Conditions) -> None:
     stated_names = {f.name for f in dataclasses.fields(conditions) if getattr(conditions, f.name) is not None}
-    # A duty that nobody states is 1, and under a transformation a tracer: that is no statement either.
+    # An unstated duty is 1, and under a transformation a tracer; neither counts as stated.
     if has_tracer(conditions.duty) or (np.asarray(conditions.duty) == 1).all():
         stated_names.remove("duty")
     if why := sides_contradict(stated_names):
@@ -284,7 +280,7 @@ def _check_conditions(conditions: Conditions) -> None:
 
 
 def _ends(values: jax.Array | np.ndarray) -> tuple[float, float]:
-    """Least and greatest of some numbers, found where they are; NaN where one of them is."""
+    """Least and greatest of some numbers, computed by the library that holds them; NaN if one of them is."""
     on_host = not isinstance(values, jax.Array) or all(device.platform == "cpu" for device in values.devices())
     numbers = np.asarray(values) if on_host else values
     least, most = jax.device_get((numbers.min(), numbers.max()))
@@ -292,12 +288,12 @@ def _ends(values: jax.Array | np.ndarray) -> tuple[float, float]:
 
 
 def _within(ends: tuple[float, float], low: float, high: float) -> bool:
-    """Whether every number is within the limits, and finite."""
+    """True if every number is finite and within the limits."""
     return low <= ends[0] and ends[1] <= high and math.isfinite(ends[0]) and math.isfinite(ends[1])
 
 
 def _first_outside(value: Any, low: float, high: float) -> tuple[str, float] | None:
-    """Index in brackets (none for one number) and value of the first number that is not within the limits."""
+    """Index in brackets (empty for a scalar) and value of the first number outside the limits, or None."""
     numbers = np.asarray(value)
     if not numbers.shape and low <= numbers <= high and math.isfinite(numbers):
         return None

@@ -1,4 +1,4 @@
-"""Stages of a start (Figs. 23, 24), starting, acceleration with slipping, uniform travel, and the slip over each."""
+"""Stages of a start (Figs. 23, 24): starting, acceleration with slipping, uniform travel; and the slip of each."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from mmrjax.fidelities.base import History
 from mmrjax.model.paper_tables import PITCH_GROUSER, PITCH_TOOTH
 from mmrjax.model.robot import Robot
 
-#: What the stages are called, in order.
+#: Names of the stages, in order.
 NAMES = ("starting", "acceleration with slipping", "uniform")
-#: Share of the last speed within which a start is over [-], and the end of a run over which that is averaged [s].
+#: Deviation from the last speed that ends a start [-], and length of the end of a run that is averaged for it [s].
 WITHIN, LAST = 0.01, 0.15
 
 
@@ -25,12 +25,12 @@ class Stages:
     """The stages of one start; times since its first sample.
 
     Attributes:
-        sense: in which the shafts turn at the end, 1 or -1.
+        sense: direction of the shafts at the end, 1 or -1.
         starting: end of the first stage [s]: the slide has reached its maximum, the shafts have spun up.
-        slipping: end of the second [s]: the slide is back within V_s for good; `starting` if it never left.
-        settled: t' [s]: the speed within 1 % of its last value, the mean over the last 0.15 s.
+        slipping: end of the second stage [s]: the slide stays within V_s from here; `starting` if it never left.
+        settled: t' [s]: the speed is within 1 % of its last value, the mean over the last 0.15 s.
         end: of the run [s].
-        slip: of each stage, and over_settling: from 0 to t', by `mean_slip` [-]; NaN of one that has no length.
+        slip: of each stage, and over_settling: from 0 to t', by `mean_slip` [-]; NaN for a stage of no length.
     """
 
     sense: float
@@ -43,11 +43,11 @@ class Stages:
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
-        """Where the stages begin and end [s]."""
+        """Start and end times of the stages [s]."""
         return 0.0, self.starting, self.slipping, self.end
 
     def to_json(self) -> dict[str, Any]:
-        """What `result.json` says of it."""
+        """The stages as in `result.json`."""
 
         def number(x: float) -> float | None:
             return float(x) if np.isfinite(x) else None
@@ -61,7 +61,7 @@ class Stages:
 
 
 def _smoothed(time: np.ndarray, values: np.ndarray, period: float) -> np.ndarray:
-    """Means over a `period` about each instant of evenly spaced samples; at the ends of the nearest whole one."""
+    """Means over a `period` about each instant of evenly spaced samples; at the ends, of the nearest whole period."""
     count = min(round(period / (time[-1] / len(time))) | 1, len(values) | 1) if time[-1] > 0 else 1
     if count < 3 or count > len(values):
         return values
@@ -75,9 +75,9 @@ def mean_slip(
     begin: float,
     end: float,
 ) -> float:
-    """Mean of the slip (33) over a time, 1 - ∫V_x dt / ∫V_x_teor dt [-]: the share of the movers' way that is lost.
+    """Mean slip (33) over an interval, 1 - ∫V_x dt / ∫V_x_teor dt [-]: the lost share of the movers' distance.
 
-    That is s weighted by V_x_teor, and finite from standstill on, where s itself is 0/0. NaN without any way.
+    It weights s by V_x_teor and is finite from standstill on, where s itself is 0/0. NaN if the movers do not move.
     """
     if not end > begin:
         return np.nan
@@ -95,13 +95,13 @@ def stages(
     speed_static: float,
     way: float = 0.0,
 ) -> Stages:
-    """The stages of one start, of samples without gaps.
+    """The stages of one start, from samples without gaps.
 
     Args:
         time: [s]; speed, theoretical, sliding: V, r_k ω_k and the contact patch's speed over the ground [m/s].
         speed_static: V_s of the friction law [m/s].
-        way: of the movers between two contacts that make them ripple [m]; slide and speed are judged by their means
-            over that at the last speed. 0: nothing ripples.
+        way: distance of the movers between two contacts that cause ripple [m]; slide and speed are averaged over it
+            at the last speed. 0: no ripple.
     """
     sense = -1.0 if theoretical[-1] < -1e-4 else 1.0
     starting = float(time[int(np.argmax(sense * sliding))])
@@ -118,10 +118,10 @@ def stages(
 
 
 def of_histories(robot: Robot, history: History, which: Sequence[int] | np.ndarray) -> list[Stages | None]:
-    """Of each run of a batch from standstill up to its last number; None of one without numbers.
+    """Stages of each run of a batch from standstill, up to its last number; None for a run without numbers.
 
     Args:
-        which: index of each run's configuration in `robot`, whose loads are vehicles.
+        which: index of each run's configuration in `robot`; its loads are vehicles.
     """
     found: list[Stages | None] = []
     for k, index in enumerate(which):
@@ -131,18 +131,18 @@ def of_histories(robot: Robot, history: History, which: Sequence[int] | np.ndarr
         time, *motion = (np.asarray(x)[k][:upto] for x in of_run)
         chassis = robot.configurations.members[int(index)]
         static, way = float(chassis.ground.friction.speed_static), 0.0
-        if history.reactions is not None:  # contacts are resolved
+        if history.reactions is not None:  # from individual contacts
             way = PITCH_GROUSER if float(chassis.on_tracks) > 0.5 else PITCH_TOOTH
         found.append(stages(time, motion[0], motion[1], motion[2], static, way) if upto else None)
     return found
 
 
 def numbers(values: Float[np.ndarray, " times"]) -> int:
-    """How many samples a run has up to its last that is a number."""
+    """Number of samples of a run up to its last finite one."""
     finite = np.flatnonzero(np.isfinite(values))
     return int(finite[-1]) + 1 if finite.size else 0
 
 
 def ending(time: Float[np.ndarray, " times"]) -> np.ndarray:
-    """Which samples are of the last 0.15 s, some pitches of the running gear; of a short run its last tenth."""
+    """Mask of the last 0.15 s, several pitches of the running gear; for a short run, of its last tenth."""
     return np.asarray(time >= time[-1] - min(LAST, 0.1 * float(time[-1])))

@@ -38,13 +38,15 @@ from mmrjax.numerics.newton import root
 from mmrjax.numerics.rarely import rarely
 from mmrjax.turning import circling as turning
 
-# Units of the unknowns and of the torque residual, so that all are of the order of one.
+# Units of the unknowns and of the torque residual, which scale them to the order of one.
 _SPEED, _CURRENT, _SPEED_MOTOR, _VOLTAGE, _TORQUE = 1.0, 10.0, 1000.0, 10.0, 100.0
 
 
 def _state(unknowns: Vector, discharge: Float[Array, ""]) -> State:
-    """Of speed, current and motor speed, in the order in which the balances are eliminated: the slip determines the
-    speed and the voltage the current, whatever the robot; the torque what is left, the motor speed."""
+    """State from speed, current and motor speed, in the order of elimination of the balances.
+
+    For any robot the slip determines the speed and the voltage the current; the torque then gives the motor speed.
+    """
     speed, current, speed_motor = unknowns
     return State(_CURRENT * current, _SPEED_MOTOR * speed_motor, _SPEED * speed, discharge)
 
@@ -62,22 +64,22 @@ def _residual(unknowns: Vector, robot: Robot, own: tuple[Conditions, Array]) -> 
 
 
 def _left(unknowns: Vector, conditions: Conditions, sense: Array, signals: Signals, creep: Scalar) -> Vector:
-    """What the balances leave at some unknowns, all 0 at the operating point."""
-    # Moving with balanced torques, or at rest with too little torque: speed >= 0, torque <= 0 in the direction of
-    # travel, one of them 0.
+    """Residuals of the balances, all 0 at the operating point."""
+    # Moving with balanced torques, or at rest with too little torque: speed >= 0 and torque <= 0 in the direction of
+    # travel, and one of them is 0.
     lacking, moving = -sense * signals.torque_net / _TORQUE, sense * unknowns[2]
     torque = sense * jnp.where(moving < lacking, moving, lacking)
     slip, voltage = signals.speed_sliding - creep, signals.voltage_left / _VOLTAGE
-    if conditions.motor_speed is not None:  # the torque determines the current, and the motor speed is known
+    if conditions.motor_speed is not None:  # the torque determines the current; the motor speed is given
         known = unknowns[2] - conditions.motor_speed / _SPEED_MOTOR
         return jnp.asarray(slip), jnp.asarray(signals.torque_net / _TORQUE), jnp.asarray(known)
     return jnp.asarray(slip), jnp.asarray(voltage), torque
 
 
 def _sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
-    """Whether a run's conditions are finite and its mass positive; where not, all ones in their place.
+    """Returns whether a run's conditions are finite and its mass positive, and the conditions, set to 1 if not.
 
-    A NaN that entered the residual would reach the derivatives of the whole batch, as 0 * NaN.
+    A NaN in the residual would reach the derivatives of the whole batch, as 0 * NaN.
     """
     stated = conditions.total_mass
     mass = robot.chassis(conditions.configuration).mass + conditions.payload if stated is None else stated
@@ -85,7 +87,7 @@ def _sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
     for number in jax.tree.leaves(conditions):
         sound &= jnp.isfinite(number)
     conditions = jax.tree.map(lambda x: jnp.where(sound, x, jnp.ones_like(x)), conditions)
-    # No adhesion at all: the robot slides, but a share of nothing has no value.
+    # Without adhesion the robot slides, and the share of adhesion used has no value.
     return sound, dataclasses.replace(conditions, adhesion=jnp.maximum(conditions.adhesion, 1e-9))
 
 
@@ -102,8 +104,10 @@ def _start(robot: Robot, conditions: Conditions) -> Vector:
 
 
 def _root(robot: Robot, conditions: Conditions, large: bool = True) -> tuple[Vector, Array]:
-    """The unknowns at which the balances close, and whether the search got there; derivatives are implicit. `large`:
-    the program is to be quick over large batches, else soon compiled."""
+    """The root of the balances, and whether the search converged; derivatives are implicit.
+
+    `large` selects the program for large batches; the other compiles sooner.
+    """
     tolerance = float(jnp.finfo(jnp.result_type(conditions.voltage)).eps) ** 0.85
     sound = _sound(robot, conditions)[1]
     start = jax.lax.stop_gradient(_start(robot, sound))
@@ -117,8 +121,10 @@ def _circled(robot: Robot, conditions: Conditions) -> Signals:
 
 
 def operating_signals(robot: Robot, conditions: Conditions) -> Signals:
-    """Every signal of one run at its operating point, with numbers whatever the status (see `operating_point`); of a
-    robot that turns those of each side, along an axis of 2."""
+    """Every signal of one run at its operating point, with numbers at any status (see `operating_point`).
+
+    For a robot that turns, those of each side, on an axis of 2.
+    """
     if conditions.turns:
         return _circled(robot, conditions)
     unknowns, _ = _root(robot, conditions)
@@ -136,25 +142,24 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
         conditions: one run, scalar fields.
 
     Returns:
-        Scalars. `status` is `converged`; `reverses` (steady travel backward, as a negative voltage asks);
-        `rolls_back` (gravity drives the robot against its motors, or backward without voltage); `stalled` (shafts or
-        robot slower than a tenth of V_s, where friction at rest is not resolved: neither the motors nor gravity can
-        turn the shafts: stall current, shaft speed 0, and the robot creeps at the sliding speed of the static
-        friction law); `slides`
-        (the demand is above the adhesion limit), `battery_empty` or `failed`, all three with NaN in
-        every number but `mass` and `adhesion_used` (NaN too where the conditions are no numbers, or
-        the mass not positive). A member that has no numbers has zero derivatives and harms no
-        other.
+        Scalars. The status is one of these. `converged`. `reverses`: steady travel backward due to a negative
+        voltage. `rolls_back`: gravity drives the robot against its motors, or backward without voltage. `stalled`:
+        shafts or robot are slower than a tenth of V_s, where static friction is not resolved, and neither motors nor
+        gravity
+        can turn the shafts: stall current, shaft speed 0, and the robot creeps at the sliding speed of the friction
+        law. `slides`: the demand is above the adhesion limit. `battery_empty`. `failed`. The last three have NaN in
+        every number but `mass` and `adhesion_used`, which are NaN too if the conditions are not finite or the mass
+        is not positive. A member without numbers has zero derivatives and does not affect the others.
     """
     if conditions.turns:
         return turning.steady(robot, conditions)
     point, sound = operating_point(robot, conditions)
-    # What the contact's law gives a robot that stands as creep, friction at rest holds.
+    # Friction at rest holds a standing robot; the contact law alone would give it a creep.
     crept = jnp.abs(point.speed) >= robot.chassis(conditions.configuration).speed_still
     parked = (point.status == STALLED) & ((jnp.abs(point.theoretical_speed) < 1e-9) | crept)
     speed = jnp.where(parked, 0.0, point.speed)
     reading = {**point.reading, "speed": speed}
-    # Nor does the ground of a robot that stands carry more than it can, though its shafts creep.
+    # The ground of a standing robot does not carry more than its limit either, although the shafts creep.
     beyond = parked & (point.adhesion_used > 1)
     point = dataclasses.replace(
         point,
@@ -170,9 +175,9 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
 
 @compiled
 def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array]:
-    """`steady` with the numbers left in whatever the status, for a fit that has to find its way back.
+    """`steady` with numbers at any status, for a fit that needs a way back.
 
-    Where the robot `slides` they are those of the balances with the contact held at V_s: current and motor
+    If the robot `slides` they are those of the balances with the contact held at V_s: current and motor
     speed as if the ground held, the robot V_s slower than r_k ω_k, and no derivative of the speed in μ_s.
 
     Returns:
@@ -198,12 +203,12 @@ def operating(robot: Robot, conditions: Conditions) -> tuple[Signals, Array, Arr
 def _operating_at(
     robot: Robot, conditions: Conditions, unknowns: Vector, solved: Array, stands: bool = True
 ) -> tuple[Signals, Array, Array, Vector]:
-    """`operating` at some unknowns, and what the balances leave there.
+    """`operating` at given unknowns, and the residuals of the balances there.
 
     Args:
-        stands: whether it is found out if a run beyond the limit of adhesion slides or stands; else it `slides`.
+        stands: True to test whether a run beyond the limit of adhesion slides or stands; False: it `slides`.
     """
-    given = jax.lax.stop_gradient((robot, conditions))  # as they came: nothing is stored for a loop that seldom turns
+    given = jax.lax.stop_gradient((robot, conditions))  # nothing is stored for a loop that rarely runs
     robot = robot.within(conditions.configuration)
     sound, conditions = _sound(robot, conditions)
     sense = direction(robot, conditions)
@@ -213,7 +218,7 @@ def _operating_at(
     voltage = voltage_at_rest(robot, conditions)
     still = creeps(sense, voltage, signals.speed_theoretical, signals.speed, rest)
     still |= sense * signals.speed_theoretical <= 1e-9
-    # Ordered by what a person would say first.
+    # In the order in which they matter to a reader.
     status = jnp.where(still, STALLED, travels(signals.speed, voltage))
     if robot.has_ground:
         beyond = jnp.abs(signals.demand) > signals.adhesion_limit
@@ -231,20 +236,20 @@ def _operating_at(
 
 
 def _axes(tree: Any) -> Any:
-    """Which numbers have a leading axis of points, for `jax.vmap`."""
+    """Axes for `jax.vmap`: 0 for arrays with a leading axis of points, else None."""
     return jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, tree)
 
 
-#: Most points that a CPU computes at once: what is stored between two steps of a block stays in its cache.
+#: Most points that a CPU computes at once; the intermediate values of a block then fit in its cache.
 BLOCK = 32_768
 
 
 def _over_points(function: Callable[..., Any], *arguments: Any) -> Any:
-    """`function` of scalars over the leading axis of whatever numbers have one; on a CPU block by block."""
+    """`function` of scalars, mapped over the leading axis of all arrays that have one; on a CPU block by block."""
     batched = jax.vmap(function, in_axes=_axes(arguments))
     leaves, tree = jax.tree.flatten(arguments)
     points = max((len(x) for x in leaves if jnp.ndim(x)), default=0)
-    # Blocks of one size, so that one is compiled; points that have no such divisor go together.
+    # Blocks of equal size share a program; a number of points without a suitable divisor is computed at once.
     block = next((size for size in range(BLOCK, BLOCK // 8, -1) if points % size == 0), points)
     if points <= BLOCK or block == points or jax.default_backend() != "cpu":
         return batched(*arguments)
@@ -253,7 +258,7 @@ def _over_points(function: Callable[..., Any], *arguments: Any) -> Any:
         own = [x if row is None else row for x, row in zip(leaves, rows, strict=True)]
         return batched(*jax.tree.unflatten(tree, own))
 
-    # Derivatives in reverse compute a block again: what they need of all blocks would fill the memory.
+    # Reverse mode computes a block again: the stored values of all blocks would fill the memory.
     found = jax.lax.map(
         jax.checkpoint(of_block), [jnp.reshape(x, (-1, block)) if jnp.ndim(x) else None for x in leaves]
     )
@@ -284,7 +289,7 @@ def _check_outputs(names: Iterable[str]) -> None:
 
 @compiled
 def steady_outputs(robot: Robot, conditions: Conditions, names: tuple[str, ...]) -> dict[str, Array]:
-    """`steady` over a batch, of which only what is asked for is computed.
+    """`steady` over a batch, limited to the named outputs.
 
     Args:
         robot: one robot, or parameters of shape (points,) among its numbers.
@@ -292,10 +297,10 @@ def steady_outputs(robot: Robot, conditions: Conditions, names: tuple[str, ...])
         names: of `outputs.table`, `status` (code into `STATUSES`) and `flags` (bit mask over `FLAGS`).
 
     Returns:
-        Arrays of shape (points,) by name [SI]; NaN where a point has no such number, see `steady`.
+        Arrays of shape (points,) by name [SI]; NaN if a point has no such number, see `steady`.
 
     Raises:
-        KeyError: an unknown name; the message lists those that there are.
+        KeyError: an unknown name; the message lists the valid ones.
     """
     _check_outputs(names)
 
@@ -330,13 +335,13 @@ def _shown(
 IMPLICIT = Implicit(_solve, _shown)
 
 
-#: Rows to which tables are padded, so that those of about one size share what is compiled; beyond the last of them a
-#: multiple of it.
+#: Numbers of rows that tables are padded to, so that tables of similar size share a program; beyond the last number,
+#: a multiple of it.
 SIZES = (16, 24, 32, 48, 64, 96, 128, 192, 256)
 
 
 def shown_batch(robot: Robot, conditions: Conditions) -> tuple[Result, Signals]:
-    """Results and signals of the rows of a table, by both halves as programs of their own."""
+    """Results and signals of the rows of a table, with each half as a separate program."""
     robot, rows = params.strong(robot), conditions.shape[0]
     size = next((s for s in SIZES if s >= rows), rows + -rows % SIZES[-1])
     index = np.concatenate([np.arange(rows), np.zeros(size - rows, int)])
@@ -360,18 +365,20 @@ def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], pro
 
 
 def _check(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
-    """Refuse what has no steady state: an arm that gravity pulls, which turns unevenly, or hangs where its friction
-    lets it; and a turn on a slope."""
+    """Raises for runs without a steady state: an arm with gravity over its angle, or a turn on a slope.
+
+    Such an arm turns unevenly, or hangs at an angle that its friction decides.
+    """
     if conditions.turns and np.any(np.asarray(conditions.slope_deg) != 0):
         steepest = np.asarray(conditions.slope_deg).flat[int(np.argmax(np.abs(np.asarray(conditions.slope_deg))))]
         raise ValueError(
-            f"got a slope of {steepest:g} deg for a robot that turns: its heading changes there all the time, so it "
+            f"got a slope of {steepest:g} deg for a robot that turns: its heading changes there continuously, so it "
             "has no steady state; follow it over time: --model drive"
         )
     for k, (name, load) in enumerate(robot.configurations.items()):
         if np.any(np.asarray(load.torque_gravity) > 0) and np.any(np.asarray(conditions.configuration) == k):
             raise ValueError(
-                f"{name} is an arm on which gravity acts with its angle (torque_gravity above 0), so it has no "
+                f"{name} has a torque of gravity that depends on its angle (torque_gravity above 0), so it has no "
                 "steady state; follow it over time: --model drive, and tables with a column time_s"
             )
 

@@ -1,5 +1,4 @@
-"""Fidelity `track`: half a robot, or all of one free to turn, as multibody dynamics in MJX, its contacts resolved one
-by one."""
+"""Fidelity `track`: half a robot, or all of one free to turn, as multibody dynamics in MJX with all contacts."""
 
 from __future__ import annotations
 
@@ -39,17 +38,17 @@ from mmrjax.undercarriage.stability import largest_step, refuse
 
 STEP = fidelities.facts("track").resolved()["step"]  # [s]
 SAMPLE = 1e-3  # [s]
-WINDOW = 0.4  # share of a run at its end over which it is averaged
-PARTS = 20  # of a run between which progress is told
-#: Length of a run from a rolling start after which it is read as settled [s]. Its last 40 % hold two grouser periods
-#: (34) or more down to 0.29 m/s, and averages over them are within 1e-4 of those of a run of 1.5 s.
+WINDOW = 0.4  # share of a run, at its end, that is averaged
+PARTS = 20  # of a run, with progress reported in between
+#: Length of a run from a rolling start after which it counts as settled [s]. Its last 40 % hold two grouser periods
+#: (34) or more down to 0.29 m/s; averages over them are within 1e-4 of those of a run of 1.5 s.
 TIME_ROLLED = 0.6
-#: A robot jumps where for this share of the window its reaction is less than this share of its mean [-].
+#: A robot jumps if for this share of the window its reaction is below this share of its mean [-].
 JUMPS, ALOFT = 0.01, 0.01
 
 
 class Record(eqx.Module):
-    """What is kept of each sample: motion and loads at its end, means over it (`guided`: of the guides' load)."""
+    """One sample of a run: motion and loads at its end, means over it (`guided`: of the guides' load)."""
 
     motions: Motion
     passed: Signals | balances.Travel
@@ -62,13 +61,13 @@ class Trajectory(eqx.Module):
 
     Attributes:
         time: ends of the sample intervals [s], shape (samples,).
-        q, v: coordinates and velocities at those times (see `undercarriage`), shape (samples, 5); of a robot free to
+        q, v: coordinates and velocities at those times (see `undercarriage`), shape (samples, 5); for a robot free to
             turn those of `both_sides`, shape (samples, 10).
-        signals: means over each interval; each field has shape (samples,), of a robot free to turn (samples, 2), for
-            left and right side, and so have the others.
+        signals: means over each interval; each field has shape (samples,). For a robot free to turn they and the
+            following have a last axis of left and right side: (samples, 2).
         reactions: loads at those times, of one side.
         steady: averages at the end of the run.
-        result: the observation of those averages, with the run's status.
+        result: the observation from those averages, with the run's status.
     """
 
     time: Float[Array, " samples"]
@@ -83,10 +82,10 @@ class Trajectory(eqx.Module):
 def _average(
     run: System, time: Array, travelled: Array, sums: tuple[Any, Array]
 ) -> tuple[Any, Scalar, Array, Changes]:
-    """Means of signals (or `Travel`) and guides' load, periods averaged, and of three signals the change and size."""
-    # Weights over the belt's travel that rise over one pitch and fall over another by the cubic step, which
-    # adds up to one with its neighbour a pitch on: the mean of an orbit that repeats with the pitch is exact
-    # and varies smoothly with the place at which the run happens to end.
+    """Means of signals (or `Travel`) and guides' load, number of periods, and change and size of three signals."""
+    # Weights over the belt's travel that rise over one pitch and fall over another by the cubic step. Each adds up to
+    # one with its neighbour a pitch on: the mean of an orbit that repeats with the pitch is exact
+    # and varies smoothly with the place at which the run ends.
     pitch, end = run.path.pitch, travelled[-1]
     middle = (travelled[1:] + travelled[:-1]) / 2
     plain = (time[1:] > time[-1] - WINDOW * (time[-1] - time[0])).astype(time.dtype)
@@ -121,7 +120,7 @@ def track(
     sample: float = SAMPLE,
     rolling: bool = False,
 ) -> Trajectory:
-    """Run one robot under a constant conditions, from standstill or rolling.
+    """Runs one robot under constant conditions, from standstill or rolling.
 
     Pure and traceable: differentiable forward and backward, vmappable over every argument's leaves.
 
@@ -129,17 +128,16 @@ def track(
         robot: any robot; its parameters may be tracers. Its `guide_share` is not used: it is an output.
         conditions: one run, scalar fields.
         duration: of the run [s]; step, sample: intervals of integration and of the record [s].
-        rolling: start at the steady fidelity's speed, which settles sooner; else from standstill.
+        rolling: True to start at the steady fidelity's speed, which settles sooner; False: from standstill.
 
     Returns:
-        The trajectory. Status: `converged` when current and speeds change by less than 0.1 % from one half
-        of the averaging window to the other, else `not_settled`; `stalled` the shafts do not turn forward;
-        `slides` the movers slide beyond V_s and the robot loses speed or stands (one that goes on steadily
-        has `converged`, flagged `slips`); `tips` the line of gravity passes
-        outside the contacts, or the robot has turned over though gravity alone would not turn it (a
-        resonance, a wild start); `battery_empty`; `failed` the numbers are no longer finite, or the robot has
-        left the ground. `failed` and `tips` withhold the result's numbers. Flagged `jumps`: nothing bears it
-        for more than a hundredth of the averaging window.
+        The trajectory, with one of these statuses. `converged`: current and speeds change by less than 0.1 % from one
+        half of the averaging window to the other; else `not_settled`. `stalled`: the shafts do not turn forward.
+        `slides`: the movers slide beyond V_s and the robot loses speed or stands; in steady travel it has
+        `converged`, flagged `slips`. `tips`: the line of gravity passes outside the contacts, or the robot has turned
+        over although gravity alone would not turn it (a resonance, a wild start). `battery_empty`. `failed`: the
+        numbers are no longer finite, or the robot has left the ground. `failed` and `tips` withhold the result's
+        numbers. Flag `jumps`: the robot has no contact for more than a hundredth of the averaging window.
     """
     run = system(robot, conditions, step)
     start = _start(run, rolling)
@@ -148,7 +146,7 @@ def track(
 
 
 def _kind(conditions: Conditions) -> ModuleType:
-    """The room of what moves: half a robot, or all of one that is free to turn."""
+    """The module of the moving system: half a robot, or a whole robot free to turn."""
     return both_sides if conditions.turns else half_robot
 
 
@@ -165,7 +163,7 @@ def _record(run: System, start: Motion, steps: int, samples: int) -> tuple[Motio
         after, passed, guided = kind.advance(run, motion)
         return after, (passed, guided)
 
-    @jax.checkpoint  # reverse mode keeps one motion a sample and recomputes the steps between
+    @jax.checkpoint  # reverse mode keeps one motion per sample and recomputes the steps in between
     def interval(motion: Motion, _: None) -> tuple[Motion, Record]:
         after, every = jax.lax.scan(small, motion, None, length=steps)
         passed, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), every)
@@ -192,33 +190,33 @@ def _trajectory(run: System, start: Motion, end: Motion, record: Record, sample:
 
 
 def check(robot: Robot, conditions: Conditions, *, duration: float, step: float, sample: float = SAMPLE) -> None:
-    """Refuse what some run of a batch cannot bear.
+    """Raises if the track model cannot compute some run of a batch.
 
     Raises:
-        ValueError: `sample` is no whole number of steps or `duration` of samples; a lever reaches below the
+        ValueError: `sample` is not a whole number of steps or `duration` of samples; a lever reaches below the
             ground; the step is above the largest stable one, which the message states; a load without ground, an
-            imposed motor speed, movers without inertia, parts heavier than the robot or of more inertia than stated.
+            imposed motor speed, movers without inertia, parts with more mass or inertia than the robot.
     """
     if not robot.has_ground:
-        raise ValueError("the robot's load is a shaft, which has no running gear; steady and drive take it")
+        raise ValueError("the robot's load is a shaft, which has no running gear; use steady or drive")
     if robot.rig.imposed != "voltage":
         what = robot.rig.imposed.removeprefix("motor_")
         raise ValueError(
-            f"the motors' {what} is imposed, and this model drives them by their voltage; use steady or drive"
+            f"the motors' {what} is imposed, but this model drives them by their voltage; use steady or drive"
         )
     if conditions.motor_speed is not None or (conditions.turns and conditions.of_sides().motor_speed is not None):
-        raise ValueError("motor_speed: got an imposed one; this model drives the motors by their voltage")
+        raise ValueError("motor_speed: got an imposed speed; this model drives the motors by their voltage")
     if sample < step or abs(sample / step - round(sample / step)) > 1e-6:
         raise ValueError(f"step: got {step:g} s; expected {sample:g} s, a sample, divided by a whole number")
     if duration < sample or abs(duration / sample - round(duration / sample)) > 1e-6:
         raise ValueError(f"duration: got {duration:g} s; expected a whole number of samples of {sample:g} s")
     if has_tracer((robot, conditions)):
-        return  # inside a transformation no number is known
+        return  # within a transformation the numbers are not known
     for name, chassis in robot.configurations.items():
         if not np.all(np.asarray(chassis.inertia) > 0):
             raise ValueError(
-                f"{name}.inertia: got 0; expected the inertia of what turns with the movers of one side, which this "
-                "model needs [kg·m^2]"
+                f"{name}.inertia: got 0; this model needs the inertia of all parts that turn with the movers of one "
+                "side [kg·m^2]"
             )
     masses.check_parts(robot)
     refuse(robot, conditions, step, sample)
@@ -237,11 +235,11 @@ def track_batch(
     """`track` over a batch of conditions (leading axis of every field) for one robot, compiled once.
 
     Args:
-        progress: told now and then the share of the runs' time that is done; between its calls the runs can be
-            interrupted. None makes one call of XLA of it, which cannot.
+        progress: called with the finished share of the runs' time; between its calls the runs can be
+            interrupted. None: one call of XLA, which cannot be interrupted.
 
     Raises:
-        ValueError: what `check` refuses.
+        ValueError: a run that `check` refuses.
     """
     check(robot, conditions, duration=duration, step=step, sample=sample)
     if progress is not None:
@@ -273,7 +271,7 @@ def _in_parts(
     rolling: bool,
     progress: Progress,
 ) -> Trajectory:
-    # All parts are of one length, for one compilation; what the last one has too many is cut off.
+    # All parts have one length, to share a compilation; the excess of the last one is cut off.
     samples = round(duration / sample)
     length = math.ceil(samples / PARTS)
     start = motion = _begin(robot, conditions, step, rolling)
@@ -349,7 +347,7 @@ def _too_stiff(robot: Robot, conditions: Conditions) -> list[str]:
         return []
     return [
         f"rows {rows}: the track model's step of {STEP:g} s is above the largest stable one of the calibrated robot, "
-        f"{limits.min():.2g} s, so its readings there are not to be trusted; its contacts or its belt are too stiff"
+        f"{limits.min():.2g} s; do not trust its readings there: contacts or belt are too stiff"
     ]
 
 

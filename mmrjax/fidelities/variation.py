@@ -1,4 +1,4 @@
-"""What varies over many points: parameters of a robot and conditions by name, and the outputs of each point."""
+"""Variation over many points: parameters of a robot and conditions by name, and the outputs of each point."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CODES
 
-#: Every condition of a run in words; `configuration` is an index among the robot's.
+#: Every condition of a run in words; `configuration` is an index into the robot's.
 CONDITIONS: dict[str, str] = {
     "configuration": "configuration of the chassis",
     **{field: condition.label for field, condition in quantities.CONDITIONS.items()},
 }
-#: What every point has beside its outputs: code into `signals.STATUSES`, bit mask over `signals.FLAGS`.
+#: Further outputs of every point: code into `signals.STATUSES`, bit mask over `signals.FLAGS`.
 STATUS, FLAGS = CODES
 
 
 @dataclasses.dataclass(frozen=True)
 class Axis:
-    """What is known of one thing that varies.
+    """A parameter or condition that varies.
 
     Attributes:
         name: dotted parameter, or condition.
         unit: of its values; meaning: in words; bounds: least and greatest value allowed [unit].
-        value: of the robot, or of conditions where none is stated [unit]; None: the robot's own mass and the payload.
+        value: the robot's, or the default of a condition [unit]; None: the robot's own mass plus the payload.
         prior_sd: standard deviation of the parameter's prior around `value` [unit]; None for a condition.
         spec: of the parameter's field; None for a condition.
     """
@@ -54,14 +54,14 @@ class Axis:
 
 
 class Variation(eqx.Module):
-    """A robot of which some parameters, and conditions, take other values at each point.
+    """A robot with some parameters and conditions that take other values at each point.
 
     Attributes:
-        robot: that every point starts from.
-        names: of what varies: dotted parameters as `params.walk` gives them, or conditions (`CONDITIONS`).
+        robot: common start of all points.
+        names: of what varies: dotted parameters as in `params.walk`, or conditions (`CONDITIONS`).
 
     Raises:
-        UsageError: a name that is neither, or stated twice; the message says which are near.
+        UsageError: an unknown name, or a name stated twice; the message suggests similar ones.
     """
 
     robot: Robot
@@ -80,7 +80,7 @@ class Variation(eqx.Module):
 
     @property
     def axes(self) -> dict[str, Axis]:
-        """What is known of each name, in order."""
+        """Properties of each name that varies, in order."""
         every = {p.name: p for p in params.walk(self.robot)}
         return {name: self._axis(name, every.get(name)) for name in self.names}
 
@@ -96,15 +96,15 @@ class Variation(eqx.Module):
 
     @property
     def varies_robot(self) -> bool:
-        """Whether some name is a parameter of the robot."""
+        """True if some name is a parameter of the robot."""
         return any(name not in CONDITIONS for name in self.names)
 
     def at(self, values: Float[Array, "... names"], conditions: Conditions) -> tuple[Robot, Conditions]:
-        """The robot and the conditions of a point, or of a batch, whose leaves that vary then have its shape.
+        """The robot and the conditions of a point, or of a batch; the leaves that vary have the shape of the batch.
 
         Args:
             values: in the order of `names`, in the axes' units; `configuration` is an index, rounded.
-            conditions: what does not vary, names of configurations resolved.
+            conditions: values of the other conditions, names of configurations resolved.
         """
         given: dict[str, Any] = {name: values[..., k] for k, name in enumerate(self.names)}
         stated = {name: given.pop(name) for name in self.names if name in CONDITIONS}
@@ -130,15 +130,15 @@ def evaluate(
 ) -> dict[str, Array]:
     """Outputs of many points in one call, compiled once for each number of points.
 
-    Traceable; what does not vary is an argument of the compiled program, not a constant in it.
+    Traceable. Parts that do not vary are arguments of the compiled program, not constants in it.
 
     Args:
-        fidelity: one of `fidelities.NAMES`; options: all that it has, from `Facts.resolved`.
-        values: a row a point, in the order of `variation.names`.
-        conditions: what does not vary, of shape () or (points,), names of configurations resolved.
+        fidelity: one of `fidelities.NAMES`; options: all of its options, from `Facts.resolved`.
+        values: one row per point, in the order of `variation.names`.
+        conditions: the other conditions, of shape () or (points,), names of configurations resolved.
         outputs: names of `outputs.table`, or of columns that the fidelity adds; also `flags`. Over a profile
             columns of `missions.OUTPUTS`.
-        profile: a mission that every point is to follow, by the fidelity `missions.MODEL`; fields of shape (rows,).
+        profile: a mission that every point follows, with the fidelity `missions.MODEL`; fields of shape (rows,).
 
     Returns:
         By name in SI units (a fidelity's own column in its unit), and `status`; arrays of shape (points,).
@@ -190,7 +190,7 @@ def _evaluate(
 
 
 def pick(run: Run, shown: tuple[Channel, ...], names: tuple[str, ...]) -> dict[str, Array]:
-    """Outputs of a batch by name, as `evaluate` returns them, of a rig that shows these channels."""
+    """Outputs of a batch by name, as from `evaluate`, of a rig with these channels."""
     rows = {row.name: row for row in table_of_outputs.table(shown)}
     _known(names, (*rows, *run.columns))
     found = {n: rows[n].get(run.result) if n in rows else run.columns[n] for n in names if n != FLAGS}

@@ -1,8 +1,8 @@
 """Missions: the ODE of `drive` over a profile, with heat, standing still, and energy integrated as states.
 
-A robot that has come to rest stands: what friction can hold does not move, neither by the smooth friction of the
-shafts nor by the creep of the ground's law, until motors or gravity overcome it. Standing and breaking away are
-events that the steps land on, and derivatives pass through the moments at which they happen.
+Friction holds a robot at rest until motors or gravity exceed it; neither smooth shaft friction nor the ground's law
+lets it creep. Stopping and breaking away are events that the steps land on;
+derivatives pass through their moments.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ from mmrjax.model.signals import (
     Signals,
 )
 
-#: Relative tolerance of a step, and in the units of the unknowns.
+#: Relative tolerance of a step; the absolute one is the same in the units of the unknowns.
 TOLERANCE = 2e-5
 #: Most steps of one segment.
 MOST_STEPS = 4096
-#: A demanded speed is missed where at the end of a segment it is off by more than this share of the segment's
-#: largest [-].
+#: A demanded speed counts as missed if its error at the end of a segment exceeds this share of the segment's largest
+#: speed [-].
 MISSED = 0.02
 
 
 class Totals(eqx.Module):
-    """What a mission or a segment comes to.
+    """Totals of a mission or a segment.
 
     Attributes:
-        time: that it took [s].
-        of: integrals by the names of the law's `TOTALS`; `drawn` and `returned` are the source's, the rest where it
-            went.
+        time: duration [s].
+        of: integrals by the names of the law's `TOTALS`; `drawn` and `returned` belong to the source, the others are
+            sinks.
         stored: rise of the energy in motion [J].
-        given: by the source on balance [J]: by a battery as its charge at both ends says, by a supply as integrated.
+        given: net energy of the source [J]: of a battery from its charge at both ends, of a supply as integrated.
     """
 
     time: Array
@@ -64,20 +64,20 @@ class Totals(eqx.Module):
 
     @property
     def energy(self) -> Scalar:
-        """Taken from the source on balance [J]."""
+        """Net energy taken from the source [J]."""
         return self.of["drawn"] - self.of["returned"]
 
     @property
     def unaccounted(self) -> Scalar:
-        """Energy in, less where it went, less what is stored [J]: what the integration is off by.
+        """Energy in, less the sinks and the energy stored [J]: the error of the integration.
 
-        That a battery gives follows from its charge alone, so that a charge that is off shows too.
+        A battery's energy follows only from its charge, so that an error of the charge shows too.
         """
         return self.given - sum(self.of[name] for name in energy.SINKS) - self.stored
 
 
 class Start(eqx.Module):
-    """The state that a mission begins in; at rest and at ambient temperature where nothing is stated.
+    """The state at the start of a mission; by default at rest and at ambient temperature.
 
     Attributes:
         speed: of the robot, its movers rolling [m/s]; current: of one motor [A].
@@ -91,15 +91,15 @@ class Start(eqx.Module):
 
 
 class Course(eqx.Module):
-    """A mission over time: its accepted steps, shape (kept,); those after the last are NaN.
+    """A mission over time: its accepted steps, shape (kept,); entries after the last step are NaN.
 
     Attributes:
-        time: since the mission began [s]; segment: index of the segment, -1 after the last.
-        event: index into `MARKS` of what a step has landed on, -1 for none.
-        distance: along the ground, forward less backward [m]; path: either way [m].
-        temperature_winding, temperature_housing: [°C]; of a robot that turns of either side, shape (kept, 2).
-        energy: taken from the source on balance [J].
-        signals: every signal; of a robot that turns of left and right side, shape (kept, 2).
+        time: since the start of the mission [s]; segment: index of the segment, -1 after the last.
+        event: index into `MARKS` of the event at the end of a step, -1 for none.
+        distance: along the ground, forward less backward [m]; path: in both directions [m].
+        temperature_winding, temperature_housing: [°C]; for a robot that turns, of each side, shape (kept, 2).
+        energy: net energy taken from the source [J].
+        signals: every signal; for a robot that turns, of left and right side, shape (kept, 2).
     """
 
     time: Float[Array, " kept"]
@@ -118,15 +118,15 @@ class Mission(eqx.Module):
 
     Attributes:
         total: of the mission; segments: of each segment of each cycle, fields of shape (cycles, segments).
-        peaks: by the names of the law's `PEAKS` (`cell_low` the lowest voltage of a cell); of the segments too.
+        peaks: by the names of the law's `PEAKS` (`cell_low` is the lowest voltage of a cell); also of the segments.
         status: of each segment at its end, flags: of each segment; shape (cycles, segments).
-        result: the end of the mission, with its status and the flags of all of it. Status is `converged` where the
-            profile was followed to its end; `battery_empty`; `cut_off` where the cells stayed below their cut-off;
-            `stalled`, `slides`, `rolls_back` or `tips` where some segment that asks for motion ends so, the first
-            one; `failed` the integrator gave up.
-        temperature_winding, temperature_housing: of the hottest at the end [°C]; discharge: [C].
-        steps: that were taken, and how many of them were rejected.
-        course: over time, where it was asked for.
+        result: the end of the mission, with its status and all flags. `converged`: the profile was followed to its
+            end. `battery_empty`. `cut_off`: the cells stayed below their cut-off. `stalled`, `slides`, `rolls_back`
+            or `tips`: status of the first segment with demanded motion that ends so. `failed`: the integrator gave
+            up.
+        temperature_winding, temperature_housing: of the hottest side at the end [°C]; discharge: [C].
+        steps: number of steps, and number of rejected ones.
+        course: over time, if requested.
     """
 
     total: Totals
@@ -145,12 +145,12 @@ class Mission(eqx.Module):
 
 
 def law_of(conditions: Conditions, profile: Profile) -> Law:
-    """How a robot moves: free to turn where the profile or the conditions drive its sides apart, or head it."""
+    """Law of motion: free to turn if profile or conditions drive the sides apart or state a heading."""
     return mission_turning if profile.turns or conditions.turns else mission_straight
 
 
 def initial_unknowns(law: Law, robot: Robot, conditions: Conditions, start: Start) -> Float[Array, " unknowns"]:
-    """The unknowns at the beginning, headed as the conditions say, else uphill; in SI."""
+    """The unknowns at the start in SI, with the heading of the conditions, else uphill."""
     ambient, heading = robot.motor.temperature_ambient, conditions.heading_deg
     winding, housing = (ambient if t is None else t for t in (start.temperature_winding, start.temperature_housing))
     shafts = start.speed / robot.chassis(conditions.configuration).radius * robot.gearbox.ratio
@@ -167,18 +167,18 @@ def initial_unknowns(law: Law, robot: Robot, conditions: Conditions, start: Star
 def _ends(
     law: Law, robot: Robot, otherwise: Conditions, segment: Profile, found: Any, asked: Asked, stands: Array
 ) -> tuple[Array, Array]:
-    """Status of a segment at its end, and whether the robot has missed what was demanded."""
+    """Status of a segment at its end, and whether the robot has missed the demanded speed."""
     mode, signals = segment.mode[0], balances.signals_of(found)
     driven = jnp.max(jnp.abs(jnp.asarray(signals.duty * signals.voltage_source)))
     status = jnp.where(stands, STALLED, law.status(robot, asked.conditions, found))
     slow = [jnp.max(jnp.abs(jnp.asarray(x))) < 1.0 for x in (signals.direction, signals.direction_travel)]
     rests = stands | (slow[0] & slow[1])
     wanted = (mode != BRAKE) & (mode != COAST) & (driven > 1e-6)
-    status = jnp.where(~wanted & (status == STALLED), CONVERGED, status)  # it stands, as it should
+    status = jnp.where(~wanted & (status == STALLED), CONVERGED, status)  # it stands as demanded
     controlled = (mode == MOTOR_SPEED) | (mode == SPEED)
     per_speed = robot.gearbox.ratio / robot.chassis(otherwise.configuration).radius
     demanded = law.demanded(robot, otherwise, segment)
-    # A ramp that ends in a stop is measured by where it began.
+    # A ramp that ends in a stop is measured by its first value.
     largest = jnp.max(jnp.abs(demanded if segment.linear else demanded[:1])) * jnp.where(
         mode == SPEED, per_speed, 1.0
     )
@@ -189,7 +189,7 @@ def _ends(
 
 
 def _ending(c: Carry) -> Array:
-    """Status of a mission that has ended before its profile."""
+    """Status of a mission that ended before its profile did."""
     return jnp.where(c.failed, FAILED, jnp.where(c.cut_off, CUT_OFF, BATTERY_EMPTY))
 
 
@@ -203,20 +203,21 @@ def mission(
     most_steps: int = MOST_STEPS,
     keep: int = 0,
 ) -> Mission:
-    """Run one robot over a profile.
+    """Runs one robot over a profile.
 
     Args:
         robot: any robot; its parameters may be tracers.
-        conditions: one run, scalar fields: what the profile does not state.
+        conditions: one run, scalar fields; they supply what the profile does not state.
         profile: one mission.
-        start: state that it begins in; None: at rest, at ambient temperature.
+        start: state at its start; None: at rest, at ambient temperature.
         tolerance: relative, and in `UNITS` absolute, error of a step.
         most_steps: of one segment; a mission that needs more has `failed`.
-        keep: accepted steps of which the mission over time is kept; 0 for none.
+        keep: largest number of accepted steps in the recorded course; 0 for no course.
 
     Returns:
-        The mission; derivatives are forward (`jax.jvp`, `jax.jacfwd`), by parameters, conditions and values and times
-        of the profile, through stops and reversals; at a limit that begins to act they are those of one side.
+        The mission. Derivatives are forward (`jax.jvp`, `jax.jacfwd`), with respect to parameters, conditions, and
+        values and times of the profile, through stops and reversals. At a limit that begins to act they are
+        one-sided.
     """
     begin, law = Start() if start is None else start, law_of(conditions, profile)
     nothing = jnp.full(len(law.PEAKS), -jnp.inf, jnp.result_type(conditions.voltage, profile.time))
@@ -236,7 +237,7 @@ def mission(
 
 
 class _Segment(NamedTuple):
-    """A segment at its end, as of `Totals` and `Mission`; found: its last instant; kept: steps kept so far."""
+    """A segment at its end, as in `Totals` and `Mission`; found: its last instant; kept: steps recorded so far."""
 
     time: Array
     q: Array
@@ -255,7 +256,7 @@ def _charge(law: Law, y: Array) -> Array:
 
 
 def _at_start(law: Law, robot: Robot, conditions: Conditions, start: Start, peaks: Array, keep: int) -> Carry:
-    """The state at the beginning of a mission, with room for `keep` steps of its course."""
+    """The state at the start of a mission, with room for `keep` steps of its course."""
     dtype, whole, false = peaks.dtype, jnp.asarray(0), jnp.asarray(False)
     y0 = initial_unknowns(law, robot, conditions, start).astype(dtype) / law.units(robot).astype(dtype)
     q0 = jnp.zeros(len(law.TOTALS), dtype)
@@ -274,7 +275,7 @@ def _at_start(law: Law, robot: Robot, conditions: Conditions, start: Start, peak
 def _segment_end(
     law: Law, robot: Robot, conditions: Conditions, segment: Profile, before: Carry, c: Carry, beginning: Any
 ) -> _Segment:
-    """A segment at its end `c`, of the state `before` it and its first instant."""
+    """A segment at its end `c`, from the state `before` it and its first instant."""
     found, _, _, asked = law.instant(robot, conditions, segment, c.y, c.stands)
     status, missed = _ends(law, robot, conditions, segment, found, asked, c.stands)
     status = jnp.where(c.ended, _ending(c), status)
@@ -290,7 +291,7 @@ def _segment_end(
 
 
 def _mission(law: Law, robot: Robot, conditions: Conditions, profile: Profile, c: Carry, ends: _Segment) -> Mission:
-    """The mission of its last state `c` and the ends of its segments, (cycles · segments, ...)."""
+    """The mission from its last state `c` and the ends of its segments, (cycles · segments, ...)."""
     shape = (profile.cycles, profile.segments)
     totals = {n: ends.q[:, i].reshape(shape) for i, n in enumerate(law.TOTALS)}
     each = Totals(ends.time.reshape(shape), totals, ends.rise.reshape(shape), ends.given.reshape(shape))
@@ -321,7 +322,7 @@ def _mission(law: Law, robot: Robot, conditions: Conditions, profile: Profile, c
 
 
 def _temperatures(law: Law, y: Array) -> tuple[Array, Array]:
-    """Of windings and housings [°C]."""
+    """Temperatures of windings and housings [°C]."""
     winding, housing = (np.asarray(law.UNITS)[k] * y[..., k] for k in (law.WINDING, law.HOUSING))
     return winding, housing
 
@@ -332,7 +333,7 @@ def _course(
     assert c.buffer is not None
     ys, qs, stood, marks = c.buffer
     at = jnp.arange(len(ys))
-    # Of each kept step its segment: the first whose count reaches beyond it.
+    # Segment of each recorded step: the first one with a larger step count.
     segment = jnp.minimum(jnp.searchsorted(kept, at, side="right"), len(kept) - 1)
     within = at < kept[-1]
     begun = jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.time.ravel())])[segment]

@@ -1,4 +1,4 @@
-"""Missions of a batch of runs, and what each comes to: energy, distance, peaks, heat, charge."""
+"""Missions of a batch of runs, and their numbers: energy, distance, peaks, heat, charge."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from mmrjax.model.signals import BATTERY_EMPTY, CUT_OFF
 #: The fidelity that follows profiles.
 MODEL = "drive"
 JOULE_PER_WH = 3600.0
-#: Steps of a segment for which room is kept at first, at least so many in all, and at most of all runs at once.
+#: Steps of a segment that fit at first, least number in all, and largest number for all runs together.
 ROOM, LEAST_KEPT, MOST_KEPT = 64, 4096, 2**20
 
 
@@ -38,7 +38,7 @@ class Output:
 
     Attributes:
         name: noun; column: in tables, with the unit in the name; unit: of the column; factor: the SI value of one.
-        label: words of tables and reports; resolution: digits after the point that a person wants to see [unit].
+        label: words in tables and reports; resolution: digits after the point in reports [unit].
     """
 
     name: str
@@ -53,7 +53,7 @@ def _wh(name: str, label: str) -> Output:
     return Output(name, f"{name}_Wh", "Wh", JOULE_PER_WH, label, 3)
 
 
-#: Numbers of a mission in the order of columns, in SI by `numbers`.
+#: Numbers of a mission in the order of columns, in SI from `numbers`.
 OUTPUTS: tuple[Output, ...] = (
     Output("duration", "duration_s", "s", 1.0, "duration", 1),
     Output("distance", "distance_m", "m", 1.0, "distance travelled, either way", 2),
@@ -79,11 +79,11 @@ OUTPUTS: tuple[Output, ...] = (
     _wh("energy_stored", "rise of the energy in motion"),
     Output("unaccounted_share", "unaccounted_share", "-", 1.0, "energy unaccounted for, of that turned over", 9),
 )
-#: Numbers of a mission with sides beside those.
+#: Further numbers of a mission with separate sides.
 OF_TURNS: tuple[Output, ...] = (
     Output("turned", "turned_deg", "deg", math.pi / 180, "turned by, positive to the left", 1),
     Output("place_x", "place_x_m", "m", 1.0, "moved uphill, or ahead of the start", 2),
-    Output("place_y", "place_y_m", "m", 1.0, "moved to the left of that", 2),
+    Output("place_y", "place_y_m", "m", 1.0, "moved to the left of the start", 2),
     Output("peak_yaw_rate", "peak_yaw_rate_rad_s", "rad/s", 1.0, "peak yaw rate", 3),
     *(Output(f"rms_current_{s}", f"rms_current_{s}_A", "A", 1.0, f"rms current, {s} motor", 3) for s in SIDES),
     *(Output(f"peak_current_{s}", f"peak_current_{s}_A", "A", 1.0, f"peak current, {s} motor", 2) for s in SIDES),
@@ -92,11 +92,11 @@ OF_TURNS: tuple[Output, ...] = (
 
 
 def names(turns: bool = False) -> tuple[str, ...]:
-    """Columns of a mission's numbers, in order; of one with sides."""
+    """Columns of a mission's numbers, in order; `turns`: of a mission with separate sides."""
     return tuple(output.column for output in (*OUTPUTS, *(OF_TURNS if turns else ())))
 
 
-#: Columns that a sweep over a profile stores where none are named.
+#: Columns that a sweep over a profile stores by default.
 USUAL = (
     "energy_Wh", "energy_per_metre_Wh", "distance_m", "rms_current_A", "peak_current_A", "winding_peak_C",
     "state_of_charge",
@@ -114,7 +114,7 @@ def _root(x: Scalar) -> Array:
 
 
 def totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array]:
-    """Numbers of missions or of segments that are in their totals and peaks [SI], by name; any shape.
+    """Numbers [SI] by name that follow from totals and peaks of missions or segments; any shape.
 
     A segment that was not reached has NaN.
     """
@@ -157,18 +157,17 @@ def totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array]:
 
 
 def numbers(robot: Robot, conditions: Conditions, found: Mission) -> dict[str, Array]:
-    """What missions come to [SI], by the names of `OUTPUTS`; any shape, NaN where a number does not apply.
+    """Numbers of missions [SI], by the names of `OUTPUTS`; any shape, NaN if a number does not apply.
 
-    State of charge, endurance and range are of the on-board battery. Endurance is the time from the charge that the
-    mission begins with to empty at the mission's mean current, range the distance in that time; both are exact where
-    the battery has ended within the mission. As the voltage falls a demanded speed takes more current, which they
-    leave out.
+    State of charge, endurance and range refer to the on-board battery. Endurance is the time from the charge at the
+    start of the mission to empty at the mission's mean current, range the distance in that time. Both are exact if
+    the battery ends within the mission. They ignore that a demanded speed takes more current as the voltage falls.
     """
     on_battery, capacity = conditions.battery > 0.5, robot.battery.capacity
     used = found.discharge - conditions.discharge
     time, path = jnp.asarray(found.total.time), jnp.asarray(found.total.of["path"])
     ended = (found.result.status == BATTERY_EMPTY) | (found.result.status == CUT_OFF)
-    times = jnp.where(ended, 1.0, _quotient(capacity - conditions.discharge, used))  # that the charge lasts
+    times = jnp.where(ended, 1.0, _quotient(capacity - conditions.discharge, used))  # number of missions per charge
     return {
         **totals(found.total, found.peaks),
         "state_of_charge": jnp.where(on_battery, 1 - found.discharge / capacity, jnp.nan),
@@ -180,9 +179,9 @@ def numbers(robot: Robot, conditions: Conditions, found: Mission) -> dict[str, A
 
 
 def begins_below(robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None) -> np.ndarray:
-    """Voltage of a cell as missions on the battery begin [V], where it is below the cut-off, else NaN; shape (runs,).
+    """Cell voltage at the start of missions on the battery [V] if it is below the cut-off, else NaN; shape (runs,).
 
-    Not traceable. The motors draw what they do at the start; at rest that is nothing.
+    Not traceable. The motors draw the current of the start, which is 0 at rest.
     """
     battery, first = robot.battery, jax.tree.map(lambda x: x[..., 0], profile)
     other = battery.current_other if first.current_other is None else first.current_other
@@ -194,7 +193,7 @@ def begins_below(robot: Robot, conditions: Conditions, profile: Profile, start: 
 
 
 def columns(found: Mapping[str, Any]) -> dict[str, Any]:
-    """Numbers [SI] by the columns of tables, in the columns' units."""
+    """Numbers [SI] by column of tables, in the columns' units."""
     return {
         output.column: found[output.name] / output.factor for output in (*OUTPUTS, *OF_TURNS) if output.name in found
     }
@@ -207,7 +206,7 @@ def batch(
 
     Args:
         conditions: shape (runs,); profile: fields of shape (rows,), or (runs, rows).
-        start: that all begin in; history: whether the missions over time are kept, see `parts`.
+        start: common start of all; history: True to record the missions over time, see `simulate_in_parts`.
     """
     if not history:
         return simulate_batch(robot, conditions, profile, start, 0)
@@ -220,16 +219,16 @@ def batch(
 def simulate_in_parts(
     robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None
 ) -> Iterator[Mission]:
-    """Missions of a batch of runs, kept over time, some runs after others, so that all their steps fit into memory.
+    """Missions of a batch of runs with recorded courses, in parts whose steps fit into memory.
 
-    Where a mission has taken more steps than there was room for it is simulated again with more room, up to
-    `MOST_KEPT`; of a longer mission the course ends there.
+    A mission with more steps than fit is simulated again with more room, up to `MOST_KEPT`; the course of a longer
+    mission ends there.
     """
     (runs,) = conditions.shape
     keep, first = _room(profile), 0
     while first < runs:
         size = max(1, min(runs, MOST_KEPT // keep))
-        rows = np.minimum(np.arange(first, first + size), runs - 1)  # the last ones stand for the last run again
+        rows = np.minimum(np.arange(first, first + size), runs - 1)  # padding repeats the last run
         some = jax.tree.map(lambda x, rows=rows: jnp.asarray(np.asarray(x)[rows]), conditions)
         found = jax.device_get(simulate_batch(robot, some, _rows_of(profile, rows), start, keep))
         steps = int(np.max(found.steps - found.rejected))
@@ -264,7 +263,7 @@ def simulate_batch(
     """Missions of a batch in one call, compiled; see `batch`.
 
     Args:
-        keep: steps that the missions over time have room for; 0 for none.
+        keep: largest number of steps in the recorded courses; 0 for no courses.
     """
     own = jax.tree.map(lambda x: 0 if x.ndim == 2 else None, profile)
 
@@ -275,6 +274,6 @@ def simulate_batch(
 
 
 def run(robot: Robot, conditions: Conditions, profile: Profile) -> Run:
-    """Missions of a batch as a fidelity's runs, their numbers as columns."""
+    """Missions of a batch as runs of a fidelity, with their numbers as columns."""
     found = batch(robot, conditions, profile)
     return Run(found.result, columns(numbers(robot, conditions, found)))

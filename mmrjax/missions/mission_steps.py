@@ -1,7 +1,7 @@
-"""Steps of a mission: events that they land on, and one segment of the profile. What acts at an instant is the law's
-of its motion: `mission_straight` or `mission_turning`.
+"""Steps of a mission, events that they land on, and one segment of the profile.
 
-For a start and a stop the loop of diffrax with its `Event` takes 1.8 to 2.5 times as long. It takes as many steps of
+The law of motion gives the equations of an instant: `mission_straight` or `mission_turning`. For a start and a stop
+the loop of diffrax with its `Event` takes 1.8 to 2.5 times as long. It takes as many steps of
 the same method, and finds neither peaks nor flags (docs/lab/figures.md).
 """
 
@@ -27,27 +27,31 @@ from mmrjax.numerics.rosenbrock import stages, step_longest
 
 #: The first step of a segment [s], and the shortest.
 FIRST, SHORTEST = 1e-4, 1e-9
-#: What steps land on: standing and breaking away, an empty battery, cells falling below their cut-off and recovering.
+#: Events that steps land on: stopping, breaking away, an empty battery, cells falling below their cut-off,
+#: recovering.
 EVENTS = ("stands", "breaks_away", "battery_empty", "below_cut_off", "above_cut_off")
 STANDS, BREAKS_AWAY, EMPTY, FALLS, RECOVERS = range(len(EVENTS))
-#: What a row over time may mark: an event, or that the cells have been below their cut-off for as long as they may,
-#: which is timed from its event.
+#: Marks of a row over time: an event, or the end of the permitted time below the cut-off, which is measured from its
+#: event.
 MARKS = (*EVENTS, "cut_off")
-#: How near an event a step has to end, of what its function is scaled to; or how short a step is near enough [s].
+#: Largest distance of a step's end from an event, relative to the event's scale; or the step length that suffices
+#: [s].
 EVENT, NEAR = 1e-2, 1e-7
-#: Scales of events: charge, of the capacity [-]; voltage of a cell [V]. From an event at most `EVENT` of its scale
-#: away a Newton step leads to it, along which rates are constant.
+#: Scales of events: charge, of the capacity [-]; voltage of a cell [V]. Within `EVENT` of its scale a Newton step
+#: leads to the event, with constant rates.
 OF_CHARGE, OF_CELL = 1e-3, 1e-3
-#: How far above its cut-off a cell has recovered [V]: beyond the rounding of the crossing.
+#: Margin above the cut-off of a recovered cell [V]: beyond the rounding of the crossing.
 RECOVERED = 1e-6
-#: How firmly friction holds a robot before it stands [-].
+#: Margin of the friction that holds a robot before it counts as standing [-].
 FIRMLY = 1e-3
 
 
 class Asked(NamedTuple):
-    """What acts on the robot at an instant: the robot with its other consumers, conditions with the duty that the
-    controller gives, rate of the controller's integral [rad/s], and the error of the demand [rad/s]; of a robot that
-    turns the duties, integrals and errors of either side."""
+    """Inputs of the robot at an instant.
+
+    The robot with its other consumers; the conditions with the controller's duty; the rate of the controller's
+    integral [rad/s]; the error of the demand [rad/s]. For a robot that turns, duty, rate and error are per side.
+    """
 
     robot: Robot
     conditions: Conditions
@@ -56,18 +60,19 @@ class Asked(NamedTuple):
 
 
 class Law(Protocol):
-    """How a robot moves through a mission: unknowns, what acts at an instant, and what is read of it.
+    """Law of motion of a robot in a mission: unknowns, equations of an instant, and the quantities read from it.
 
-    `found` is what `instant` gives of an instant: signals, and whatever else of a robot that turns.
+    `found` is the result of `instant`: signals, and for a robot that turns also its motion.
 
     Attributes:
-        TOTALS: what is integrated, and its unit; PEAKS: largest values of any instant, and their unit.
-        CLOCK, DISCHARGE, WINDING, HOUSING: places among the unknowns of the time in the segment [s], the charge taken
-            [C], and the temperatures [°C], of a robot that turns those of both sides.
-        CURRENT, MOTOR, GROUND, HEADING: of currents, motor speeds, speed and heading.
-        STOPS: of what is 0 at rest; AT_REST: the room of standing robots of its kind (`rest`, `turning`).
-        RESULT: what there is of a run that ends so, of robot, instant and status.
-        UNITS: of the unknowns before the memories of effects; LONG: whether an instant takes long to compile.
+        TOTALS: integrated quantities and their units; PEAKS: largest values of any instant and their units.
+        CLOCK, DISCHARGE, WINDING, HOUSING: positions among the unknowns of the time in the segment [s], the charge
+            taken [C], and the temperatures [°C], for a robot that turns of both sides.
+        CURRENT, MOTOR, GROUND, HEADING: positions of currents, motor speeds, speed and heading.
+        STOPS: positions of unknowns that are 0 at rest; AT_REST: module for standing robots of its kind (`rest`,
+            `turning`).
+        RESULT: returns the result of a run at its end, from robot, instant and status.
+        UNITS: of the unknowns before the memories of effects; LONG: True if an instant takes long to compile.
     """
 
     TOTALS: Mapping[str, str]
@@ -87,29 +92,29 @@ class Law(Protocol):
     LONG: bool
 
     def units(self, robot: Robot) -> Float[Array, " unknowns"]:
-        """What the unknowns are measured in."""
+        """Units of the unknowns."""
         ...
 
     def state_of(self, robot: Robot, y: Array, stands: Array) -> Any:
-        """The state that the unknowns stand for."""
+        """The state of the unknowns."""
         ...
 
     def asked_at(self, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> Asked:
-        """What acts on the robot."""
+        """Inputs of the robot, see `Asked`."""
         ...
 
     def instant(
         self, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
     ) -> tuple[Any, Array, Array, Asked]:
-        """What there is of an instant, rates of the unknowns in their units, and of the totals [1/s]."""
+        """Signals of an instant, rates of the unknowns in their units and of the totals [1/s], and the inputs."""
         ...
 
     def slowness(self, asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
-        """By how much shafts, and what slides, are slower than friction at rest is resolved [-]."""
+        """Relative distance of shafts and sliding contacts below the speed at which friction is resolved [-]."""
         ...
 
     def drawn(self, asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
-        """What the motors take from the source [A], and the charge taken [C]."""
+        """Current that the motors take from the source [A], and the charge taken [C]."""
         ...
 
     def stored(self, robot: Robot, found: Any) -> Scalar:
@@ -117,39 +122,41 @@ class Law(Protocol):
         ...
 
     def peaks(self, robot: Robot, found: Any) -> dict[str, Scalar]:
-        """Values of which `PEAKS` are the largest, of the cells' voltage the negative."""
+        """Values of an instant that enter `PEAKS`; of the cell voltage the negative."""
         ...
 
     def peaks_within(self, robot: Robot, y: Array, tops: Array) -> dict[str, Scalar]:
-        """Those of currents and temperatures, of the sizes of the unknowns within a step."""
+        """Peaks of currents and temperatures from the largest unknowns within a step."""
         ...
 
     def over(self, robot: Robot, found: Any) -> dict[str, Scalar]:
-        """What an instant exceeds."""
+        """Limits exceeded at an instant."""
         ...
 
     def norm(self, error: Array) -> Scalar:
-        """Of an error of the unknowns over what is allowed [-]."""
+        """Norm of an error of the unknowns relative to the tolerance [-]."""
         ...
 
     def demanded(self, robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
-        """What is demanded of each row [rad/s or m/s]."""
+        """Demanded speed of each row [rad/s or m/s]."""
         ...
 
     def status(self, robot: Robot, conditions: Conditions, found: Any) -> Array:
-        """Status of a robot that friction does not hold, by its last instant."""
+        """Status of a robot that friction does not hold, from its last instant."""
         ...
 
     def at_places(self, signals: Signals, so_far: dict[str, Array]) -> Signals:
-        """Signals over time, with what follows from the totals so far."""
+        """Signals over time, completed by quantities that follow from the totals so far."""
         ...
 
 
 def _firmly(
     law: Law, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
 ) -> tuple[Array, Array]:
-    """How firmly friction would hold the robot now, and with what current will flow then too: a controller asks for
-    less once there is no error."""
+    """Margins of the friction that would hold the robot, now and at the later current.
+
+    A controller reduces its demand after the error has vanished.
+    """
     asked = law.asked_at(robot, otherwise, segment, y, stands)
     at_rest = law.asked_at(robot, otherwise, segment, y, jnp.asarray(True))
     current = law.AT_REST.current_at_rest(at_rest.robot, at_rest.conditions, law.state_of(at_rest.robot, y, stands))
@@ -159,7 +166,7 @@ def _firmly(
 
 
 def _firm(law: Law, asked: Asked, y: Array, stands: Array) -> Array:
-    """How firmly friction would hold the robot [-], see `rest.firmness`."""
+    """Margin of the friction that would hold the robot [-], see `rest.firmness`."""
     return jnp.asarray(law.AT_REST.firmness(asked.robot, asked.conditions, law.state_of(asked.robot, y, stands)))
 
 
@@ -168,10 +175,10 @@ class Carry(NamedTuple):
     q: Array
     step: Array
     stands: Array
-    ended: Array  # no more: empty, cut off or failed
-    below: Array  # whether the cells are below their cut-off
-    low: Array  # for how long they have been [s]
-    cut_off: Array  # whether they have been for as long as they may
+    ended: Array  # True after the end: empty, cut off or failed
+    below: Array  # True while the cells are below their cut-off
+    low: Array  # time since they fell below [s]
+    cut_off: Array  # True once that time exceeds the permitted one
     peaks: Array
     flags: Array
     events: Array
@@ -184,14 +191,14 @@ class Carry(NamedTuple):
 
 
 def _top(before: Array, after: Array, rise: Array, fall: Array) -> Array:
-    """Largest size of a curve between two values, on the cubic with the slopes `rise` and `fall` at its ends."""
+    """Largest magnitude of a curve between two values, on the cubic with slopes `rise` and `fall` at its ends."""
     sign = jnp.sign(after)
     x0, x1, d0, d1 = sign * before, sign * after, sign * rise, sign * fall
     bends = (d0 > 0) & (d1 < 0)
     a, b = 3 * (d0 + d1 - 2 * (x1 - x0)), 2 * (3 * (x1 - x0) - 2 * d0 - d1)
     root = b * b - 4 * a * d0
     bends &= root > 0
-    # The root in 0..1, in the form that stays finite where the cubic is a parabola.
+    # The root in 0..1, in the form that stays finite if the cubic is a parabola.
     low = b - jnp.sqrt(jnp.where(bends, root, 1.0))
     t = jnp.clip(-2 * d0 / jnp.where(jnp.abs(low) > 1e-12, low, -1e-12), 0.0, 1.0)
     top = x0 + t * (d0 + t * (b / 2 + t * a / 3))
@@ -199,7 +206,7 @@ def _top(before: Array, after: Array, rise: Array, fall: Array) -> Array:
 
 
 def _cell_above(law: Law, asked: Asked, y: Array, stands: Array) -> Scalar:
-    """By how much a cell is above its cut-off [V]; on an external supply far."""
+    """Margin of a cell above its cut-off [V]; large on an external supply."""
     battery = asked.robot.battery
     cell = battery.voltage_cell(*law.drawn(asked, y, stands))
     return jnp.where(asked.conditions.battery > 0.5, cell - battery.voltage_cutoff, 10.0)
@@ -208,7 +215,7 @@ def _cell_above(law: Law, asked: Asked, y: Array, stands: Array) -> Scalar:
 def events_of(
     law: Law, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array, below: Array
 ) -> Float[Array, " events"]:
-    """Functions that are positive once their event of `EVENTS` has happened [-]."""
+    """Functions that become positive when their event of `EVENTS` has happened [-]."""
     asked = law.asked_at(robot, otherwise, segment, y, stands)
     slow, grips = law.slowness(asked, y, stands)
     near = stands | ((slow > -1) & (grips > -1))
@@ -236,8 +243,9 @@ def _onto(
     after: Array,
     h: Array,
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Onto the earliest event by a Newton step in time, which carries the derivative of its moment (the implicit
-    function theorem: dt = -dg / (∂g/∂y y')); and what it changes.
+    """Moves to the earliest event by a Newton step in time, and applies the change of state.
+
+    The step carries the derivative of the event's moment (implicit function theorem: dt = -dg / (∂g/∂y y')).
 
     Returns:
         Unknowns, integrals, whether the robot stands, whether the cells are below their cut-off; the event, and the
@@ -250,7 +258,7 @@ def _onto(
     which = jnp.argmin(jnp.where(after > 0, back, jnp.inf))
     back = back[which]
     y, q = y + back * dy, q + back * dq
-    # To rest: what is left of the motion is lost where it slid.
+    # At a stop, the remaining kinetic energy is dissipated by the sliding contacts.
     rest = y
     for k in law.STOPS:
         rest = rest.at[k].set(0.0)
@@ -272,7 +280,7 @@ def follow(
     tolerance: Scalar,
     most: int,
 ) -> Carry:
-    """One segment: steps until its end, or until the mission has."""
+    """Integrates one segment until its end, or until the mission ends."""
     length = (segment.time[1] - segment.time[0]).astype(carry.y.dtype)
     limit = step_longest(robot, otherwise)
     leg = _Leg(law, robot, otherwise, segment, tolerance, length, jnp.inf if limit is None else limit)
@@ -291,11 +299,11 @@ def follow(
 
 
 class _Tried(NamedTuple):
-    """A step before it is known whether it counts.
+    """A step before it is accepted or rejected.
 
     Attributes:
         y, q: unknowns and integrals at its end; h: its length [s]; last: True if it ends the segment or trips.
-        good: its error is small enough; grown: the length that its error allows next [s].
+        good: True if its error is small enough; grown: length that its error permits for the next step [s].
     """
 
     y: Array
@@ -307,12 +315,12 @@ class _Tried(NamedTuple):
 
 
 class _Landed(NamedTuple):
-    """A step with the event that it lands on.
+    """A step with the event at its end.
 
     Attributes:
-        y, q, stands, below, low: as of `Carry`, at its end; which: the event, -1 for none.
-        cut_off: the cells stayed below their cut-off; after: functions of events at the end of the step tried.
-        taken: the step counts; event: it lands on an event; step: length of the next one [s].
+        y, q, stands, below, low: as in `Carry`, at its end; which: the event, -1 for none.
+        cut_off: True if the cells stayed below their cut-off; after: event functions at the end of the tried step.
+        taken: True if the step is accepted; event: True if it ends at an event; step: length of the next one [s].
     """
 
     y: Array
@@ -340,13 +348,13 @@ class _Leg(NamedTuple):
     longest: Array | float
 
     def begin(self, carry: Carry) -> Carry:
-        """The state at the beginning of the segment."""
+        """The state at the start of the segment."""
         law, robot, otherwise, segment, *_ = self
-        # The segment's beginning may have taken away what held the robot.
+        # The inputs of the segment may exceed the friction that held the robot.
         y = carry.y.at[law.CLOCK].set(0.0)
         asked = law.asked_at(robot, otherwise, segment, y, carry.stands)
         stands = carry.stands & (_firm(law, asked, y, carry.stands) >= 0)
-        # And it may have lifted the cells above their cut-off, or pressed them below.
+        # They may also change the cell voltage across its cut-off.
         below = jnp.asarray(_cell_above(law, asked, y, stands) < 0)
         low = jnp.where(below & carry.below, carry.low, 0.0)
         step = jnp.minimum(jnp.asarray(FIRST, y.dtype), self.longest)
@@ -359,7 +367,7 @@ class _Leg(NamedTuple):
         return begin._replace(slope=law.instant(robot, otherwise, segment, y, stands)[1])
 
     def tried(self, c: Carry) -> _Tried:
-        """A step of the length that is planned, at most to the segment's end or to the cut-off of the cells."""
+        """A step of the planned length, limited by the end of the segment and by the cut-off time of the cells."""
         law, robot, otherwise, segment, *_ = self
 
         def rates(y: Array) -> tuple[Array, Array]:
@@ -380,13 +388,13 @@ class _Leg(NamedTuple):
         return _Tried(y, q, h, last, size <= 1, grown)
 
     def landed(self, c: Carry, tried: _Tried) -> _Landed:
-        """The step, on the first event in it if there is one."""
+        """The step, shortened to its first event if it contains one."""
         law, robot, otherwise, segment, *_ = self
         y, q, h, last, good, grown = tried
         after = events_of(law, robot, otherwise, segment, y, c.stands, c.below)
         happened = after > 0
         between = happened & (c.events < 0)
-        # The next one is to end a little beyond it.
+        # The next step is to end slightly beyond it.
         share = jnp.where(between, (c.events - EVENT / 2) / jnp.where(between, c.events - after, 1.0), 1.0)
         far = jnp.any(between & (after > EVENT)) & (h > NEAR)
         taken = good & ~far
@@ -398,7 +406,7 @@ class _Leg(NamedTuple):
         stands = jnp.where(taken, stands, c.stands)
         low = jnp.where(below & c.below, c.low + jnp.where(taken, h + back, 0.0), 0.0)
         cut_off = taken & _stayed_below(robot, below, low)
-        # After a step cut short by the segment's end or an event, the length from before it.
+        # After a step shortened by the segment's end or an event, the length before it.
         step = jnp.where(taken, jnp.where(last, jnp.maximum(grown, c.step), grown), grown)
         step = jnp.where(good & far, h * jnp.clip(jnp.min(share), 0.02, 0.99), step)
         step = jnp.where(event, FIRST, step)
@@ -406,12 +414,12 @@ class _Leg(NamedTuple):
         return _Landed(y, q, stands, below, low, which, cut_off, after, taken, event, step)
 
     def after(self, c: Carry, h: Array, good: Array, landed: _Landed) -> Carry:
-        """The state after a step of length h [s], with what it adds to peaks, flags and the course."""
+        """The state after a step of length h [s], with its contributions to peaks, flags and the course."""
         law, robot, otherwise, segment, *_ = self
         y, stands, below, taken, cut_off = landed.y, landed.stands, landed.below, landed.taken, landed.cut_off
         found, dy, _, _ = law.instant(robot, otherwise, segment, y, stands)
-        # Current and heat may be largest within the step. Not so speeds: at the end of a long step their slopes are
-        # those of what is stiff in them, and a cubic would swing.
+        # Current and heat may peak within the step. Speeds are different: at the end of a long step their slopes
+        # belong to the stiff part of the solution, and a cubic would oscillate.
         tops = _top(c.y, y, h * c.slope, h * dy)
         within = law.peaks_within(robot, y, tops)
         highest = jnp.stack([jnp.where(taken, within.get(name, -jnp.inf), -jnp.inf) for name in law.PEAKS])
@@ -437,7 +445,7 @@ class _Leg(NamedTuple):
 
 
 def _stayed_below(robot: Robot, below: Array, low: Array) -> Array:
-    """Whether the cells have been below their cut-off for as long as they may."""
+    """True if the cells have been below their cut-off longer than permitted."""
     rounding = 8 * jnp.finfo(low.dtype).eps
     return below & (low >= robot.battery.delay_cutoff * (1 - rounding))
 
@@ -448,10 +456,10 @@ def _peaks_of(law: Law, robot: Robot, found: Any) -> Array:
 
 
 def _flags(law: Law, robot: Robot, found: Any, cut_off: Array) -> Array:
-    """What an instant exceeds.
+    """Limits exceeded at an instant.
 
-    A start draws more than the cells bear for an instant; only what lasts counts.
+    A start exceeds the limits of the cells for an instant; only longer loads count.
     """
     over = law.over(robot, found)
-    over.pop("slips")  # every start slips for an instant; of a segment it counts at its end
+    over.pop("slips")  # every start slips for an instant; for a segment, slip counts at its end
     return mask({**over, "cut_off": cut_off})

@@ -1,4 +1,4 @@
-"""A mission of a robot whose sides are alike: its unknowns, what acts at an instant, rates and integrals."""
+"""A mission in straight travel, with equal sides: its unknowns, inputs, rates and integrals."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ from mmrjax.model.signals import Signals, State
 from mmrjax.numerics import rosenbrock
 from mmrjax.numerics.one_sided import clip
 
-#: Of the unknowns current, motor speed, speed, discharge, temperatures of winding and housing, integral of the
-#: controller and time in the segment; all are then of the order of one. The memories of effects follow.
+#: Units of the unknowns current, motor speed, speed, discharge, temperatures of winding and housing, integral of the
+#: controller and time in the segment, which scale them to the order of one. The memories of effects follow.
 UNITS = (10.0, 1000.0, 1.0, 100.0, 50.0, 50.0, 10.0, 1.0)
 CURRENT, MOTOR, GROUND, DISCHARGE, WINDING, HOUSING, INTEGRAL, CLOCK = range(len(UNITS))
 
-#: Unknowns that are 0 at rest; where the heading is: nowhere.
+#: Unknowns that are 0 at rest; position of the heading: none.
 STOPS, HEADING = (MOTOR, GROUND), slice(0)
 LONG, AT_REST, RESULT = False, rest, result.result
 
-#: What is integrated beside them: name, and unit of a total.
+#: Integrated quantities: name, and unit of a total.
 TOTALS: dict[str, str] = {
     "distance": "m", "path": "m", "drawn": "J", "returned": "J", "current_squared": "A²·s",
     "torque_squared": "N²·m²·s", **dict.fromkeys(energy.SINKS, "J"),
 }  # fmt: skip
 
-#: Largest values of a mission, of any instant: name, and unit.
+#: Largest values of a mission over all instants: name, and unit.
 PEAKS: dict[str, str] = {
     "current": "A", "torque": "N·m", "temperature": "°C", "motor_speed": "rad/s", "speed": "m/s", "cell_low": "V",
 }  # fmt: skip
 
 
 def units(robot: Robot) -> Float[Array, " unknowns"]:
-    """What the unknowns are measured in."""
+    """Units of the unknowns."""
     return jnp.asarray(UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering))
 
 
@@ -55,7 +55,7 @@ def state_of(robot: Robot, y: Float[Array, " unknowns"], stands: Array) -> State
 
 
 def with_consumers(robot: Robot, asked: Profile) -> Robot:
-    """The robot with what its other consumers draw at an instant."""
+    """The robot with the current of its other consumers at an instant."""
     if asked.current_other is None:
         return robot
     battery = dataclasses.replace(robot.battery, current_other=asked.current_other)
@@ -63,7 +63,7 @@ def with_consumers(robot: Robot, asked: Profile) -> Robot:
 
 
 def source(robot: Robot, conditions: Conditions, discharge: Scalar) -> Scalar:
-    """Voltage of which the driver gives the motors a share [V]: of a battery that of no load."""
+    """Source voltage that the duty multiplies [V]: for a battery the no-load voltage."""
     battery = robot.battery.voltage(0.0, discharge)
     return jnp.where(conditions.battery > 0.5, battery, jnp.abs(conditions.voltage))
 
@@ -71,15 +71,15 @@ def source(robot: Robot, conditions: Conditions, discharge: Scalar) -> Scalar:
 def driven(
     robot: Robot, mode: Array, demand: Scalar, conditions: Conditions, state: State, integral: Scalar
 ) -> tuple[Array, Array, Array]:
-    """What drives a motor at an instant.
+    """Duty of a motor at an instant, and the state of its controller.
 
     Args:
-        mode: of the profile; demand: what it demands, of this side [rad/s or m/s].
-        conditions: of this side; state: of it; integral: of its controller [rad].
+        mode: of the profile; demand: of this side [rad/s or m/s].
+        conditions: of this side; state: of this side; integral: of its controller [rad].
 
     Returns:
-        The duty [-], the rate of the controller's integral, and the error of the demand, a ground speed as the motor
-        speed that it takes [rad/s].
+        The duty [-], the rate of the controller's integral, and the error of the demand [rad/s]; for a ground speed,
+        in terms of the motor speed that it needs.
     """
     per_speed = robot.gearbox.ratio / robot.chassis(conditions.configuration).radius
     on_ground = mode == SPEED
@@ -90,7 +90,7 @@ def driven(
     voltage = robot.driver.demand(error, integral, demanded, robot.motor.torque_constant)
     wanted = voltage / jnp.maximum(voltage_source, 1e-3)
     limited = robot.driver.duty_limited(clip(wanted, -1.0, 1.0), state.current)
-    # What the limits take away, the integral gives back: it does not wind up.
+    # Anti-windup: the part of the demand beyond the limits is taken off the integral.
     excess = (wanted - limited) * voltage_source / (robot.driver.gain * robot.motor.torque_constant + 1e-12)
     duty = clip(jnp.where(controlled, conditions.polarity * wanted, conditions.duty), -1.0, 1.0)
     return duty, jnp.where(controlled, error - excess, 0.0), jnp.where(controlled, error, 0.0)

@@ -1,7 +1,7 @@
-"""A mission of a robot whose sides are driven apart, as `mission_straight` is of one whose sides are alike.
+"""A mission of a robot with independently driven sides; counterpart of `mission_straight`.
 
-A demanded speed and yaw rate are those of either side, V_s = v - ω y_s, which its own controller follows; equal sides
-are a mission of straight travel.
+A demanded speed and yaw rate give the speed of each side, V_s = v - ω y_s, which its own controller follows. Equal
+sides give a mission of straight travel.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from mmrjax.numerics import rosenbrock
 from mmrjax.turning import circling
 from mmrjax.turning.two_sides import SIDES, total
 
-#: Of the unknowns, of either side: current, motor speed, temperatures of winding and housing, integral of the
+#: Units of the unknowns, of each side: current, motor speed, temperatures of winding and housing, integral of the
 #: controller; of the robot: speed, lateral speed, yaw rate, heading, discharge, and time in the segment. The memories
-#: of effects follow, of either side.
+#: of effects follow, of each side.
 _EACH = tuple(straight.UNITS[k] for k in (
     straight.CURRENT, straight.MOTOR, straight.WINDING, straight.HOUSING, straight.INTEGRAL
 ))  # fmt: skip
@@ -41,13 +41,13 @@ GROUND, LATERAL, YAW, HEADING, DISCHARGE, CLOCK = range(2 * len(_EACH), len(UNIT
 STOPS = (MOTOR, GROUND, LATERAL, YAW)
 LONG, AT_REST, RESULT = True, circling, circling.result_of
 
-#: What is integrated beside them: name, and unit of a total; of current and torque the mean over both sides.
+#: Integrated quantities: name, and unit of a total; of current and torque the mean over both sides.
 OF_SIDES = tuple(f"current_squared_{side}" for side in channels.SIDES)
 TOTALS: dict[str, str] = {
     **straight.TOTALS, "place_x": "m", "place_y": "m", "turned": "rad", **dict.fromkeys(OF_SIDES, "A²·s"),
 }  # fmt: skip
 
-#: Largest values of a mission, of any instant: of either side, and of one motor of each.
+#: Largest values of a mission over all instants: of each side, and of one motor of each.
 PEAKS: dict[str, str] = {
     **straight.PEAKS, "yaw_rate": "rad/s", "current_left": "A", "current_right": "A", "temperature_left": "°C",
     "temperature_right": "°C",
@@ -55,13 +55,13 @@ PEAKS: dict[str, str] = {
 
 
 class Found(balances.Travel):
-    """An instant: all that both sides do, and how the robot moves."""
+    """One instant: signals of both sides, and the motion of the robot."""
 
     motion: PlaneMotion
 
 
 def units(robot: Robot) -> Float[Array, " unknowns"]:
-    """What the unknowns are measured in."""
+    """Units of the unknowns."""
     return jnp.asarray((*UNITS, *(size for e in robot.remembering for size in (e.memory_size or 1.0,) * 2)))
 
 
@@ -74,7 +74,7 @@ def state_of(robot: Robot, y: Float[Array, " unknowns"], stands: Array) -> Plane
 
 
 def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
-    """What is demanded of either side, of each row [rad/s or m/s], shape (rows, 2)."""
+    """Demanded speed of each side for each row [rad/s or m/s], shape (rows, 2)."""
     demand = jnp.stack([segment.demand, segment.demand], -1)
     if segment.yaw_rate is None:
         return demand
@@ -102,7 +102,7 @@ def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, st
 def instant(
     robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
 ) -> tuple[Found, Array, Array, Asked]:
-    """All of an instant, rates of the unknowns in their units, and of the totals [1/s]."""
+    """Signals and motion, rates of the unknowns in their units and of the totals [1/s], and inputs of an instant."""
     asked = asked_at(robot, otherwise, segment, y, stands)
     motion = state_of(robot, y, stands)
     travel = balances.turning(asked.robot, asked.conditions, motion)
@@ -144,7 +144,7 @@ def instant(
 
 
 def _size(motion: PlaneMotion) -> Scalar:
-    """How fast the robot moves over the ground [m/s], with a derivative at rest."""
+    """Speed of the robot over the ground [m/s], with a derivative at rest."""
     square = jnp.asarray(motion.speed) ** 2 + jnp.asarray(motion.speed_lateral) ** 2
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
@@ -184,7 +184,7 @@ def peaks_within(robot: Robot, y: Array, tops: Array) -> dict[str, Scalar]:
 
 
 def _of_sides(robot: Robot, each: dict[str, Any]) -> dict[str, Scalar]:
-    """Peaks of one motor of either side."""
+    """Peaks of one motor of each side."""
     current = jnp.asarray(each["current"]) / robot.sides
     both = (("current", current), ("temperature", jnp.asarray(each["temperature"])))
     return {f"{name}_{side}": x[k] for name, x in both for k, side in enumerate(channels.SIDES)}
@@ -203,6 +203,6 @@ def status(robot: Robot, conditions: Conditions, found: Found) -> Array:
 
 
 def at_places(signals: Signals, so_far: dict[str, jax.Array]) -> Signals:
-    """Signals over time, with the places that the robot has come to."""
+    """Signals over time, with the position of the robot."""
     x, y = (jnp.stack([so_far[name]] * 2, -1) for name in ("place_x", "place_y"))
     return dataclasses.replace(signals, place_x=x, place_y=y)

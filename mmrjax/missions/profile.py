@@ -1,4 +1,4 @@
-"""Profiles: what is asked of a robot, and what it meets, over the time of a mission."""
+"""Profiles: demands on a robot and its conditions over the time of a mission."""
 
 from __future__ import annotations
 
@@ -17,40 +17,40 @@ from mmrjax.errors import UsageError, counted
 from mmrjax.model.conditions import Conditions, Number
 from mmrjax.model.params import Scalar
 
-#: How the motors are driven in a segment: by a share of the supply's voltage; at a demanded motor speed or ground
-#: speed, by the driver's controller; or not: with their terminals shorted (brake) or their circuit open (coast).
+#: Drive of the motors in a segment: by a share of the supply's voltage; by the driver's controller, at a demanded
+#: motor speed or ground speed; or not driven, with terminals shorted (brake) or circuit open (coast).
 MODES = ("voltage", "motor_speed", "speed", "brake", "coast")
 VOLTAGE, MOTOR_SPEED, SPEED, BRAKE, COAST = range(len(MODES))
 
-#: What a profile may state for each row besides the mode, and of which a row keeps what the conditions say if not.
+#: Conditions that a profile may state for each row; a profile that does not state them uses those of the run.
 CONDITIONS = (
     "voltage", "duty", "duty_left", "duty_right", "slope_deg", "payload", "adhesion", "adhesion_lateral",
     "load_torque",
 )  # fmt: skip
-#: What it may state besides, which is no condition.
+#: Further fields of a profile that are no conditions.
 FURTHER = ("voltage_left", "voltage_right", "yaw_rate", "current_other")
-#: What drives the sides apart, stated of both or of none.
+#: Fields that drive the sides apart, stated for both sides or for neither.
 PAIRS = (("duty_left", "duty_right"), ("voltage_left", "voltage_right"))
-#: What makes a robot free to turn where a profile states it.
+#: Fields that make a robot free to turn if a profile states them.
 APART = (*PAIRS[0], *PAIRS[1], "yaw_rate")
 
 
 class Profile(eqx.Module):
-    """A mission as rows in time; between two rows lies a segment. All numbers differentiable and batchable.
+    """A mission as rows in time, with a segment between two rows. All numbers differentiable and batchable.
 
     Attributes:
         time: of the rows, increasing [s], shape (rows,); the last row ends the mission.
         mode: index into `MODES` of the segment that a row begins, shape (rows,).
-        demand: motor speed [rad/s] or ground speed [m/s] where the mode asks for one, else not used, shape (rows,).
+        demand: motor speed [rad/s] or ground speed [m/s] for modes with a demand, else not used, shape (rows,).
         voltage: of the external supply [V]; duty: share of the supply's voltage [-]; slope_deg: [deg]; payload: [kg];
             adhesion, adhesion_lateral: as a ratio to the robot's surface, along and across [-]; load_torque: of a
-            brake on the output of each drive, of a load on a shaft [N·m]; current_other: of other consumers on the
-            battery [A]. Shape (rows,), or None: as the conditions (the robot, for current_other) say.
-        duty_left, duty_right: as `duty`, of either side; voltage_left, voltage_right: given to the motors of either
-            side [V], as a share of what the source has at no load; yaw_rate: demanded beside a ground speed, positive
+            brake on the output of each drive, for a load on a shaft [N·m]; current_other: of other consumers on the
+            battery [A]. Shape (rows,), or None: as in the conditions (for current_other, in the robot).
+        duty_left, duty_right: as `duty`, of each side; voltage_left, voltage_right: at the motors of each side [V],
+            as a share of the no-load voltage of the source; yaw_rate: demanded together with a ground speed, positive
             to the left [rad/s]. Stating any of them makes the robot free to turn.
-        linear: whether values change linearly from a row to the next; else they hold until it.
-        cycles: how often the rows are run through.
+        linear: True if values change linearly between rows; False if they hold until the next row.
+        cycles: number of repetitions of the rows.
     """
 
     time: Float[Array, " rows"]
@@ -74,7 +74,7 @@ class Profile(eqx.Module):
 
     @property
     def segments(self) -> int:
-        """Segments of one cycle."""
+        """Number of segments of one cycle."""
         return self.time.shape[-1] - 1
 
     @property
@@ -84,20 +84,20 @@ class Profile(eqx.Module):
 
     @property
     def turns(self) -> bool:
-        """Whether it drives the sides apart: the robot is then free to turn."""
+        """True if it drives the sides apart; the robot is then free to turn."""
         return any(getattr(self, name) is not None for name in APART)
 
     @property
     def duration(self) -> Scalar:
-        """Of the whole mission [s]."""
+        """Duration of the whole mission [s]."""
         return self.cycles * (self.time[-1] - self.time[0])
 
     def row(self, k: Index) -> Profile:
-        """The rows `k` and `k + 1`: one segment as a profile of its own."""
+        """The rows `k` and `k + 1`: one segment as a separate profile."""
         return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, k, 2), self)
 
     def at(self, elapsed: Scalar) -> Profile:
-        """What is asked `elapsed` seconds after the first of two rows: its fields are scalars."""
+        """Values of a profile of two rows `elapsed` seconds after the first; its fields are scalars."""
         share = elapsed / (self.time[1] - self.time[0]) if self.linear else 0.0
 
         def value(x: Array) -> Array:
@@ -109,7 +109,7 @@ class Profile(eqx.Module):
         return dataclasses.replace(values, **still)
 
     def conditions(self, otherwise: Conditions) -> Conditions:
-        """The conditions of an instant, see `at`; `otherwise` where the profile states nothing."""
+        """The conditions of an instant, see `at`; from `otherwise` if the profile does not state them."""
         stated = {name: getattr(self, name) for name in CONDITIONS if getattr(self, name) is not None}
         if "payload" in stated and otherwise.total_mass is not None:
             stated["total_mass"] = otherwise.total_mass + stated["payload"] - otherwise.payload
@@ -133,15 +133,15 @@ def profile(
     cycles: int = 1,
     **values: Number | None,
 ) -> Profile:
-    """A profile from plain numbers, each one for all rows or one a row.
+    """A profile from plain numbers, each one for all rows or one per row.
 
     Args:
-        time: of the rows [s]; mode: of `MODES`, one or one a row.
-        demand, linear, cycles: see `Profile`; values: the rest of its fields, by name.
+        time: of the rows [s]; mode: of `MODES`, one or one per row.
+        demand, linear, cycles: see `Profile`; values: its other fields, by name.
 
     Raises:
-        UsageError: fewer than two rows, a time that does not increase, an unknown mode or field, a length that is not
-            that of `time`, a value that is not finite, a duty beyond -1..1, cycles below 1.
+        UsageError: fewer than two rows; a time that does not increase; an unknown mode or field; a length that
+            differs from that of `time`; a value that is not finite; a duty beyond -1..1; cycles below 1.
     """
     rows = np.asarray(time, float)
     if rows.ndim != 1 or len(rows) < 2:
@@ -163,7 +163,7 @@ def profile(
     known = (*CONDITIONS, *FURTHER)
     unknown = sorted(set(values) - set(known))
     if unknown:
-        raise UsageError(f"profile: no field {unknown[0]}; there are {', '.join(known)}")
+        raise UsageError(f"profile: no field {unknown[0]}; expected one of {', '.join(known)}")
     given: dict[str, Any] = {"demand": demand, **{name: v for name, v in values.items() if v is not None}}
     if why := sides_refused(list(given), MODES[SPEED] in modes):
         raise UsageError(f"profile: {why}")
@@ -190,18 +190,19 @@ def profile(
 
 
 def sides_refused(stated: Sequence[str], speed: bool, named: Callable[[str], str] = str) -> str | None:
-    """Why fields that a profile states of its sides cannot be: one side without the other, both kinds at once, a yaw
-    rate without a demanded speed; None: they can.
+    """Error message if a profile's fields for the sides contradict each other, else None.
+
+    They do for one side without the other, two kinds at once, or a yaw rate without a demanded speed.
 
     Args:
-        stated: fields; speed: whether a ground speed is demanded; named: what a field is called where it is stated.
+        stated: fields; speed: True if a ground speed is demanded; named: maps a field to its name in the input.
     """
     for left, right in (pair for either in PAIRS for pair in (either, either[::-1])):
         if left in stated and right not in stated:
             return f"got {named(left)} without {named(right)}; expected both"
     kinds = [named(name) for name in ("duty", PAIRS[0][0], PAIRS[1][0]) if name in stated]
     if len(kinds) > 1:
-        return f"got {kinds[0]} beside {kinds[1]}; expected one of the two"
+        return f"got {kinds[0]} together with {kinds[1]}; expected one of the two"
     if "yaw_rate" in stated and not speed:
-        return f"got {named('yaw_rate')} without {named(MODES[SPEED])}; expected a demanded ground speed beside it"
+        return f"got {named('yaw_rate')} without {named(MODES[SPEED])}; expected a demanded ground speed too"
     return None

@@ -29,7 +29,7 @@ from mmrjax.numerics.one_sided import at_least
 from mmrjax.numerics.trigonometry import cosine, sine
 from mmrjax.turning.two_sides import SIDES, Grip, Stance, grip, total
 
-#: Every balance with its unit and what it closes.
+#: Each balance with its unit and its equation.
 BALANCES = {
     "mass": ("kg", "M = robot + payload"),
     "inertia": ("kg·m^2", "J_w of one side's parts that turn with the driving wheel, eq. (31)"),
@@ -43,24 +43,29 @@ BALANCES = {
     "slip": ("m/s", "V = r_k ω_k - slip speed, eqs. (32), (33)"),
     "lateral": ("N", "m (dv_y/dt + ω v_x) = sum of lateral forces, of a robot that turns"),
     "yaw": ("N·m", "J_ψ dω/dt = sum of x F_y - y F_x, of a robot that turns"),
-    "sensor": ("", "what the instruments show, each channel in its unit"),
+    "sensor": ("", "readings of the instruments, each channel in its unit"),
 }
 
-#: Of these, those of a robot that turns: they act round the turn, the others along the travel of a side.
+#: The balances of the turn; the others act along the travel of one side.
 ROUND = ("lateral", "yaw")
 
 
 def absent(robot: Robot) -> frozenset[str]:
-    """Balances that a robot has not, or that nothing of it shows: the ground's of a load on a shaft, those of the
-    voltage where the motors' speed or current is imposed."""
+    """Balances that a robot lacks or that its instruments cannot show.
+
+    A load on a shaft lacks those of the ground. `supply` needs an imposed voltage, `electrical` and `inductance` an
+    imposed or measured one, `lateral` and `yaw` instruments of a turn.
+    """
     supply = set() if robot.rig.imposed == "voltage" else {"supply"}
     winding = set() if robot.rig.shows_voltage else {"electrical", "inductance"}
     return robot.lacks | supply | winding | (set() if robot.rig.turns else {*ROUND})
 
 
 def added(robot: Robot, signals: Signals, balance: str, channel: str = "") -> Scalar:
-    """What the robot's effects add to a balance (and in `sensor` to a channel), in its unit; an effect adds nothing
-    in configurations on which it does not act, none where its load lacks the balance."""
+    """Sum of the robot's effects in one balance, and for `sensor` in one channel, in its unit.
+
+    An effect adds 0 in configurations that it does not apply to. All effects add 0 if the load lacks the balance.
+    """
     if balance in robot.lacks:
         return 0.0
     entering = [e for e in robot.effects if e.balance == balance and e.channel == channel]
@@ -75,7 +80,7 @@ def _fill(signals: Signals, **values: Any) -> Signals:
     return dataclasses.replace(signals, **values)
 
 
-#: What a robot that turns does in the plane of the ground; of straight travel it is nothing.
+#: Motion in the plane of the ground, which straight travel does not have.
 IN_PLANE = ("speed_lateral", "yaw_rate", "heading", "place_x", "place_y")
 
 
@@ -123,7 +128,7 @@ def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar 
 
 
 def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
-    """Voltage at the motors [V]: the driver's share of what the supply gives, less the drops on the way to it."""
+    """Voltage at the motors [V]: the duty times the source voltage, less the drops on the way to the motors."""
     if conditions.voltage_follows:
         return signals
     source = power.voltage_source(
@@ -136,19 +141,22 @@ def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
 
 
 def power_drawn(robot: Robot, signals: Signals) -> Scalar:
-    """Power that all motors take [W], the heat of their current's pulses with it."""
+    """Power that all motors take [W], including the heat of the current ripple."""
     pulses = (robot.driver.ripple(signals.duty) - 1) * signals.voltage_drop
     return robot.sides * (signals.voltage + pulses) * signals.current
 
 
 def charge_drawn(robot: Robot, conditions: Conditions, total_current: Scalar) -> Scalar:
-    """Current out of the on-board battery, by which its charge falls [A], eq. (11); 0 on an external supply."""
+    """Battery current [A], which reduces its charge, eq. (11); 0 on an external supply."""
     return robot.battery.current(total_current) * (conditions.battery > 0.5)
 
 
 def electrical(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
-    """What of the supply voltage is left to change the current [V]; or the voltage that an imposed speed takes, or an
-    amplifier gives that brings the current to what is imposed within the winding's time constant."""
+    """Voltage available to change the current [V].
+
+    With an imposed speed, the voltage that the speed needs. With an imposed current, the voltage of an amplifier that
+    brings the current to its set value within the winding's time constant.
+    """
     back = robot.motor.voltage_back(signals.speed_motor)
     drop = robot.motor.voltage_winding(signals.current, signals.temperature) + added(robot, signals, "electrical")
     if conditions.voltage_follows:
@@ -178,13 +186,13 @@ def motor(robot: Robot, signals: Signals) -> Signals:
 
 
 def torque_held(chassis: Shaft, signals: Signals) -> Scalar:
-    """Torque that acts against forward rotation of a shaft whichever way it turns: its own and a brake's [N·m]."""
+    """Torque that opposes forward rotation of a shaft in both directions: its own load and a brake's [N·m]."""
     own = chassis.torque_load(signals.angle)
     return own if signals.load_torque is None else own + signals.load_torque
 
 
 def travel(robot: Robot, chassis: Load, signals: Signals) -> Signals:
-    """Forces along the slope that traction has to overcome [N]; of a shaft what its load takes at the radius."""
+    """Forces along the slope that traction has to overcome [N]; for a shaft, its load torque over the radius."""
     if isinstance(chassis, Shaft):
         demand = torque_held(chassis, signals) / chassis.radius
         none = jnp.zeros_like(demand)
@@ -202,15 +210,15 @@ def travel(robot: Robot, chassis: Load, signals: Signals) -> Signals:
 
 
 def slip(robot: Robot, signals: Signals) -> Signals:
-    """Speed at which the contact patch slides over the ground [m/s]."""
+    """Sliding speed of the contact patch over the ground [m/s]."""
     terms = added(robot, signals, "slip")
     return _fill(signals, speed_slip_terms=terms, speed_sliding=signals.speed_theoretical - signals.speed - terms)
 
 
 def track(robot: Robot, chassis: Load, signals: Signals, guide: Scalar | None = None) -> Signals:
-    """Losses between pulley and ground, at the pulley; of a shaft its load's friction [N·m].
+    """Losses between pulley and ground, at the pulley; for a shaft the friction of its load [N·m].
 
-    `guide` is the friction on the lower guide [N]; None takes (26) on the guides' stated share.
+    `guide` is the friction on the lower guide [N]; None applies (26) to the guides' stated share of the weight.
     """
     if isinstance(chassis, Shaft):
         loss = chassis.torque_loss(signals.speed_wheel, signals.direction) + added(robot, signals, "track")
@@ -221,17 +229,17 @@ def track(robot: Robot, chassis: Load, signals: Signals, guide: Scalar | None = 
     return _fill(signals, torque_track_loss=loss)
 
 
-#: Of what turns with a wheel [kg·m²]: a rig's file need not state any.
+#: Least inertia of the parts that turn with a wheel [kg·m²]: a rig's file may state none.
 LEAST_INERTIA = 1e-12
 
 
 def gearbox(robot: Robot, chassis: Load, signals: Signals, mover: Scalar | None = None) -> Signals:
     """Torques at both shafts and the acceleration of the driving wheel, the armature taking its share.
 
-    `mover` is what the mover takes from the shaft beside the track's losses [N·m]; None: the traction.
+    `mover` is the mover's torque on the shaft in addition to the track losses [N·m]; None: the traction.
 
-    With A the motor torque less idle loss and B the load at the output, the torque transmitted has the
-    sign of A J_w + i J_d B whatever the efficiency, which decides which way the load loss acts.
+    Let A be the motor torque less the idle loss, and B the load at the output. The transmitted torque has the sign of
+    A J_w + i J_d B at any efficiency. That sign decides the direction in which the load loss acts.
     """
     gear, inertia_motor = robot.gearbox, robot.motor.inertia
     idle = gear.torque_idle(signals.speed_motor, signals.direction)
@@ -240,9 +248,9 @@ def gearbox(robot: Robot, chassis: Load, signals: Signals, mover: Scalar | None 
     load = signals.torque_track_loss + mover + own
     drive = signals.torque_motor - idle
     inertia_added = added(robot, signals, "inertia")
-    # Of shafts without inertia, the side from which power flows and what they transmit are those of next to none.
+    # Shafts without inertia get a very small one, which decides the direction of power and the torque transmitted.
     inertia_wheel = chassis.inertia + inertia_added
-    next_to_none = LEAST_INERTIA + at_least(inertia_wheel, 0.0)  # with a derivative by what is added to none
+    next_to_none = LEAST_INERTIA + at_least(inertia_wheel, 0.0)  # keeps the derivative by an added inertia
     inertia_wheel = jnp.where(inertia_wheel < LEAST_INERTIA, next_to_none, inertia_wheel)
     through = gear.ratio * inertia_motor
     side = (drive * inertia_wheel + through * load) / (inertia_wheel + through)
@@ -267,23 +275,24 @@ def gearbox(robot: Robot, chassis: Load, signals: Signals, mover: Scalar | None 
 
 
 def _to_slip(robot: Robot, conditions: Conditions, chassis: Load, signals: Signals) -> Signals:
-    """The balances between kinematics and traction, in their order."""
+    """Applies the balances between kinematics and traction, in their order."""
     signals = electrical(robot, conditions, supply(robot, conditions, signals))
     return slip(robot, travel(robot, chassis, motor(robot, signals)))
 
 
 def _pulled(robot: Robot, signals: Signals, traction: Scalar) -> Signals:
-    """Traction [N] and what it leaves to accelerate the robot, eq. (1)."""
+    """Traction [N] and the force left to accelerate the robot, eq. (1)."""
     acceleration = (traction - signals.demand) / (signals.mass / robot.sides)
     return _fill(signals, traction=traction, acceleration=acceleration)
 
 
 def moving(robot: Robot, conditions: Conditions, state: State, way: Scalar | None = None) -> Signals:
-    """All signals of a robot in motion: traction follows from sliding by the friction law, and the current from
-    torque where the speed of the motors is imposed.
+    """All signals of a robot in motion: traction follows from sliding by the friction law.
+
+    With an imposed motor speed, the current follows from the torque.
 
     Args:
-        way: in which dry friction acts as of motion, ±1 [-]; None, or 0: it follows the speeds, smooth through rest.
+        way: direction of motion that dry friction opposes, ±1 [-]; None or 0: from the speeds, smooth through rest.
     """
     if conditions.motor_speed is not None:
         state = dataclasses.replace(state, current=_current(robot, conditions, state, way))
@@ -291,8 +300,10 @@ def moving(robot: Robot, conditions: Conditions, state: State, way: Scalar | Non
 
 
 def rolling(robot: Robot, conditions: Conditions, state: State, way: Scalar | None = None) -> Signals:
-    """All signals of a robot in motion whose load follows its wheels: its inertia acts at the driving shaft, and
-    traction is what it and the demand take. Args: as of `moving`.
+    """All signals of a robot in motion whose load turns rigidly with its wheels.
+
+    The load's inertia acts at the driving shaft, and traction is what the inertia and the demand need. Args: as for
+    `moving`.
     """
     robot = robot.within(conditions.configuration)
     chassis = robot.chassis(conditions.configuration)
@@ -308,19 +319,19 @@ def rolling(robot: Robot, conditions: Conditions, state: State, way: Scalar | No
 
 
 def _one_way(signals: Signals, way: Scalar | None) -> Signals:
-    """Signals with the way in which dry friction acts, as of `moving`."""
+    """Signals with the direction that dry friction opposes, as in `moving`."""
     if way is None:
         return signals
     directions = "direction", "direction_travel"
     return _fill(signals, **{d: jnp.where(way == 0, getattr(signals, d), way) for d in directions})
 
 
-#: Newton steps of the current at an imposed speed: its torque is linear but for which way power flows, and effects.
+#: Newton steps of the current at an imposed speed: torque is linear in it except for effects and the power direction.
 CURRENT_STEPS = 4
 
 
 def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar | None) -> Scalar:
-    """Current with which the motors accelerate as the imposed speed does [A]."""
+    """Motor current that gives the imposed acceleration [A]."""
 
     def at(given: tuple[Robot, Conditions, State], current: Scalar) -> Signals:
         robot, conditions, state = given
@@ -330,7 +341,7 @@ def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar | N
 
 
 def _speed_imposed(robot: Robot, conditions: Conditions, chassis: Chassis, signals: Signals) -> Signals:
-    """The signals of a side whose motor speed is imposed, its traction known."""
+    """Signals of a side whose motor speed is imposed and whose traction is known."""
 
     def at(given: tuple[Robot, Conditions, Chassis, Signals], current: Scalar) -> Signals:
         robot, conditions, chassis, signals = given
@@ -343,11 +354,11 @@ def _speed_imposed(robot: Robot, conditions: Conditions, chassis: Chassis, signa
 
 
 def _current_of(signals: Callable[[Any, Scalar], Signals], given: tuple) -> Scalar:
-    """Current with which the motors accelerate as the imposed speed does [A].
+    """Motor current that gives the imposed acceleration [A].
 
     Args:
-        signals: of `given` and a current [A]; given: robot, conditions, and what else they depend on. Derivatives by
-            it are those of the last step alone.
+        signals: function of `given` and a current [A].
+        given: robot, conditions and further inputs. Derivatives with respect to it are those of the last step only.
     """
 
     def lacking(given: tuple, current: Scalar) -> Scalar:
@@ -380,11 +391,11 @@ def _moving(robot: Robot, conditions: Conditions, state: State, way: Scalar | No
 
 
 def _within_backlash(robot: Robot, chassis: Shaft, signals: Signals, gap: Scalar) -> Signals:
-    """Motor and load as two bodies, between which the flanks of the gear carry what they are pressed with [N·m]."""
+    """Motor and load as two bodies, between which the gear flanks carry their contact torque [N·m]."""
     gear = robot.gearbox
     idle = gear.torque_idle(signals.speed_motor, signals.direction)
     loss = chassis.torque_loss(signals.speed_output, signals.direction_travel) + added(robot, signals, "track")
-    signals = _fill(signals, torque_track_loss=loss)  # which effects of the gearbox go by
+    signals = _fill(signals, torque_track_loss=loss)  # effects of the gearbox depend on it
     own = added(robot, signals, "gearbox")
     inertia_added = added(robot, signals, "inertia")
     inertia_motor = robot.motor.inertia * gear.ratio**2
@@ -411,7 +422,7 @@ def _within_backlash(robot: Robot, chassis: Shaft, signals: Signals, gap: Scalar
 
 
 class Mover(Protocol):
-    """Movers whose contacts are resolved one by one."""
+    """Movers whose contacts are computed one by one."""
 
     @property
     def normal(self) -> Scalar:
@@ -419,7 +430,7 @@ class Mover(Protocol):
         ...
 
     def pull(self, chassis: Chassis, signals: Signals) -> Any:
-        """What the contacts do, with `traction` [N], `guide` [N], and `load` on the driving shaft [N·m]."""
+        """Contact forces: `traction` [N], `guide` [N], and `load` on the driving shaft [N·m]."""
         ...
 
 
@@ -430,10 +441,10 @@ def resolved(
 
     Args:
         mover: the contacts at this instant.
-        inertia: of what turns rigidly with the driving shaft, in place of `chassis.inertia` [kg·m²].
+        inertia: of all parts that turn rigidly with the driving shaft, in place of `chassis.inertia` [kg·m²].
 
     Returns:
-        The signals, and what `mover.pull` gave.
+        The signals, and the result of `mover.pull`.
     """
     robot = robot.within(conditions.configuration)
     chassis = dataclasses.replace(robot.chassis(conditions.configuration), inertia=inertia)
@@ -444,7 +455,7 @@ def resolved(
 
 
 def _drawn(robot: Robot, chassis: Chassis, signals: Signals, pull: Any) -> Signals:
-    """The signals of one side, known up to its sliding, that its contacts pull."""
+    """Signals of one side whose sliding is known, with the forces of its contacts."""
     traction, guide = pull.traction, jnp.sum(pull.guide)
     signals = track(robot, chassis, _pulled(robot, signals, traction), guide)
     return gearbox(robot, chassis, signals, pull.load - guide * chassis.radius)
@@ -453,8 +464,10 @@ def _drawn(robot: Robot, chassis: Chassis, signals: Signals, pull: Any) -> Signa
 def resolved_sides(
     robot: Robot, conditions: Conditions, motion: PlaneMotion, mover: Mover, inertia: Scalar
 ) -> tuple[Signals, Any]:
-    """`resolved` of a robot free to turn, of left and right side: a leading axis of 2 in the signals, in the normal
-    loads of `mover` and in what it pulls."""
+    """Same as `resolved` for a robot free to turn; left and right side are a leading axis of 2.
+
+    Signals, the normal loads of `mover` and its result have that axis.
+    """
     robot = robot.within(conditions.configuration)
     chassis = dataclasses.replace(robot.chassis(conditions.configuration), inertia=inertia)
     own = conditions.of_sides()
@@ -465,13 +478,13 @@ def resolved_sides(
 
 
 def driven(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None) -> Signals:
-    """Signals of an instant up to the voltage balance; direction: as of `begin`."""
+    """Signals of an instant up to the voltage balance; direction: as in `begin`."""
     robot = robot.within(conditions.configuration)
     return electrical(robot, conditions, supply(robot, conditions, begin(robot, conditions, state, direction)))
 
 
 def demanded(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
-    """Signals of an instant up to what traction has to overcome and the sliding of the contact."""
+    """Signals of an instant up to the demand on traction and the sliding of the contact."""
     robot = robot.within(conditions.configuration)
     return _to_slip(
         robot, conditions, robot.chassis(conditions.configuration), begin(robot, conditions, state, direction)
@@ -482,16 +495,16 @@ def settled(robot: Robot, conditions: Conditions, state: State, direction: Scala
     """All signals of steady travel: traction is the demand.
 
     Args:
-        direction: of travel, 1 forward or -1 backward; friction acts against it also at rest.
+        direction: of travel, 1 forward or -1 backward; friction acts against it, also at rest.
 
     Returns:
-        The signals, and the sliding speed at which the friction law carries that demand [m/s], which
-        `signals.speed_sliding` has to meet.
+        The signals, and the sliding speed that the friction law needs to carry the demand [m/s]. In steady travel
+        `signals.speed_sliding` equals it.
     """
     robot = robot.within(conditions.configuration)
     chassis = robot.chassis(conditions.configuration)
     signals = demanded(robot, conditions, state, direction * jnp.ones_like(state.speed_motor))
-    # Nothing changes in steady travel: the rates that other fidelities compute are zero.
+    # In steady travel nothing changes: the rates that other fidelities compute are zero.
     still = jnp.zeros_like(signals.demand)
     signals = _fill(signals, traction=signals.demand, acceleration=still)
     if isinstance(chassis, Shaft):
@@ -502,11 +515,11 @@ def settled(robot: Robot, conditions: Conditions, state: State, direction: Scala
 
 
 class Travel(eqx.Module):
-    """All of an instant of a robot that turns.
+    """All signals of one instant of a robot that turns.
 
     Attributes:
-        signals: of each side, a leading axis of 2: left, right; totals and what the robot does as a whole alike.
-        grip: what the ground does to each side.
+        signals: of each side, a leading axis of 2: left, right; both hold totals and motion of the whole robot.
+        grip: forces of the ground on each side.
         acceleration, acceleration_lateral: dv_x/dt and dv_y/dt [m/s²]; acceleration_yaw: dω/dt [rad/s²].
     """
 
@@ -518,8 +531,11 @@ class Travel(eqx.Module):
 
 
 def stance(robot: Robot, conditions: Conditions, chassis: Chassis, mass: Scalar) -> Stance:
-    """How a robot of this mass with its payload [kg] stands: the centre of mass of all, over axles that are a radius,
-    on tracks and a grouser, above the ground; with levers stated in the posture that it takes on level ground."""
+    """Stance of a robot with its payload, of this total mass [kg].
+
+    The centre of mass includes all parts. Axles are one radius above the ground, on tracks a grouser height more.
+    Levers with stated angles have the posture that they take on level ground.
+    """
     length, on_tracks = robot.running_gear.wheelbase, chassis.on_tracks
     if conditions.states_levers:
         rests = resting_posture.level(robot, conditions, mass)
@@ -555,12 +571,12 @@ def lateral_friction(conditions: Conditions, chassis: Chassis) -> Scalar:
 
 
 def _both(x: Scalar) -> Array:
-    """The same of left and right side."""
+    """The same value for left and right side."""
     return jnp.broadcast_to(x, SIDES.shape)
 
 
 def _begin_sides(robot: Robot, conditions: Conditions, own: Conditions, motion: PlaneMotion) -> Signals:
-    """`begin` of left and right side, and what the robot does in the plane; `own` are the sides' conditions."""
+    """Same as `begin` for left and right side, with motion in the plane; `own` are the conditions of each side."""
     chassis = robot.chassis(conditions.configuration)
     signals = jax.vmap(functools.partial(begin, robot))(own, states_of_sides(robot, conditions, motion))
     return _fill(
@@ -574,7 +590,7 @@ def _begin_sides(robot: Robot, conditions: Conditions, own: Conditions, motion: 
 
 
 def added_in_plane(robot: Robot, signals: Signals) -> tuple[Scalar, Scalar]:
-    """What effects add to the balances `lateral` [N] and `yaw` [N·m], of all sides."""
+    """Sums of the robot's effects in the balances `lateral` [N] and `yaw` [N·m], over both sides."""
 
     def of(balance: str) -> Scalar:
         each = _both(jax.vmap(lambda s: added(robot, s, balance))(signals))
@@ -586,13 +602,13 @@ def added_in_plane(robot: Robot, signals: Signals) -> tuple[Scalar, Scalar]:
 def turning(
     robot: Robot, conditions: Conditions, motion: PlaneMotion, loads: Float[Array, " 2"] | None = None
 ) -> Travel:
-    """All signals of a robot free to turn: both sides by the balances above, the supply and the ground between them.
+    """All signals of a robot free to turn: the balances of both sides, coupled by supply and ground.
 
-    Each side is on the part of the slope that lies along its heading. What effects lower the speed of a side by is
-    read at equal loads of both.
+    Each side is on the part of the slope along its heading. Effects that lower the speed of a side are evaluated at
+    equal loads of both.
 
     Args:
-        loads: see `turning.grip`.
+        loads: normal loads of both sides [N], see `turning.grip`.
     """
     robot = robot.within(conditions.configuration)
     chassis, own = robot.chassis(conditions.configuration), conditions.of_sides()
@@ -634,7 +650,7 @@ def turning(
 
 
 def sensor(robot: Robot, signals: Signals) -> dict[str, Scalar]:
-    """What the instruments show of every channel [SI], by its name; NaN where that rests on what is not known."""
+    """Ideal readings of every channel [SI], by channel name; NaN if a reading depends on an unknown parameter."""
     return {
         c.name: robot.rig.instrument(c.name).shows(c.read(robot, signals)) + added(robot, signals, "sensor", c.name)
         if robot.knows(c.rests_on)
@@ -644,7 +660,10 @@ def sensor(robot: Robot, signals: Signals) -> dict[str, Scalar]:
 
 
 def shown(robot: Robot, signals: Signals) -> dict[str, Scalar]:
-    """The same of signals whose last axis is that of left and right side: of a side its own, else their mean."""
+    """Same as `sensor` for signals with a last axis of left and right side.
+
+    A channel of one side shows that side; the others show the mean.
+    """
     read = sensor(robot, signals)
     return {
         c.name: jnp.mean(jnp.asarray(read[c.name]), -1) if c.side is None else jnp.asarray(read[c.name])[..., c.side]
@@ -653,10 +672,10 @@ def shown(robot: Robot, signals: Signals) -> dict[str, Scalar]:
 
 
 def together(signals: Signals) -> Signals:
-    """Signals of both sides as those of one motor on average, from which totals follow as of sides alike."""
+    """Mean signals of both sides, as one motor's; totals follow as for equal sides."""
     return jax.tree.map(lambda x: jnp.mean(x, axis=-1) if jnp.ndim(x) else x, signals)
 
 
 def signals_of(found: Signals | Travel) -> Signals:
-    """The signals of an instant; of a robot that turns of left and right side."""
+    """Signals of an instant; for a robot that turns, of left and right side."""
     return found.signals if isinstance(found, Travel) else found

@@ -1,7 +1,7 @@
-"""The table of channels: everything that an instrument can show, one row each. No other room counts them.
+"""The table of channels, one row for each quantity that an instrument can show. No other module lists them.
 
-Importable without jax. A new channel is a row of `EVERY`. Which of them there are belongs to the rig: a robot
-(`Robot.channels`), a table of its runs (`Runs.channels`) and every result carry theirs, in the order of `EVERY`.
+Importable without jax. A new channel is a row of `EVERY`. The rig decides which channels exist: a robot
+(`Robot.channels`), a table of its runs (`Runs.channels`) and each result carry them, in the order of `EVERY`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from mmrjax.model.robot import Robot
     from mmrjax.model.signals import Signals
 
-#: Parameters of the robot that a number may rest on: current where the motors' speed is imposed, the voltage that an
-#: imposed speed or current takes, a winding's temperature at a current after long running, and over time.
+#: Parameters of the robot that a reading may depend on: the current at an imposed speed, the voltage at an imposed
+#: speed or current, the winding temperature after long running at a current, and the same over time.
 CURRENT = ("motor.torque_constant",)
 VOLTAGE = ("motor.resistance", *CURRENT)
 HEAT = (*VOLTAGE, "motor.resistance_thermal_winding", "motor.resistance_thermal_housing")
@@ -27,22 +27,21 @@ WARMING = (*HEAT, "motor.time_constant_winding", "motor.time_constant_housing")
 
 @dataclasses.dataclass(frozen=True)
 class Channel(Quantity):
-    """A quantity that an instrument shows.
+    """A quantity that an instrument can show.
 
     Attributes:
         word: short name that `--noise` takes.
         sd_largest: largest sd that a table may hold [unit].
-        read: what of the signals an ideal instrument shows [SI].
-        sd_share: sd that is assumed where none is known, as a share of the reading [-].
-        resolution: digits after the point that a person wants to see [unit].
-        zero_at_rest: whether it shows 0 until the robot moves.
-        directed: whether its sign is that of the motion; an angle counts on from where it was.
-        settled, over_time: whether settled runs and histories can show it.
-        zero_error: sd of what its instrument may show where there is nothing to show [SI]; 0: it counts or times, and
-            misses no zero.
-        side: 0 or 1 of what the left or the right side alone shows; None: what both together do.
-        where: it is measured, where the label does not say.
-        rests_on: parameters of the robot without which it is not known, by dotted name.
+        read: reading of an ideal instrument, from the signals [SI].
+        sd_share: assumed standard deviation as a share of the reading, if no other is known [-].
+        resolution: digits after the point in reports [unit].
+        zero_at_rest: True if it shows 0 until the robot moves.
+        directed: True if its sign is that of the motion; an angle counts on from its last value.
+        settled, over_time: True if settled runs and histories can show it.
+        zero_error: standard deviation of the instrument's zero [SI]; 0 for counters and clocks, which have none.
+        side: 0 or 1 for a channel of the left or right side; None: a channel of both together.
+        where: place of the measurement, if the label does not give it.
+        rests_on: dotted names of the parameters that it depends on; it is unknown if one of them is.
     """
 
     word: str
@@ -61,7 +60,7 @@ class Channel(Quantity):
 
     @property
     def deviation(self) -> Quantity:
-        """The standard deviation of its readings, as a column of tables."""
+        """Standard deviation of its readings, as a column of tables."""
         return Quantity(
             f"{self.stem or self.name}_sd", self.unit, self.factor, f"standard deviation of {self.label}",
             (0.0, self.sd_largest), other_units=self.other_units,
@@ -69,21 +68,21 @@ class Channel(Quantity):
 
     @property
     def sd_column(self) -> str:
-        """The column of its standard deviations."""
+        """Name of the column of its standard deviation."""
         return self.deviation.column
 
     @property
     def misses_zero(self) -> bool:
-        """Whether its instrument may miss zero; that of a temperature is a convention."""
+        """True if its instrument may have a zero error; the zero of a temperature is a convention."""
         return self.zero_error > 0 and self.directed
 
     def __reduce__(self) -> tuple[Callable[[str], Channel], tuple[str]]:
-        """Pickled by its name, so that tables and results go to other processes and back."""
+        """Pickles the channel by its name, so that tables and results can go to other processes."""
         return find, (self.name,)
 
 
 def _winding_temperature(robot: Robot, signals: Signals) -> Any:
-    """Of the winding [°C]: where it is followed as it is, else after long running at this current."""
+    """Winding temperature [°C]: the present one if it is followed, else after long running at this current."""
     if signals.temperature is not None:
         return signals.temperature
     return robot.motor.temperature_settled(signals.current)
@@ -94,7 +93,7 @@ SIDES = ("left", "right")
 
 
 def _of_side(channel: Channel, side: int) -> Channel:
-    """What one side shows of a channel that both sides have."""
+    """Channel of one side, made from a channel of both sides."""
     name = f"{channel.name}_{SIDES[side]}"
     return dataclasses.replace(
         channel,
@@ -105,7 +104,7 @@ def _of_side(channel: Channel, side: int) -> Channel:
     )
 
 
-#: Of either kind of travel.
+#: Channels of straight travel and of turns.
 _EITHER: tuple[Channel, ...] = (
     Channel(
         name="total_current",
@@ -116,7 +115,7 @@ _EITHER: tuple[Channel, ...] = (
         range=(-2000.0, 2000.0),
         sd_largest=100.0,
         read=lambda robot, signals: signals.total_current,
-        where="drawn from the supply by all motors, with a duty that share of their current",
+        where="drawn from the supply by all motors; with a duty, that share of their current",
         rests_on=CURRENT,
         sd_share=0.02,
         resolution=3,
@@ -264,7 +263,7 @@ _EITHER: tuple[Channel, ...] = (
 )
 
 _BY_NAME = {c.name: c for c in _EITHER}
-#: Those of a robot that turns alone: of each side, and in the plane of the ground.
+#: Channels of robots that turn: of each side, and of the motion in the plane.
 OF_TURNS: tuple[Channel, ...] = (
     *(_of_side(_BY_NAME[f"motor_{what}"], side) for what in ("current", "speed", "voltage") for side in (0, 1)),
     Channel(
@@ -336,15 +335,15 @@ OF_TURNS: tuple[Channel, ...] = (
         )
     ),
 )
-#: Every channel that there is.
+#: All channels.
 EVERY: tuple[Channel, ...] = _EITHER + OF_TURNS
 
-#: Of a robot whose file states none.
+#: Channels of a robot whose file states none.
 USUAL = ("total_current", "motor_speed", "speed")
 
 
 def rows(names: Iterable[str]) -> tuple[Channel, ...]:
-    """The channels of these names, in the order of columns, arrays and reports, which is that of `EVERY`.
+    """The channels of these names, in the order of `EVERY`, which columns, arrays and reports follow.
 
     Raises:
         KeyError: no such channel.
@@ -356,12 +355,12 @@ def rows(names: Iterable[str]) -> tuple[Channel, ...]:
 
 
 def usual() -> tuple[Channel, ...]:
-    """Those of a robot without a rig."""
+    """The channels of a robot without a rig."""
     return rows(USUAL)
 
 
 def find(name: str) -> Channel:
-    """The channel of a name.
+    """The channel with this name.
 
     Raises:
         KeyError: no such channel.
@@ -370,15 +369,15 @@ def find(name: str) -> Channel:
 
 
 def names(shown: Iterable[Channel]) -> tuple[str, ...]:
-    """Names of channels, in order."""
+    """Names of the channels, in order."""
     return tuple(c.name for c in shown)
 
 
 def index(name: str, shown: Iterable[Channel]) -> int:
-    """Position of a channel in arrays of those that are shown.
+    """Position of a channel in arrays over the channels `shown`.
 
     Raises:
-        KeyError: it is not among them.
+        KeyError: `shown` does not contain the channel.
     """
     known = names(shown)
     if name not in known:

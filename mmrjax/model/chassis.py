@@ -19,8 +19,8 @@ class Chassis(eqx.Module):
 
     Attributes:
         on_tracks: 1 on tracks, 0 on wheels [-].
-        turning: what straight travel does not show.
-        lacks: balances that it has not; torque_constant, torque_gravity, backlash: of a `Shaft`, none here.
+        turning: parameters of the chassis that matter only in turns.
+        lacks: balances that it does not have; torque_constant, torque_gravity, backlash: of a `Shaft`, 0 here.
     """
 
     lacks: ClassVar[frozenset[str]] = frozenset()
@@ -56,16 +56,16 @@ class Chassis(eqx.Module):
 
     @property
     def speed_still(self) -> Scalar:
-        """Speed within which friction at rest is not resolved [m/s]."""
+        """Speed below which friction at rest is not resolved [m/s]."""
         return self.ground.friction.speed_rest
 
     @property
     def speed_grip(self) -> Scalar:
-        """Sliding speed V_s up to which the movers grip [m/s]."""
+        """Sliding speed V_s below which the movers grip [m/s]."""
         return self.ground.friction.speed_static
 
     def torque_weight(self, mass: Scalar, slope: Scalar) -> Scalar:
-        """Torque of gravity at rest against forward travel, at the driving wheel of one side of this mass [N·m]."""
+        """Torque of gravity at rest against forward travel, at the driving wheel of one side [N·m]."""
         return force_gravity(mass, slope, GRAVITY) * self.radius
 
 

@@ -1,4 +1,4 @@
-"""The conditions of runs: what is set from outside before a robot starts."""
+"""The conditions of runs: inputs that are set before a robot starts."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from mmrjax.model.robot import Robot
 
 Number = float | Sequence[float] | np.ndarray | Array
 
-#: Conditions that are stated of either side.
+#: Conditions that can be stated for each side.
 OF_SIDES = ("duty_left", "duty_right", "open_left", "open_right", "motor_speed_left", "motor_speed_right")
-#: Conditions that free a robot to turn where they are stated.
+#: Conditions that free a robot to turn if they are stated.
 OF_TURNS = (*OF_SIDES, "heading_deg")
 
 
@@ -37,8 +37,8 @@ class Named(eqx.Module):
 
     @staticmethod
     def of(words: np.ndarray) -> Named:
-        """From an array of names."""
-        # one word for all, as `Conditions` broadcasts it, is looked up once
+        """Encodes an array of names."""
+        # one name for all runs, as `Conditions` broadcasts it, is looked up once
         once = np.asarray(words[tuple(slice(1) if stride == 0 else slice(None) for stride in words.strides)])
         index, names = np.full(once.shape, -1, np.int32), list[str]()
         while (left := index < 0).any():
@@ -52,10 +52,10 @@ class Named(eqx.Module):
         return self.index.shape
 
     def among(self, names: Sequence[str]) -> Any:
-        """Returns the place of each run's name among some names.
+        """Position of each run's name in a sequence of names.
 
         Raises:
-            KeyError: a name of some run that is none of them; of conditions that are traced, of any.
+            KeyError: a run has a name that is not in the sequence; if the conditions are traced, any name is missing.
         """
         places = np.array([names.index(name) if name in names else -1 for name in self.names], int)
         traced = isinstance(self.index, jax.core.Tracer)
@@ -66,7 +66,7 @@ class Named(eqx.Module):
 
 
 class Conditions(eqx.Module):
-    """The conditions of one run, or of a batch: every field broadcast to one shape.
+    """The conditions of one run or of a batch; all fields broadcast to one shape.
 
     Attributes:
         configuration: which of the robot's configurations, its index; until `resolved` also by name (`Named`).
@@ -75,26 +75,27 @@ class Conditions(eqx.Module):
         payload: additional load mass m_c [kg].
         battery: 0 external supply (Source Mode 2), 1 on-board battery (Source Mode 1), eq. (8).
         discharge: charge C_b already taken from the battery [C].
-        adhesion: adhesion of this surface as a ratio to the one that the robot's friction is stated for [-].
-        total_mass: mass of robot and payload as weighed [kg]; None takes the robot's own mass and the payload.
+        adhesion: adhesion of this surface, as a ratio to that of the surface the robot's friction is stated for [-].
+        total_mass: weighed mass of robot and payload [kg]; None: the robot's own mass plus the payload.
         order: place in the sequence of runs; what drifts from run to run depends on it [-].
-        duty: share of the supply's voltage that the driver gives the motors, negative backward [-]; None: 1.
-        open: 1 where the motors' circuit is open, so that they coast; -1 where the driver shorts it, so that they
+        duty: share of the supply voltage that the driver applies to the motors, negative backward [-]; None: 1.
+        open: 1 if the motors' circuit is open, so that they coast; -1 if the driver shorts it, so that they brake at
+            any duty.
             brake whatever it does between pulses.
-        motor_speed: imposed on the motors' shafts [rad/s], whatever voltage that takes; None: the voltage is imposed.
-        motor_acceleration: of an imposed speed [rad/s²]; None: none.
-        motor_current: imposed on each motor [A], whatever voltage that takes; None: it follows.
-        begin: which of the beginnings of `Rig.begins` is a history's, its index; None: it starts from rest.
-        duty_left, duty_right: as `duty`, of either side; None: `duty`. Stating anything of a side makes the robot
+        motor_speed: speed imposed on the motor shafts [rad/s]; the voltage follows. None: the voltage is imposed.
+        motor_acceleration: of an imposed speed [rad/s²]; None: 0.
+        motor_current: current imposed on each motor [A]; the voltage follows. None: the current follows.
+        begin: index of the history's beginning in `Rig.begins`; None: it starts from rest.
+        duty_left, duty_right: as `duty`, for each side; None: `duty`. Stating any condition of a side makes the robot
             free to turn.
-        open_left, open_right: as `open`, of either side; None: `open`.
-        motor_speed_left, motor_speed_right: as `motor_speed`, of either side; None: `motor_speed`.
-        heading_deg: at the start, from uphill, positive to the left [deg]; None: 0. It too frees the robot to turn.
+        open_left, open_right: as `open`, for each side; None: `open`.
+        motor_speed_left, motor_speed_right: as `motor_speed`, for each side; None: `motor_speed`.
+        heading_deg: at the start, from uphill, positive to the left [deg]; None: 0. It also frees the robot to turn.
         adhesion_lateral: as `adhesion`, across the travel; None: `adhesion`.
-        levers_front_deg, levers_rear_deg: angles at which the levers stand, 0 along the wheelbase outward, positive
-            up, 180 folded [deg]; None: those of the running gear, as folded as it states them.
-        load_torque: torque of a brake, or of a motor as the load, on the output of each drive [N·m]: positive against
-            forward rotation, whichever way it turns; of a load on a shaft alone; None: none.
+        levers_front_deg, levers_rear_deg: lever angles, 0 along the wheelbase outward, positive up, 180 folded [deg];
+            None: those of the running gear, folded as it states.
+        load_torque: torque of a brake or load motor on the output of each drive [N·m]: positive against forward
+            rotation, in both directions of rotation. Only for a load on a shaft; None: 0.
     """
 
     configuration: Any  # Int[Array, "..."] | Named
@@ -153,7 +154,7 @@ class Conditions(eqx.Module):
         levers_rear_deg: Number | None = None,
         load_torque: Number | None = None,
     ) -> None:
-        # arrays are of other conditions, or of a table; what a user writes down is a number or some
+        # arrays come from other conditions or a table; users write a number or a few
         if not isinstance(duty, np.ndarray | jax.Array | None) and None not in (duty_left, duty_right):
             raise UsageError(sides_contradict(("duty", *OF_SIDES[:2])))
         duty = 1.0 if duty is None else duty
@@ -180,7 +181,7 @@ class Conditions(eqx.Module):
             said = ", ".join(f"{name} {s}" for name, s in by_name.items() if s)
             raise ValueError(f"Conditions: shapes do not broadcast to one another: {said}") from None
         self.configuration = jax.tree.map(lambda x: _broadcast(x, shape), which)
-        # the same number for all is one array: most fields of a large batch are 0 or 1
+        # an equal number for all runs is stored once: most fields of a large batch are 0 or 1
         shared: dict[float, Array] = {}
         for k, value in enumerate(given):
             if not isinstance(value, float):
@@ -203,31 +204,31 @@ class Conditions(eqx.Module):
 
     @property
     def voltage_follows(self) -> bool:
-        """Whether the motors' voltage is what an imposed speed or current takes."""
+        """True if the motor voltage follows from an imposed speed or current."""
         return self.motor_speed is not None or self.motor_current is not None
 
     @property
     def polarity(self) -> Array:
-        """Sign of a duty that drives forward, ±1: that of the supply's voltage; of a battery 1."""
+        """Sign of a duty that drives forward, ±1: the sign of the supply voltage; 1 on the battery."""
         return jnp.where((jnp.asarray(self.battery) < 0.5) & (jnp.asarray(self.voltage) < 0), -1.0, 1.0)
 
     @property
     def states_levers(self) -> bool:
-        """Whether it is stated at which angles levers stand: the robot then rests on what they leave it."""
+        """True if lever angles are stated; the robot then rests on the contacts that they leave."""
         return self.levers_front_deg is not None or self.levers_rear_deg is not None
 
     @property
     def turns(self) -> bool:
-        """Whether the sides are driven apart, or the robot heads elsewhere than uphill: it is then free to turn."""
+        """True if the sides are driven apart or the heading is not uphill; the robot is then free to turn."""
         return any(getattr(self, name) is not None for name in OF_TURNS)
 
     def straight(self) -> Conditions:
-        """The same of a robot whose sides are driven alike, uphill."""
+        """Same conditions without any that belong to one side, heading uphill."""
         alike: dict[str, Any] = dict.fromkeys(OF_TURNS)
         return dataclasses.replace(self, **alike)
 
     def of_sides(self) -> Conditions:
-        """Those of left and right side, a leading axis of 2."""
+        """Conditions of left and right side, with a leading axis of 2."""
 
         def side(name: str) -> Conditions:
             stated = {key: getattr(self, f"{key}_{name}") for key in ("duty", "open", "motor_speed")}
@@ -242,26 +243,28 @@ class Conditions(eqx.Module):
         return self.slope_deg * (math.pi / 180)
 
     def resolved(self, robot: Robot) -> Conditions:
-        """The same with names of configurations replaced by their indices in `robot`.
+        """Same conditions with configuration names replaced by their indices in `robot`.
 
         Raises:
-            KeyError: a name that the robot does not have; the message lists those that it has.
+            KeyError: a name is no configuration of the robot; the message lists the robot's configurations.
         """
         if not isinstance(self.configuration, Named):
             return self
         try:
             which = self.configuration.among(robot.configurations.names)
         except KeyError as error:
-            robot.configurations.index(error.args[0])  # which says what there is
+            robot.configurations.index(error.args[0])  # raises a KeyError that lists the valid names
             raise
         return dataclasses.replace(self, configuration=which)
 
 
 def sides_contradict(stated: Collection[str]) -> str:
-    """What is wrong where conditions of these names impose the speed of one side's motor and not the other's, or a
-    duty beside those of both sides; empty where nothing is."""
+    """Error message if conditions of these names contradict each other, else an empty string.
+
+    They do if only one side's motor speed is imposed, or if a side's duty is stated together with that of both.
+    """
     if {"duty", *OF_SIDES[:2]} <= {*stated}:
-        return f"duty: got it beside {' and '.join(OF_SIDES[:2])}; expected one of the two"
+        return f"duty: got it together with {' and '.join(OF_SIDES[:2])}; expected one of the two"
     left, right = (name in stated for name in OF_SIDES[-2:])
     if left == right or "motor_speed" in stated:
         return ""
@@ -270,12 +273,12 @@ def sides_contradict(stated: Collection[str]) -> str:
 
 
 def _number(x: Any, kind: type = float) -> Any:
-    """Numbers of that kind, of NumPy where they are not JAX's yet: no operation of JAX is compiled for them."""
+    """Array of numbers of that kind; NumPy input stays NumPy's, so that no JAX operation is compiled for it."""
     return jnp.asarray(x, kind) if isinstance(x, jax.Array) else np.asarray(x, kind)
 
 
 def _broadcast(x: Any, shape: tuple[int, ...]) -> Any:
-    """An array of that shape; of numbers that are not JAX's yet where JAX is single NumPy's, which keeps digits."""
+    """Array of that shape; NumPy input stays NumPy's if JAX computes in single precision, to keep its digits."""
     if isinstance(x, jax.Array):
         return jnp.broadcast_to(x, shape)
     return jax.device_put(np.broadcast_to(x, shape)) if is_double() else np.broadcast_to(x, shape)

@@ -51,7 +51,7 @@ class Friction(eqx.Module):
     speed_static: Scalar = parameter(
         0.02,
         unit="m/s",
-        meaning="V_s, sliding speed at which μ_s is reached",
+        meaning="sliding speed V_s that reaches μ_s",
         bounds=(1e-4, 2.0),
         relative_sd=1.0,
         source=_SLIPS,
@@ -59,7 +59,7 @@ class Friction(eqx.Module):
     speed_dynamic: Scalar = parameter(
         0.2,
         unit="m/s",
-        meaning="V_d, sliding speed from which μ_d holds",
+        meaning="sliding speed V_d above which μ_d holds",
         bounds=(1e-3, 20.0),
         relative_sd=0.5,
         source=_PACKAGE,
@@ -67,22 +67,24 @@ class Friction(eqx.Module):
 
     @property
     def speed_rest(self) -> Scalar:
-        """Speed within which a direction fades and a robot is said to stand, a tenth of V_s [m/s].
+        """Speed below which a robot counts as at rest, a tenth of V_s [m/s]; directions are smoothed within it.
 
         Friction at rest is then resolved on the same scale as sliding.
         """
         return 0.1 * self.speed_static
 
     def coefficient(self, speed: Scalar) -> Scalar:
-        """Friction coefficient [-] at sliding `speed` [m/s], of the speed's sign."""
+        """Friction coefficient [-] at sliding `speed` [m/s], with the sign of the speed."""
         size = jnp.abs(speed)
         falling = step(size, self.speed_static, self.static, self.speed_dynamic, self.dynamic)
         rising = self.static * direction(speed, self.speed_static)
         return jnp.where(size < self.speed_static, rising, jnp.sign(speed) * falling)
 
     def per_speed(self, square: Scalar) -> Scalar:
-        """Coefficient over sliding speed [s/m] at the square of that speed [m²/s²]: finite at rest, with its
-        derivatives."""
+        """Coefficient over sliding speed [s/m] at the square of that speed [m²/s²].
+
+        Finite at rest, with finite derivatives.
+        """
         slow = square < self.speed_static**2
         creeping = self.static * (3 - square / self.speed_static**2) / (2 * self.speed_static)
         size = jnp.sqrt(jnp.where(slow, self.speed_static**2, square))
@@ -90,14 +92,14 @@ class Friction(eqx.Module):
         return jnp.where(slow, creeping, falling / size)
 
     def per_speed_rise(self, square: Scalar) -> Scalar:
-        """Derivative of `per_speed` by that square [s³/m³]."""
+        """Derivative of `per_speed` with respect to that square [s³/m³]."""
         slow = square < self.speed_static**2
         size = jnp.sqrt(jnp.where(slow, self.speed_static**2, square))
         falling = (self.rise(size) - self.per_speed(square)) / (2 * size**2)
         return jnp.where(slow, -self.static / (2 * self.speed_static**3), falling)
 
     def rise(self, speed: Scalar) -> Scalar:
-        """How fast the coefficient rises with sliding `speed` [s/m]; negative between V_s and V_d."""
+        """Derivative of the coefficient with respect to sliding `speed` [s/m]; negative between V_s and V_d."""
         size, width = jnp.abs(speed), self.speed_dynamic - self.speed_static
         u = jnp.clip((size - self.speed_static) / width, 0.0, 1.0)
         x = jnp.clip(speed / self.speed_static, -1.0, 1.0)
@@ -105,10 +107,10 @@ class Friction(eqx.Module):
         return jnp.where(size < self.speed_static, rising, (self.dynamic - self.static) * 6 * u * (1 - u) / width)
 
     def speed_creep(self, coefficient: Scalar) -> Scalar:
-        """Sliding speed [m/s] at which static friction gives `coefficient`: the inverse below V_s.
+        """Sliding speed [m/s] for a static friction coefficient: the inverse of the law below V_s.
 
-        x (3 - x²) / 2 = sin 3θ for x = 2 sin θ, so v = 2 V_s sin(asin(μ/μ_s) / 3). Beyond ±μ_s there is
-        none; ±V_s is returned, with a zero derivative.
+        x (3 - x²) / 2 = sin 3θ for x = 2 sin θ, so v = 2 V_s sin(asin(μ/μ_s) / 3). A coefficient beyond ±μ_s has no
+        such speed; ±V_s is returned, with a zero derivative.
         """
         share = coefficient / self.static
         within = jnp.abs(share) < 1.0
@@ -129,16 +131,16 @@ def force_contact(
 
     Args:
         gap: distance q [m]; gap_rate: its rate q̇ [m/s]; gap_free: q_0 = r_1 + r_2 [m], eq. (29).
-        stiffness: c [N/m^e]; exponent: e [-]; damping: b_max [N·s/m]; depth: d [m], at which the damping
-            is full (cubic step of Fig. 9a, from 0 at q_0).
+        stiffness: c [N/m^e]; exponent: e [-]; damping: b_max [N·s/m]; depth: penetration d [m] for full damping
+            (cubic step of Fig. 9a, from 0 at q_0).
     """
     h = gap_free - gap
     touching = h > 0
-    deep = jnp.where(touching, h, depth)  # a value with a finite derivative where there is no contact
+    deep = jnp.where(touching, h, depth)  # a value with a finite derivative when there is no contact
     force = stiffness * deep**exponent - damping * gap_rate * step(deep, 0.0, 0.0, depth, 1.0)
     return jnp.where(touching, jnp.maximum(force, 0.0), 0.0)
 
 
 def damping_contact(force: Scalar, gap: Scalar, gap_free: Scalar, damping: Scalar, depth: Scalar) -> Scalar:
-    """How fast a `force` given by `force_contact` falls with the gap's rate [N·s/m]; its arguments."""
+    """Damping of a `force` from `force_contact`: its decrease with the gap's rate [N·s/m]; same arguments."""
     return jnp.where(force > 0, damping * step(gap_free - gap, 0.0, 0.0, depth, 1.0), 0.0)

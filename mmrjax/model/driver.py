@@ -1,4 +1,4 @@
-"""Motor driver: the bridge between supply and motors, its current limit, and the controller of a demanded speed."""
+"""Motor driver: the bridge between supply and motors, its current limit, and the speed controller."""
 
 from __future__ import annotations
 
@@ -8,43 +8,42 @@ import jax.numpy as jnp
 from mmrjax.model.params import Scalar, parameter
 from mmrjax.numerics.one_sided import at_least, clip
 
-#: How fast the duty falls beyond the current limit, per limit exceeded by its own size [-]: 0.1 % over takes 0.5.
+#: Slope of the duty beyond the current limit, per relative excess [-]: an excess of 0.1 % lowers the duty by 0.5.
 STEEPNESS = 500.0
 #: Duty below which a driver gives no pulses [-].
 LEAST_DUTY = 1e-9
 
 
-#: What a bridge does between the pulses of a duty: it shorts the motors, or lets them coast.
+#: State of the bridge between the pulses of a duty: motors shorted (`slow`), or coasting (`fast`).
 DECAYS = SLOW, FAST = "slow", "fast"
 
 
 class Driver(eqx.Module):
-    """A bridge that gives the motors the supply's voltage in pulses; D is their share of a period, with their sign.
+    """A bridge that applies the supply voltage in pulses; the duty D is their signed share of a period.
 
     It is lossless and its ripple is not resolved: voltage and current are means over a period.
 
-    Slow decay, the bridge shorts the motors between pulses and the current flows on: U = D U_s, I_s = D I.
+    Slow decay: the bridge shorts the motors between pulses and the current continues. U = D U_s, I_s = D I.
 
-    Fast decay, it lets go of them and the current ends within each period, so that they coast between pulses:
-    U = D U_s + (1 - |D|) E and I = |D| (±U_s - E) / R, all of which the supply gives, I_s = ±I; the mean of I² is
-    I²/|D|. This takes pulses and pauses long against L/R, whose rise and fall then cancel in the mean; with shorter
-    ones the current flows on through the pauses, at the latest where D exceeds (1 + E/U_s)/2. Mohan, Undeland and
-    Robbins, Power Electronics (2003), chapter 7, of the discontinuous conduction of such a stage. At |D| = 1 both
-    are the same.
+    Fast decay: the bridge disconnects the motors and the current ends within each period, so that they coast between
+    pulses. U = D U_s + (1 - |D|) E and I = |D| (±U_s - E) / R. The supply gives all of it, I_s = ±I, and the mean of
+    I² is I²/|D|. This holds for pulses and pauses long compared with L/R, whose rise and fall cancel in the mean.
+    With shorter ones the current continues through the pauses, at the latest above D = (1 + E/U_s)/2 (discontinuous
+    conduction: Mohan, Undeland and Robbins, Power Electronics, 2003, chapter 7). At |D| = 1 both are equal.
 
     Attributes:
         decay: `slow` or `fast`.
-        returns_current: whether supply and bridge take current back from motors that are driven; where not, a diode
-            keeps it from flowing, and motors that turn faster than the supply would turn them coast.
+        returns_current: True if supply and bridge take current back from driven motors. If False, a diode blocks it,
+            and motors that turn faster than the supply would turn them coast.
     """
 
     current_limit: Scalar = parameter(
         1000.0,
         unit="A",
-        meaning="largest current of one motor that the driver lets flow",
+        meaning="largest current of one motor that the driver permits",
         bounds=(0.01, 1e4),
         relative_sd=0.1,
-        source="none on the bench: above any current",
+        source="no limit on the bench: above any current",
     )
     gain: Scalar = parameter(
         4.0,
@@ -57,7 +56,7 @@ class Driver(eqx.Module):
     time_reset: Scalar = parameter(
         0.05,
         unit="s",
-        meaning="reset time of the speed controller: how long its integral takes to repeat the proportional answer",
+        meaning="reset time of the speed controller: time in which its integral repeats the proportional action",
         bounds=(1e-3, 1e3),
         relative_sd=0.1,
         source="assumed; the paper has no controller",
@@ -66,7 +65,7 @@ class Driver(eqx.Module):
     decay: str = eqx.field(default=SLOW, static=True)
 
     def voltage(self, source: Scalar, duty: Scalar, pause: Scalar, back: Scalar) -> Scalar:
-        """Mean voltage at the motors [V]; `pause`: share of a period without a pulse [-]; `back`: their E [V]."""
+        """Mean voltage at the motors [V]; `pause`: share of a period without pulses [-]; `back`: back-EMF E [V]."""
         pulses = duty * source
         return pulses + pause * back if self.decay == FAST else pulses
 
@@ -75,32 +74,34 @@ class Driver(eqx.Module):
         return jnp.sign(duty) if self.decay == FAST else duty
 
     def ripple(self, duty: Scalar) -> Scalar:
-        """Mean of the square of the current over the square of its mean [-]; 1 where no pulse makes one flow."""
+        """Mean square of the current over the square of its mean [-]; 1 if no pulse drives a current."""
         if self.decay != FAST:
             return 1.0
         pulsed = jnp.abs(duty) > LEAST_DUTY
         return jnp.where(pulsed, 1 / jnp.where(pulsed, jnp.abs(duty), 1.0), 1.0)
 
     def duty_limited(self, duty: Scalar, current: Scalar, polarity: Scalar = 1.0) -> Scalar:
-        """Duty D [-] that holds the motor's `current` [A] at the limit, between -1 and 1; `polarity`: sign of the
-        supply's voltage."""
+        """Duty D [-], -1 to 1, that holds the motor's `current` [A] at the limit.
+
+        `polarity` is the sign of the supply voltage.
+        """
         over = at_least(0.0, jnp.abs(current) / self.current_limit - 1)
         return clip(duty - polarity * jnp.sign(current) * STEEPNESS * over, -1.0, 1.0)
 
     def limits(self, current: Scalar) -> Scalar:
-        """Whether the limit acts at a motor's `current` [A]."""
+        """True if the limit acts at a motor `current` [A]."""
         return jnp.abs(current) > self.current_limit
 
     def blocks(self, duty: Scalar, current: Scalar, open_circuit: Scalar) -> Scalar:
-        """Whether nothing holds the motors' terminals, which are then at the back-EMF.
+        """True if the motor terminals are free, and therefore at the back-EMF.
 
-        The circuit is open, or the diode of a supply that takes nothing back keeps a current from flowing there.
+        The circuit is open, or the diode of a supply that takes no current back blocks it.
         """
         blocked = jnp.asarray(open_circuit) > 0.5
         return blocked if self.returns_current else blocked | (duty * current < 0)
 
     def demand(self, error: Scalar, integral: Scalar, speed: Scalar, constant: Scalar) -> Scalar:
-        """Voltage [V] by which a demanded motor speed is followed: PI with the back-EMF fed forward.
+        """Voltage [V] of the speed controller: PI with the back-EMF fed forward.
 
         U = C_E (ω* + K (e + 1/T ∫ e dt)).
 

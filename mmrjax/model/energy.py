@@ -1,4 +1,4 @@
-"""Energy: where the power of an instant comes from and goes, and what is stored."""
+"""Energy: sources and sinks of the power of an instant, and the energy stored."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY, PlaneMotion, Signals
 from mmrjax.numerics.trigonometry import sine
 
-#: Where energy goes, in the order of the chain: name, and what it is.
+#: Sinks of energy, in the order of the drive chain: name and description.
 SINKS: dict[str, str] = {
     "battery": "heat in the battery's cells",
-    "other": "the other consumers on the battery",
+    "other": "other consumers on the battery",
     "driver": "driver and wiring: open bridge, diode, and drops on the way to the motors",
     "winding": "heat in windings, leads and brushes",
     "motor": "friction of the motors",
@@ -30,21 +30,23 @@ SINKS: dict[str, str] = {
 
 
 def source(robot: Robot, conditions: Conditions, signals: Signals) -> Scalar:
-    """Power that the source gives [W], negative where it takes some back: the battery's charge at no-load voltage, or
-    what the external supply delivers."""
+    """Power of the source [W], negative if it takes power back.
+
+    For the battery, its current times the no-load voltage; for the external supply, its output.
+    """
     battery = robot.battery
     chemical = battery.cells * battery.voltage_no_load(signals.discharge) * battery.current(signals.total_current)
     return jnp.where(conditions.battery > 0.5, chemical, signals.voltage_source * signals.total_current)
 
 
 def sinks(robot: Robot, conditions: Conditions, signals: Signals) -> dict[str, Scalar]:
-    """Power that goes each way of `SINKS` [W], of all motors and sides.
+    """Power into each of `SINKS` [W], over all motors and sides.
 
-    With what drives inductances and masses (`stored`) they add up to `source`, at every instant.
+    Together with the change of the energy `stored` they add up to `source` at each instant.
     """
     sides, battery, on_battery = robot.sides, robot.battery, conditions.battery > 0.5
     load = battery.current(signals.total_current)
-    own = signals.torque_load - signals.torque_track_loss  # at the wheel, of the ground and of effects of the gearbox
+    own = signals.torque_load - signals.torque_track_loss  # at the wheel: ground, and effects of the gearbox
     ground = signals.traction * signals.speed_theoretical
     into = signals.torque_input * signals.speed_motor - signals.torque_gear * signals.speed_wheel
     return {
@@ -70,7 +72,7 @@ def stored(robot: Robot, signals: Signals) -> Scalar:
 
 
 def sinks_turning(robot: Robot, conditions: Conditions, travel: Travel) -> dict[str, Scalar]:
-    """The same of a robot that turns: sliding is Σ F·u over all contacts, lift follows its heading."""
+    """Same as `sinks` for a robot that turns: sliding is Σ F·u over all contacts, lift follows its heading."""
     signals = travel.signals
     each = jax.vmap(lambda c, s: sinks(robot, c, s))(conditions.of_sides(), signals)
     found: dict[str, Scalar] = {name: jnp.mean(jnp.asarray(power)) for name, power in each.items()}
@@ -85,7 +87,7 @@ def sinks_turning(robot: Robot, conditions: Conditions, travel: Travel) -> dict[
 
 
 def stored_turning(robot: Robot, travel: Travel, motion: PlaneMotion) -> Scalar:
-    """The same of a robot that turns, lateral and yaw motion with it [J]."""
+    """Same as `stored` for a robot that turns, with lateral and yaw motion [J]."""
     signals = dataclasses.replace(travel.signals, speed=jnp.broadcast_to(motion.speed, (2,)))
     turning = robot.chassis(jnp.max(jnp.asarray(signals.configuration))).turning
     own = jnp.mean(jax.vmap(lambda s: stored(robot, s))(signals))

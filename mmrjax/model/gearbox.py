@@ -8,21 +8,21 @@ import jax.numpy as jnp
 from mmrjax.model.params import Scalar, parameter
 from mmrjax.model.signals import quotient
 
-#: Torque below which the gearbox transmits none, so that rounding does not decide which way power flows [N·m].
+#: Torque below which the gearbox counts as unloaded, so that rounding does not decide the direction of power [N·m].
 NO_TORQUE = 1e-12
 
 
 class Gearbox(eqx.Module):
     """M_r = i η_rm (M_d - M_rf_idle) with M_rf_idle = M_rf0 sign ω + K_fr ω.
 
-    Driven from the output (overhauling) the load loss turns round: M_r = (i / η_b) (M_d - M_rf_idle) with the
-    efficiency η_b of `efficiency_backward`, which the paper leaves out because it never coasts; without it a descent
-    would gain energy.
+    Driven from the output (overhauling), the load loss changes direction: M_r = (i / η_b) (M_d - M_rf_idle) with the
+    efficiency η_b of `efficiency_backward`. The paper leaves it out because its robot never coasts; without it a
+    descent would gain energy.
 
     Attributes:
-        mesh_theory: η_b by the theory of the mesh, 2 - 1/η_rm; else equal to η_rm.
-        speed_limit: at the input [rad/s]; torque_limit: for long, at the driving wheel, where the total ratio ends
-            [N·m], None where not stated.
+        mesh_theory: True: η_b = 2 - 1/η_rm, the theory of the mesh; False: η_b = η_rm.
+        speed_limit: at the input [rad/s]; torque_limit: continuous, at the driving wheel, where the total ratio ends
+            [N·m], None if not stated.
     """
 
     ratio: Scalar = parameter(
@@ -58,16 +58,16 @@ class Gearbox(eqx.Module):
         source="Table 2: 1.4e-3 mN·m·s",
     )
     speed_limit: float = eqx.field(default=8_000 * 0.10471975511965977, static=True)  # 8000 rpm input, catalogue
-    # GP32C 166936, maker's sheet: 3 N·m at its output for long, 3.75 for short; times the belt stage 25/12 [N·m]
+    # GP32C 166936, maker's sheet: at its output 3 N·m continuous, 3.75 short-term; times the belt stage 25/12 [N·m]
     torque_limit: float | None = eqx.field(default=3.0 * 25 / 12, static=True)
     mesh_theory: bool = eqx.field(default=False, static=True)
 
     @property
     def efficiency_backward(self) -> Scalar:
-        """η_b, load driving the motor [-]: η_rm, or by the theory of the mesh 2 - 1/η_rm, at least 0.02.
+        """Efficiency η_b with the load driving the motor [-]: η_rm, or 2 - 1/η_rm by the theory of the mesh.
 
-        A loss in proportion to the force in the mesh is (1/η - 1) of the power that leaves it, whichever way that
-        flows; from η = 1/2 down such a gear locks itself.
+        Bounded below by 0.02. A loss in proportion to the mesh force is (1/η - 1) of the power that leaves the mesh,
+        in both directions; a gear with η <= 1/2 is self-locking.
         """
         if not self.mesh_theory:
             return self.efficiency_load
@@ -78,10 +78,10 @@ class Gearbox(eqx.Module):
         return self.friction_coulomb * direction + self.friction_viscous * speed
 
     def efficiency_flow(self, transmitted: Scalar, direction: Scalar) -> Scalar:
-        """η_rm where power flows to the wheels, 1/η_b where it flows back, fading to 1 at rest with `direction` [-].
+        """η_rm if power flows to the wheels, 1/η_b if it flows back, fading to 1 at rest with `direction` [-].
 
-        `transmitted` is the input torque less the idle torque [N·m]. Without any, the efficiency is that of a load
-        about to grow: power flows to the wheels.
+        `transmitted` is the input torque less the idle torque [N·m]. If it is 0, the efficiency is that of a small
+        load: power flows to the wheels.
         """
         way = jnp.where(jnp.abs(transmitted) > NO_TORQUE, jnp.sign(transmitted), jnp.sign(direction))
         flow = way * direction

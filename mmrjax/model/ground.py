@@ -10,12 +10,12 @@ from mmrjax.model.params import Scalar, parameter
 from mmrjax.model.signals import quotient
 from mmrjax.numerics.trigonometry import sine
 
-#: Least load by which a demand is divided, beyond what it can hold [N].
+#: Least normal load that divides a demand, beyond the traction it can hold [N].
 NO_LOAD = 1e-9
 
 
 class Ground(eqx.Module):
-    """What the surface does to one mover: it resists, and it holds."""
+    """Resistance and adhesion of the surface for one mover."""
 
     friction: Friction
     rolling_resistance: Scalar = parameter(
@@ -39,17 +39,17 @@ class Ground(eqx.Module):
         return self.friction.coefficient(speed_sliding) * adhesion * normal
 
     def traction_rise(self, speed_sliding: Scalar, normal: Scalar, adhesion: Scalar) -> Scalar:
-        """How fast that traction rises with `speed_sliding` [N·s/m]."""
+        """Derivative of `traction` with respect to `speed_sliding` [N·s/m]."""
         return self.friction.rise(speed_sliding) * adhesion * normal
 
     def speed_creep(self, demand: Scalar, normal: Scalar, adhesion: Scalar) -> Scalar:
-        """Sliding speed [m/s] at which the contact carries `demand` [N]."""
-        # Nothing presses on a vertical ground: a quotient of nothing would make NaN of a whole batch's derivatives.
+        """Sliding speed [m/s] for a traction equal to `demand` [N]."""
+        # A vertical ground carries no normal load: 0 / 0 would make the derivatives of the whole batch NaN.
         return self.friction.speed_creep(demand / jnp.maximum(adhesion * normal, NO_LOAD))
 
 
 def force_gravity(mass: Scalar, slope: Scalar, gravity: float) -> Scalar:
-    """Downhill pull m g sin α [N], eq. (1)."""
+    """Downhill force m g sin α [N], eq. (1)."""
     return mass * gravity * sine(slope)
 
 

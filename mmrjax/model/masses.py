@@ -17,15 +17,15 @@ from mmrjax.undercarriage.running_gear import RunningGear
 
 
 class Masses(eqx.Module):
-    """Masses of half a robot [kg, m, kg·m²].
+    """Masses and inertias of half a robot [kg, m, kg·m²].
 
     Attributes:
-        chassis: mass of all that does not turn with the pulleys.
+        chassis: mass of all parts that do not turn with the pulleys.
         forward, up: its centre from the middle of the wheelbase.
         inertia: its moment of inertia in pitch about that centre.
-        body: mass of what neither turns nor is lever, track or payload.
-        pulley: mass of what turns on one axle: main and additional pulley, in 4W2T the wheel.
-        inertia_pulley: about its axle, front and rear alike: half of J_w of eq. (31) each.
+        body: mass without pulleys, wheels, tracks, levers and payload.
+        pulley: mass on one axle that turns with it: main and additional pulley, in 4W2T the wheel.
+        inertia_pulley: about its axle, front and rear equal: half of J_w of eq. (31) each.
     """
 
     chassis: Scalar
@@ -38,13 +38,18 @@ class Masses(eqx.Module):
 
     @property
     def centre(self) -> tuple[Scalar, Scalar]:
-        """Centre of mass of all, ahead of the middle of the wheelbase and above it [m]; pulleys sit on the axles."""
+        """Centre of mass of all parts, ahead of the middle of the wheelbase and above it [m].
+
+        Pulleys sit on the axles.
+        """
         share = self.chassis / (self.chassis + 2 * self.pulley)
         return share * self.forward, share * self.up
 
     def pitching(self, wheelbase: Scalar) -> Scalar:
-        """Moment of inertia in pitch of all about the middle of the wheelbase, where pulleys do not turn on their
-        axles [kg·m²]; J of the pulleys about their axles apart."""
+        """Moment of inertia in pitch of all parts about the middle of the wheelbase [kg·m²].
+
+        Pulleys do not turn on their axles; their own inertia J about the axles is not included.
+        """
         return self.inertia + self.chassis * (self.forward**2 + self.up**2) + self.pulley * wheelbase**2 / 2
 
     def inertia_pitch(self, wheelbase: Scalar) -> Scalar:
@@ -54,8 +59,7 @@ class Masses(eqx.Module):
 
 
 class _Part(NamedTuple):
-    """A rigid part: its mass [kg], its centre from the middle of the wheelbase [m], its moment of inertia in pitch
-    about that centre [kg·m²]."""
+    """A rigid part: mass [kg], centre from the middle of the wheelbase [m], inertia in pitch about it [kg·m²]."""
 
     mass: Scalar
     forward: Scalar
@@ -73,7 +77,7 @@ def _together(parts: list[_Part]) -> _Part:
 
 
 def _belt(gear: RunningGear, radius: Scalar) -> _Part:
-    """A main track round its pulleys, its inertia less what turns with them, m r², which is in J_w."""
+    """A main track round its pulleys; its inertia is reduced by m r², which is in J_w and turns with the pulleys."""
     base, mass = gear.wheelbase, gear.belt_mass
     straights = 2 * base * (base**2 / 12 + radius**2)
     arcs = 2 * radius * (jnp.pi * base**2 / 4 + 2 * base * radius + jnp.pi * radius**2)
@@ -83,8 +87,10 @@ def _belt(gear: RunningGear, radius: Scalar) -> _Part:
 
 
 def lever_angles(gear: RunningGear, conditions: Conditions) -> tuple[Scalar, Scalar]:
-    """Angles of front and rear levers, 0 along the wheelbase outward, positive up [rad]: those that the conditions
-    state, else those of the running gear, whose rear one is measured from forward."""
+    """Angles of front and rear levers, 0 along the wheelbase outward, positive up [rad].
+
+    They come from the conditions, else from the running gear, which measures the rear one from forward.
+    """
     front, rear = conditions.levers_front_deg, conditions.levers_rear_deg
     return (
         gear.lever_front if front is None else jnp.radians(front),
@@ -105,17 +111,16 @@ def _levers(gear: RunningGear, tracked: Scalar, front: Scalar, rear: Scalar) -> 
 def masses(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
     """Masses of half a robot whose total with payload is `mass` [kg], as `balances.begin` gives it.
 
-    The body has what pulleys, wheels, tracks, levers and payload leave of the mass, and its radius of gyration; the
-    moment of inertia follows from the parts, wherever the levers stand. Where the robot states that of the whole with
-    its levers folded and without payload (`inertia_tracked`, `inertia_wheeled`), the body's is what the other parts
-    leave of that.
+    The body's mass is the rest after pulleys, wheels, tracks, levers and payload; it has its own radius of gyration.
+    The moment of inertia is summed over the parts at the lever angles. A robot may state the inertia of the whole
+    with folded levers and without payload (`inertia_tracked`, `inertia_wheeled`); the body's is then the difference.
     """
     fixed, levers, body, pulley, inertia_pulley = _of_robot(robot, conditions, mass)
     return Masses(*_together([*fixed, *levers]), body, pulley, inertia_pulley)
 
 
 def without_levers(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
-    """The same of all but the levers, which stand on their axles."""
+    """Same as `masses` without the levers, which rest on their axles."""
     fixed, _, body, pulley, inertia_pulley = _of_robot(robot, conditions, mass)
     return Masses(*_together(fixed), body, pulley, inertia_pulley)
 
@@ -123,7 +128,7 @@ def without_levers(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses
 def _of_robot(
     robot: Robot, conditions: Conditions, mass: Scalar
 ) -> tuple[list[_Part], list[_Part], Scalar, Scalar, Scalar]:
-    """Parts fixed in the chassis, levers, mass of the body, mass and inertia of what turns on an axle."""
+    """Parts fixed in the chassis, levers, mass of the body, mass and inertia of the parts that turn on an axle."""
     kind, gear = robot.chassis(conditions.configuration), robot.running_gear
     tracked = kind.on_tracks
     wheeled = 1 - tracked
@@ -151,10 +156,10 @@ def _of_robot(
 
 
 def check_parts(robot: Robot) -> None:
-    """Refuse a robot of which nothing is left for the body.
+    """Raises if the parts of a robot leave no mass or inertia for its body.
 
     Raises:
-        ValueError: its parts weigh as much as a configuration, or have more inertia than is stated of the whole.
+        ValueError: the parts weigh as much as a configuration, or have more inertia than stated for the whole.
     """
     without = {"body_gyration": 0.0, "inertia_tracked": 0.0, "inertia_wheeled": 0.0}
     folded = {"lever_front": np.pi, "lever_rear": 0.0}
@@ -166,7 +171,7 @@ def check_parts(robot: Robot) -> None:
             parts = np.max(np.asarray(chassis.mass - robot.sides * half.body))
             raise ValueError(
                 f"{name}.mass: got {np.min(np.asarray(chassis.mass)):.3g} kg; expected more than {parts:.3g} kg, "
-                "what its pulleys, wheels, tracks and levers weigh (running_gear.pulley_mass and the like)"
+                "the mass of its pulleys, wheels, tracks and levers (running_gear.pulley_mass and others)"
             )
         whole = "inertia_tracked" if chassis.on_tracks > 0.5 else "inertia_wheeled"
         stated = np.asarray(getattr(robot.running_gear, whole))
@@ -174,5 +179,5 @@ def check_parts(robot: Robot) -> None:
         if np.any((stated > 0) & (stated <= least)):
             raise ValueError(
                 f"running_gear.{whole}: got {np.min(stated):.3g} kg·m^2; expected 0, or more than "
-                f"{np.max(least):.3g} kg·m^2, what the parts of {name} have without the body's own"
+                f"{np.max(least):.3g} kg·m^2, the inertia of the parts of {name} without the body's own"
             )

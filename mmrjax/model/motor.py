@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import Array
 
 from mmrjax.model.params import Scalar, parameter
 
 _SHEET = "maker's sheet of RE30 310007 (24 V, 60 W)"
 
-#: Temperature for which makers state the resistance of a winding [°C].
+#: Winding temperature at which makers state the resistance [°C].
 TEMPERATURE_REFERENCE = 25.0
-UNLIMITED = 1e9  # of a limit that nobody states, in its unit
-_LONG = 1e6  # s, many of a motor's time constants
+UNLIMITED = 1e9  # value of a limit that is not stated, in its unit
+#: Times between which a motor reaches its limit [s]; the second is many of its time constants.
+_SHORT, _LONG = 1e-6, 1e6
 
 
 class Motor(eqx.Module):
@@ -112,15 +116,17 @@ class Motor(eqx.Module):
     #: α of copper [1/K]: IEC 60028 (1925), at 20 °C; makers take it from 25 °C, where it is 2 % less
     temperature_coefficient: float = eqx.field(default=0.00393, static=True)
     voltage_limit: float | None = eqx.field(default=None, static=True)  # [V], highest for short; not on this sheet
-    speed_limit: float = eqx.field(default=12_000 * 0.10471975511965977, static=True)  # 12 000 rpm, sheet
+    speed_limit: float = eqx.field(default=12_000 * 0.10471975511965977, static=True)  # 12 000 rpm, data sheet
 
     def voltage_back(self, speed: Scalar) -> Scalar:
         """Back-EMF E = C_E ω [V], eq. (16)."""
         return self.torque_constant * speed
 
     def voltage_winding(self, current: Scalar, temperature: Scalar | None = None) -> Scalar:
-        """Voltage across the winding's resistance I R [V], eq. (15); R follows the copper where its `temperature`
-        [°C] is given: R (1 + α (T - 25 °C))."""
+        """Voltage across the winding's resistance I R [V], eq. (15).
+
+        If its `temperature` [°C] is given, R follows that of copper: R (1 + α (T - 25 °C)).
+        """
         drop = current * self.resistance
         return (
             drop
@@ -142,13 +148,13 @@ class Motor(eqx.Module):
         return self.resistance_thermal_winding + self.resistance_thermal_housing
 
     def temperature_cold(self, current: Scalar) -> Scalar:
-        """Winding temperature after long running at `current` if its resistance did not rise [°C]."""
+        """Winding temperature after long running at `current` with a constant resistance [°C]."""
         return self.temperature_ambient + self.resistance_thermal * self.resistance * current**2
 
     def temperature_settled(self, current: Scalar) -> Scalar:
-        """Winding temperature after long running at `current` [°C], its resistance risen with it; inf: there is none.
+        """Winding temperature after long running at `current` [°C], with the rise of its resistance.
 
-        T = T_a + R_th R I² (1 + α (T - 25 °C)). From R_th R I² α = 1 on every kelvin more brings more than a kelvin.
+        T = T_a + R_th R I² (1 + α (T - 25 °C)). From R_th R I² α = 1 on the temperature runs away; inf is returned.
         """
         rise = self.resistance_thermal * self.resistance * current**2
         left = 1 - self.temperature_coefficient * rise
@@ -160,16 +166,16 @@ class Motor(eqx.Module):
 
     @property
     def current_continuous(self) -> Scalar:
-        """Current at which the winding settles at its permissible temperature [A], its resistance risen with it."""
+        """Current with a final winding temperature at the permissible limit [A], with the rise of its resistance."""
         allowed = jnp.maximum(self.temperature_limit - self.temperature_ambient, 1.0)
         hot = self.resistance * (1 + self.temperature_coefficient * (self.temperature_limit - TEMPERATURE_REFERENCE))
         return jnp.sqrt(allowed / jnp.maximum(self.resistance_thermal * hot, 1e-9))
 
     def heating(self, power: Scalar, winding: Scalar, housing: Scalar) -> tuple[Scalar, Scalar]:
-        """Rates of the temperatures of winding and housing [K/s], two bodies in a row.
+        """Rates of the temperatures of winding and housing [K/s], two thermal masses in series.
 
-        C_w T_w' = P - (T_w - T_h) / R_wh, C_h T_h' = (T_w - T_h) / R_wh - (T_h - T_a) / R_ha, with C_w = τ_w / R_wh
-        and C_h = τ_h / R_ha as makers state the time constants (maxon, Key information on motor data).
+        C_w T_w' = P - (T_w - T_h) / R_wh, C_h T_h' = (T_w - T_h) / R_wh - (T_h - T_a) / R_ha. Makers state the time
+        constants τ_w and τ_h: C_w = τ_w / R_wh and C_h = τ_h / R_ha (maxon, Key information on motor data).
 
         Args:
             power: lost in the winding [W]; winding, housing: temperatures [°C].
@@ -186,7 +192,7 @@ class Motor(eqx.Module):
     ) -> tuple[Scalar, Scalar]:
         """Temperatures of winding and housing [°C] after `time` [s] at `current` [A], in closed form.
 
-        `heating` with P = I² R (1 + α (T_w - 25 °C)) is linear in both temperatures: the exponential of its matrix.
+        `heating` with P = I² R (1 + α (T_w - 25 °C)) is linear in both temperatures: a matrix exponential solves it.
         """
         zero = jnp.zeros(())
 
@@ -204,30 +210,35 @@ class Motor(eqx.Module):
     def time_permissible(
         self, current: Scalar, winding: Scalar | None = None, housing: Scalar | None = None
     ) -> Scalar:
-        """How long a `current` [A] may flow before the winding is at its limit [s]; inf: for ever, 0: it is already.
+        """Time for which a `current` [A] may flow before the winding reaches its limit [s]; inf: no end, 0: above it.
 
         Args:
-            winding, housing: temperatures at the beginning [°C], None: ambient.
+            winding, housing: temperatures at the start [°C], None: ambient.
         """
         ambient, limit = self.temperature_ambient, self.temperature_limit
         begin = (ambient if winding is None else winding, ambient if housing is None else housing)
 
-        def excess(time: Scalar) -> Array:
-            reached = self.temperatures_after(current, time, *begin)[0] - limit
+        def excess(time: Scalar, held: tuple[Motor, Scalar, tuple[Scalar, Scalar]]) -> Array:
+            motor, current, begin = held
+            reached = motor.temperatures_after(current, time, *begin)[0] - motor.temperature_limit
             return jnp.where(jnp.isfinite(reached), reached, jnp.inf)
 
-        def halve(_: int, between: tuple[Array, Array]) -> tuple[Array, Array]:
-            low, high = between
-            middle = jnp.sqrt(low * high)
-            hot = excess(middle) > 0
-            return jnp.where(hot, low, middle), jnp.where(hot, middle, high)
-
-        low, high = jax.lax.fori_loop(0, 60, halve, (jnp.asarray(1e-6), jnp.asarray(_LONG)))
-        found = jax.lax.stop_gradient(jnp.sqrt(low * high))
-        # Newton's step from there is nothing but carries the derivative.
+        bounds = {"lower": math.log(_SHORT), "upper": math.log(_LONG)}
+        held = jax.lax.stop_gradient((self, current, begin))
+        solution: optx.Solution = optx.root_find(
+            lambda log_time, held: excess(jnp.exp(log_time), held),
+            optx.Bisection(rtol=0.0, atol=0.0, flip=False),
+            jnp.asarray(sum(bounds.values()) / 2),
+            held,
+            options=bounds,
+            max_steps=60,
+            throw=False,
+        )
+        found = jax.lax.stop_gradient(jnp.exp(solution.value))
+        # The Newton step from here changes no value; it carries the derivative.
         hot, around = self.temperatures_after(current, found, *begin)
         rise = self.heating(self.voltage_winding(current, hot) * current, hot, around)[0]
         rises = jnp.isfinite(hot) & (rise > 0)
         found = found - jnp.where(rises, (hot - limit) / jnp.where(rises, rise, 1.0), 0.0)
-        ever = (self.temperature_settled(current) > limit) & (excess(jnp.asarray(_LONG)) > 0)
+        ever = (self.temperature_settled(current) > limit) & (excess(jnp.asarray(_LONG), held) > 0)
         return jnp.where(jnp.asarray(begin[0]) >= limit, 0.0, jnp.where(ever, found, jnp.inf))

@@ -45,7 +45,7 @@ __all__ = [
 RADIUS_WHEEL = 50e-3  # D_w / 2, Table 6
 
 DYNAMIC_SHARE = 0.8  # μ_d / μ_s, assumed; the paper prints none
-GUIDE_SHARE = 0.3  # of the weight, between the brackets that Table A1 simulated sets (docs/paper-notes)
+GUIDE_SHARE = 0.3  # of the weight, between the limits that Table A1 simulated sets (docs/explanation/paper-notes.md)
 
 
 def _friction(adhesion: float) -> Friction:
@@ -79,7 +79,7 @@ def nominal() -> Robot:
     return Robot(Battery(), Motor(), Gearbox(), Configurations({TRACKED: tracked, WHEELED: wheeled}))
 
 
-#: Of a drive that nobody has stated more of: no friction, no loss, no limits.
+#: A drive of which only the stated parameters are known: no friction, no loss, no limits.
 _NOTHING = {
     "motor.friction_coulomb": 0.0,
     "motor.friction_viscous": 0.0,
@@ -90,16 +90,15 @@ _NOTHING = {
 }
 
 
-#: What makers and drawings say, and nothing stands for where nobody does.
+#: Parameters from makers and drawings, which have no substitute if nobody states them.
 _OF_A_SHEET, _ASSUMED = ("battery.", "motor.", "running_gear."), ("motor.temperature_ambient",)
 
 
 def blank(configurations: Configurations, sides: float = 1.0, rig: Rig | None = None) -> Robot:
-    """A robot of which nothing is known but its loads: no losses in its drive and no limits; what a rig's file states
-    comes on top.
+    """A robot with known loads only: no losses in its drive and no limits; a rig's file adds what it states.
 
     Args:
-        configurations: its loads; sides: motors driven alike; rig: how it is driven and measured.
+        configurations: its loads; sides: number of motors driven with the same input; rig: drive and measurement.
     """
     motor = dataclasses.replace(Motor(), speed_limit=UNLIMITED, temperature_limit=UNLIMITED)
     gearbox = dataclasses.replace(Gearbox(), speed_limit=UNLIMITED, torque_limit=None)
@@ -110,7 +109,7 @@ def blank(configurations: Configurations, sides: float = 1.0, rig: Rig | None = 
 
 
 def _simplified(track_torque: float) -> Robot:
-    """Constant losses as in Table A4; the wheeled chassis, of which it says nothing, in proportion."""
+    """Constant losses as in Table A4; the wheeled chassis, which the table leaves out, in proportion."""
     constant = {
         "motor.friction_coulomb": 4.2e-3,
         "motor.friction_viscous": 0.0,
@@ -140,5 +139,5 @@ def sm2() -> Robot:
     return _simplified(0.300)
 
 
-#: Robots by the name that the command line takes.
+#: Robots by their name on the command line.
 ROBOTS: dict[str, Callable[[], Robot]] = {"nominal": nominal, "sm1": sm1, "sm2": sm2}

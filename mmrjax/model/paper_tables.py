@@ -17,7 +17,7 @@ RADIUS_PULLEY = TEETH_PULLEY * PITCH_TOOTH / (2 * math.pi)  # 38.2 mm
 #: Height of the body [m], Table 6.
 BODY_HEIGHT = 76e-3
 
-#: Charge that a battery's maker states in mAh, in coulombs.
+#: One mAh, the unit of a maker's capacity, in coulombs.
 COULOMB_PER_MAH = 3.6
 
 #: Axes of Table 8.
@@ -47,12 +47,12 @@ BENCH = "lacquered_wood"
 
 
 def adhesion_ratio(surface: str, on_tracks: bool) -> float:
-    """Adhesion of `surface` over that of the bench [-], Table 5; right for a robot whose friction is the bench's."""
+    """Adhesion of `surface` over that of the bench [-], Table 5; valid for friction stated on the bench's surface."""
     here, bench = SURFACES[surface], SURFACES[BENCH]
     return here.tracked_x / bench.tracked_x if on_tracks else here.wheeled_x / bench.wheeled_x
 
 
 def lateral_ratio(surface: str, on_tracks: bool) -> float:
-    """The same across the travel: lateral adhesion of `surface` over that of the bench [-], Table 5."""
+    """Lateral adhesion of `surface` over that of the bench [-], Table 5."""
     here, bench = SURFACES[surface], SURFACES[BENCH]
     return here.tracked_y / bench.tracked_y if on_tracks else here.wheeled_y / bench.wheeled_y

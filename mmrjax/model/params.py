@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 from mmrjax.compile.precision import as_array
 from mmrjax.errors import near
 
-#: A number, or an array of numbers: one of a batch, or a tracer.
+#: A number, or an array of numbers (a batch or a tracer).
 Scalar = Float[Array, "..."] | float
 #: An index, or an array of indices.
 Index = Int[Array, "..."] | np.ndarray | int
@@ -25,14 +25,14 @@ Index = Int[Array, "..."] | np.ndarray | int
 
 @dataclasses.dataclass(frozen=True)
 class Spec:
-    """What a parameter field declares about its number.
+    """Specification of a parameter field.
 
     `relative_sd` is the prior's standard deviation as a share of the prior mean, `sd` the absolute one
     in the field's unit; one of the two is set. The prior mean is the nominal robot's value.
-    `bounds` are what a file may state and what a fit may reach, never what a constructor checks.
-    `scanned` is set where the misfit over it may be a staircase or have several basins (a dead time, a phase, a gap):
-    the half width of a basin, at least [the field's unit]. A fit of histories whose prior reaches further looks at
-    the misfit over all of its range, and not at its gradient alone.
+    `bounds` are the values that a file may state and a fit may reach; constructors never check them.
+    `scanned` is set if the misfit over the parameter may be a staircase or have several basins (a dead time, a phase,
+    a gap). It is the least half width of a basin [the field's unit]. A fit of histories with a wider prior scans the
+    misfit over the whole range in addition to following its gradient.
     """
 
     unit: str
@@ -61,7 +61,7 @@ def parameter(
     amplitude: bool = False,
     scanned: float | None = None,
 ) -> Any:
-    """Declare a differentiable scalar of a component; see `Spec` for the arguments."""
+    """Declares a differentiable scalar of a component; see `Spec` for the arguments."""
     if (relative_sd is None) == (sd is None):
         raise ValueError("a parameter states either relative_sd or sd")
     spec = Spec(unit, meaning, bounds, source, relative_sd, sd, amplitude, scanned)
@@ -70,10 +70,10 @@ def parameter(
 
 
 def as_float(value: Any) -> Any:
-    """A number as a float array (`precision.as_array`); an array passes, without a weak type."""
+    """A number as a float array (`precision.as_array`); an array passes without its weak type."""
     if isinstance(value, int | float):
         return as_array(value)
-    # A weakly typed array, as of `jnp.asarray(0.5)`, would be another program to compile of every function. A tracer
+    # A weakly typed array, as from `jnp.asarray(0.5)`, would make every function compile another program. A tracer
     # or a placeholder of a tree transformation passes.
     weak = isinstance(value, jax.Array) and not isinstance(value, jax.core.Tracer) and value.weak_type
     return jnp.asarray(value, value.dtype) if weak else value
@@ -81,16 +81,16 @@ def as_float(value: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """One parameter of a robot: dotted name, its value now, its specification."""
+    """One parameter of a robot: dotted name, current value, specification."""
 
     name: str
     value: Any
     spec: Spec
 
 
-#: Numbers of equations and tables of the paper, in what is said of a parameter.
+#: Equation and table numbers of the paper in the text of a parameter.
 _OF_PAPER = re.compile(r",? (?:of )?(?:(?:eqs?\. )?\(\d+\)(?:-\(\d+\))?|Tables? \w+(?:-\w+)?)")
-#: Words by which a source is of the paper's robot.
+#: Words that mark a source as the paper's robot.
 _PAPERS = re.compile(r"Table|eq\.|paper|Section|Fig\.|lacquered|sheet|M_t0|GP32|RE30")
 #: Sources of a rig's parameters.
 STATED, DEFAULT = "stated in the robot's file", "default"
@@ -98,21 +98,20 @@ STATED, DEFAULT = "stated in the robot's file", "default"
 
 @functools.cache
 def own_spec(spec: Spec, stated: bool) -> Spec:
-    """What a field says of a rig's parameter: its meaning without the paper's numbers, its own source.
+    """Specification of a rig's parameter: the meaning without the paper's numbers, and its own source.
 
     Args:
-        stated: whether the rig's file states its prior.
+        stated: True if the rig's file states its prior.
     """
     source = STATED if stated else DEFAULT if not spec.amplitude or _PAPERS.search(spec.source) else spec.source
     return dataclasses.replace(spec, meaning=_OF_PAPER.sub("", spec.meaning), source=source)
 
 
 def walk(component: eqx.Module, prefix: str = "") -> Iterator[Parameter]:
-    """Yield every parameter below `component`, depth first, by dotted name; those of a rig that starts from nothing
-    say nothing of the paper's robot (`own_spec`).
+    """Yields every parameter below `component`, depth first, by dotted name.
 
-    A tuple of modules (the effects) is walked by each member's `name`; a collection of modules by name (the
-    configurations) by those names alone: `6T2A.mass`.
+    Parameters of a rig without a base robot do not mention the paper (`own_spec`). A tuple of modules (the effects)
+    is walked by each member's `name`; a mapping of modules (the configurations) by its keys only: `6T2A.mass`.
     """
     rig = getattr(component, "rig", None)
     if rig is None or rig.inherits:
@@ -142,7 +141,7 @@ def _walk(component: eqx.Module, prefix: str) -> Iterator[Parameter]:
 
 
 def table(component: eqx.Module) -> str:
-    """Every parameter with value and unit, a line for each part; of a batch or a tracer its shape."""
+    """Every parameter with value and unit, one line for each part; for a batch or a tracer, its shape."""
     parts: dict[str, list[str]] = {}
     for p in walk(component):
         part, _, key = p.name.rpartition(".")
@@ -152,7 +151,7 @@ def table(component: eqx.Module) -> str:
 
 
 def shown(value: Any) -> str:
-    """A number to six digits; of an array its shape."""
+    """A number to six digits; for an array its shape."""
     if isinstance(value, jax.core.Tracer) or not isinstance(value, jax.Array | np.ndarray | np.number | float | int):
         return str(value)
     return f"{float(value):.6g}" if np.ndim(value) == 0 else f"array{list(np.shape(value))}"
@@ -162,18 +161,19 @@ M = TypeVar("M", bound=eqx.Module)
 
 
 def replace(component: M, values: dict[str, Any]) -> M:
-    """Return `component` with the named parameters replaced, of a rig known from then on; values may be tracers or
-    batches.
+    """Returns `component` with the named parameters replaced; values may be tracers or batches.
+
+    Replaced parameters of a rig count as known.
 
     Args:
         component: a robot or a part of one.
         values: dotted names, such as `motor.resistance`, and their values [SI].
 
     Returns:
-        Another component of the same kind.
+        A component of the same kind.
 
     Raises:
-        KeyError: a name is no parameter of `component`; the message says what is near it.
+        KeyError: a name is no parameter of `component`; the message suggests similar names.
     """
     known = [p.name for p in walk(component)]
     unknown = sorted(set(values) - set(known))
@@ -210,10 +210,10 @@ def _replace(component: Any, values: dict[str, Any], prefix: str) -> Any:
 
 
 def one_by_one(numbers: Float[Array, " n"]) -> tuple[Array, ...]:
-    """The numbers of an array, each by itself."""
+    """Splits an array into its numbers."""
     return tuple(x.reshape(()) for x in jax.lax.split(numbers, [1] * len(numbers))) if len(numbers) else ()
 
 
 def strong(robot: M) -> M:
-    """`robot` without weakly typed numbers: each of those is another program to compile of the same function."""
+    """Returns `robot` without weakly typed numbers, which would make a function compile another program."""
     return jax.tree.map(lambda x: jnp.asarray(x, x.dtype) if isinstance(x, jax.Array) else x, robot)

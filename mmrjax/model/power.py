@@ -1,4 +1,4 @@
-"""Supply and on-board battery: what voltage reaches the motors, eqs. (8)-(13)."""
+"""Supply and on-board battery: the voltage that reaches the motors, eqs. (8)-(13)."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from mmrjax.model.params import Scalar, parameter
 __all__ = ["COULOMB_PER_MAH", "Battery"]
 
 
-#: Capacity of the paper's cell [C], whose discharge Table 1 describes.
+#: Capacity of the paper's cell [C]; Table 1 describes its discharge.
 CAPACITY = 2200 * COULOMB_PER_MAH
 
 
 class Battery(eqx.Module):
-    """Cells in series, each with a parabola over the share of its capacity that is taken; Tables 1 and A4.
+    """Cells in series, each with a parabola over the discharged share of its capacity; Tables 1 and A4.
 
     U_b = n (A q² + B q + U'_b0 - I_b R_b), eqs. (9), (12), (13), with I_b = I_s + I_p, eq. (10), and
-    q = C_b C_n / C: A and B are those of a cell of capacity C_n. The paper's cell has C = C_n, so q = C_b; one of
-    another capacity falls as far over its own.
+    q = C_b C_n / C. A and B belong to a cell of capacity C_n. The paper's cell has C = C_n, so q = C_b; a cell of
+    another capacity has the same voltage at the same share.
     """
 
     curvature: Scalar = parameter(
@@ -67,18 +67,18 @@ class Battery(eqx.Module):
     capacity: Scalar = parameter(
         CAPACITY,
         unit="C",
-        meaning="charge at which the battery is empty",
+        meaning="charge taken from a full battery until it is empty",
         bounds=(1.0, 1e6),
         relative_sd=0.05,
         source="type designation XP2200SL: 2200 mAh",
     )
-    capacity_curve: float = eqx.field(default=CAPACITY, static=True)  # C_n, of the cell whose A and B these are [C]
+    capacity_curve: float = eqx.field(default=CAPACITY, static=True)  # C_n, of the cell that A and B belong to [C]
     cells: int = eqx.field(default=8, static=True)
     voltage_charge: float = eqx.field(default=4.2, static=True)  # highest of a cell [V], Section 3.3: fully charged
     voltage_cutoff: float = eqx.field(
         default=3.0, static=True
     )  # lowest of a cell [V], usual for Li-Po; not in the paper
-    delay_cutoff: float = eqx.field(default=1.0, static=True)  # how long it may be below [s]; a start draws more
+    delay_cutoff: float = eqx.field(default=1.0, static=True)  # permitted time below it [s]; a start draws more
     current_limit: float | None = eqx.field(default=None, static=True)  # of a cell, discharging [A]
     current_charge: float | None = eqx.field(default=None, static=True)  # of a cell, charging [A]
 
@@ -88,15 +88,15 @@ class Battery(eqx.Module):
         return self.curvature * taken**2 + self.slope * taken + self.voltage_full
 
     def _on_curve(self, discharge: Scalar) -> Scalar:
-        """Charge at which a cell of capacity C_n has given the same share of its own, q [C]."""
+        """Charge q [C] that discharges a cell of capacity C_n by the same share."""
         return discharge * (self.capacity_curve / self.capacity)
 
     def rises(self, discharge: Scalar) -> Bool[Array, "..."]:
-        """Whether the no-load voltage rises as the battery discharges further: eq. (13) has turned up."""
+        """True if the no-load voltage rises with further discharge, beyond the minimum of eq. (13)."""
         return jnp.asarray(2 * self.curvature * self._on_curve(discharge) + self.slope > 0)
 
     def energy(self, discharge: Scalar) -> Scalar:
-        """What the whole battery has given at no-load voltage [J] after `discharge` [C]: the integral of eq. (13)."""
+        """Energy given by the whole battery at no-load voltage [J] after `discharge` [C]: integral of eq. (13)."""
         taken = self._on_curve(discharge)
         per_charge = (self.curvature / 3 * taken + self.slope / 2) * taken + self.voltage_full
         return self.cells * per_charge * discharge
@@ -119,12 +119,12 @@ class Battery(eqx.Module):
         return self.voltage_no_load(self.capacity)
 
     def empty(self, discharge: Scalar) -> Bool[Array, "..."]:
-        """Whether the charge taken [C] has reached the capacity."""
+        """True if the charge taken [C] has reached the capacity."""
         return jnp.asarray(discharge >= self.capacity)
 
 
 def cutoff_refused(battery: Battery) -> str | None:
-    """Why no mission can begin on a battery [a sentence without its place]; None: one can. Not traceable."""
+    """Reason why no mission can start on a battery, without naming its place; None: one can. Not traceable."""
     full = float(battery.voltage_full)
     if battery.voltage_cutoff < full:
         return None
@@ -134,7 +134,7 @@ def cutoff_refused(battery: Battery) -> str | None:
 
 
 def cutoff_remark(battery: Battery) -> str | None:
-    """What to know of a cut-off that an empty cell is above without load; None of the assumed one. Not traceable."""
+    """Remark on a cut-off voltage below that of an empty cell; None for the assumed cut-off. Not traceable."""
     cutoff, empty, resistance = battery.voltage_cutoff, float(battery.voltage_empty), float(battery.resistance)
     if cutoff >= empty or cutoff == Battery.voltage_cutoff:
         return None
@@ -143,7 +143,7 @@ def cutoff_remark(battery: Battery) -> str | None:
 
 
 def curve_remark(battery: Battery) -> str | None:
-    """What to know of a parabola (13) that turns up before the battery is empty; None: it falls. Not traceable."""
+    """Remark on a parabola (13) that rises before the battery is empty; None: it falls. Not traceable."""
     if not bool(battery.rises(battery.capacity)):
         return None
     share = -float(battery.slope) / (2 * float(battery.curvature)) / battery.capacity_curve

@@ -1,4 +1,4 @@
-"""Rig: what is imposed on a robot's drives, and what its instruments show."""
+"""Rig: the inputs imposed on a robot's drives, and the instruments that measure it."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from jaxtyping import Array, Float
 from mmrjax.model import channels
 from mmrjax.model.params import Index, Scalar, parameter
 
-#: How histories may begin.
+#: Ways in which histories may begin.
 STARTS = ("rest", "measured", "free")
-#: What may be imposed: the voltage of supply or battery (times the duty), the speed of the motors' shafts, or the
-#: current of each motor by an amplifier, whatever voltage these take.
+#: Imposed quantity: the voltage of supply or battery (times the duty), the speed of the motor shafts, or the current
+#: of each motor, supplied by an amplifier.
 IMPOSED = ("voltage", "motor_speed", "motor_current")
-#: What is imposed between the rows of a history: as at the row before, or on a straight line to the next.
+#: Imposed values between the rows of a history: those of the row before, or on a straight line to the next.
 BETWEEN = ("held", "linear")
 
 
 def on_line(first: Array, second: Array, share: Array) -> Array:
-    """Values a share of the way from first ones to second ones, shape (*share.shape, ...).
+    """Values at a share of the way from `first` to `second`, shape (*share.shape, ...).
 
-    An instant itself takes nothing of the one after it, which may be no number.
+    At a share of 0 the second value is ignored, because it may be NaN.
     """
     share = jnp.reshape(share, (*jnp.shape(share), *[1] * (first.ndim - jnp.ndim(share))))
     return first + share * (jnp.where((share < 1e-9) & jnp.isnan(second), first, second) - first)
@@ -34,12 +34,12 @@ def on_line(first: Array, second: Array, share: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class Instrument:
-    """What is known of the instrument of a channel.
+    """Properties of the instrument of a channel.
 
     Attributes:
-        channel: its name.
-        signed: whether it shows the sign; False: the magnitude alone; None: its table tells.
-        quantum: step of its readings [SI]; 0: none; None: its table tells.
+        channel: name of the channel.
+        signed: True if it shows the sign; False if it shows the magnitude; None: to be found from its table.
+        quantum: step of its readings [SI]; 0: none; None: to be found from its table.
     """
 
     channel: str
@@ -48,21 +48,21 @@ class Instrument:
 
     @property
     def free(self) -> bool:
-        """Whether its table has to tell something of it."""
+        """True if a property has to be found from its table."""
         return self.signed is None or self.quantum is None
 
     def shows(self, value: Scalar) -> Scalar:
-        """What it shows of a value [SI]; its step is noise, see `variance`."""
+        """Reading for a value [SI]; the step counts as noise, see `variance`."""
         return jnp.abs(value) if self.signed is False else value
 
     @property
     def variance(self) -> float:
-        """Of the error by its step, Δ²/12 [SI²] (Bennett, Spectra of quantized signals, 1948); 0 where it is free."""
+        """Error variance due to its step, Δ²/12 [SI²] (Bennett, Spectra of quantized signals, 1948); 0 if unknown."""
         return (self.quantum or 0.0) ** 2 / 12
 
 
 class Begin(eqx.Module):
-    """How a run begins that does not begin at rest: its shafts turn, and its load rolls with them."""
+    """Start of a run that does not begin at rest: its shafts turn, and its load rolls with them."""
 
     motor_speed: Scalar = parameter(
         0.0,
@@ -83,7 +83,7 @@ class Begin(eqx.Module):
 
 
 class Begins(eqx.Module):
-    """The beginnings of runs by their names, in a fixed order; conditions hold the index of one."""
+    """The beginnings of runs by name, in a fixed order; conditions hold an index."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     members: tuple[Begin, ...]
@@ -92,42 +92,42 @@ class Begins(eqx.Module):
         self.names, self.members = tuple(by_name), tuple(by_name.values())
 
     def items(self) -> Iterator[tuple[str, Begin]]:
-        """Names with their beginnings, in order."""
+        """Names and beginnings, in order."""
         return zip(self.names, self.members, strict=True)
 
     def of(self, index: Index) -> Begin:
-        """That of a run by its index; traceable."""
+        """The beginning with this index; traceable."""
         stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *self.members)
         return jax.tree.map(lambda x: x[jnp.asarray(index)], stacked)
 
 
 class Rig(eqx.Module):
-    """How a robot is driven and measured.
+    """Drive and measurement of a robot.
 
     Attributes:
         imposed: one of `IMPOSED`.
-        channels: names of those that its instruments show, see `channels.EVERY`.
-        instruments: of channels, where more is known than that they are there.
-        delay: by which what is imposed acts later than its column says [s].
-        columns: of tables: (column as this program calls it, column of the file, factor from its unit).
-        priors: (parameter, mean, sd) [SI] that the file states, in place of the parameters' own; of sd 0 it is exact.
-        start: of histories: `rest`, `measured` (by the first samples) or `free`, which those are the prior of.
+        channels: names of the channels that its instruments show, see `channels.EVERY`.
+        instruments: known properties of the instruments of some channels.
+        delay: dead time between a value in the column and its action [s].
+        columns: of tables: (column name in this program, column name in the file, factor from its unit).
+        priors: (parameter, mean, sd) [SI] stated in the file, which replace the parameters' own; sd 0: exactly known.
+        start: of histories: `rest`, `measured` (by the first samples) or `free` (the same as prior means).
         begins: of histories that do not begin at rest, once their table is known.
-        between_rows: of histories, one of `BETWEEN`; an imposed speed is on straight lines in any case.
-        surfaces: (configuration, another from which it differs by its ground alone).
-        inherits: whether what its file leaves open is a packaged robot's; if not, nothing in it is another robot's.
-        unknown: parameters that nobody stated and for which nothing stands: what their fields hold is a packaged
-            robot's, so that equations have numbers, and what rests on it is not known (`Robot.knows`).
-        loose: whether the load on the shaft has backlash, which histories then follow as a state.
+        between_rows: of histories, one of `BETWEEN`; an imposed speed is always interpolated linearly.
+        surfaces: (configuration, another configuration that differs only by its ground).
+        inherits: True if a packaged robot supplies what the file leaves open; False: nothing comes from another.
+        unknown: parameters that nobody stated and that have no substitute. Their fields hold a packaged robot's value
+            to keep the equations computable; results that depend on them are not known (`Robot.knows`).
+        loose: True if the load on the shaft has backlash, which histories then follow as a state.
     """
 
     delay: Scalar = parameter(
         0.0,
         unit="s",
-        meaning="delay by which what is imposed acts later than its column says",
+        meaning="dead time between a value in the imposed quantity's column and its action",
         bounds=(-10.0, 10.0),
         sd=0.02,
-        source="stated by whoever owns the rig",
+        source="stated by the owner of the rig",
         scanned=0.0,
     )
     begins: Begins | None = None
@@ -144,7 +144,7 @@ class Rig(eqx.Module):
     loose: bool = eqx.field(default=False, static=True)
 
     def for_equations(self) -> Rig:
-        """Without what only files, priors and reports read."""
+        """Same rig without the fields that only files, priors and reports read."""
         usual = self.start == STARTS[0] and self.between_rows == BETWEEN[0]
         if usual and not (self.instruments or self.columns or self.priors or self.surfaces):
             return self
@@ -154,11 +154,13 @@ class Rig(eqx.Module):
         )
 
     def before(self, times: Float[Array, " times"], at: Scalar | Float[Array, "..."]) -> tuple[Array, Array]:
-        """Which of `times` is the last before what happens at instants, and how far on the way to the next one that
-        is [-], held before the first and after the last; what is imposed acts `delay` later than its column says.
+        """Index of the last of `times` before each instant, and the share of the way to the next one [-].
+
+        Both are held before the first and after the last. The imposed quantity acts `delay` later than its column
+        states.
 
         Args:
-            times: since what is imposed acts [s], increasing; at: instants of the tables' clock [s], of any shape.
+            times: since the imposed quantity acts [s], increasing; at: instants of the tables' clock [s], any shape.
         """
         wanted = at - self.delay
         k = jnp.clip(jnp.searchsorted(times, wanted, side="right") - 1, 0, times.shape[0] - 2)
@@ -167,54 +169,58 @@ class Rig(eqx.Module):
 
     @staticmethod
     def between(values: Array, k: Array, share: Array) -> Array:
-        """Values, shape (times, ...), where `before` says, of its shape first: on the straight line between the
-        instants about it, of what has no values between its own those before."""
+        """Values, shape (times, ...), at the index and share that `before` returns, with their shape in front.
+
+        Linear between neighbouring instants; a quantity without values between rows keeps that of the row before.
+        """
         if not jnp.issubdtype(values.dtype, jnp.inexact):
             return values[k]
         return on_line(values[k], values[k + 1], share)
 
     def clock(self, times: Float[Array, " times"]) -> Array:
-        """Instants of the tables' clock [s] at which a run is shown that is known at `times` since what is imposed
-        acts: `delay` later, from 0 on; the rest before the run begins at 0. The same where the delay is traced."""
+        """Instants of the tables' clock [s] for a run known at `times` since the imposed quantity acts.
+
+        They are `delay` later and start at 0, with rest before the run. If the delay is traced, `times` are returned.
+        """
         if isinstance(self.delay, jax.core.Tracer):
             return times
         return jnp.where(times <= 0, jnp.minimum(times, 0.0), jnp.maximum(times + self.delay, 0.0))
 
     @property
     def prompt(self) -> bool:
-        """Whether it is known that what is imposed acts when its column says."""
+        """True if the imposed quantity is known to act when its column states."""
         return not isinstance(self.delay, jax.core.Tracer) and not np.any(np.asarray(self.delay) != 0)
 
     @property
     def turns(self) -> bool:
-        """Whether an instrument shows what a robot does that turns."""
+        """True if an instrument shows the motion of a robot that turns."""
         return not {c.name for c in channels.OF_TURNS}.isdisjoint(self.channels)
 
     @property
     def stated(self) -> frozenset[str]:
-        """Parameters of which the file says how sure it is."""
+        """Parameters whose uncertainty the file states."""
         return frozenset(name for name, _, _ in self.priors)
 
     @property
     def exact(self) -> frozenset[str]:
-        """Parameters that the file states as exactly known; no fit frees them."""
+        """Parameters that the file states as exactly known; no fit changes them."""
         return frozenset(name for name, _, sd in self.priors if sd == 0)
 
     @property
     def scales_adhesion(self) -> bool:
-        """Whether labels of Table 5 scale its adhesion to the bench's; else each surface is a ground of its own."""
+        """True if labels of Table 5 scale its adhesion to the bench's; else each surface is a ground of its own."""
         return self.inherits
 
     @property
     def shows_voltage(self) -> bool:
-        """Whether the motors' voltage is imposed or read."""
+        """True if the motor voltage is imposed or measured."""
         return self.imposed == "voltage" or "motor_voltage" in self.channels
 
     @property
     def magnitudes(self) -> frozenset[str]:
-        """Channels whose instruments show the magnitude alone."""
+        """Channels whose instruments show only the magnitude."""
         return frozenset(i.channel for i in self.instruments if i.signed is False)
 
     def instrument(self, channel: str) -> Instrument:
-        """That of a channel."""
+        """The instrument of a channel."""
         return next((i for i in self.instruments if i.channel == channel), Instrument(channel))

@@ -27,16 +27,16 @@ if TYPE_CHECKING:
     from mmrjax.effects import Effect
 
 
-#: What the drives of a configuration move: a vehicle's chassis, or a shaft on a bench.
+#: Load of the drives in one configuration: a vehicle's chassis, or a shaft on a bench.
 Load = Chassis | Shaft
 
 
 class Configurations(eqx.Module):
-    """Loads by name, in a fixed order; conditions hold the index of one.
+    """Loads by name, in a fixed order; conditions hold an index.
 
     Attributes:
-        names: in order; members: the loads, all vehicles' or all shafts'.
-        chosen: that of the configuration in hand, within equations of one run (`Robot.within`).
+        names: in order; members: the loads, either all vehicles or all shafts.
+        chosen: the load of the current configuration, within equations of one run (`Robot.within`).
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -50,7 +50,7 @@ class Configurations(eqx.Module):
         """Position of a configuration.
 
         Raises:
-            KeyError: no such configuration; the message lists those that there are.
+            KeyError: no such configuration; the message lists the robot's configurations.
         """
         if name not in self.names:
             raise KeyError(f"no configuration {name}; the robot has {', '.join(self.names)}")
@@ -69,7 +69,7 @@ class Configurations(eqx.Module):
         return len(self.names)
 
     def items(self) -> Iterator[tuple[str, Any]]:
-        """Names with their loads, in order."""
+        """Names and loads, in order."""
         return zip(self.names, self.members, strict=True)
 
 
@@ -82,11 +82,11 @@ class Robot(eqx.Module):
 
     Attributes:
         configurations: loads by name, at least one; given as a mapping.
-        effects: terms beyond the paper's model; the empty tuple is the paper's model.
-        sides: how many motors are driven alike; all per-side quantities are of one of them (assumption 3).
-        running_gear: of one side, what the track model needs beside the rest.
+        effects: terms beyond the paper's model; an empty tuple gives the paper's model.
+        sides: number of motors driven with the same input; per-side quantities belong to one motor (assumption 3).
+        running_gear: of one side, further parameters of the track model.
         driver: of the motors.
-        rig: what is imposed on it and what its instruments show.
+        rig: imposed inputs and instruments.
     """
 
     battery: Battery
@@ -105,7 +105,7 @@ class Robot(eqx.Module):
         return f"{head}\n{params.table(self)}"
 
     def for_equations(self) -> Robot:
-        """Without what only files, priors and reports read."""
+        """Same robot without the fields that only files, priors and reports read."""
         rig, effects = self.rig.for_equations(), tuple(e.for_equations() for e in self.effects)
         if rig is self.rig and all(a is b for a, b in zip(effects, self.effects, strict=True)):
             return self
@@ -113,11 +113,11 @@ class Robot(eqx.Module):
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """Those that its rig's instruments show, in order."""
+        """Channels that its rig's instruments show, in order."""
         return channels.rows(self.rig.channels)
 
     def showing_turns(self, columns: Collection[str] | None = None) -> Robot:
-        """With instruments of both sides and of its yaw too; of `columns` those alone that have one there."""
+        """Same robot with instruments for both sides and yaw; with `columns`, only for columns of the table."""
         own = self.rig.channels
         read = [c for c in channels.OF_TURNS if (c.settled if columns is None else c.column in columns)]
         more = [c.name for c in read if c.name not in own]
@@ -125,51 +125,50 @@ class Robot(eqx.Module):
 
     @property
     def unlike(self) -> tuple[str, ...]:
-        """Names of its effects by which its sides differ; runs that say nothing of either side have none of them."""
+        """Names of its effects that make the sides differ; they have no meaning in runs without data of each side."""
         return tuple(effect.name for effect in self.effects if effect.unlike)
 
     @property
     def lacks(self) -> frozenset[str]:
-        """Balances that its loads have not."""
+        """Balances that its loads lack."""
         return frozenset(self.configurations.members[0].lacks)
 
     @property
     def has_ground(self) -> bool:
-        """Whether a ground carries it, on which slope, payload and adhesion act and its movers can slip."""
+        """True if a ground carries it; slope, payload and adhesion then act, and its movers can slip."""
         return "ground" not in self.lacks
 
     def unknown(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Those of some parameters, by dotted name, that are not its own: neither stated nor of its base."""
+        """Parameters among `names` (dotted) that neither its file nor its base robot states."""
         return tuple(name for name in names if name in self.rig.unknown)
 
     def knows(self, names: Iterable[str]) -> bool:
-        """Whether all of some parameters are its own."""
+        """True if all of the parameters are known."""
         return not self.unknown(names)
 
     @property
     def current_continuous(self) -> Scalar:
-        """Current of one motor that its winding bears for long [A]; inf where it is not known how heat leaves it."""
+        """Continuous current of one motor that its winding permits [A]; inf if its thermal data are unknown."""
         return self.motor.current_continuous if self.knows(channels.HEAT) else jnp.inf
 
     def heating(self, power: Scalar, winding: Scalar, housing: Scalar) -> tuple[Scalar, Scalar]:
-        """Rates of the temperatures of winding and housing [K/s], as of `Motor.heating`; none where it is not known
-        how heat leaves them."""
+        """Rates of the temperatures of winding and housing [K/s], as in `Motor.heating`; 0 if unknown."""
         rates = self.motor.heating(power, winding, housing)
         return rates if self.knows(channels.WARMING) else (jnp.zeros_like(rates[0]), jnp.zeros_like(rates[1]))
 
     @property
     def shows_travel(self) -> bool:
-        """Whether anything shows how far it travels: a ground, or a channel of what turns with its shaft."""
+        """True if the distance is observable: on a ground, or by a channel of its shaft."""
         return self.has_ground or "speed" in self.rig.channels
 
     @property
     def loose(self) -> bool:
-        """Whether its load can turn within a backlash, as a body of its own."""
+        """True if its load can turn within a backlash, as a separate body."""
         return self.rig.loose
 
     @property
     def moves_as_one(self) -> bool:
-        """Whether its shafts and its load come to rest at one moment: without a backlash or a ground to slip on."""
+        """True if shafts and load stop together: neither backlash nor a ground to slip on."""
         return not (self.loose or self.has_ground)
 
     def chassis(self, configuration: Index) -> Any:
@@ -183,8 +182,7 @@ class Robot(eqx.Module):
         return chosen
 
     def within(self, configuration: Index) -> Robot:
-        """This robot in the configuration with this index: its load is chosen here, once, for all equations that ask
-        for it."""
+        """Same robot in the configuration with this index; its load is selected once, here, for all equations."""
         if self.configurations.chosen is not None:
             return self
         chosen = eqx.tree_at(
@@ -194,8 +192,10 @@ class Robot(eqx.Module):
 
     @property
     def radius_pulley(self) -> Scalar:
-        """Pitch radius of the pulleys that carry the belts [m]: the rolling radius of the first configuration on
-        tracks, 48 teeth of 5 mm for a robot that has none."""
+        """Pitch radius of the pulleys that carry the belts [m].
+
+        It is the rolling radius of the first configuration on tracks; without tracks, the radius of 48 teeth of 5 mm.
+        """
         radius: Scalar = jnp.asarray(RADIUS_PULLEY)
         for chassis in reversed(self.configurations.members):
             radius = jnp.where(jnp.asarray(chassis.on_tracks) > 0.5, chassis.radius, radius)
@@ -203,22 +203,22 @@ class Robot(eqx.Module):
 
     @property
     def remembering(self) -> tuple[Effect, ...]:
-        """Its effects whose term depends on the past of the run, in order."""
+        """Its effects with a memory, in order."""
         return tuple(effect for effect in self.effects if effect.memory_size is not None)
 
 
-#: Why no torque can be stated on the output of a vehicle.
-NO_BRAKE = "the robot is a vehicle, whose load is its ground, and a brake's torque acts on a shaft"
+#: Reason why a vehicle has no brake torque on its output.
+NO_BRAKE = "the robot is a vehicle; the torque of a brake acts only on a shaft"
 
 
 def cannot_turn(robot: Robot, names: Iterable[str]) -> str | None:
-    """Why a robot whose sides are driven apart cannot be computed in these configurations; None where it can."""
+    """Reason why a robot with independently driven sides cannot be computed in these configurations, else None."""
     if not robot.has_ground:
         return "the robot's load is a shaft, which does not turn over the ground"
     if float(robot.sides) < 2:
         return f"got a robot of {float(robot.sides):g} side; expected sides = 2, one motor on each"
     if robot.rig.imposed == "motor_current":
-        return "the robot's file says that its motors' current is imposed, which says nothing of either side"
+        return "the robot's file imposes the motors' current, which is not available for each side"
     lacking = [
         f"{name}.turning.{key} [{unit}]"
         for name in names
@@ -226,4 +226,4 @@ def cannot_turn(robot: Robot, names: Iterable[str]) -> str | None:
         for key, unit in (("width", "m"), ("inertia", "kg·m^2"))
         if not float(getattr(robot.configurations[name].turning, key)) > 0
     ]
-    return f"{', '.join(lacking)} missing in the robot's file, which a turn needs" if lacking else None
+    return f"the robot's file lacks {', '.join(lacking)}, needed for a turn" if lacking else None

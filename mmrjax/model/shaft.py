@@ -1,4 +1,4 @@
-"""Load on a bench: a shaft with inertia, friction, a constant torque and one that gravity makes of its angle."""
+"""Load on a bench: a shaft with inertia, friction, a constant torque and a torque of gravity over its angle."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ import jax.numpy as jnp
 
 from mmrjax.model.params import Scalar, parameter
 
-_STATED = "stated by whoever owns the rig"
-#: Of flanks that touch: natural frequency of the two sides on them [Hz], and damping ratio [-].
+_STATED = "stated by the owner of the rig"
+#: Flanks in contact: natural frequency of the two sides [Hz], and damping ratio [-].
 MESH_FREQUENCY, MESH_DAMPING = 150.0, 0.4
 
 
 class Shaft(eqx.Module):
     """J dω/dt = M_r - (M_0 sign ω + K ω) - M_c - m g l sin(θ - θ_0), at the output of one drive.
 
-    One law for bench, winch, screw, pendulum and carriage: a winch has M_c = m g r; a screw of lead p with a carriage
-    of mass m has J = m (p / 2π)² and travels p / 2π a radian. Newton's law for rotation; friction as of the tracks,
-    eq. (24).
+    One law for bench, winch, screw, pendulum and carriage. A winch has M_c = m g r. A screw of lead p with a carriage
+    of mass m has J = m (p / 2π)² and travels p / 2π per radian. Newton's law for rotation; friction as for the
+    tracks, eq. (24).
 
     Attributes:
         speed_rest: of the output, within which friction is smoothed through rest [rad/s].
-        lacks: balances that it has not, as no ground carries it; on_tracks: neither on tracks nor on wheels;
-            mass: of a robot; speed_grip: nothing slides.
+        lacks: balances that it lacks, having no ground; on_tracks: 0, neither tracks nor wheels;
+            mass: of a robot, 0; speed_grip: 0, nothing slides.
     """
 
     lacks: ClassVar[frozenset[str]] = frozenset({"ground", "slip", "mass"})
@@ -34,7 +34,7 @@ class Shaft(eqx.Module):
     speed_grip: ClassVar[float] = math.inf
     inertia: Scalar = parameter(
         unit="kg·m^2",
-        meaning="inertia J of all that turns with the output of one drive",
+        meaning="inertia J of all parts that turn with the output of one drive",
         bounds=(0.0, 1e4),
         relative_sd=0.2,
         source=_STATED,
@@ -57,7 +57,7 @@ class Shaft(eqx.Module):
     torque_constant: Scalar = parameter(
         0.0,
         unit="N·m",
-        meaning="torque M_c that acts against forward rotation whatever the speed, as a winch's weight",
+        meaning="torque M_c that acts against forward rotation at any speed, such as a winch's weight",
         bounds=(-1e4, 1e4),
         relative_sd=0.2,
         source=_STATED,
@@ -73,7 +73,7 @@ class Shaft(eqx.Module):
     angle_zero: Scalar = parameter(
         0.0,
         unit="rad",
-        meaning="angle θ_0 at which the arm hangs, from where a run starts",
+        meaning="hanging angle θ_0 of the arm, from the start of a run",
         bounds=(-6.3, 6.3),
         sd=0.05,
         source=_STATED,
@@ -100,7 +100,7 @@ class Shaft(eqx.Module):
 
     @property
     def speed_still(self) -> Scalar:
-        """Speed within which friction at rest is not resolved [m/s]."""
+        """Speed below which friction at rest is not resolved [m/s]."""
         return self.radius * self.speed_rest
 
     def torque_loss(self, speed: Scalar, direction: Scalar) -> Scalar:
@@ -108,11 +108,11 @@ class Shaft(eqx.Module):
         return self.loss_coulomb * direction + self.loss_viscous * speed
 
     def torque_mesh(self, gap: Scalar, closing: Scalar, inertia_motor: Scalar) -> Scalar:
-        """Torque that the flanks carry [N·m], none while they do not touch.
+        """Torque that the gear flanks carry [N·m]; 0 while they do not touch.
 
         k s + d ds/dt over the compression s beyond half the backlash, never pulling (a dead zone with compliance:
-        Nordin and Gutman, Controlling mechanical systems with backlash, Automatica 38 (2002) 1633). How stiff the
-        flanks are does not show in what a rig samples: they swing at `MESH_FREQUENCY`, damped by `MESH_DAMPING`.
+        Nordin and Gutman, Controlling mechanical systems with backlash, Automatica 38 (2002) 1633). A rig's sampling
+        does not resolve the flanks' stiffness: they oscillate at `MESH_FREQUENCY`, damped by `MESH_DAMPING`.
 
         Args:
             gap: of the output's motor side ahead of the load, from the middle [rad]; closing: its rate [rad/s].
@@ -123,14 +123,14 @@ class Shaft(eqx.Module):
         ahead = jnp.maximum(gap - 0.5 * self.backlash, 0.0)
         behind = jnp.minimum(gap + 0.5 * self.backlash, 0.0)
         damping = 2 * MESH_DAMPING * omega * inertia * closing
-        # Damping sets in over a tenth of the backlash, so that the torque has no jump where flanks meet.
+        # Damping sets in over a tenth of the backlash, so that the torque is continuous at contact.
         full = 0.1 * self.backlash + 1e-4
         push = jnp.maximum(omega**2 * inertia * ahead + damping * jnp.minimum(ahead / full, 1.0), 0.0)
         pull = jnp.minimum(omega**2 * inertia * behind + damping * jnp.minimum(-behind / full, 1.0), 0.0)
         return push + pull
 
     def torque_weight(self, mass: Scalar, slope: Scalar) -> Scalar:
-        """Torque of gravity at rest against forward rotation [N·m], whatever the mass and slope of a vehicle."""
+        """Torque of gravity at rest against forward rotation [N·m], independent of a vehicle's mass and slope."""
         return self.torque_load(0.0)
 
     def torque_load(self, angle: Scalar) -> Scalar:

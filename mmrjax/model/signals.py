@@ -1,4 +1,4 @@
-"""What flows between the rooms: the state, the signals of one instant, and the result of a run."""
+"""Data that modules exchange: the state, the signals of one instant, and the result of a run."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ CONVERGED, STALLED, SLIDES, NOT_SETTLED, BATTERY_EMPTY, FAILED, TIPS, REVERSES, 
     len(STATUSES)
 )
 
-#: Statuses of a run that ended as its conditions ask: `reverses` travels backward since its voltage is negative.
+#: Statuses of a run that ended as requested: `reverses` travels backward because its voltage is negative.
 DONE = (CONVERGED, REVERSES)
 
-#: Limits that a run may exceed; that it slides on average though it goes on steadily; that it leaves the ground at
-#: times. Bit k of `Result.flags` is the k-th name; `winding_hot` is after long running at this current, `too_hot`
-#: what a mission really reaches.
+#: Warnings of a run: limits exceeded, sliding on average in steady travel, loss of ground contact. Bit k of
+#: `Result.flags` is the k-th name. `winding_hot` is after long running at this current, `too_hot` at the temperature
+#: that a mission reaches.
 FLAGS = (
     "motor_overspeed", "gearbox_overspeed", "winding_hot", "slips", "jumps", "overvoltage", "cut_off",
     "battery_overcurrent", "current_limited", "gearbox_overload", "too_hot", "demand_missed",
@@ -36,21 +36,21 @@ FLAGS = (
 )  # fmt: skip
 
 
-#: A quantity that the balances have not computed yet.
+#: Value of a quantity that the balances have not computed yet.
 UNSET = math.nan
 
 
 class State(eqx.Module):
-    """What a run remembers, per side of the chassis (the sides are alike, assumption 3).
+    """State of a run, per side of the chassis (both sides have the same, assumption 3).
 
     Attributes:
         current: current of one motor I_d [A].
         speed_motor: motor shaft speed [rad/s].
         speed: speed of the robot along the slope V [m/s].
         discharge: charge taken from the battery C_b [C].
-        memory: of each effect that has one, by the effect's name, in its own unit; empty where none is kept.
-        temperature: of the winding [°C], whose resistance follows it; None: not followed, resistance as stated.
-        distance: travelled since the start of the run [m]; read where a load depends on its angle.
+        memory: of each effect that has one, by effect name, in its own unit; empty if not followed.
+        temperature: of the winding [°C], which sets its resistance; None: not followed, resistance as stated.
+        distance: travelled since the start of the run [m]; used by loads that depend on their angle.
         gap: of the output's motor side ahead of the load within the backlash, from its middle [rad]; None: rigid.
     """
 
@@ -65,14 +65,14 @@ class State(eqx.Module):
 
 
 class PlaneMotion(eqx.Module):
-    """What a run of a robot that turns remembers: of each side, left and right, and of the robot in the plane.
+    """State of a run of a robot that turns: of each side, left and right, and of the robot in the plane.
 
     Attributes:
         current: of one motor of each side [A], shape (2,); speed_motor: motor shaft speeds [rad/s], shape (2,).
         speed, speed_lateral: of the centre of mass, ahead and to the left [m/s]; yaw_rate: to the left [rad/s].
         heading: from uphill, to the left [rad]; place_x, place_y: uphill of the start, and to the left of it [m].
         discharge: charge taken from the battery C_b [C].
-        memory: of each effect that has one, by its name, shape (2,).
+        memory: of each effect that has one, by effect name, shape (2,).
         temperature: of the windings of each side [°C], shape (2,); None: not followed.
     """
 
@@ -90,7 +90,7 @@ class PlaneMotion(eqx.Module):
 
 
 class Signals(eqx.Module):
-    """Every quantity of one instant, filled in order by `balances`; per side unless `total` is said.
+    """Every quantity of one instant, filled in order by `balances`; per side unless its name has `total`.
 
     A field is `UNSET` until the balance that computes it has run.
     """
@@ -101,7 +101,7 @@ class Signals(eqx.Module):
     slope: Scalar = UNSET
     payload: Scalar = UNSET
     adhesion: Scalar = UNSET
-    battery: Scalar = UNSET  # 1 where the on-board battery feeds the motors
+    battery: Scalar = UNSET  # 1 if the on-board battery feeds the motors
     discharge: Scalar = UNSET
     order: Scalar = UNSET  # place in the sequence of runs [-]
     load_torque: Scalar | None = None  # of a brake on the output, against forward rotation [N·m]
@@ -109,35 +109,35 @@ class Signals(eqx.Module):
     current: Scalar = UNSET  # I_d of one motor [A]
     speed_motor: Scalar = UNSET  # [rad/s]
     speed: Scalar = UNSET  # V of the robot [m/s]
-    temperature: Scalar | None = None  # of the winding, where it is followed [°C]
-    # of the robot in the plane of the ground; of one that travels straight nothing
+    temperature: Scalar | None = None  # of the winding, if it is followed [°C]
+    # motion of the robot in the plane of the ground; 0 in straight travel
     side: Scalar = 0.0  # 1 of the left side, -1 of the right one [-]
     speed_lateral: Scalar = 0.0  # v_y to the left [m/s]
     yaw_rate: Scalar = 0.0  # ω, positive to the left [rad/s]
-    direction_turn: Scalar = 0.0  # way round, -1..1, positive to the left [-]
+    direction_turn: Scalar = 0.0  # direction of the turn, -1..1, positive to the left [-]
     moment_lateral: Scalar = 0.0  # of the lateral forces about the centre of mass, positive to the left [N·m]
     heading: Scalar = 0.0  # ψ from uphill, positive to the left [rad]
-    place_x: Scalar = 0.0  # uphill of where the run started [m]
-    place_y: Scalar = 0.0  # to the left of that [m]
+    place_x: Scalar = 0.0  # uphill of the start [m]
+    place_y: Scalar = 0.0  # to the left of the start [m]
     # kinematics
     direction: Scalar = UNSET  # of the shafts, -1..1, 0 at rest [-]
     direction_travel: Scalar = UNSET  # of the robot, -1..1 [-]
     speed_wheel: Scalar = UNSET  # of driving wheel or pulley [rad/s]
     speed_theoretical: Scalar = UNSET  # r_k ω_k, eq. (32) [m/s]
-    speed_output: Scalar = UNSET  # of the load's side of the output, within a backlash not the wheel's [rad/s]
+    speed_output: Scalar = UNSET  # of the load's side of the output, not the wheel's within a backlash [rad/s]
     angle: Scalar = UNSET  # of the output since the start of the run, of a load on a shaft [rad]
     # mass
-    mass: Scalar = UNSET  # total M [kg]; to effects of balance `mass`, the stated one
+    mass: Scalar = UNSET  # total M [kg]; effects of balance `mass` see the stated one
     normal: Scalar = UNSET  # normal load of one side [N]
     # supply and electrical
-    duty: Scalar = UNSET  # D of the driver, its limit seen to [-]
-    pause: Scalar = UNSET  # share of a period without a pulse, 1 - |D|; 0 where the motors are open or shorted [-]
-    share_drawn: Scalar = UNSET  # of the motors' current, from the supply [-]
+    duty: Scalar = UNSET  # D of the driver, after its current limit [-]
+    pause: Scalar = UNSET  # share of a period without pulses, 1 - |D|; 0 if the motors are open or shorted [-]
+    share_drawn: Scalar = UNSET  # share of the motors' current that the supply gives [-]
     total_current: Scalar = UNSET  # D I of all motors, from the supply I_s, eq. (10) [A]
     voltage_source: Scalar = UNSET  # of battery or external supply, eq. (8) [V]
     voltage: Scalar = UNSET  # U_e at the motors [V]
     voltage_back: Scalar = UNSET  # E, eq. (16) [V]
-    voltage_drop: Scalar = UNSET  # I R and every further drop [V]
+    voltage_drop: Scalar = UNSET  # I R and all further drops [V]
     voltage_left: Scalar = UNSET  # drives L dI/dt, eq. (15) [V]
     inductance: Scalar = UNSET  # L_d of the armature circuit, eq. (15) [H]
     # motor
@@ -155,13 +155,13 @@ class Signals(eqx.Module):
     # track and gearbox
     torque_track_loss: Scalar = UNSET  # eq. (24), (26) at the pulley [N·m]
     inertia_added: Scalar = UNSET  # by effects, of one side at the driving wheel [kg·m²]
-    torque_load: Scalar = UNSET  # all that the gearbox output carries, inertia apart [N·m]
-    efficiency_load: Scalar = UNSET  # η_rm, or 1/η_rm where power flows back [-]
+    torque_load: Scalar = UNSET  # all load of the gearbox output except inertia [N·m]
+    efficiency_load: Scalar = UNSET  # η_rm, or 1/η_rm if power flows back [-]
     torque_idle: Scalar = UNSET  # M_rf_idle at the gearbox input, eq. (20) [N·m]
-    torque_input: Scalar = UNSET  # into the gearbox, the armature's share taken off [N·m]
+    torque_input: Scalar = UNSET  # into the gearbox, less the armature's share [N·m]
     torque_gear: Scalar = UNSET  # M_r, eq. (23) [N·m]
     torque_output: Scalar = (
-        UNSET  # that, less what effects of the gearbox take: what a meter at the output reads [N·m]
+        UNSET  # M_r less the effects of the gearbox: reading of a torque meter at the output [N·m]
     )
     torque_net: Scalar = UNSET  # drives the rotating masses, at the pulley [N·m]
     # motion
@@ -173,22 +173,22 @@ class Result(eqx.Module):
     """One settled operating point (or the end of a run), with its status.
 
     Attributes:
-        reading: what the instruments show [SI], by the name of the channel (`channels.EVERY`); each is an
-            attribute too: `result.total_current`.
+        reading: of the instruments [SI], by channel name (`channels.EVERY`); each is also an attribute:
+            `result.total_current`.
         theoretical_speed: r_k ω_k, eq. (32) [m/s].
         slip: 1 - V / V_theoretical, eq. (33) [-]; 0 at rest.
         voltage: at the motors [V].
         mass: total [kg].
         traction: of both sides [N].
-        adhesion_used: size of the demand over the largest traction of the friction law [-]; above 1 the robot slides.
+        adhesion_used: |demand| over the largest traction of the friction law [-]; above 1 the robot slides.
         power_supply: P_e taken by the motors [W].
         power_motor: N_d at the motor shafts [W].
         power_gear: N_r at the gearbox outputs [W].
         power_ground: N_t from the movers to the ground [W].
         power_lift: against gravity [W].
         efficiency_motor, efficiency_gear, efficiency_chassis: N_d/P_e, N_r/N_d, N_t/N_r [-]; 0 at rest
-            and where power does not flow that way.
-        winding_settled: after long running at this current [°C]; inf where none settles.
+            and if power does not flow that way.
+        winding_settled: after long running at this current [°C]; inf if it has no limit.
         voltage_cell: of one cell of the battery [V]; 0 on the external supply.
         status: code into `STATUSES`.
         flags: bit mask over `FLAGS`.
@@ -222,7 +222,7 @@ class Result(eqx.Module):
 
 
 def done(status: Any) -> Any:
-    """Whether runs ended as their conditions ask, by their codes: an operating point with numbers."""
+    """True for status codes of runs that ended as requested, with an operating point."""
     return (status == CONVERGED) | (status == REVERSES)
 
 
@@ -232,5 +232,5 @@ def quotient(part: Scalar, whole: Scalar) -> Float[Array, "..."]:
     return jnp.where(moving, part / jnp.where(moving, whole, 1.0), 0.0)
 
 
-#: Names of what every point has beside its numbers: code into `STATUSES`, bit mask over `FLAGS`.
+#: Names of further columns of each point: code into `STATUSES`, bit mask over `FLAGS`.
 CODES = ("status", "flags")

@@ -37,7 +37,7 @@ class Track(eqx.Module):
         meaning="share of the weight that the guides carry (the pulleys carry the rest)",
         bounds=(0.0, 1.0),
         sd=0.2,
-        source="Table A1 simulated lies between none and all of the weight; wheels carry all of it in 4W2T",
+        source="Table A1 simulated lies between 0 and 1 of the weight; wheels carry all of it in 4W2T",
     )
 
     def torque_loss(self, speed_wheel: Scalar, direction: Scalar) -> Scalar:

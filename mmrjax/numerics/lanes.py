@@ -1,9 +1,9 @@
-"""A loop whose turns differ much in number over a batch: a member that has ended makes room for the next."""
+"""A loop for batches with very different numbers of turns: finished members are replaced by queued ones."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -13,66 +13,39 @@ from jaxtyping import Array, Bool
 
 T = TypeVar("T")
 
-#: Members of a batch that are at work at once: enough to fill vectors and caches, few enough that seldom many have
-#: ended at its end.
+#: Number of members that are computed at a time: enough to fill vectors and caches, few enough that most are still
+#: running at the end.
 LANES = 256
 
 
-def until(
-    begun: Callable[[Any], T],
-    turn: Callable[[Any, T], T],
-    ended: Callable[[T], Bool[Array, ""]],
-    own: Any,
-    kept: Callable[[T], Any] = lambda state: state,
-    most: int | None = None,
-) -> Any:
-    """The state at which `ended`, by `turn` from `begun`, without derivatives.
+class _Loop(NamedTuple):
+    """A loop of one member, see `until`: functions of its numbers.
 
-    A batch of `jax.lax.while_loop` takes for each of its members as many turns as the longest of them. Here it takes
-    the mean, beside what the last `most` members take; those that have ended when they begin take none.
-
-    Args:
-        begun: state of arrays, of `own`; turn: the next state, of `own` and a state; ended: of a state. They close
-            over no traced number.
-        own: what a member has of its own; numbers in it may be batched.
-        kept: what of the last state is returned; most: members that are at work at once, `LANES` if
-            none are stated.
+    Attributes:
+        lanes: members that are at work at once.
     """
-    numbers, rest = eqx.partition(jax.lax.stop_gradient(own), eqx.is_array)
 
-    def of(numbers: Any) -> Any:
-        return eqx.combine(numbers, rest)
+    begun: Callable[[Any], Any]
+    turn: Callable[[Any, Any], Any]
+    ended: Callable[[Any], Bool[Array, ""]]
+    kept: Callable[[Any], Any]
+    lanes: int
 
-    def many(numbers: Any, batched: Any, size: int) -> T:
-        """The end of each of `size` members; where these are a batch again, all members go through the same lanes."""
+    def alone(self, numbers: Any) -> Any:
+        """Returns the end of one member."""
+        turned = jax.lax.while_loop(lambda s: ~self.ended(s), lambda s: self.turn(numbers, s), self.begun(numbers))
+        return self.kept(turned)
 
-        @custom_vmap
-        def each(numbers: Any) -> T:
-            return refilled(numbers, batched, size)
+    def refilled(self, numbers: Any, batched: Any, size: int) -> Any:
+        """Returns the end of each of `size` members; a queued member replaces a finished one.
 
-        @each.def_vmap
-        def flat(outer: int, of_outer: Any, numbers: Any) -> tuple[T, Any]:
-            (of_outer,) = of_outer
-
-            def member(x: Array, inner: bool, out: bool) -> Array:
-                if inner and not out:
-                    return jnp.concatenate([x] * outer)
-                if out and not inner:
-                    return jnp.repeat(x, size, axis=0)
-                return x.reshape(outer * size, *x.shape[2:]) if inner else x
-
-            whole = jax.tree.map(member, numbers, batched, of_outer)
-            either = jax.tree.map(lambda inner, out: inner or out, batched, of_outer)
-            found = jax.tree.map(lambda x: x.reshape(outer, size, *x.shape[1:]), many(whole, either, outer * size))
-            return found, jax.tree.map(lambda _: True, found)
-
-        return each(numbers)
-
-    def refilled(numbers: Any, batched: Any, size: int) -> T:
-        lanes = min(size, LANES if most is None else most)
+        Args:
+            numbers: of the members, with a leading axis where `batched`, a tree of booleans, is true.
+        """
+        lanes = min(size, self.lanes)
         axes = jax.tree.map(lambda b: 0 if b else None, batched)
 
-        def chosen(which: Array, one: T, other: T) -> T:
+        def chosen(which: Array, one: Any, other: Any) -> Any:
             return jax.tree.map(
                 lambda x, y: jnp.where(jnp.reshape(which, which.shape + (1,) * (x.ndim - 1)), x, y), one, other
             )
@@ -80,9 +53,9 @@ def until(
         def at(index: Array) -> Any:
             return jax.tree.map(lambda x, b: x[index] if b else x, numbers, batched)
 
-        begin = jax.vmap(lambda x: begun(of(x)), in_axes=(axes,))
-        go = jax.vmap(lambda x, s: turn(of(x), s), in_axes=(axes, 0))
-        over = jax.vmap(ended)
+        begin = jax.vmap(self.begun, in_axes=(axes,))
+        go = jax.vmap(self.turn, in_axes=(axes, 0))
+        over = jax.vmap(self.ended)
 
         begins = begin(numbers)
         idle = over(begins)
@@ -102,18 +75,74 @@ def until(
             found = jax.tree.map(
                 lambda all_, x: all_.at[jnp.where(free, member, size)].set(x, mode="drop"),
                 found,
-                jax.vmap(kept)(state),
+                jax.vmap(self.kept)(state),
             )
             place = jnp.where(free, following + jnp.cumsum(free) - 1, place)
             return found, place, following + jnp.sum(free), chosen(free, begin(at(member_of(place))), state)
 
         first = jnp.arange(lanes)
-        carry = jax.vmap(kept)(begins), first, jnp.asarray(lanes), begin(at(member_of(first)))
+        carry = jax.vmap(self.kept)(begins), first, jnp.asarray(lanes), begin(at(member_of(first)))
         return jax.lax.while_loop(busy, step, carry)[0]
+
+
+def until(
+    begun: Callable[[Any], T],
+    turn: Callable[[Any, T], T],
+    ended: Callable[[T], Bool[Array, ""]],
+    own: Any,
+    kept: Callable[[T], Any] = lambda state: state,
+    most: int | None = None,
+) -> Any:
+    """The first state with `ended`, by repeated `turn` from `begun`; without derivatives.
+
+    A batch of `jax.lax.while_loop` takes the turns of its longest member for every member. This loop takes their
+    mean, plus those of the last `most` members; members that have ended at the start take none.
+
+    Args:
+        begun: state of arrays, from `own`; turn: the next state, from `own` and a state; ended: of a state. They
+            close over no traced number.
+        own: data of one member; its numbers may be batched.
+        kept: the part of the last state to return; most: number of members computed at a time, `LANES` if
+            None.
+    """
+    numbers, rest = eqx.partition(jax.lax.stop_gradient(own), eqx.is_array)
+
+    def of(numbers: Any) -> Any:
+        return eqx.combine(numbers, rest)
+
+    lanes = LANES if most is None else most
+    loop = _Loop(lambda x: begun(of(x)), lambda x, state: turn(of(x), state), ended, kept, lanes)
+
+    def many(numbers: Any, batched: Any, size: int) -> T:
+        """The end of each of `size` members; if these are batched again, all members share the same lanes."""
+
+        @custom_vmap
+        def each(numbers: Any) -> T:
+            found: T = loop.refilled(numbers, batched, size)
+            return found
+
+        @each.def_vmap
+        def flat(outer: int, of_outer: Any, numbers: Any) -> tuple[T, Any]:
+            (of_outer,) = of_outer
+
+            def member(x: Array, inner: bool, out: bool) -> Array:
+                if inner and not out:
+                    return jnp.concatenate([x] * outer)
+                if out and not inner:
+                    return jnp.repeat(x, size, axis=0)
+                return x.reshape(outer * size, *x.shape[2:]) if inner else x
+
+            whole = jax.tree.map(member, numbers, batched, of_outer)
+            either = jax.tree.map(lambda inner, out: inner or out, batched, of_outer)
+            found = jax.tree.map(lambda x: x.reshape(outer, size, *x.shape[1:]), many(whole, either, outer * size))
+            return found, jax.tree.map(lambda _: True, found)
+
+        return each(numbers)
 
     @custom_vmap
     def alone(numbers: Any) -> T:
-        return kept(jax.lax.while_loop(lambda s: ~ended(s), lambda s: turn(of(numbers), s), begun(of(numbers))))
+        found: T = loop.alone(numbers)
+        return found
 
     @alone.def_vmap
     def together(size: int, batched: Any, numbers: Any) -> tuple[T, Any]:

@@ -1,11 +1,11 @@
 """Newton's method for a few unknowns over a large batch, with derivatives by the implicit function theorem.
 
-`FewUnknowns` is a root finder of optimistix, called through `optimistix.root_find`. Processor time for 65 536
-points of `steady`, two cores, medians of four turns of ten calls, alternately in one run (2026-11-28): 29 ms, where
-a loop of our own took 27 ms. optimistix's `Newton` takes 3.1 times as long: it factorises by batched calls of
-LAPACK. The derivative is written here, since a program that holds optimistix's (`ImplicitAdjoint`) holds a host
-callback, through lineax, and JAX's cache never keeps such a program. With `elimination` as lineax's solver it is as
-fast (0.5 ms for 4096 gradients); by `Newton` it takes seven times as long.
+`FewUnknowns` is a root finder of optimistix, called through `optimistix.root_find`. For 65 536 points of `steady` on
+two cores it takes 29 ms of processor time (a loop of our own took 27 ms; medians of four turns of ten calls,
+alternating in one run, 2026-11-28). optimistix's `Newton` takes 3.1 times as long, because it factorises by batched
+calls of LAPACK. The derivative is written here. A program with optimistix's derivative (`ImplicitAdjoint`) contains a
+host callback, through lineax, and JAX's cache never stores such a program. With `elimination` as lineax's solver it
+is as fast (0.5 ms for 4096 gradients); with `Newton` it takes seven times as long.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from jaxtyping import Array, Bool, Float
 
 from mmrjax.numerics.linear_equations import Entry, Matrix, Vector, factorise, regular, substitute
 
-#: f(y, shared, own): as many numbers as there are unknowns, each a scalar, so that a batch of them is an array each.
+#: f(y, shared, own): as many scalars as unknowns, so that in a batch each is an array.
 Residual = Callable[[Vector, Any, Any], Vector]
 
-#: The same as optimistix takes it: f(y, (shared, own)), and nothing beside it.
+#: The same in the form of optimistix: f(y, (shared, own)), without further arguments.
 Function = Callable[[Vector, tuple[Any, Any]], tuple[Vector, Any]]
 
 #: Linearisations after which a search has failed.
@@ -34,8 +34,11 @@ MAX_STEPS = 40
 
 
 def _linearised(fn: Function, y: Vector, args: Any, apart: bool) -> tuple[Matrix, Vector]:
-    """∂f/∂y by its rows, and f. `apart` by one unknown after another, so that what does not depend on it costs
-    nothing; else by all together, which is a third of the program."""
+    """∂f/∂y by its rows, and f.
+
+    `apart`: one unknown after another, so that rows that do not depend on it cost nothing; else all together, in a
+    program of a third of the size.
+    """
     if not apart:
 
         def together(y: Array) -> tuple[Vector, Vector]:
@@ -59,7 +62,7 @@ def _linearised(fn: Function, y: Vector, args: Any, apart: bool) -> tuple[Matrix
 
 
 def _watched(value: Array, index: int, moved: set[int]) -> Array:
-    """`value`; while it is differentiated, `index` is added to `moved` if it has a derivative at all."""
+    """`value`; while it is differentiated, `index` is added to `moved` if it has a derivative."""
 
     @jax.custom_jvp
     def watched(x: Array) -> Array:
@@ -79,31 +82,31 @@ def _small(value: Vector, tolerance: float) -> Bool[Array, ""]:
 
 
 def _step(fn: Function, y: Vector, args: Any, apart: bool) -> tuple[Vector, Vector]:
-    """y - J⁻¹ f, each unknown as it was where that is no number; and J⁻¹ f."""
+    """y - J⁻¹ f, with unknowns unchanged that would not be finite; and J⁻¹ f."""
     jacobian, value = _linearised(fn, y, args, apart)
     step = tuple(jnp.zeros(()) if x is None else x for x in substitute(factorise(jacobian), value))
     return tuple(jnp.where(jnp.isfinite(b), a - b, a) for a, b in zip(y, step, strict=True)), step
 
 
 class Turning(eqx.Module):
-    """State of a search: the unknowns, and True once f is 0 there."""
+    """State of a search: the unknowns, and True once f is 0 at them."""
 
     y: Vector
     solved: Bool[Array, ""]
 
 
 class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
-    """Newton's method for a few scalars, each determined by the equation beside it (see `factorise`).
+    """Newton's method for a few scalars, each determined by the equation of the same index (see `factorise`).
 
-    A member is solved once |f| < `atol`, or after a step so small that its square is below it. A linear f needs one
-    pass. `init` makes it, outside the loop, where XLA fuses it over a batch with the code before and after; the loop
-    then turns only for members that crossed into another branch of f.
+    A member is solved once |f| < `atol`, or after a step whose square is below `atol`. A linear f needs one
+    pass. `init` makes it, outside the loop, so that XLA fuses it over a batch with the code before and after. The
+    loop then runs only for members that crossed into another branch of f.
 
     Attributes:
         atol: of f; rtol, norm: not read.
-        linear: whether f is linear in y but for branches; right for any f, fast for such. Arguments of f are then the
-            data shared by a batch and those of each member, in this order.
-        apart: whether ∂f/∂y is found by one unknown after another, which is faster over large batches, or by all
+        linear: True if f is linear in y except for branches; correct for any f, fast for such. Arguments of f are
+            then the data shared by a batch and the data of each member, in this order.
+        apart: True to compute ∂f/∂y one unknown after another, which is faster over large batches; False: all
             together, a program of a third of the size.
     """
 
@@ -134,11 +137,11 @@ class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
     ) -> tuple[Vector, Turning, Any]:
         """One turn: y - J⁻¹ f."""
         if self.linear:
-            # Members that are there count for nothing. Were this not said, the compiler would compute and store
-            # what the turns have in common before the first of them, also where there is none.
+            # Solved members are masked. Without the mask the compiler would compute and store the common part of the
+            # turns before the first of them, even if there is none.
             shared, own = args
             args = shared, jax.tree.map(lambda x: jnp.where(state.solved, jnp.ones_like(x), x), own)
-        # A step so small leaves an error of its square.
+        # Such a small step leaves an error of the order of its square.
         y, step = _step(fn, state.y, args, self.apart)
         return y, Turning(y, _small(step, self.atol**0.7)), None
 
@@ -167,19 +170,19 @@ class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
 def root(
     residual: Residual, start: Vector, shared: Any, own: Any, tolerance: float, linear: bool, apart: bool
 ) -> tuple[Vector, Bool[Array, ""]]:
-    """y with f(y) = 0, by `FewUnknowns`, until every member of a batch is there.
+    """Solves f(y) = 0 by `FewUnknowns`, until every member of a batch has converged.
 
     Args:
-        residual: f, scaled to the order of one; pure, with no data of its own that is differentiated. Equation k
+        residual: f, scaled to the order of one; pure, without differentiated data of its own. Equation k
             determines unknown k (see `factorise`).
         start: first guess; no derivative passes through it.
-        shared, own: what f depends on beside y: data of all members of a batch and of each. Derivatives by both
-            are implicit, dy = -(∂f/∂y)⁻¹ (∂f/∂shared dshared + ∂f/∂own down), forward and reverse, zero where ∂f/∂y
-            is singular. The program holds no host callback.
-        tolerance, linear, apart: as of `FewUnknowns`.
+        shared, own: arguments of f other than y: data of all members of a batch and of each. Derivatives with respect
+            to both are implicit, dy = -(∂f/∂y)⁻¹ (∂f/∂shared dshared + ∂f/∂own down), forward and reverse, zero if
+            ∂f/∂y is singular. The program holds no host callback.
+        tolerance, linear, apart: as for `FewUnknowns`.
 
     Returns:
-        y, and whether it was there within `MAX_STEPS` turns; one whose residual is not finite is not.
+        y, and whether it converged within `MAX_STEPS` turns; False for a residual that is not finite.
     """
 
     function: Any = _function(residual)
@@ -215,14 +218,14 @@ def _implicit(primals: tuple, tangents: tuple) -> tuple[tuple[Vector, Array], tu
 
 
 def implicit_slopes(slope: Float[Array, "rows outputs x_and_y"], left: Float[Array, "rows n x_and_y"]) -> Array:
-    """Slopes of what rows show by x, where the unknowns y of each row follow from f(x, y) = 0.
+    """Derivatives of the outputs of rows with respect to x; the unknowns y of each row follow from f(x, y) = 0.
 
     Args:
-        slope: ∂/∂x of the outputs, then ∂/∂y; left: the same of f, one equation for each of the n unknowns, in the
+        slope: ∂/∂x of the outputs, then ∂/∂y; left: the same for f, one equation for each of the n unknowns, in the
             order of `root`.
 
     Returns:
-        Shape (rows, outputs, x): ∂/∂x - ∂/∂y (∂f/∂y)⁻¹ ∂f/∂x, without the second where ∂f/∂y is singular.
+        Shape (rows, outputs, x): ∂/∂x - ∂/∂y (∂f/∂y)⁻¹ ∂f/∂x, without the second term if ∂f/∂y is singular.
     """
     n = left.shape[1]
     size = left.shape[2] - n

@@ -1,4 +1,4 @@
-"""What seldom has to be computed: a branch that a batch skips too where no member of it needs it."""
+"""A branch for rarely needed computations, which a batch skips if no member needs it."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ T = TypeVar("T")
 
 
 def rarely(needed: Bool[Array, ""], function: Callable[..., T], arguments: tuple, otherwise: T) -> T:
-    """`function(*arguments)` where `needed`, else `otherwise`.
+    """`function(*arguments)` if `needed`, else `otherwise`.
 
-    As `jax.lax.cond`, which `jax.vmap` turns into computing both branches for every member of a batch. Here it is a
-    loop of at most one turn: a batch turns it if one member needs it.
+    Similar to `jax.lax.cond`, but `jax.vmap` turns that into computing both branches for every member of a batch.
+    This is a loop of at most one turn: a batch runs it if one member needs it.
 
     Args:
-        function: pure; arguments: trees of arrays; otherwise: of the shapes and types of what `function` gives.
+        function: pure; arguments: trees of arrays; otherwise: with the shapes and types of the result of `function`.
     """
 
     def turn(state: tuple[Array, T]) -> tuple[Array, T]:
-        # Tied to the loop's own state, or the compiler would compute what does not change before the loop.
+        # Tied to the loop's state; otherwise the compiler would move the computation out of the loop.
         _, here = jax.lax.optimization_barrier((state[0], arguments))
         like = jax.tree.map(lambda x, y: jnp.asarray(x, y.dtype), function(*here), otherwise)
         return jnp.zeros_like(state[0]), like

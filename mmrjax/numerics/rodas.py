@@ -1,4 +1,4 @@
-"""Rodas4 as a solver of diffrax, which takes long to import: whoever integrates imports this first then."""
+"""Rodas4 as a solver of diffrax; imported only for integrations, because diffrax takes long to import."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _D = (
 class RodasInterpolation(diffrax.LocalLinearInterpolation):
     """The method's own dense output, of order 3: y0 (1 - s) + s (y1 + (1 - s) (c2 + s c3)).
 
-    A Hermite cubic would not do: its slopes are right-hand sides, in which a stiff component multiplies
-    the error of its value, so that it swings between the ends of a long step.
+    A Hermite cubic would not work: its slopes are right-hand sides, in which a stiff component multiplies
+    the error of its value, so that it oscillates between the ends of a long step.
     """
 
     c2: Any
@@ -40,9 +40,9 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
     """Stiffly accurate, L-stable Rosenbrock method of order 4(3) with six stages.
 
     Source: Hairer and Wanner, Solving Ordinary Differential Equations II (1996), Section IV.7, RODAS. diffrax has no
-    Rosenbrock method. Its implicit ones (Kvaerno's of order 3 to 5) take ten times as long over Table 8 at the same
-    accuracy, or longer (docs/lab/figures.md).
-    Only for autonomous right-hand sides of one flat vector: the Jacobian in time is taken to be zero.
+    Rosenbrock method. Its implicit ones (Kvaerno's of order 3 to 5) take at least ten times as long over Table 8 at
+    the same accuracy (docs/lab/figures.md). Only for autonomous right-hand sides of one flat vector: the derivative
+    with respect to time is assumed to be zero.
     """
 
     term_structure: ClassVar[Any] = diffrax.ODETerm

@@ -1,4 +1,4 @@
-"""The stages of Rodas4, a stiff method for small autonomous ODEs that solves linear systems only.
+"""The stages of Rodas4, a stiff method for small autonomous ODEs that solves only linear systems.
 
 Source: Hairer and Wanner, Solving Ordinary Differential Equations II (1996), Section IV.7, RODAS.
 """
@@ -39,15 +39,18 @@ def norm(error: Float[Array, " unknowns"], own: int, weight: float | np.ndarray 
 
 
 def norm_of_sides(error: Float[Array, " unknowns"], whole: slice, own: int) -> Scalar:
-    """The same where both sides have unknowns but those of the `whole` robot: a pair counts as one, so that steps are
-    those of the `own` unknowns of straight travel where sides are alike."""
+    """Same as `norm` for unknowns of both sides and those of the `whole` robot.
+
+    A pair counts as one unknown, so that with equal sides the steps are those of the `own` unknowns of straight
+    travel.
+    """
     weight = np.full(error.shape[0], 0.5)
     weight[whole] = 1.0
     return norm(error, own, weight)
 
 
 def step_longest(robot: Robot, conditions: Conditions) -> Array | None:
-    """The longest step that still resolves every effect with a memory [s]; None where none has one."""
+    """The longest step that resolves every effect with a memory [s]; None if no effect limits it."""
     limits = [jnp.asarray(effect.step_longest(robot, conditions)) for effect in robot.remembering]
     return jax.lax.stop_gradient(jnp.min(jnp.stack(limits))) if limits else None
 
@@ -59,13 +62,13 @@ def stages(
     h: Array,
     looped: bool = False,
 ) -> tuple[Array, Array, Array | list[Array], Array | list[Array]]:
-    """One step over `h`, with integrals that do not act back on what they are integrals of.
+    """One step of length `h`, with integrals that do not act back on the unknowns.
 
-    The equations of the integrals q' = g(y) need no system to be solved: their part of the matrix is triangular.
+    The equations of the integrals q' = g(y) need no linear system: their part of the matrix is triangular.
 
     Args:
         rates: f(y) and g(y).
-        looped: hold `rates` once for all stages but the first: a program that compiles in less time.
+        looped: True to include `rates` once for all stages but the first, in a program that compiles faster.
 
     Returns:
         y and q at the end of the step, and the stages of both; the last stage estimates the error.
@@ -76,8 +79,7 @@ def stages(
         return found, found
 
     (jacobian, jacobian_q), (f, g) = jax.jacfwd(both, has_aux=True)(y0)
-    # A pivot that vanishes spoils the step, which the control of the error then rejects: a shorter one makes the
-    # diagonal dominate.
+    # A vanishing pivot spoils the step, and the error control rejects it; a shorter step makes the diagonal dominate.
     inverted = inverse(jnp.eye(y0.shape[0], dtype=y0.dtype) / (h * _GAMMA) - jacobian)[0]
     u, v, y, q = [inverted @ f], [], y0, q0
     v.append(h * _GAMMA * (g + jacobian_q @ u[0]))
@@ -104,8 +106,8 @@ def _looped(
     first: Array,
     first_q: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """The stages after the first, see `stages`, one after the other by one loop."""
-    reach = np.zeros((5, 6))  # of the second stage to the sixth, which begins where the fifth ends
+    """The stages after the first, see `stages`, in one loop."""
+    reach = np.zeros((5, 6))  # of the second to the sixth stage; the sixth begins at the end of the fifth
     for row, weights in enumerate((*_A, (*_A[-1], 1.0))):
         reach[row, : len(weights)] = weights
     turns = np.zeros((5, 6))

@@ -1,8 +1,8 @@
-"""Sine, cosine and a third of an arc sine in plain arithmetic, which XLA vectorises and fuses with its neighbours.
+"""Sine, cosine and a third of an arc sine in plain arithmetic, which XLA vectorises and fuses with other operations.
 
-Its own `sin`, `cos` and `asin` are calls of the C library on a CPU, one for each member of a batch: they took nine
-tenths of the time of a closed form that holds four of them. Each ends with a quotient, if only by ±1: XLA stores
-what is divided once for the whole batch, while products and sums are computed again for each that needs them.
+On a CPU XLA's own `sin`, `cos` and `asin` call the C library for each member of a batch. They took nine tenths of the
+time of a closed form with four of them. Each function here ends with a quotient, even if only by ±1, because XLA
+stores quotients once for the whole batch but computes products and sums again for each use.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-#: Taylor's series in x² of sin x / x and of cos x: what they leave out on ±π/2 is 1e-18 and 2e-17.
+#: Taylor's series in x² of sin x / x and of cos x; their truncation errors on ±π/2 are 1e-18 and 2e-17.
 _SINE = [(-1) ** k / math.factorial(2 * k + 1) for k in range(11)]
 _COSINE = [(-1) ** k / math.factorial(2 * k) for k in range(11)]
-#: π in two parts, of which the first times a small integer is exact (Cody and Waite, 1980).
+#: π in two parts; the first times a small integer is exact (Cody and Waite, 1980).
 _PI = 3.14159265346825122834e00, 1.21542010130123844986e-10
 #: (asin x - x) / x as P / Q of x², on ±1/2: fdlibm (Sun Microsystems, 1993), e_asin.c.
 _ARCSINE_P = (
@@ -38,7 +38,7 @@ def _polynomial(x: Array, coefficients: Sequence[float]) -> Array:
 
 
 def _half_turns(angle: Array) -> tuple[Array, Array]:
-    """1 or -1 for an even or odd number of half turns in `angle`, to the nearest, and what is left, within ±π/2."""
+    """1 or -1 for an even or odd nearest number of half turns in `angle`, and the remainder, within ±π/2."""
     turns = jnp.round(angle * (1 / math.pi))
     return 1 - 2 * jnp.abs(turns - 2 * jnp.round(turns / 2)), (angle - turns * _PI[0]) - turns * _PI[1]
 
@@ -46,7 +46,7 @@ def _half_turns(angle: Array) -> tuple[Array, Array]:
 @jax.custom_jvp
 @jax.jit
 def sine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
-    """sin of an angle within ±1e5 [rad], to 3e-16."""
+    """sin of an angle within ±1e5 [rad], accurate to 3e-16."""
     sign, left = _half_turns(jnp.asarray(angle))
     return left * _polynomial(left * left, _SINE) / sign
 
@@ -54,7 +54,7 @@ def sine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
 @jax.custom_jvp
 @jax.jit
 def cosine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
-    """cos of an angle within ±1e5 [rad], to 3e-16."""
+    """cos of an angle within ±1e5 [rad], accurate to 3e-16."""
     sign, left = _half_turns(jnp.asarray(angle))
     return _polynomial(left * left, _COSINE) / sign
 
@@ -62,11 +62,11 @@ def cosine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
 @jax.custom_jvp
 @jax.jit
 def sine_third(share: Float[Array, "..."]) -> Float[Array, "..."]:
-    """sin(asin(x) / 3), a root of 3 y - 4 y³ = x, for x within ±1, to 2e-16; NaN beyond."""
+    """sin(asin(x) / 3), a root of 3 y - 4 y³ = x, for x within ±1, accurate to 2e-16; NaN beyond."""
     share = jnp.asarray(share)
     size = jnp.abs(share)
     small = size < 0.5
-    # asin x = π/2 - 2 asin √((1 - x) / 2) where the fraction would not do.
+    # asin x = π/2 - 2 asin √((1 - x) / 2) if the fraction is not accurate.
     square = jnp.where(small, size * size, (1 - size) / 2)
     root = jnp.where(small, share, jnp.sqrt(square))
     arc = root + root * (_polynomial(square, _ARCSINE_P) / _polynomial(square, _ARCSINE_Q))

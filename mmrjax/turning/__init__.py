@@ -1,1 +1,1 @@
-"""Robots whose sides are driven apart."""
+"""Robots with independently driven sides."""

@@ -1,14 +1,14 @@
-"""Two sides: how a robot whose sides are driven apart stands on the ground and slides over it.
+"""Two sides: loads and sliding of a robot with independently driven sides on the ground.
 
 Frame of the robot, its origin the centre of mass: x ahead, y to the left, yaw positive to the left. Sides are in the
 order left, right (leading axis 2), their contact lines at y = ±B/2. A contact at (x, y_s) slides over the ground by
 
     u_x = r ω_k,s - V_s - slip, V_s = v_x - ω y_s,    u_y = -v_y - ω x,
 
-and is held by N μ(|u|) (u_x, λ^a u_y) / |(u_x, λ^(a-1) u_y)|, with μ the law of Fig. 7 and λ = φ_y / φ_x: at u_y = 0
-the law of straight travel, and on the friction ellipse whatever a, the rule of direction. At a = 1 the force is along
-(φ_x u_x, φ_y u_y), at a = 2 it takes the most power that the ellipse allows. Which holds is an assumption; so is that
-loads are those of a rigid robot in balance at every instant.
+and carries the force N μ(|u|) (u_x, λ^a u_y) / |(u_x, λ^(a-1) u_y)|, with μ the law of Fig. 7 and λ = φ_y / φ_x. At
+u_y = 0 this is the law of straight travel, and for any a it is on the friction ellipse; a is the rule of direction.
+At a = 1 the force is along (φ_x u_x, φ_y u_y), at a = 2 it dissipates the most power that the ellipse allows. The
+rule is an assumption, as are the loads of a rigid robot in equilibrium at each instant.
 """
 
 from __future__ import annotations
@@ -25,19 +25,23 @@ from mmrjax.model.contact import Friction
 from mmrjax.model.params import Scalar, parameter
 from mmrjax.numerics.rarely import rarely
 
-#: Of a side's contact line from the middle of the robot, in shares of B [-]: left, right.
+#: Position of a side's contact line from the middle of the robot, in shares of B [-]: left, right.
 SIDES = np.array([0.5, -0.5])
-#: Widths of the packaged robot between and over its tracks, between which its contact lines are [m] (Table 6).
+#: Widths of the packaged robot between and over its tracks, which enclose its contact lines [m] (Table 6).
 BETWEEN, OVER = 0.208, 0.278
-#: Square of a sliding speed too small to have a direction [m²/s²].
+#: Square of a sliding speed that is too small to have a direction [m²/s²].
 STILL = 1e-16
-#: Newton steps of the transfer of load; the contact's forces are nearly bilinear in it.
+#: Newton steps of the load transfer; the contact's forces are nearly bilinear in it. The loop over three steps is
+#: unrolled: for 1024 turns `newton.FewUnknowns` takes 1.28 times its time, and optimistix's `Newton` 4.8 times, for
+#: the same loads (two cores, processor time in one run, 2026-11-28).
 LOAD_STEPS = 3
 
 
 def _nodes(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places of nodes on -1..1 and their weights, Gauss and Legendre's; and the weights of two wheels at the ends,
-    which have the first and the last of them."""
+    """Gauss-Legendre nodes on -1..1 and their weights; and the weights of two wheels at the ends.
+
+    The wheels use the first and the last node.
+    """
     place, weight = np.polynomial.legendre.leggauss(count)
     ends = np.zeros(count)
     ends[[0, -1]] = 0.5
@@ -45,12 +49,12 @@ def _nodes(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def total(sides: Float[Array, "2 ..."]) -> Array:
-    """Sum over both sides, as two numbers: XLA makes a call of every reduction, however short."""
+    """Sum over both sides, as two numbers: XLA makes a call of every reduction, even a short one."""
     return sides[0] + sides[1]
 
 
 class Turning(eqx.Module):
-    """What straight travel does not show of a robot with two sides.
+    """Parameters of a robot with two sides that matter only in turns.
 
     Attributes:
         nodes: of a track's contact, see `Stance`.
@@ -92,15 +96,15 @@ class Turning(eqx.Module):
 
 
 class Stance(eqx.Module):
-    """How a robot stands on its contacts.
+    """Position of a robot on its contacts.
 
     Attributes:
         length: of the contact, or the wheelbase [m]; width: B [m].
         height: of the centre of mass above the ground [m]; ahead: of it from the middle of the contact [m].
-        on_tracks: 1 on tracks, whose contact is a line, 0 on wheels, which bear at its ends [-].
+        on_tracks: 1 on tracks, whose contact is a line, 0 on wheels, with contacts only at its ends [-].
         lateral: λ on this ground [-]; rule: a [-].
-        nodes: of a track's contact, even. With 16 the width of a turn on the spot under dry friction is 3e-5 off,
-            with 32 1e-8.
+        nodes: of a track's contact, even. The width of a turn on the spot under dry friction has an error of 3e-5
+            with 16 nodes and 1e-8 with 32.
     """
 
     length: Scalar
@@ -114,15 +118,15 @@ class Stance(eqx.Module):
 
 
 class Grip(eqx.Module):
-    """What the ground does to each side, shape (2,): left, right.
+    """Forces of the ground on each side, shape (2,): left, right.
 
     Attributes:
         normal: load of a side [N]; ahead, aside: forces along x and y [N]; moment: of the lateral forces about the
             centre of mass, positive to the left [N·m].
         across: power that lateral sliding turns into heat [W].
-        moved: load that has moved from the left side to the right one [N]; centre: of pressure, ahead of the middle
+        moved: load transferred from the left side to the right one [N]; centre: of pressure, ahead of the middle
             of the contact [m].
-        lacking: by how much both are above what these forces move: nothing, but in a search for them [N, m].
+        lacking: excess of both over the values that these forces give: 0, except during a search for them [N, m].
     """
 
     normal: Float[Array, " 2"]
@@ -136,11 +140,11 @@ class Grip(eqx.Module):
 
 
 def footprint(stance: Stance, centre: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """Middle of what a contact bears on, from its own middle [m], half the length of that [m], and how much more than
-    the mean its front end bears [-].
+    """Centre and half length of the loaded part of a contact, from its own middle [m], and its relative excess load.
 
-    Tracks: p = (N/L)(1 + 12 x_p x / L²), and from |x_p| = L/6 on a triangle of length 3 (L/2 - |x_p|), its foot where
-    the contact lifts off (middle third rule). Wheels: by the lever.
+    The excess is that of the pressure at its front end over the mean [-]. Tracks: p = (N/L)(1 + 12 x_p x / L²). From
+    |x_p| = L/6 on it is a triangle of length 3 (L/2 - |x_p|), up to the lift-off of the contact (middle third rule).
+    Wheels: by the lever.
     """
     tracks, length = stance.on_tracks > 0.5, stance.length
     tilt = jnp.clip(jnp.where(tracks, 6.0, 2.0) * centre / length, -1.0, 1.0)
@@ -149,10 +153,10 @@ def footprint(stance: Stance, centre: Scalar) -> tuple[Scalar, Scalar, Scalar]:
 
 
 class Law(eqx.Module):
-    """What of a contact's law nodes share.
+    """Data of a contact's law that all nodes share.
 
     Attributes:
-        friction: along; ratio: λ^(2a-2), by which sliding across weighs more than along in a direction [-].
+        friction: along; ratio: λ^(2a-2), the weight of lateral over longitudinal sliding in a direction [-].
         on_tracks, nodes: see `Stance`.
     """
 
@@ -176,12 +180,12 @@ class Law(eqx.Module):
         return jnp.where(self.on_tracks > 0.5, both[..., : most + 1], both[..., most + 1 :])
 
     def per_speed(self, along: Scalar, across: Scalar) -> Scalar:
-        """Force along over load and sliding speed [s/m], at the squares of the sliding speeds [m²/s²]."""
+        """Longitudinal force over load and sliding speed [s/m], at the squares of the sliding speeds [m²/s²]."""
         square, weighed = along + across, along + self.ratio * across
         return jnp.sqrt((square + STILL) / (weighed + STILL)) * self.friction.per_speed(square)
 
     def per_speed_rise(self, along: Scalar, across: Scalar) -> tuple[Scalar, Scalar]:
-        """Derivatives of `per_speed` by those squares [s³/m³]."""
+        """Derivatives of `per_speed` with respect to those squares [s³/m³]."""
         square, weighed = along + across, along + self.ratio * across
         turned, held = jnp.sqrt((square + STILL) / (weighed + STILL)), self.friction.per_speed(square)
         slower = turned * self.friction.per_speed_rise(square)
@@ -192,9 +196,9 @@ class Law(eqx.Module):
         )
 
     def rises(self, along: Scalar, across: Scalar) -> tuple[tuple[Scalar, Scalar], tuple[Scalar, Scalar]]:
-        """How fast forces over load, `per_speed` times the sliding speeds, rise with these [s/m], by rows.
+        """Derivatives of forces over load, `per_speed` times the sliding speeds, with respect to those [s/m].
 
-        A force that falls as all of the sliding grows is taken as one that stays.
+        For a force that falls with all of the sliding, the derivative is set to 0.
         """
         square, other, both = along**2, across**2, along * across
         held, (by_along, by_across) = self.per_speed(square, other), self.per_speed_rise(square, other)
@@ -206,12 +210,13 @@ class Law(eqx.Module):
 
 @eqx.filter_custom_jvp
 def moments(law: Law, sliding: Float[Array, " 2"], middle: Scalar, end: Scalar) -> Float[Array, "2 4"]:
-    """Moments of order 0 to 3 of `Law.per_speed` over a contact that is even loaded, from its middle and in halves of
-    its length [s/m]; of each side.
+    """Moments of order 0 to 3 of `Law.per_speed` over a uniformly loaded contact, of each side [s/m].
+
+    They are taken about its middle and in units of half its length.
 
     Args:
-        sliding: along, of each side [m/s]; middle: across, at the middle of the contact [m/s]; end: by how much
-            more at its front end [m/s].
+        sliding: longitudinal, of each side [m/s]; middle: lateral, at the middle of the contact [m/s]; end: its
+            increase to the front end [m/s].
     """
     across = middle + end * law.places()
     return law.over(law.per_speed(sliding[:, None] ** 2, across**2), 3)
@@ -219,7 +224,7 @@ def moments(law: Law, sliding: Float[Array, " 2"], middle: Scalar, end: Scalar) 
 
 @moments.def_jvp
 def _moments_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    """By the speeds in closed form, once for however many directions; by the law's own numbers as it is computed."""
+    """Tangents in closed form for the speeds, once for all directions; as computed for the law's own numbers."""
     law, sliding, middle, end = primals
     across = middle + end * law.places()
     along = sliding[:, None] ** 2
@@ -238,7 +243,7 @@ def _moments_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 class _Given(NamedTuple):
-    """What `grip` is of."""
+    """Arguments of `grip`."""
 
     stance: Stance
     friction: Friction
@@ -261,17 +266,17 @@ def grip(
     resistance: Float[Array, " 2"],
     loads: Float[Array, " 2"] | None = None,
 ) -> Grip:
-    """Forces and loads of both sides, which hang together.
+    """Forces and loads of both sides, which depend on each other.
 
-    The load moves to the outer side, T = h ΣF_y / B, and to the rear, N x_p = N x_c - h (ΣF_x - ΣR); no side bears
-    less than nothing.
+    The load moves to the outer side, T = h ΣF_y / B, and to the rear, N x_p = N x_c - h (ΣF_x - ΣR); the load of a
+    side is never negative.
 
     Args:
-        stance: how it stands; friction: of the ground; adhesion: the surface's ratio [-].
+        stance: of the robot; friction: of the ground; adhesion: the surface's ratio [-].
         load: normal to the ground, of both sides [N].
         sliding: u_x of each side [m/s]; lateral_speed: v_y [m/s]; yaw_rate: ω [rad/s].
         resistance: rolling resistance over the normal load, with its sign, of each side [-].
-        loads: T [N] and x_p [m] where a search that holds more unknowns finds them too; None: found here.
+        loads: T [N] and x_p [m] if a larger search has them among its unknowns; None: found here.
     """
     given = _Given(stance, friction, adhesion, load, sliding, lateral_speed, yaw_rate, resistance)
     if loads is not None:
@@ -279,22 +284,22 @@ def grip(
     held = jax.lax.stop_gradient(given)
     at, rise = _loads(held)
     found = _at_loads(at, None, given)
-    # The last step alone carries the derivatives, which are the implicit ones; it is so small that lines will do.
+    # Only the last step carries derivatives, the implicit ones; it is so small that linear terms suffice.
     change = _step(found.lacking, rise.lacking)
     return jax.tree.map(lambda x, slope: x - slope @ change, found, rise)
 
 
 def _step(lacking: Float[Array, " 2"], slope: Float[Array, "2 2"]) -> Float[Array, " 2"]:
-    """Newton's of the loads, to be taken off."""
+    """Newton step of the loads, to be subtracted."""
     (a, b), (c, d) = slope
     first, second = lacking
     return jnp.stack([d * first - b * second, a * second - c * first]) / (a * d - b * c)
 
 
 def _loads(given: _Given) -> tuple[Float[Array, " 2"], Grip]:
-    """The load that has moved [N] and the centre of pressure [m], and how all rises with them; without derivatives.
+    """The transferred load [N] and the centre of pressure [m], and the derivatives of `Grip` with respect to them.
 
-    As long as all of the contact bears, the moments of its law do not depend on them.
+    None of these carry derivatives. While the whole contact is loaded, the moments of its law do not depend on them.
     """
     stance, load = given.stance, given.load
 
@@ -318,7 +323,7 @@ def _loads(given: _Given) -> tuple[Float[Array, " 2"], Grip]:
 
 
 def _along(centre: Scalar, given: _Given) -> tuple[Law, Array, Scalar, Scalar]:
-    """Arguments of `moments` where the centre of pressure is there."""
+    """Arguments of `moments` for this centre of pressure."""
     stance, yaw = given.stance, given.yaw_rate
     place, half, _ = footprint(stance, centre)
     law = Law(given.friction, stance.lateral ** (2 * stance.rule - 2), stance.on_tracks, stance.nodes)
@@ -326,10 +331,10 @@ def _along(centre: Scalar, given: _Given) -> tuple[Law, Array, Scalar, Scalar]:
 
 
 def _at_loads(loads: Array, even: Array | None, given: _Given) -> Grip:
-    """What the ground does where so much load has moved, and the centre of pressure is there.
+    """Forces of the ground for a given load transfer and centre of pressure.
 
-    The lateral speed of a contact is linear along it, and so is the load that it bears: its forces and moments are
-    sums of four moments of the law over an even load; `even` are these, where they are known.
+    The lateral speed of a contact is linear along it, and so is its load. Its forces and moments are therefore
+    sums of four moments of the law over a uniform load; `even` are these, if known.
     """
     (moved, centre), stance, adhesion, load = loads, given.stance, given.adhesion, given.load
     normal = jnp.maximum(load / 2 - 2 * SIDES * moved, 0.0)
@@ -343,7 +348,7 @@ def _at_loads(loads: Array, even: Array | None, given: _Given) -> Grip:
     turned = across * (middle * first + end * second)
     ahead = held * zeroth * sliding
     outward = stance.height * total(aside) / stance.width
-    # Nothing presses on a vertical ground.
+    # A vertical ground carries no normal load.
     behind = stance.height * total(ahead - given.resistance * normal) / jnp.maximum(load, 1e-9)
     return Grip(
         normal=normal,

@@ -1,1 +1,1 @@
-"""Belts, grousers and contacts resolved one by one, in MJX, and pictures of them."""
+"""Belts, grousers and individual contacts in MJX, and pictures of them."""

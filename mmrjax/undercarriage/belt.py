@@ -1,7 +1,7 @@
 """The main track of one side: its path around two pulleys, its elastic runs, its tooth mesh.
 
-The belt does not hang as a chain of bodies: it runs on its path. A point of it is told by how far it has
-come along the path, counted from where the belt leaves the front pulley downwards, in the direction of
+The belt is not a chain of bodies: it runs on its path. The coordinate of a point is its distance along the path,
+counted from the end of the front pulley, in the direction of
 forward running: lower run (backwards), rear pulley (up), upper run (forwards), front pulley (down).
 """
 
@@ -20,7 +20,7 @@ from mmrjax.model.params import Scalar
 from mmrjax.numerics.trigonometry import cosine, sine
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_PULLEY, RunningGear
 
-#: Relative swing of the pulley's radius: links of a chain lie on a polygon of as many sides as teeth.
+#: Relative variation of the pulley's radius: links of a chain form a polygon with as many sides as teeth.
 POLYGON = (1 - math.cos(math.pi / TEETH_PULLEY)) / 2
 
 
@@ -48,14 +48,14 @@ class Path(eqx.Module):
     def weight(self, place: Float[Array, " n"]) -> Float[Array, " n"]:
         """Share of the rear pulley's motion in a belt point's: 0 on the front pulley, 1 on the rear one.
 
-        Between them a run stretches evenly, so the share is linear; a force on the point loads the
+        A run stretches uniformly between them, so the share is linear. A force on the point loads the
         pulleys in the same shares (virtual work), which is exact for a uniform elastic run.
         """
         run, arc = self.gear.wheelbase, jnp.pi * self.radius
         return jnp.clip(place / run, 0.0, 1.0) - jnp.clip((place - run - arc) / run, 0.0, 1.0)
 
     def place(self, front: Scalar, rear: Scalar) -> tuple[Float[Array, " 24"], Float[Array, " 24"]]:
-        """Where the grousers are [m along the path] at pulley angles [rad], and their `weight`."""
+        """Positions of the grousers [m along the path] at pulley angles [rad], and their `weight`."""
         at_front = jnp.mod(jnp.arange(GROUSERS) * self.pitch + self.radius * front, self.length)
         weight = self.weight(at_front)
         return jnp.mod(at_front + self.radius * weight * (rear - front), self.length), weight
@@ -82,11 +82,11 @@ class Tips(eqx.Module):
 def tips(path: Path, place: Float[Array, " n"]) -> Tips:
     """Tips of the grousers at `place` [m along the path].
 
-    A grouser stands on a rigid base: it turns with the mean direction of the path under that base, so its
-    tip speeds up from r to r + height over one base length instead of at once. From the end of an arc the
-    belt rises to the guide over the free gap; there a load divides between pulley and guide (cubic step,
-    in place of the lever's straight line, for a continuous slope) and the belt yields as a string,
-    x (gap - x) / gap per unit of tension. Both ends of the lower run are alike: x counts from the nearer.
+    A grouser sits on a rigid base and turns with the mean direction of the path under that base. Its
+    tip therefore accelerates from r to r + height over one base length instead of at once. From the end of an arc the
+    belt rises to the guide over the free gap. In the gap a load is shared between pulley and guide, by a cubic
+    step in place of the lever's straight line, for a continuous slope. The belt deflects as a string,
+    x (gap - x) / gap per unit of tension. Both ends of the lower run are equal: x counts from the nearer.
     """
     gear, radius = path.gear, path.radius
     run, arc, base = gear.wheelbase, jnp.pi * radius, gear.grouser_length
@@ -94,7 +94,7 @@ def tips(path: Path, place: Float[Array, " n"]) -> Tips:
     side = jnp.where(ahead, 1.0, -1.0)
     x = jnp.where(ahead, jnp.where(place < run / 2, place, place - path.length), run - place)
     turned = jnp.clip(-x / radius, 0.0, jnp.pi)  # on the arc, from its bottom
-    share = jnp.clip((base / 2 - x) / base, 0.0, 1.0)  # of the base that lies on the arc
+    share = jnp.clip((base / 2 - x) / base, 0.0, 1.0)  # of the base on the arc
     tilt = jnp.minimum(jnp.where(x < -base / 2, -x / radius, share**2 * base / (2 * radius)), jnp.pi)
     tilt_rate = -jnp.where(tilt < jnp.pi, share, 0.0) / radius
     rise = gear.guide_recess * step(x, 0.0, 0.0, gear.guide_gap, 1.0)
@@ -117,7 +117,7 @@ class Runs(eqx.Module):
 
     Attributes:
         upper, lower: total tension, mean over the run [N].
-        centrifugal: what of it turns the belt's own mass round the pulleys, P_ct = m v² / length [N].
+        centrifugal: part that accelerates the belt's own mass round the pulleys, P_ct = m v² / length [N].
         torque_front, torque_rear: on the pulleys, in the direction of running [N·m].
     """
 
@@ -131,8 +131,8 @@ class Runs(eqx.Module):
 def travel(radius: Scalar, angle: Scalar) -> tuple[Scalar, Scalar]:
     """Belt drawn by a pulley turned by `angle` [m], and per radian [m]: s = r (φ + ε sin(nφ) / n).
 
-    The links lie on a polygon of n = 48 sides, so the lever swings by ±ε with each tooth (chordal action;
-    ε from the geometry): the tooth mesh, whose period is S_t.
+    The links form a polygon of n = 48 sides, so the lever arm varies by ±ε with each tooth (chordal action;
+    ε from the geometry). This is the tooth mesh, with period S_t.
     """
     phase = TEETH_PULLEY * angle
     return radius * (angle + POLYGON * sine(phase) / TEETH_PULLEY), radius * (1 + POLYGON * cosine(phase))
@@ -141,8 +141,8 @@ def travel(radius: Scalar, angle: Scalar) -> tuple[Scalar, Scalar]:
 def runs(path: Path, angles: Sequence[Scalar], rates: Sequence[Scalar]) -> Runs:
     """Tensions from the angles [rad] and rates [rad/s] of front and rear pulley, relative to the chassis.
 
-    P = max(0, P_0 ± k Δs ± b Δṡ), Δs the belt drawn by the front pulley less that of the rear one: the
-    upper run pulls, the lower one slackens. The teeth transmit, so P_0 only keeps the runs from slack.
+    P = max(0, P_0 ± k Δs ± b Δṡ), with Δs the belt drawn by the front pulley less that of the rear one: the
+    upper run pulls, the lower one slackens. The teeth transmit, so P_0 only keeps the runs from going slack.
     """
     gear = path.gear
     drawn_front, lever_front = travel(path.radius, angles[0])
@@ -167,8 +167,8 @@ def tension_along(
 ) -> Float[Array, " s"]:
     """Tension [N] at `stations` [m along the path] under forces [N] on the belt against its running.
 
-    A force F at x of the lower run leaves P - F (1 - x/L) ahead of it and P + F x/L behind; the arcs carry
-    the tension of one run over to the other along the engaged teeth, evenly.
+    A force F at x of the lower run leaves P - F (1 - x/L) ahead of it and P + F x/L behind. On the arcs the tension
+    changes uniformly along the engaged teeth, from that of one run to that of the other.
     """
     run, arc = path.gear.wheelbase, jnp.pi * path.radius
     on_run = place < run
@@ -181,7 +181,7 @@ def tension_along(
     def one(at: Float[Array, ""]) -> Float[Array, ""]:
         rear = jnp.clip((at - run) / arc, 0.0, 1.0)
         front = jnp.clip((at - 2 * run - arc) / arc, 0.0, 1.0)
-        # from the lower run's end over the rear arc to the upper run, and over the front arc down again
+        # from the end of the lower run over the rear arc to the upper run, and over the front arc back down
         up = lower(run) * (1 - rear) + tension.upper * rear
         down = tension.upper * (1 - front) + lower(-1.0) * front
         return jnp.where(at < run, lower(at), jnp.where(at < run + arc + run, up, down))

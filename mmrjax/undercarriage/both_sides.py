@@ -1,10 +1,11 @@
-"""A robot free to turn, in motion: its state, all its forces at an instant, one step, and where a run starts.
+"""A robot free to turn, in motion: its state, all its forces at an instant, one step, and the start of a run.
 
 Coordinates q: place x uphill and y to the left [m], height z of the middle of the wheelbase over the ground [m], yaw,
 pitch (nose down) and roll (left side up) [rad], then the angles of driving and driven pulley of the left and of the
-right side [rad], relative to the chassis. Velocities v alike. MJX carries chassis and pulleys (`mjcf`). Each side is
-the half robot's belt, contacts and drive (`undercarriage`, `balances.resolved_sides`) at its own height z + y_s roll
-and speed v_x - ω y_s; `turning.Law` at each contact takes the place of Fig. 7 along the travel alone. Roll is small.
+right side [rad], relative to the chassis. Velocities v are their rates. MJX computes chassis and pulleys (`mjcf`).
+Each side is the half robot's belt, contacts and drive (`undercarriage`, `balances.resolved_sides`) at its own height
+z + y_s roll and speed v_x - ω y_s. `turning.Law` at each contact replaces the straight-travel law of Fig. 7. Roll is
+small.
 """
 
 from __future__ import annotations
@@ -41,12 +42,12 @@ X, Y, HEIGHT, YAW, PITCH, ROLL = range(6)
 PULLEYS = np.array([[6, 7], [8, 9]])
 SHAFTS = PULLEYS[:, 0]
 COORDINATES = 10
-#: Coordinates on which the contacts of left and right side act.
+#: Coordinates that the contacts of left and right side act on.
 OF_SIDE = np.array([[*range(6), *pulleys] for pulleys in PULLEYS])
 
 
 class _Sides(eqx.Module):
-    """The contacts of both sides, a leading axis of 2, as `balances.resolved_sides` asks for them."""
+    """The contacts of both sides, a leading axis of 2, in the form that `balances.resolved_sides` expects."""
 
     path: Path
     law: Law
@@ -80,7 +81,7 @@ def _ahead(run: System, v: Float[Array, " 10"], yaw: Scalar) -> tuple[Scalar, Sc
 
 
 def plane_motion(run: System, motion: Motion) -> PlaneMotion:
-    """The same motion as the other fidelities have it: speeds of the centre of mass, the robot level."""
+    """The motion in the form of the other fidelities: speeds of the centre of mass, the robot level."""
     q, v = motion.q, motion.v
     speed, lateral = _ahead(run, v, q[YAW])
     forward, up = run.half.centre
@@ -125,7 +126,7 @@ def instant(run: System, motion: Motion) -> tuple[Signals, Touch, Pull]:
 
 
 def _losses(run: System, motion: PlaneMotion, sides: _Sides) -> Float[Array, "2 2"]:
-    """See `half_robot._losses`: by the speed of each side, and by that of its driving shaft."""
+    """See `half_robot._losses`: with respect to the speed of each side, and to that of its driving shaft."""
 
     def along(change: Scalar) -> Array:
         signals, pulled = _resolved(run, dataclasses.replace(motion, speed=motion.speed + change), sides)
@@ -140,7 +141,7 @@ def _losses(run: System, motion: PlaneMotion, sides: _Sides) -> Float[Array, "2 
 
 
 class _Levers(eqx.Module):
-    """How each contact of a side moves along the robot, to its left and off the ground with velocities `OF_SIDE`."""
+    """Motion of each contact of a side along the robot, to its left and off the ground, per velocity of `OF_SIDE`."""
 
     along: Float[Array, "2 contacts 8"]
     across: Float[Array, "2 contacts 8"]
@@ -185,8 +186,11 @@ def _turned(run: System, signals: Signals, at: Touch, pulled: Pull) -> Signals:
 def resistance(
     run: System, motion: Motion, signals: Signals, sides: _Sides, pulled: Pull
 ) -> tuple[Float[Array, "10 10"], _Levers, Array]:
-    """How the forces on v fall with v, see `half_robot.resistance`; of friction with both of its directions. With it
-    the levers, and how fast each contact's forces rise with its sliding [N·s/m], shape (2, 2, 2, contacts)."""
+    """Damping matrix K of the forces on v, see `half_robot.resistance`, with friction in both directions.
+
+    Also returns the levers, and the rise of each contact's forces with its sliding [N·s/m], shape (2, 2, 2,
+    contacts).
+    """
     levers, at = _levers(run, motion, sides.at), sides.at
     assert pulled.aside is not None
     sliding = jax.vmap(undercarriage.sliding)(signals, at)
@@ -204,7 +208,7 @@ def resistance(
     ]
     each = jnp.einsum("sci,scj->sij", moves, jnp.concatenate([*pushes, falls], axis=1))
     losses = _losses(run, plane_motion(run, motion), sides)
-    # Rolling resistance acts where a side is, along the robot.
+    # Rolling resistance acts at each side, along the robot.
     cos, sin = cosine(motion.q[YAW]), sine(motion.q[YAW])
     found = jnp.zeros((COORDINATES, COORDINATES), motion.v.dtype)
     for k, y in enumerate(SIDES):
@@ -218,7 +222,7 @@ def resistance(
 def dynamics(
     run: System, motion: Motion, armature: Float[Array, " 2"]
 ) -> tuple[Float[Array, "10 10"], Float[Array, " 10"]]:
-    """Mass matrix and bias of MJX, with the rotors' `armature` at the driving shafts [kg·m²] in the first."""
+    """Mass matrix and bias of MJX; the mass matrix includes the rotors' `armature` at the driving shafts [kg·m²]."""
     model = run.model.replace(dof_armature=jnp.zeros(COORDINATES).at[SHAFTS].set(armature))
     data = run.data.replace(qpos=motion.q, qvel=motion.v)
     data = mjx.com_pos(model, mjx.kinematics(model, data))
@@ -227,7 +231,7 @@ def dynamics(
 
 
 class _Forces(eqx.Module):
-    """Of an instant, all that a step is made of: mass matrix M, damping K, and `push`, Δt (Q - c)."""
+    """Data of a step at an instant: mass matrix M, damping K, and `push`, Δt (Q - c)."""
 
     sides: _Sides
     signals: Signals
@@ -240,8 +244,7 @@ class _Forces(eqx.Module):
 
 
 def _forces(run: System, motion: Motion, stored: bool = False) -> _Forces:
-    """All of an instant; contacts and signals `stored`, or XLA computes their derivatives again for each that reads
-    them."""
+    """Forces of an instant; unless `stored`, XLA computes derivatives of contacts and signals again at each use."""
 
     def found(x: Any) -> Any:
         return jax.lax.optimization_barrier(x) if stored else x
@@ -264,8 +267,8 @@ def advance(run: System, motion: Motion) -> tuple[Motion, balances.Travel, Float
     """One step, see `half_robot.advance`: (M + Δt K) Δv = Δt (Q - c).
 
     Returns:
-        The motion after it; all of an instant before it, with forces and accelerations of the step; the load on each
-        lower guide before it [N].
+        The motion after it; all signals of the instant before it, with forces and accelerations of the step; the load
+        on each lower guide before it [N].
     """
     found = _forces(run, motion)
     return _moved(run, motion, found, _solver(run, found)(found.push))
@@ -273,7 +276,7 @@ def advance(run: System, motion: Motion) -> tuple[Motion, balances.Travel, Float
 
 @advance.def_jvp
 def _differentiated(primals: tuple[System, Motion], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
-    """See `half_robot.advance`; of K its product with Δv alone."""
+    """See `half_robot.advance`; K enters only by its product with Δv."""
     found = _forces(*primals)
     solve = _solver(primals[0], found)
     gained = solve(found.push)
@@ -288,7 +291,7 @@ def _differentiated(primals: tuple[System, Motion], tangents: tuple[Any, Any]) -
 
 
 def _fallen(run: System, motion: Motion, found: _Forces, gained: Float[Array, " 10"]) -> Float[Array, " 10"]:
-    """K Δv, see `resistance`, without K."""
+    """The product K Δv, see `resistance`, without forming K."""
     at, pulled, levers = found.sides.at, found.pulled, found.levers
     assert pulled.aside is not None
     after = forces_after(at, pulled, levers, found.rises, gained)
@@ -323,8 +326,10 @@ def _moved(
 def forces_after(
     at: Touch, pulled: Pull, levers: _Levers, rises: Array, gained: Float[Array, " 10"]
 ) -> tuple[Array, Array, Array]:
-    """Forces of the contacts ahead, to the left and off the ground [N] with which a step that gains Δv is made, each
-    of shape (2, contacts)."""
+    """Forces of the contacts ahead, to the left and off the ground [N] during a step that gains Δv.
+
+    Each has shape (2, contacts).
+    """
     own = gained[OF_SIDE]
     along, across, off = (jnp.einsum("sci,si->sc", x, own) for x in (levers.along, levers.across, levers.off))
     down, least = at.damped * off, jnp.maximum(at.force, 1e-9)
@@ -337,14 +342,14 @@ def forces_after(
 
 
 def _travel(run: System, motion: Motion, found: _Forces, gained: Float[Array, " 10"]) -> balances.Travel:
-    """All of a step, its forces those at its end to first order."""
+    """All signals of a step, with its forces at its end to first order."""
     sides, signals, at, several = found.sides, found.signals, found.sides.at, run.robot.sides / 2
     ahead, aside, normal = forces_after(at, found.pulled, found.levers, found.rises, gained)
     forward = run.half.centre[0]
     arm = at.lever_x - forward
     load, moment = jnp.sum(normal, axis=-1), jnp.sum(aside * arm, axis=-1)
     signals = dataclasses.replace(signals, traction=jnp.sum(ahead, axis=-1), normal=load, moment_lateral=moment)
-    # Of the centre of mass, in the frame of the robot that turns.
+    # Of the centre of mass, in the rotating frame of the robot.
     speed, lateral = _ahead(run, motion.v, motion.q[YAW])
     ahead_gained, aside_gained = _ahead(run, gained / run.step, motion.q[YAW])
     turn = gained[YAW] / run.step
@@ -365,8 +370,10 @@ def _travel(run: System, motion: Motion, found: _Forces, gained: Float[Array, " 
 
 
 def stand(run: System) -> Motion:
-    """At rest on the ground, headed as the conditions say: see `half_robot.stand`, on the slope along its heading.
-    Load has not moved yet to the side that is lower."""
+    """At rest on the ground, with the heading of the conditions; see `half_robot.stand`, on the slope along it.
+
+    Load transfer to the lower side is not included yet.
+    """
     heading = _heading(run)
     along = jnp.degrees(jnp.arcsin(sine(run.conditions.slope) * cosine(heading)))
     half = half_robot.stand(dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, slope_deg=along)))
@@ -385,7 +392,7 @@ def _heading(run: System) -> Scalar:
 
 
 def roll(run: System) -> Motion:
-    """In the settled turn of the steady fidelity, at rest where that has none."""
+    """In the settled turn of the steady fidelity, at rest if it has none."""
     begins = stand(run)
     rolls = circling.motion_of(run.robot, circling.start(run.robot, run.conditions, rolling=True))
     cos, sin = cosine(rolls.heading), sine(rolls.heading)
@@ -397,22 +404,22 @@ def roll(run: System) -> Motion:
 
 
 def loads(run: System, at: Touch, pulled: Pull) -> Reactions:
-    """See `half_robot.loads`, of either side."""
+    """See `half_robot.loads`, for each side."""
     return jax.vmap(lambda at, pulled: half_robot.loads(run, at, pulled))(at, pulled)
 
 
 def away(q: Array, reactions: Reactions) -> tuple[Array, Reactions | None]:
-    """See `half_robot.away`: from where it started; a history has no loads of both sides."""
+    """See `half_robot.away`: distance from the start; a history has no loads of both sides."""
     return jnp.hypot(q[..., X], q[..., Y]), None
 
 
 def averaged(average: Average, travelled: Array, passed: balances.Travel, guided: Array) -> Steady:
-    """See `half_robot.averaged`: what is of the whole robot over the periods of either side."""
+    """See `half_robot.averaged`; quantities of the whole robot are averaged over the periods of both sides."""
     both = jax.tree.map(lambda x: jnp.broadcast_to(x.reshape(*x.shape[:1], -1), (*x.shape[:1], 2)), passed)
     found, load, periods, changes = jax.vmap(average, in_axes=1)(jnp.abs(travelled), (both, guided))
     travel = jax.tree.map(lambda x, like: x if like.ndim > 1 else jnp.mean(x), found, passed)
     share = jnp.sum(load) / jnp.maximum(jnp.sum(travel.signals.normal), 1e-9)
-    # A side that hardly moves has settled where its changes are small beside what the other one does.
+    # A side that hardly moves counts as settled if its changes are small compared with the other side's.
     larger = [(change, jnp.max(size)) for change, size in changes]
     return Steady(travel.signals, share, periods, jnp.max(half_robot.relative(larger)), travel)
 

@@ -1,7 +1,7 @@
-"""What all contacts of one side add up to, and the exact derivatives of those sums, a column for each input.
+"""Sums over all contacts of one side, and their exact derivatives, one column for each input.
 
-A step of the track model needs a dozen sums over its contacts. Their derivatives are taken once for every input and
-not once for every parameter that a run is differentiated by: along each tangent what is left is a small product.
+A step of the track model needs a dozen sums over its contacts. Their derivatives are computed once per input and
+not once per parameter of a derivative; each tangent then costs only a small product.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from mmrjax.numerics.trigonometry import cosine, sine
 from mmrjax.undercarriage.belt import Path, runs, tips
 from mmrjax.undercarriage.side_contacts import WHEEL, Touch, bearing, of_contacts, tension_free, touch
 
-#: What contacts read of the running gear, of the friction of the ground and of a chassis.
+#: Parameters of the running gear, of the friction of the ground and of a chassis that contacts depend on.
 GEAR = (
     "wheelbase",
     "grouser_height",
@@ -41,25 +41,25 @@ GEAR = (
 )
 FRICTION = ("static", "dynamic", "speed_static", "speed_dynamic")
 CHASSIS = ("radius", "on_tracks")
-#: Coordinates and velocities (see `undercarriage`) but for the travel, on which nothing depends.
+#: Coordinates and velocities (see `undercarriage`) except the travel, which has no influence.
 MOTION = ("z", "pitch", "front", "rear", "v_x", "v_z", "v_pitch", "v_front", "v_rear")
-#: Of each contact: F, R, F~ and R~ [N] (see `Sums`) and how fast F rises with sliding [N·s/m].
+#: Of each contact: F, R, F~ and R~ [N] (see `Sums`) and the rise of F with sliding [N·s/m].
 Forces = tuple[Array, ...]
 
 
 class Sums(eqx.Module):
-    """Sums over the contacts of one side, with a step's change of velocity Δv as given.
+    """Sums over the contacts of one side, for a given change of velocity Δv of a step.
 
-    A contact's traction is F, its normal force R; by the damping of the step (`half_robot.resistance`, but for the
-    drive's part of it) they fall by F~ and R~. On the pulleys they act with their levers, front and rear.
+    A contact's traction is F, its normal force R. The damping of the step (`half_robot.resistance`, without the
+    drive's part) reduces them by F~ and R~. They act on the pulleys with their levers, front and rear.
 
     Attributes:
         traction, normal: F and R [N].
         moment, rear: of F - F~ and R - R~ on pitch and driven pulley [N·m].
         front: of F and R on the driving pulley [N·m].
-        guide_front, guide_rear: of R's share on the guide, on both pulleys, at a coefficient of friction of 1 [N·m].
+        guide_front, guide_rear: of R's share on the guide, on both pulleys, for a coefficient of friction of 1 [N·m].
         fallen_x, fallen_z, fallen_front: F~ and R~ along the ground and off it [N] and on the driving pulley [N·m].
-        rise, rise_front: how fast F rises with all sliding speeds [N·s/m], and so does its part of `front` [N·s].
+        rise, rise_front: rise of F with all sliding speeds [N·s/m], and of its part of `front` [N·s].
     """
 
     traction: Scalar
@@ -80,7 +80,7 @@ ROWS = tuple(f.name for f in dataclasses.fields(Sums))
 
 
 def inputs(path: Path, chassis: Chassis, adhesion: Any) -> dict[str, Any]:
-    """What contacts depend on beside the motion, by name; of tangents alike (None: constant)."""
+    """Inputs of the contacts other than the motion, by name; tangents have the same form (None: constant)."""
     gear, friction = path.gear, chassis.ground.friction
     return {
         "pulley": path.radius,
@@ -103,7 +103,7 @@ def _with(path: Path, chassis: Chassis, values: Mapping[str, Any]) -> tuple[Path
 def shares(
     path: Path, chassis: Chassis, at: Touch, slip: Scalar, adhesion: Scalar, gained: Float[Array, " 5"]
 ) -> Float[Array, "sums contacts"]:
-    """Share of each contact in the `Sums`; `slip` shifts all sliding speeds [m/s], `gained` is Δv."""
+    """Contribution of each contact to the `Sums`; `slip` shifts all sliding speeds [m/s], `gained` is Δv."""
     sliding = -at.speed_x - slip
     ground = chassis.ground
     coefficient = ground.traction(sliding, 1.0, adhesion)
@@ -135,11 +135,11 @@ def shares(
 
 
 class Linearized(eqx.Module):
-    """The sums and their derivatives by motion, slip and whichever inputs are differentiated.
+    """The sums and their derivatives with respect to motion, slip and selected inputs.
 
     Attributes:
         values: the sums; slopes: their derivatives, a row for each of `names`.
-        at: values of what the rows are by.
+        at: values of the inputs of the rows.
     """
 
     values: Sums
@@ -148,12 +148,12 @@ class Linearized(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
 
     def near(self, now: Mapping[str, Any]) -> Sums:
-        """The sums where inputs are `now` (those not in it as they were), to first order."""
+        """The sums for inputs `now` to first order; inputs that it leaves out keep their values."""
         moved = [now[name] - self.at[name] if name in now else jnp.zeros(()) for name in self.names]
         return jax.tree.map(jnp.add, self.values, _sums(jnp.stack(moved) @ self.slopes))
 
     def slope(self, name: str) -> Sums:
-        """Derivatives of the sums by one of `names`."""
+        """Derivatives of the sums with respect to one of `names`."""
         return _sums(self.slopes[self.names.index(name)])
 
 
@@ -168,14 +168,16 @@ def linearize(
     gained: Float[Array, " 5"],
     constants: tuple[str, ...] = (),
 ) -> Linearized:
-    """Sums and their derivatives: by the motion and the slip written out, by what contacts are made of by forward
-    differentiation of `shares`, one at a time.
+    """Sums and their derivatives.
+
+    Derivatives with respect to motion and slip are written out. The others are by forward differentiation of
+    `shares`, one input at a time.
 
     Args:
         path, chassis: of the run.
         given: values of `MOTION`, of `inputs` and of `slip`.
-        gained: Δv of the step, held.
-        constants: which of `inputs` to have derivatives by.
+        gained: Δv of the step, constant.
+        constants: `inputs` to differentiate with respect to.
     """
 
     def each(values: Mapping[str, Any]) -> Float[Array, "sums contacts"]:
@@ -192,7 +194,7 @@ def linearize(
     if constants:
         others = jnp.stack([along(name) for name in constants])
         slopes = jnp.concatenate([slopes, others @ jnp.ones(others.shape[-1])])
-    # Slip shifts the sliding of every contact as the robot's own speed does.
+    # Slip shifts the sliding of every contact like the robot's own speed.
     slopes = jnp.concatenate([slopes, slopes[None, MOTION.index("v_x")]])
     names = (*MOTION, *constants, "slip")
     return Linearized(_sums(values), slopes, {name: given[name] for name in names}, names)
@@ -205,16 +207,16 @@ def _total(*products: tuple[Any, ...]) -> Any:
 
 
 class _Law(eqx.Module):
-    """How forces follow a contact's own motion, Δv of the step held."""
+    """Derivatives of the forces of a contact with respect to its own motion, for constant Δv of the step."""
 
     at: Touch
     by_depth: Array  # of R [N/m]
-    damped_by_depth: Array  # of D, how fast R falls with the gap's rate [N·s/m²]
-    share: Array  # both fall by this much of themselves with the belt's compliance [N/m]
+    damped_by_depth: Array  # of D, the damping by the gap's rate [N·s/m²]
+    share: Array  # relative decrease of both with the belt's compliance [N/m]
     coefficient: Array  # F = μ R
     rise: Array  # dμ/dv
     bend: Array  # d²μ/dv²
-    along: Array  # what the step changes the contact's velocity by [m/s]
+    along: Array  # change of the contact's velocity in the step [m/s]
     off: Array
 
     def forces(self) -> Forces:
@@ -232,8 +234,10 @@ class _Law(eqx.Module):
         off: Any = None,
         compliance: Any = None,
     ) -> Forces:
-        """How `forces` change with the gap, its rate, the sliding speed, what a step changes velocities by and the
-        compliance of the belt; None: not at all."""
+        """Change of `forces` with gap, gap rate, sliding speed, the step's velocity changes and belt compliance.
+
+        None: no change.
+        """
         at, sinks = self.at, None if gap is None else -gap
         yields = None if compliance is None else -self.share * compliance
         force = _total((self.by_depth, sinks), (-at.damped, gap_rate), (at.force, yields))
@@ -277,19 +281,19 @@ def _law(path: Path, chassis: Chassis, at: Touch, given: Mapping[str, Any], gain
 
 
 class _Levers(eqx.Module):
-    """Levers with which forces along the ground and off it enter the sums, each of shape (levers, contacts)."""
+    """Levers of forces along the ground and off it in the sums, each of shape (levers, contacts)."""
 
     level: Array
     steep: Array
 
     @classmethod
     def of(cls, unit: Any, x: Array, z: Array, front: tuple[Array, ...], rear: tuple[Array, ...]) -> _Levers:
-        """From levers of the pitch [m], and on each pulley those of F, R [m] and of friction on the guide [m]."""
+        """From the levers of the pitch [m], and on each pulley those of F, R [m] and of friction on the guide [m]."""
         return cls(jnp.stack([unit, z, front[0], rear[0]]), jnp.stack([unit, x, *front[1:], *rear[1:]]))
 
 
 def _weighed(forces: Sequence[Forces], levers: Sequence[_Levers]) -> Float[Array, "forces levers sums"]:
-    """The sums over all contacts of forces with levers, each with each."""
+    """Sums over all contacts for every combination of forces and levers."""
     level, steep = jnp.stack([a.level for a in levers]), jnp.stack([a.steep for a in levers])
     pulls = jnp.stack([jnp.stack([row[0], row[2], row[4]]) for row in forces])
     bears = jnp.stack([jnp.stack([row[1], row[3]]) for row in forces])
@@ -318,11 +322,11 @@ def _weighed(forces: Sequence[Forces], levers: Sequence[_Levers]) -> Float[Array
 def _by_motion(
     path: Path, chassis: Chassis, given: Mapping[str, Any], gained: Array
 ) -> tuple[Float[Array, " sums"], Float[Array, "motion sums"]]:
-    """The sums, and their derivatives by `MOTION`.
+    """The sums, and their derivatives with respect to `MOTION`.
 
-    Each contact is moved along ten directions: its height, the pitch, the place of the belt as each pulley turns,
-    five velocities and the yielding of the belt. What its forces change by is weighed with the levers of the sums,
-    and what the levers change by with its forces.
+    Each contact is moved along ten directions: its height, the pitch, the position of the belt as each pulley turns,
+    five velocities and the deflection of the belt. Changes of its forces are weighted with the levers of the sums,
+    and changes of the levers with its forces.
     """
     height, pitch, front, rear, *v = (given[name] for name in MOTION)
     at = touch(path, chassis, (0.0, height, pitch, front, rear), v)
@@ -332,7 +336,7 @@ def _by_motion(
     speed, drawn = (on_front * a[3] + on_rear * a[4] for a in (v, gained))
 
     def turned(dx: Array, dz: Array, ahead: Array, rise: Array, compliance: Array | None = None) -> Forces:
-        """Change of the forces as contact points and their rates change."""
+        """Change of the forces with contact points and their rates."""
         return law.moved(
             gap=dz,
             gap_rate=rise * speed - v[2] * dx,
@@ -343,13 +347,13 @@ def _by_motion(
         )
 
     def levers(dx: Array, dz: Array, ahead: Array, rise: Array, share: Array) -> _Levers:
-        """Change of the levers as they do."""
+        """Change of the levers with contact points and their rates."""
         rates = (ahead, rise, share)
         return _Levers.of(
             jnp.zeros_like(x), dx, dz, tuple(a * on_front for a in rates), tuple(a * on_rear for a in rates)
         )
 
-    # Along the belt the tips move in the frame of the chassis, which is pitched; their share of the pulleys changes.
+    # Along the belt the tips move in the frame of the pitched chassis, and their shares of the pulleys change.
     unit = jnp.ones_like(front)
     (place, _), (by_front, shared) = jax.jvp(lambda a: path.place(a, rear), (front,), (unit,))
     by_front, shared, by_rear = of_contacts(by_front), of_contacts(shared), at.weight * path.radius
@@ -403,7 +407,7 @@ def _by_motion(
 
 
 class Drawn(eqx.Module):
-    """What the contacts do at an instant, by their sums; see `undercarriage.Pull`."""
+    """Forces of the contacts at an instant, from their sums; see `undercarriage.Pull`."""
 
     traction: Scalar
     moment: Scalar
@@ -414,10 +418,10 @@ class Drawn(eqx.Module):
 
 
 class Mover(eqx.Module):
-    """The contacts as `balances.resolved` asks for them, by their sums near an instant.
+    """The contacts in the form that `balances.resolved` expects, from their sums near an instant.
 
-    What they do follows `speed_slip_terms` too: traction and load to second order, so that the first derivatives of
-    how they change with it are exact as well.
+    The forces also depend on `speed_slip_terms`: traction and load to second order, so that the first derivatives
+    of their change with it are exact as well.
     """
 
     linearized: Linearized
@@ -443,7 +447,7 @@ class Mover(eqx.Module):
         )
 
     def pull(self, chassis: Chassis, signals: Signals) -> Drawn:
-        """What they do at these signals."""
+        """Forces of the contacts for these signals."""
         sums = self.shifted(signals.speed_slip_terms)
         friction = chassis.track.guide_friction * signals.direction
         guided = (sums.guide_front + sums.guide_rear) / self.radius

@@ -1,7 +1,6 @@
-"""Half a robot, or all of one free to turn, as MJCF for MuJoCo, and as an MJX model whose mass constants follow each
-batch member.
+"""Half a robot, or a whole one free to turn, as MJCF for MuJoCo, and as an MJX model with mass constants per member.
 
-MJX owns the multibody dynamics alone: contacts and constraints are switched off and every force of the
+MJX computes only the multibody dynamics: contacts and constraints are switched off, and every force of the
 running gear enters as a generalized force. The same text loads in C MuJoCo and its viewer.
 """
 
@@ -28,7 +27,7 @@ from mmrjax.undercarriage.side_contacts import lever_tips
 
 with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
     import mujoco
-    from mujoco import mjx  # says on stdout which optional back ends are missing
+    from mujoco import mjx  # prints a list of missing optional back ends to stdout
 
 
 #: Joints of the chassis: of half a robot in its plane of travel, and of a robot free to turn. Name, type, axis.
@@ -58,12 +57,13 @@ class Bodies(NamedTuple):
 
 
 def bodies(robot: Robot, half: Masses, conditions: Conditions) -> Bodies:
-    """The bodies of half a robot, or of all of one that is free to turn (`Conditions.turns`).
+    """The bodies of half a robot, or of a whole robot free to turn (`Conditions.turns`).
 
-    In the plane of travel the moments about y alone count, and the others are the same. That of yaw is
-    `turning.inertia` of all about its centre, payload apart as in the other fidelities. That of roll, which decides
-    how fast load moves between the sides and not how much, is of the parts: a body as wide as the tracks stand apart,
-    evenly filled, and the parts of the sides where these are; at least what a flat robot of its yaw and pitch has.
+    In the plane of travel only the moments about y count, and the others are set equal. The moment of yaw is
+    `turning.inertia` of all parts about their centre, without payload as in the other fidelities. The moment of roll
+    decides the speed of load transfer between the sides, not its size. It is summed over the parts: a uniform body as
+    wide as the distance of the tracks, and the parts of the sides at their positions; at least that of a flat robot
+    with this yaw and pitch.
     """
     zero, base = jnp.zeros_like(half.chassis), robot.running_gear.wheelbase
     ends = (("driving", base / 2), ("driven", -base / 2))
@@ -97,10 +97,13 @@ def bodies(robot: Robot, half: Masses, conditions: Conditions) -> Bodies:
 
 
 def text(robot: Robot, conditions: Conditions, mass: float, step: float = 1e-4) -> str:
-    """MJCF of half a robot under some conditions (scalar fields), of all of it where these free it to turn; `mass`
-    total [kg], `step` [s].
+    """MJCF of half a robot under some conditions (scalar fields), or of a whole one if they free it to turn.
 
-    The shapes are for the eye and show both sides; masses and inertias are stated, of half a robot those of one side.
+    The shapes are for display and show both sides; masses and inertias are stated, for half a robot those of one
+    side.
+
+    Args:
+        mass: total [kg]; step: [s].
     """
     gear = robot.running_gear
     parts = bodies(robot, masses(robot, conditions, jnp.asarray(mass)), conditions)
@@ -175,8 +178,8 @@ def impulse(
 ) -> Float[Array, " 5"]:
     """Generalized impulse that changes velocities by `gained` in a `step`, M Δv + Δt c, in closed form.
 
-    M is the mass matrix and c the bias (gravity and centrifugal forces) of the model that `text` writes: MJX has them
-    too, but the derivatives of its general tree cost many times those of this one. No other force depends on v here.
+    M is the mass matrix and c the bias (gravity and centrifugal forces) of the model from `text`. MJX computes them
+    too, but the derivatives of its general tree cost many times as much. No other force depends on v here.
 
     Args:
         half, wheelbase: masses and distance of the pulleys.
@@ -185,7 +188,7 @@ def impulse(
         gained: Δv; step: Δt [s].
     """
     cos, sin = cosine(pitch), sine(pitch)
-    ahead = half.chassis * (half.forward * cos + half.up * sin)  # times the mass: the pulleys' cancel
+    ahead = half.chassis * (half.forward * cos + half.up * sin)  # times the mass: the pulleys' parts cancel
     above = half.chassis * (half.up * cos - half.forward * sin)
     mass, turning = half.chassis + 2 * half.pulley, half.inertia_pulley
     pitching = half.pitching(wheelbase)
@@ -205,7 +208,7 @@ def impulse(
 
 @functools.cache
 def _template(double: bool, turns: bool) -> tuple[Any, Any]:
-    from mmrjax.model.paper_robots import nominal  # topology only: every number is replaced per member
+    from mmrjax.model.paper_robots import nominal  # for the topology only: every number is replaced per member
 
     with jax.ensure_compile_time_eval():
         run = Conditions(heading_deg=0.0 if turns else None)
@@ -214,15 +217,15 @@ def _template(double: bool, turns: bool) -> tuple[Any, Any]:
 
 
 def template(turns: bool = False) -> tuple[Any, Any]:
-    """The MJX model and data that all members share in structure, of half a robot or one free to turn."""
+    """The MJX model and data whose structure all members share, of half a robot or one free to turn."""
     return _template(jnp.result_type(float) == jnp.float64, turns)
 
 
 def member(model: Any, parts: Bodies, slope: Scalar, step: Scalar) -> Any:
     """The MJX `model` with this member's bodies, gravity and time step.
 
-    Every constant that the smooth dynamics read and that mass decides is set here (mujoco issue 1607); the
-    derived ones that only the constraint solver and the sensors read are set where they are sums.
+    Every constant that the smooth dynamics read and that depends on mass is set here (mujoco issue 1607).
+    Derived constants for the constraint solver and the sensors are set only if they are sums.
     """
     zero = jnp.zeros_like(parts.mass[0])
     total = jnp.sum(parts.mass)

@@ -1,4 +1,4 @@
-"""Natural frequencies of half a robot on its contacts: bounce, pitch, and what swings in the drive."""
+"""Natural frequencies of half a robot on its contacts: bounce, pitch, and oscillations of the drive."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from mmrjax.undercarriage.half_robot import mass_matrix, roll, stand, system
 from mmrjax.undercarriage.stability import PROBE, step_derivative
 
 POSITIONS = 12  # of the belt within a pitch of the grousers
-#: A mode has the name of the coordinate that holds most of its kinetic energy.
+#: A mode is named after the coordinate with most of its kinetic energy.
 NAMES = ("surge", "bounce", "pitch", "drive", "driven pulley")
 #: Damping ratio below which a mode amplifies at its own frequency: 1 / 2ζ above 1.
 RESONANT = 0.5
-_SWINGS = 0.95  # damping ratio above which a motion creeps back rather than swings
+_SWINGS = 0.95  # damping ratio above which a motion does not count as an oscillation
 
 
 class Mode(NamedTuple):
@@ -31,12 +31,12 @@ class Mode(NamedTuple):
 
     Attributes:
         name: one of `NAMES`, by the kinetic energy in its eigenvector.
-        frequency: damped natural frequency, mean over the positions at which there is one [Hz].
+        frequency: damped natural frequency, mean over the positions that have the mode [Hz].
         low, high: its range over them [Hz].
         natural: undamped, |λ| / 2π, mean [Hz].
-        damping: ratio ζ = -Re λ / |λ|, mean [-]; negative: it grows by itself.
-        share: of the kinetic energy that is in the coordinate of its name, mean [-].
-        positions: share of the positions at which there is one [-].
+        damping: ratio ζ = -Re λ / |λ|, mean [-]; negative: it is unstable.
+        share: of the kinetic energy in the coordinate of its name, mean [-].
+        positions: share of the positions that have the mode [-].
     """
 
     name: str
@@ -50,20 +50,20 @@ class Mode(NamedTuple):
 
     @property
     def amplifies(self) -> bool:
-        """Whether it is lightly damped, at most positions of the belt."""
+        """True if it is lightly damped at most positions of the belt."""
         return self.damping < RESONANT and self.positions > 0.5
 
     @property
     def resonant(self) -> bool:
-        """Whether it amplifies at a frequency that the belt's position does not change by an octave or more.
+        """True if it amplifies at a frequency that changes by less than an octave with the belt's position.
 
-        Over an octave some harmonic is always within the range, and a peak there would confirm nothing.
+        An octave always contains some harmonic, so a peak there would confirm nothing.
         """
         return self.amplifies and self.high < 2 * self.low
 
     @property
     def band(self) -> tuple[float, float]:
-        """Frequencies at which it resonates [Hz]: its range or its half-power width f ± ζ f, whichever is wider."""
+        """Band of resonance [Hz]: its range or its half-power width f ± ζ f, whichever is wider."""
         width = abs(self.damping) * self.frequency
         return min(self.low, self.frequency - width), max(self.high, self.frequency + width)
 
@@ -71,9 +71,9 @@ class Mode(NamedTuple):
 def modes(robot: Robot, conditions: Conditions, positions: int = POSITIONS) -> list[list[Mode]]:
     """Oscillatory modes of each run of a batch, the lowest first.
 
-    The robot rolls at the speed of the steady fidelity, its height and pitch in balance. The derivative J of a step h
-    by the state, the one that the largest stable step is found with, gives dy/dt = (J - 1) y / h and its eigenvalues
-    λ; friction, belt, motor and winding are in it.
+    The robot rolls at the speed of the steady fidelity, with height and pitch in equilibrium. The derivative J of a
+    step h with respect to the state gives dy/dt = (J - 1) y / h and its eigenvalues λ. J is also used for the largest
+    stable step; it includes friction, belt, motor and winding.
 
     Args:
         robot, conditions: a batch of runs.

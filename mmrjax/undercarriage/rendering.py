@@ -1,4 +1,4 @@
-"""Pictures and video of the track model: the robot on its slope, its track running, forces drawn; headless."""
+"""Pictures and video of the track model: the robot on its slope with running track and drawn forces; headless."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from mmrjax.undercarriage.side_contacts import lever_tips
 
 FORMATS = (".png", ".gif", ".mp4")
 FORCE = 1 / 800  # length of an arrow [m/N]
-RATE = 20  # frames a second
-FRAMES = 10_000  # of a film at most; each takes about a third of a second to draw
+RATE = 20  # frames per second
+FRAMES = 10_000  # most frames of a film; each takes about a third of a second to draw
 
 _INK, _BODY, _BELT, _GROUND = "#1f2933", "#5b8db8", "#2f3437", "#b8a98f"
 _NORMAL, _TRACTION, _RESISTANCE, _GUIDE, _WEIGHT = "#d1495b", "#2e933c", "#b07d12", "#7048a8", "#1f2933"
 
 
 class Scene(NamedTuple):
-    """What the pictures of one run need, as plain arrays.
+    """Data for the pictures of one run, as plain arrays.
 
     Attributes:
-        slope: [rad]; name: of the configuration; wheeled: whether on wheels; axle: half the wheelbase [m];
+        slope: [rad]; name: of the configuration; wheeled: True on wheels; axle: half the wheelbase [m];
             wheel: its radius [m].
         path: of the belt; levers: tips in the chassis frame, empty on wheels.
         time, q, total_current, speed, theoretical: over the run.
@@ -63,35 +63,35 @@ class Scene(NamedTuple):
     weight: float
 
     def sheet(self, k: int) -> Any:
-        """A figure of sample `k`."""
+        """Figure of sample `k`."""
         return figure(self, k)
 
 
 class View(Protocol):
-    """A run that can be drawn: its samples' times [s], and a figure of each."""
+    """A run that can be drawn: times of its samples [s], and a figure of each."""
 
     @property
     def time(self) -> np.ndarray:
-        """Of the samples [s]."""
+        """Times of the samples [s]."""
         ...
 
     def sheet(self, k: int) -> Any:
-        """A figure of sample `k`."""
+        """Figure of sample `k`."""
         ...
 
 
 def check_finite(run: Trajectory) -> None:
-    """Refuse a run of which nothing can be drawn.
+    """Raises for a run that cannot be drawn.
 
     Raises:
         ValueError: it holds numbers that are not finite (a failed member).
     """
     if not np.isfinite(np.asarray(run.q)).all():
-        raise ValueError("run: its coordinates are not finite, there is nothing to draw; expected a run that ended")
+        raise ValueError("run: its coordinates are not finite and cannot be drawn; expected a run that ended")
 
 
 def scene(robot: Robot, conditions: Conditions, run: Trajectory) -> Scene:
-    """Gather one run (scalar conditions, one member of a batch) for drawing.
+    """Collects the data of one run (scalar conditions, one member of a batch) for drawing.
 
     Raises:
         ValueError: the run holds numbers that are not finite (a failed member).
@@ -131,14 +131,14 @@ def _turn(points: Any, angle: float, about: tuple[float, float] = (0.0, 0.0)) ->
 
 
 def outline(path: Path, height: float, places: np.ndarray) -> np.ndarray:
-    """Points of the belt (height 0) or of grouser tips in the chassis frame [m], at places on its path."""
+    """Points of the belt (height 0) or of grouser tips in the chassis frame [m], at positions on its path."""
     gear = params.replace(path.gear, {"grouser_height": jnp.asarray(height)})
     at = tips(Path(path.radius, gear), jnp.asarray(places))
     return np.stack([np.asarray(at.forward), np.asarray(at.up)], axis=1)
 
 
 def draw(axes: Any, view: Scene, k: int) -> None:
-    """Draw sample `k` of a scene into Matplotlib `axes`, uphill to the right."""
+    """Draws sample `k` of a scene into Matplotlib `axes`, uphill to the right."""
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Circle, Polygon
 
@@ -225,7 +225,7 @@ _LEGEND = (
 
 
 def figure(view: Scene, k: int) -> Any:
-    """A figure of sample `k`: the robot above, current and speeds of the whole run below."""
+    """Figure of sample `k`: the robot above, current and speeds of the whole run below."""
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
@@ -271,16 +271,16 @@ def _pixels(sheet: Any) -> np.ndarray:
 def instants(
     file: File, begin: float, end: float | None, slow: float, length: float, rate: int = RATE
 ) -> Float[np.ndarray, " frames"]:
-    """Times [s] that `render` draws of a run that lasts `length` [s]; asked before a run, it spares a vain one.
+    """Times [s] that `render` draws for a run of `length` [s]; called before a run, it finds errors early.
 
     Raises:
-        ValueError: the suffix is none of `FORMATS`; no time of the run lies between `begin` and `end`; the film
+        ValueError: the suffix is not one of `FORMATS`; no time of the run is between `begin` and `end`; the film
             has more than `FRAMES` pictures.
     """
     if file.suffix not in FORMATS:
         raise ValueError(f"file: got {file.name}; expected a name that ends in {', '.join(FORMATS)}")
     if file.suffix == ".png" and end is not None:
-        raise ValueError(f"end: got {end:g} s for {file.name}, a picture of the instant begin; leave it out")
+        raise ValueError(f"end: got {end:g} s for {file.name}, a picture at time begin; leave it out")
     film, last = file.suffix != ".png", length if end is None else end
     until = min(last, length)
     if not 0 <= begin <= length or (film and not begin < until):
@@ -297,17 +297,17 @@ def instants(
 def render(
     view: View, file: str | File, begin: float = 0.0, end: float | None = None, slow: float = 10.0, rate: int = RATE
 ) -> File:
-    """Write a picture (.png, of the instant `begin`) or a film (.gif, .mp4) of a scene.
+    """Writes a picture (.png, at time `begin`) or a film (.gif, .mp4) of a scene.
 
     Args:
         view: from `scene`, of this module or of `render_above`.
-        file: its suffix decides what is written.
+        file: its suffix decides the format.
         begin, end: part of the run to film [s]; None: to its end.
-        slow: how many times slower than life; a pitch lasts 36 ms at 1 m/s.
-        rate: frames a second.
+        slow: slow-motion factor; a pitch lasts 36 ms at 1 m/s.
+        rate: frames per second.
 
     Raises:
-        ValueError: as `instants`.
+        ValueError: as for `instants`.
     """
     file = File(file)
     times = instants(file, begin, end, slow, float(view.time[-1]), rate)
@@ -327,7 +327,7 @@ def render(
 
     writer = imageio_ffmpeg.write_frames(str(file), (first.shape[1], first.shape[0]), fps=rate, quality=7)
     with warnings.catch_warnings():
-        # jax warns of every fork; this one becomes ffmpeg at once and never touches jax's threads
+        # jax warns of every fork; this one becomes ffmpeg at once and does not use jax's threads
         warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
         writer.send(None)
     for picture in itertools.chain([first], pictures):

@@ -1,4 +1,4 @@
-"""Pictures and video of a track model that turns, from above: its path, what bears and slides, both currents."""
+"""Pictures and video of a turning track model from above: its path, loaded and sliding contacts, both currents."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from mmrjax.undercarriage import both_sides
 from mmrjax.undercarriage.belt import Path
 from mmrjax.undercarriage.rendering import check_finite, outline
 
-#: Length of an arrow over the sliding speed [s], and at how many places of a track one is drawn.
+#: Length of an arrow per sliding speed [s], and number of arrows per track.
 SPEED, ARROWS = 0.15, 5
-#: Half the width of a grouser [m], and how wide its line is where it bears as much as any ever does [points].
+#: Half the width of a grouser [m], and line width at the largest load of the run [points].
 GROUSER, LOADED = 0.014, 7.0
-#: The robot is seen with so much ground around its middle [m].
+#: Extent of the visible ground around the middle of the robot [m].
 AROUND = 0.45
 
 _INK, _BODY, _PATH, _SLIDES = "#1f2933", "#5b8db8", "#8fa3b0", "#d1495b"
@@ -28,13 +28,13 @@ _SIDES = ("#0072b2", "#d55e00")
 
 
 class Above(NamedTuple):
-    """What the pictures of one run need, as plain arrays; a side axis of 2 is left, right.
+    """Data for the pictures of one run, as plain arrays; a side axis of 2 is left, right.
 
     Attributes:
         name: of the configuration; slope: [rad]; length: wheelbase, width: between the contact lines [m].
         time, q, v: over the run, see `both_sides`.
         current: of each side's motor [A]; belt: speed of each side's movers [m/s].
-        along: of each contact ahead of the middle [m]; load: that it bears [N].
+        along: of each contact ahead of the middle [m]; load: on it [N].
     """
 
     name: str
@@ -50,12 +50,12 @@ class Above(NamedTuple):
     load: Float[np.ndarray, "n 2 contacts"]
 
     def sheet(self, k: int) -> Any:
-        """A figure of sample `k`."""
+        """Figure of sample `k`."""
         return figure(self, k)
 
 
 def scene(robot: Robot, conditions: Conditions, run: Trajectory) -> Above:
-    """Gather one run (scalar conditions, one member of a batch) for drawing.
+    """Collects the data of one run (scalar conditions, one member of a batch) for drawing.
 
     Raises:
         ValueError: the run holds numbers that are not finite (a failed member).
@@ -87,7 +87,7 @@ def scene(robot: Robot, conditions: Conditions, run: Trajectory) -> Above:
 
 
 def draw(axes: Any, view: Above, k: int) -> None:
-    """Draw sample `k` of a scene into Matplotlib `axes`, uphill to the top and left to the left."""
+    """Draws sample `k` of a scene into Matplotlib `axes`, uphill to the top and left to the left."""
     from matplotlib.patches import Polygon
 
     q, v = view.q[k], view.v[k]
@@ -123,7 +123,7 @@ def draw(axes: Any, view: Above, k: int) -> None:
 
 
 def figure(view: Above, k: int) -> Any:
-    """A figure of sample `k`: the robot from above, currents and yaw rate of the whole run below."""
+    """Figure of sample `k`: the robot from above, currents and yaw rate of the whole run below."""
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
@@ -139,7 +139,7 @@ def figure(view: Above, k: int) -> Any:
         f"{view.name}, slope {np.degrees(view.slope):.0f}°, t = {view.time[k]:.3f} s, yaw {turned:.0f}°", fontsize=11
     )
     handles = [
-        Line2D([], [], color=c, lw=4, label=f"{name} side, what bears")
+        Line2D([], [], color=c, lw=4, label=f"{name} side, contacts under load")
         for c, name in zip(_SIDES, channels.SIDES, strict=True)
     ]
     handles.append(

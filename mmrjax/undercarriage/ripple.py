@@ -1,6 +1,6 @@
-"""What the running gear's discreteness does to a run: ripple, its period (34), touchdowns, stages I-III.
+"""Effects of the running gear's discreteness on a run: ripple, its period (34), touchdowns, stages I-III.
 
-Read from a finished run, in NumPy, member by member; nothing here is differentiated.
+Computed from a finished run, in NumPy, member by member; not differentiable.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ class Ripple(NamedTuple):
     Attributes:
         mean: [the signal's unit].
         amplitude: half of peak to peak over the mean [-].
-        period: after which it repeats itself [s]; NaN: it does not within half the record.
+        period: of repetition [s]; NaN: no repetition within half the record.
     """
 
     mean: float
@@ -28,17 +28,17 @@ class Ripple(NamedTuple):
 
 
 def ripple(time: Series, values: Series) -> Ripple:
-    """Ripple of evenly sampled `values`; a straight drift is taken off.
+    """Ripple of evenly sampled `values`, with a linear drift removed.
 
-    Two events a pitch (a grouser lands in front, another lifts at the rear) make a harmonic the strongest
-    line of the spectrum, so the period is the first lag at which the record agrees with itself nearly as
-    well (0.9) as at the best one, refined by a parabola and by counting on to the last such repetition.
+    Two events per pitch (a grouser lands in front, another lifts at the rear) make a harmonic the strongest
+    line of the spectrum. The period is therefore the first lag with an autocorrelation of at least 0.9 of the
+    largest. It is refined by a parabola and by counting on to the last such repetition.
     """
     time, values = np.asarray(time, float), np.asarray(values, float)
     rest = values - np.polyval(np.polyfit(time, values, 1), time)
     n = len(rest)
     lags = np.arange(n // 2)
-    with np.errstate(invalid="ignore", divide="ignore"):  # of a signal that does not vary
+    with np.errstate(invalid="ignore", divide="ignore"):  # for a constant signal
         agreement = np.array([np.corrcoef(rest[: n - k], rest[k:])[0, 1] for k in lags])
     inner = agreement[1:-1]
     peaks = 1 + np.nonzero((inner > agreement[:-2]) & (inner >= agreement[2:]))[0]
@@ -54,12 +54,12 @@ def ripple(time: Series, values: Series) -> Ripple:
 
 
 class Fluctuation(NamedTuple):
-    """How much a signal varies about its mean, and at which frequency most.
+    """Variation of a signal about its mean, and its strongest frequency.
 
     Attributes:
         mean: [the signal's unit].
         deviation: standard deviation over the mean [-].
-        frequency: of the strongest line of its spectrum [Hz]; NaN: it does not vary.
+        frequency: of the strongest line of its spectrum [Hz]; NaN: it is constant.
     """
 
     mean: float
@@ -68,7 +68,7 @@ class Fluctuation(NamedTuple):
 
 
 def fluctuation(time: Series, values: Series) -> Fluctuation:
-    """Fluctuation of evenly sampled `values`; a straight drift is taken off, a Hann window is on the spectrum."""
+    """Fluctuation of evenly sampled `values`, with a linear drift removed and a Hann window for the spectrum."""
     time, values = np.asarray(time, float), np.asarray(values, float)
     mean = float(values.mean())
     if not np.isfinite(values).all() or mean == 0.0:
@@ -77,7 +77,7 @@ def fluctuation(time: Series, values: Series) -> Fluctuation:
     deviation = float(rest.std() / abs(mean))
     if deviation < 1e-13:  # rounding
         return Fluctuation(mean, deviation, float("nan"))
-    size = 1 << (8 * len(rest) - 1).bit_length()  # filled up with zeros, for a fine grid of frequencies
+    size = 1 << (8 * len(rest) - 1).bit_length()  # zero padding, for a fine grid of frequencies
     power = np.abs(np.fft.rfft(rest * np.hanning(len(rest)), size)) ** 2
     best = int(np.argmax(power[1:-1])) + 1
     return Fluctuation(mean, deviation, float(_vertex(power, best) / (size * (time[1] - time[0]))))
@@ -96,10 +96,10 @@ def period_pitch(pitch: float, speed_wheel: float, radius: float) -> float:
 def touchdowns(
     time: Series, grouser: Float[np.ndarray, "samples 24"], place: Float[np.ndarray, "samples 24"]
 ) -> Series:
-    """Times at which a grouser comes to bear, in order [s]; `place` tells the front arc from the rear one.
+    """Times at which a grouser touches down, in order [s]; `place` distinguishes the front arc from the rear one.
 
-    A grouser that lifts and comes back in the middle of the run does not count: only one whose place is in
-    the second half of the path, or has just begun it anew.
+    A grouser that lifts and returns in the middle of the run does not count: its place has to be in the second half
+    of the path, or just at the start of it.
     """
     bears = np.asarray(grouser) > 0
     lands = ~bears[:-1] & bears[1:]
@@ -112,8 +112,8 @@ class Stages(NamedTuple):
     """Stages of Fig. 23: I starting, II acceleration with slipping, III uniform travel.
 
     Attributes:
-        slipping: time at which the movers begin to slide beyond V_s [s]; NaN: they never do.
-        uniform: time from which the speed stays within 1 % of its last mean and nothing slides [s].
+        slipping: first time of sliding beyond V_s [s]; NaN: the movers never do.
+        uniform: start of the time with the speed within 1 % of its last mean and without sliding [s].
         slip: mean of 1 - V / V_theoretical in stage II, eq. (33) [-].
     """
 

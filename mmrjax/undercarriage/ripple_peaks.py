@@ -1,4 +1,4 @@
-"""Where ripple peaks over speed, and whether a harmonic of the running gear meets a natural frequency there."""
+"""Peaks of ripple over speed, and whether a harmonic of the running gear meets a natural frequency at each."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mmrjax.undercarriage.running_gear import TEETH_PULLEY
 
 
 class Signal(NamedTuple):
-    """What ripples: the signal's field, words for it, its unit for people and the SI value of one such unit."""
+    """A signal with ripple: the signal's field, words for it, its display unit and the SI value of one such unit."""
 
     field: str
     label: str
@@ -35,17 +35,17 @@ SIGNALS = {
     "speed": Signal("speed", "speed", "mm_s", 1e-3),
     "motor_speed": Signal("speed_motor", "motor speed", "rpm", 2 * np.pi / 60),
 }
-TAIL = 0.5  # share of a run at its end in which ripple is read
-PERIODS = 3  # fewest passings in it from which ripple is read
-#: A peak over speed stands out of its surroundings by this share of itself, and is no smaller than this [-].
+TAIL = 0.5  # share of a run, at its end, that is evaluated
+PERIODS = 3  # fewest pitches in it for a valid ripple
+#: Least prominence of a peak over speed, as a share of its height, and least height [-].
 STANDS_OUT, NOTICEABLE = 0.05, 2e-4
-MATTERS = 0.01  # ripple for which a speed is to be avoided [-]
-MOVES = 0.03  # share by which a mode moves with payload so that its peaks have to follow
-_SAME = 0.2  # of an order: how near to a whole order the strongest line has to be
+MATTERS = 0.01  # ripple above which a speed should be avoided [-]
+MOVES = 0.03  # relative change of a mode with payload that its peaks have to follow
+_SAME = 0.2  # of an order: largest distance of the strongest line from a whole order
 
 
 class Passing(NamedTuple):
-    """What passes the chassis at a pitch.
+    """Parts of the running gear that pass the chassis at a pitch.
 
     Attributes:
         name: grousers or teeth; pitch: of the belt [m]; travel: of the robot from one to the next, without slip [m].
@@ -57,7 +57,7 @@ class Passing(NamedTuple):
 
 
 def passing(robot: Robot, configuration: int) -> Passing:
-    """What shakes a configuration: the grousers S_g on tracks; on wheels, which have none, the tooth mesh S_t."""
+    """Excitation of a configuration: the grousers S_g on tracks; on wheels the tooth mesh S_t."""
     chassis, radius = robot.configurations.members[configuration], float(robot.radius_pulley)
     if float(chassis.on_tracks) > 0.5:
         pitch = float(Path(robot.radius_pulley, robot.running_gear).pitch)
@@ -68,12 +68,12 @@ def passing(robot: Robot, configuration: int) -> Passing:
 
 @dataclasses.dataclass(frozen=True)
 class Vibrations:
-    """What ripples in each run of a batch; NaN where it is not `read`.
+    """Ripple in each run of a batch; NaN if it is not `read`.
 
     Attributes:
         status: codes into `STATUSES`.
-        read: whether its ripple is: it travels and at least `PERIODS` pitches passed.
-        speed: mean [m/s]; passing: frequency at which grousers or teeth pass [Hz].
+        read: True if the ripple is valid: the robot travels and at least `PERIODS` pitches passed.
+        speed: mean [m/s]; passing: frequency of grousers or teeth [Hz].
         mean, deviation, frequency: of each of `SIGNALS`, see `ripple.Fluctuation`.
     """
 
@@ -87,7 +87,7 @@ class Vibrations:
 
     @property
     def settled(self) -> np.ndarray:
-        """Whether a run is read and goes on steadily."""
+        """True for valid runs in steady travel."""
         return self.read & (self.status == CONVERGED)
 
 
@@ -96,7 +96,7 @@ def vibrations(robot: Robot, runs: Trajectory, pitch: float) -> Vibrations:
 
     Args:
         runs: fields have shape (runs, samples, ...).
-        pitch: of what passes [m].
+        pitch: of the passing parts [m].
     """
     time, status = np.asarray(runs.time[0]), np.asarray(runs.result.status)
     tail = time > time[-1] - TAIL * (time[-1] - time[0])
@@ -118,12 +118,12 @@ class Peak(NamedTuple):
 
     Attributes:
         signal: of `SIGNALS`; payload: [kg].
-        speed, low, high: where it is highest, and where it is above 70 % of its rise [m/s].
+        speed, low, high: at the maximum, and limits of the range above 70 % of its rise [m/s].
         ripple: the highest, standard deviation over mean [-].
         rise: of the ripple over the higher of its two valleys [-].
-        order: of the passing frequency that is strongest there; 0: it is no whole one.
+        order: strongest multiple of the passing frequency; 0: not a whole one.
         frequency: of the strongest line [Hz].
-        mode: natural vibration at that frequency, which confirms the crossing; empty: none.
+        mode: natural vibration at that frequency, which confirms the crossing; empty: no such mode.
     """
 
     signal: str
@@ -147,13 +147,13 @@ def peaks(
     frequency: Float[np.ndarray, " runs"],
     modes: Sequence[Mode],
 ) -> list[Peak]:
-    """Peaks of ripple over speed at one payload, with the mode that each is at.
+    """Peaks of ripple over speed at one payload, each with its mode.
 
-    A crossing of a harmonic and a natural frequency counts where ripple peaks and its strongest line is that harmonic
-    and within the mode's band: neither is assumed from the other.
+    A crossing of a harmonic and a natural frequency counts if ripple peaks there and its strongest line is that
+    harmonic and within the mode's band. Neither is inferred from the other.
 
     Args:
-        speed, passing, deviation, frequency: of the runs that are read, in the order of `speed`.
+        speed, passing, deviation, frequency: of the valid runs, in the order of `speed`.
         modes: at this payload.
     """
     if len(speed) < 3:
@@ -178,10 +178,10 @@ def peaks(
 
 
 def confirmed(found: Sequence[Peak], modes: Mapping[float, Sequence[Mode]]) -> list[Peak]:
-    """The peaks, without their mode where they do not follow it over the payloads.
+    """The peaks, without their mode if they do not follow it over the payloads.
 
-    Where a mode's frequency changes with payload by more than `MOVES`, the lines of the peaks of one order have to
-    change the same way; a peak that moves against it only crosses its band.
+    If a mode's frequency changes with payload by more than `MOVES`, the lines of the peaks of one order have to
+    change in the same direction; a peak that moves against it only crosses its band.
 
     Args:
         modes: by payload [kg].
@@ -199,11 +199,11 @@ def confirmed(found: Sequence[Peak], modes: Mapping[float, Sequence[Mode]]) -> l
 
 
 class Crossing(NamedTuple):
-    """Where a harmonic of the passing frequency meets a natural frequency.
+    """A crossing of a harmonic of the passing frequency with a natural frequency.
 
     Attributes:
-        mode, order, payload: which [kg]; speed: at the mode's mean frequency [m/s].
-        signals: whose ripple peaks there; empty: the crossing does not show.
+        mode, order, payload: of the crossing [kg]; speed: at the mode's mean frequency [m/s].
+        signals: signals with a ripple peak there; empty: the crossing does not show.
     """
 
     mode: str
@@ -216,7 +216,7 @@ class Crossing(NamedTuple):
 def crossings(
     modes: Sequence[Mode], payload: float, travel: float, slowest: float, fastest: float, found: Sequence[Peak]
 ) -> list[Crossing]:
-    """Crossings at one payload between two speeds [m/s], and which peaks of ripple confirm them.
+    """Crossings at one payload between two speeds [m/s], and the ripple peaks that confirm them.
 
     Args:
         travel: of the robot from one passing to the next [m].
@@ -236,10 +236,10 @@ class Resonance(NamedTuple):
     """Peaks of one mode, order and signal over the payloads.
 
     Attributes:
-        mode: natural vibration that confirms them; empty: none does.
+        mode: natural vibration that confirms them; empty: no such mode.
         speeds: least and greatest speed of the peaks [m/s]; avoid: of their widths.
         frequencies: least and greatest of their lines [Hz].
-        payloads: at which it shows [kg]; ripple: the largest [-]; rise: the largest over its surroundings [-].
+        payloads: of its peaks [kg]; ripple: the largest [-]; rise: the largest over its surroundings [-].
     """
 
     mode: str
@@ -271,6 +271,6 @@ def resonances(found: Sequence[Peak]) -> list[Resonance]:
 
 
 def strongest(found: Sequence[Resonance]) -> list[Resonance]:
-    """What is to be avoided: of each signal the resonances that rise at least half as far as its largest, to 1 %."""
+    """Resonances to avoid: for each signal, all with at least half of its largest rise, to 1 %."""
     largest = {s: max((r.rise for r in found if r.signal == s), default=0.0) for s in SIGNALS}
     return [r for r in found if r.rise >= largest[r.signal] / 2 and r.ripple >= MATTERS]

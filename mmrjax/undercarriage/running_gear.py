@@ -1,4 +1,4 @@
-"""Running gear of one side: what the multibody model needs beyond the other fidelities' parameters."""
+"""Running gear of one side: further parameters that only the multibody model needs."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ __all__ = ["GROUSERS", "TEETH_BELT", "TEETH_PULLEY", "WHEELS", "RunningGear"]
 
 WHEELS = 2  # of one side, 4W2T
 
-_ASSUMED = "assumed; the paper prints none"
+_ASSUMED = "assumed; not stated in the paper"
 
 
 class RunningGear(eqx.Module):
     """Geometry (Table 6), masses (Table 7), belt and contacts (27)-(29) of one side of the chassis.
 
-    The rolling radius, the moments of inertia of the rotating parts, friction and losses are the robot's, and so is
-    its mass, of which the body has what the parts below leave.
+    The robot holds the rolling radius, the moments of inertia of the rotating parts, friction, losses and its mass.
+    The body's mass is the robot's less that of the parts below.
     """
 
     wheelbase: Scalar = parameter(
@@ -43,7 +43,7 @@ class RunningGear(eqx.Module):
     grouser_length: Scalar = parameter(
         5e-3,
         unit="m",
-        meaning="length of a grouser's rigid base along the belt; over it the grouser turns into the arc",
+        meaning="length of a grouser's rigid base along the belt; the grouser turns into the arc over this length",
         bounds=(5e-4, 0.03),
         relative_sd=0.3,
         source="one tooth pitch: the rigid link that carries a grouser, Section 3.2.4",
@@ -51,10 +51,10 @@ class RunningGear(eqx.Module):
     guide_recess: Scalar = parameter(
         0.0,
         unit="m",
-        meaning="how far the lower guide lies above the line that touches both pulleys",
+        meaning="height of the lower guide above the line that touches both pulleys",
         bounds=(-2e-3, 5e-3),
         sd=2e-4,
-        source=f"flush; {_ASSUMED}. Decides the guides' share of the weight: docs/track-model.md gives the curve",
+        source=f"flush; {_ASSUMED}. Decides the guides' share of the weight (docs/explanation/track-model.md)",
     )
     guide_gap: Scalar = parameter(
         20e-3,
@@ -62,7 +62,7 @@ class RunningGear(eqx.Module):
         meaning="free length of the belt between the end of an arc and the lower guide",
         bounds=(1e-3, 0.14),
         relative_sd=0.3,
-        source="where a guide 5 mm thick clears a pulley of 38.2 mm: sqrt(38.2² - 33.2²) = 19 mm",
+        source="clearance of a guide 5 mm thick from a pulley of 38.2 mm: sqrt(38.2² - 33.2²) = 19 mm",
     )
     pretension: Scalar = parameter(
         100.0,
@@ -123,7 +123,7 @@ class RunningGear(eqx.Module):
     contact_depth: Scalar = parameter(
         1e-4,
         unit="m",
-        meaning="depth d of penetration at which damping is full, Fig. 9a",
+        meaning="penetration depth d for full damping, Fig. 9a",
         bounds=(1e-6, 1e-2),
         relative_sd=0.5,
         source="default of the multibody package of ref. [48]: 0.1 mm",
@@ -131,7 +131,7 @@ class RunningGear(eqx.Module):
     centre_height: Scalar = parameter(
         5e-3,
         unit="m",
-        meaning="centre of mass above the axles, payload and levers apart",
+        meaning="centre of mass above the axles, without payload and levers",
         bounds=(-0.1, 0.3),
         sd=0.01,
         source="middle of the body (Table 6), half of its height of 76 mm over its underside (`clearance`)",
@@ -147,7 +147,7 @@ class RunningGear(eqx.Module):
     centre_offset: Scalar = parameter(
         0.0,
         unit="m",
-        meaning="centre of mass ahead of the middle of the wheelbase, levers apart",
+        meaning="centre of mass ahead of the middle of the wheelbase, without levers",
         bounds=(-0.3, 0.3),
         sd=0.01,
         source=f"symmetric layout, Fig. A2; {_ASSUMED}",
@@ -171,7 +171,7 @@ class RunningGear(eqx.Module):
     body_gyration: Scalar = parameter(
         0.1075,
         unit="m",
-        meaning="radius of gyration in pitch of the body, all but payload, levers, pulleys, wheels and tracks",
+        meaning="radius of gyration in pitch of the body: without payload, levers, pulleys, wheels and tracks",
         bounds=(1e-3, 3.0),
         relative_sd=0.05,
         source="Table 7: sqrt(1.19e5 kg·mm² / 10.3 kg)",
@@ -179,8 +179,8 @@ class RunningGear(eqx.Module):
     inertia_tracked: Scalar = parameter(
         0.0,
         unit="kg·m^2",
-        meaning="moment of inertia in pitch on tracks, levers folded, no payload, where it is known as a whole and "
-        "stated in place of body_gyration; 0: it follows from the parts",
+        meaning="moment of inertia in pitch on tracks, levers folded, no payload, if known as a whole; replaces "
+        "body_gyration; 0: it follows from the parts",
         bounds=(0.0, 20.0),
         sd=5e-3,
         source="not stated: the sum of the parts (Table 7's 0.251 is that of the robot with its levers outstretched)",
@@ -188,7 +188,7 @@ class RunningGear(eqx.Module):
     inertia_wheeled: Scalar = parameter(
         0.0,
         unit="kg·m^2",
-        meaning="the same on wheels",
+        meaning="moment of inertia in pitch on wheels, as a whole",
         bounds=(0.0, 20.0),
         sd=5e-3,
         source="not stated: the sum of the parts (0.146; Table 7: 0.145)",
@@ -252,7 +252,7 @@ class RunningGear(eqx.Module):
     additional_pulley_mass: Scalar = parameter(
         104e-3,
         unit="kg",
-        meaning="mass of the additional pulley beside it, which drives the lever's track or carries the wheel",
+        meaning="mass of the additional pulley on the axle, which drives the lever's track or carries the wheel",
         bounds=(0.0, 10.0),
         relative_sd=0.05,
         source="Table 7: two a side, as 13.1 and 11.5 kg need",

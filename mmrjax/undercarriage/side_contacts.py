@@ -1,8 +1,8 @@
-"""Contacts of one side with the ground and the guides, and the generalized forces they put on the chassis.
+"""Contacts of one side with the ground and the guides, and their generalized forces on the chassis.
 
 Coordinates q of half a robot in its plane of travel: travel x [m] uphill, height z [m] of the middle of the
 wheelbase (axle line) over the ground, pitch θ [rad] nose down, angles φ_1, φ_2 [rad] of driving (front) and
-driven pulley, relative to the chassis. Velocities v alike. A wheel of 4W2T sits on its pulley's shaft.
+driven pulley, relative to the chassis. Velocities v are their rates. A wheel of 4W2T sits on its pulley's shaft.
 
 Contact pairs of one side: 24 grousers with the ground, 168 teeth with each of two guides (720 in all for
 6T2A); 2 wheels with the ground for 4W2T.
@@ -27,7 +27,7 @@ from mmrjax.numerics.trigonometry import cosine, sine
 from mmrjax.undercarriage.belt import Path, Runs, Tips, runs, tension_along, tips
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT, WHEELS, RunningGear
 
-CONTACTS = GROUSERS + WHEELS  # with the ground, of one side; those of the other configuration bear nothing
+CONTACTS = GROUSERS + WHEELS  # with the ground, of one side; those of the other configuration carry no load
 TEETH_GROUSER = TEETH_BELT // GROUSERS  # teeth under one grouser's pitch
 
 WHEEL = np.arange(CONTACTS) >= GROUSERS
@@ -35,8 +35,7 @@ _END = np.where(WHEEL, np.where(np.arange(CONTACTS) == GROUSERS, 1.0, -1.0), 0.0
 
 
 class Touch(eqx.Module):
-    """Where the contacts are at an instant, how they move, and what they bear; first the grousers.
-
+    """Position, motion and load of the contacts at an instant; grousers first.
     Attributes:
         lever_x, lever_z: contact point from the middle of the wheelbase [m].
         rate_x, rate_z: its velocity per belt speed [-].
@@ -44,7 +43,7 @@ class Touch(eqx.Module):
         speed_x: its velocity over the ground, uphill [m/s].
         gap, gap_rate: height over the ground [m] and its rate [m/s].
         compliance: of the belt under it at its tension [m/N].
-        force: normal force R_z [N]; damped: how fast it falls with the gap's rate [N·s/m].
+        force: normal force R_z [N]; damped: its decrease with the gap's rate [N·s/m].
         guided: share of the force that passes to the lower guide [-].
         belt: tensions of the runs.
     """
@@ -71,7 +70,7 @@ class Touch(eqx.Module):
 
 
 def of_contacts(grousers: Float[Array, " 24"], wheels: Array | np.ndarray | float = 0.0) -> Float[Array, " contacts"]:
-    """One array of grousers and wheels, padded and masked: XLA vectorises that and not a concatenation."""
+    """One array of grousers and wheels, padded and masked: XLA vectorises this but not a concatenation."""
     return jnp.where(WHEEL, wheels, jnp.pad(grousers, (0, WHEELS)))
 
 
@@ -81,7 +80,7 @@ def _geometry(
     cos, sin = cosine(pitch), sine(pitch)
     forward, up = of_contacts(where.forward, path.gear.wheelbase / 2 * _END), of_contacts(where.up)
     ahead, rise = of_contacts(where.rate_forward), of_contacts(where.rate_up)
-    # The lowest point of a wheel is below its axle, however the robot is pitched.
+    # The lowest point of a wheel is below its axle at any pitch of the robot.
     below = jnp.where(WHEEL, radius_wheel, 0.0)
     return (
         forward * cos + up * sin,
@@ -93,24 +92,24 @@ def _geometry(
 
 
 def bearing(chassis: Chassis) -> Float[Array, " contacts"]:
-    """1 for contacts that bear in this configuration, else 0 [-]."""
+    """1 for contacts that carry load in this configuration, else 0 [-]."""
     return jnp.where(WHEEL, 1 - chassis.on_tracks, chassis.on_tracks)
 
 
 def tension_free(path: Path, belt: Runs) -> Scalar:
-    """Tension under which the lower run yields where it hangs free, P - P_ct [N], kept from slack."""
+    """Tension of the free part of the lower run, P - P_ct [N], kept above slack."""
     return jnp.maximum(belt.lower - belt.centrifugal, 0.01 * path.gear.pretension)
 
 
 def touch(path: Path, chassis: Chassis, q: Sequence[Scalar] | Array, v: Sequence[Scalar] | Array) -> Touch:
     """Contact points and normal forces (27)-(29) at coordinates `q`, velocities `v`.
 
-    Where the belt hangs free between pulley and guide it yields under the grouser as a string of tension
-    P - P_ct: the force falls by h / (h + its deflection under the unyielding contact's force), exact at e = 1.
+    The free belt between pulley and guide deflects under the grouser as a string of tension P - P_ct. The force falls
+    by h / (h + its deflection under the force of the rigid contact), exact at e = 1.
 
     Args:
         path: the belt's path.
-        chassis: on tracks the grousers bear, on wheels the wheels, of its radius.
+        chassis: on tracks the grousers carry load, on wheels the wheels, of its radius.
         q, v: coordinates and velocities, see the module.
     """
     gear = path.gear
@@ -146,7 +145,7 @@ def touch(path: Path, chassis: Chassis, q: Sequence[Scalar] | Array, v: Sequence
 
 
 class Pull(eqx.Module):
-    """What the contacts do at an instant.
+    """Forces of the contacts at an instant.
 
     Attributes:
         force: traction of each contact, uphill on the robot [N].
@@ -154,7 +153,7 @@ class Pull(eqx.Module):
         guided: load on the lower guide [N].
         load: of the belt, the ground and the guides on the driving shaft [N·m].
         generalized: forces on (x, z, θ, φ_2) [N, N, N·m, N·m]; the shaft's own torque is the gearbox's.
-        aside: lateral force of each contact, to the left on a robot free to turn [N]; None: of straight travel.
+        aside: lateral force of each contact, to the left on a robot free to turn [N]; None: straight travel.
     """
 
     force: Float[Array, " contacts"]
@@ -171,12 +170,12 @@ class Pull(eqx.Module):
 
 
 def sliding(signals: Signals, at: Touch) -> Float[Array, " contacts"]:
-    """How fast each contact slides backward over the ground [m/s]; `speed_slip_terms` shifts it."""
+    """Backward sliding speed of each contact over the ground [m/s]; `speed_slip_terms` shifts it."""
     return -at.speed_x - signals.speed_slip_terms
 
 
 def friction_rise(chassis: Chassis, signals: Signals, at: Touch) -> Float[Array, " contacts"]:
-    """How fast the traction of each contact rises with its sliding [N·s/m]."""
+    """Derivative of the traction of each contact with respect to its sliding speed [N·s/m]."""
     return jnp.asarray(chassis.ground.traction_rise(sliding(signals, at), at.force, signals.adhesion))
 
 
@@ -194,12 +193,12 @@ def pull(
         signals: those up to `balances.slip`; `speed_slip_terms` shifts the sliding of every contact.
         at: the contacts.
         height: of the axle line over the ground [m].
-        force: traction of each contact where contacts slide aside too [N]; None: by Fig. 7.
+        force: traction of each contact if contacts slide laterally too [N]; None: by Fig. 7.
     """
     if force is None:
         force = jnp.asarray(chassis.ground.traction(sliding(signals, at), at.force, signals.adhesion))
     guide = chassis.track.guide_friction * at.guided * at.force * signals.direction
-    # Power of the contact forces per belt speed, then on the pulleys in the shares of that speed.
+    # Power of the contact forces per belt speed, then on the pulleys in their shares of that speed.
     along = force * at.rate_x + at.force * at.rate_z - guide
     front = path.radius * jnp.sum(along * (1 - at.weight)) + at.belt.torque_front
     rear = path.radius * jnp.sum(along * at.weight) + at.belt.torque_rear
@@ -213,10 +212,10 @@ class Reactions(eqx.Module):
 
     Attributes:
         grouser: normal reaction of the ground on each grouser R_z [N].
-        guided: what of it passes to the lower guide [N].
+        guided: part of it that passes to the lower guide [N].
         support: on front and rear pulley (6T2A) or wheel (4W2T) [N].
         place: of the grousers on the belt's path [m].
-        tension: of the belt at as many places as grousers, half a pitch from the path's start on [N].
+        tension: of the belt at as many positions as grousers, from half a pitch after the path's start on [N].
         centrifugal: P_ct of it [N].
     """
 

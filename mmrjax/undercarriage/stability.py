@@ -1,4 +1,4 @@
-"""What is said before a run of the track model: postures that cannot be, and the largest stable step."""
+"""Checks before a run of the track model: impossible postures, and the largest stable step."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from mmrjax.undercarriage import mjcf
 from mmrjax.undercarriage.half_robot import Motion, System, advance, roll, stand, system
 from mmrjax.undercarriage.side_contacts import lever_tips
 
-SAFETY = 0.75  # of the linear limit: contacts bear more than when standing, by their ripple
-LEAST = 0.01  # [m/s], V_s that the linear limit is found with at least
-PROBE = 1e-6  # [s], step from which rates are taken
+SAFETY = 0.75  # of the linear limit: ripple loads the contacts more than standing does
+LEAST = 0.01  # [m/s], least V_s for the linear limit
+PROBE = 1e-6  # [s], step for computing rates
 
 
 def step_derivative(run: System, at: Motion) -> Float[Array, "11 11"]:
-    """Derivative of (q, v, current) one step on by (q, v, current), of one run."""
+    """Derivative of (q, v, current) after one step with respect to (q, v, current), of one run."""
 
     def after(y: Float[Array, " 11"]) -> Float[Array, " 11"]:
         moved, _, _ = advance(run, Motion(y[:5], y[5:10], y[10], at.discharge, at.memory))
@@ -38,7 +38,7 @@ def step_derivative(run: System, at: Motion) -> Float[Array, "11 11"]:
 def _maps(
     robot: Robot, conditions: Conditions, steps: Float[Array, "runs starts"]
 ) -> Float[Array, "runs starts 11 11"]:
-    """Derivatives of (q, v, current) one step on by (q, v, current), standing and rolling."""
+    """Derivatives of (q, v, current) after one step with respect to (q, v, current), standing and rolling."""
 
     def one(conditions: Conditions, steps: Float[Array, " starts"]) -> Float[Array, "starts 11 11"]:
         run = system(robot, conditions, PROBE)
@@ -55,7 +55,7 @@ def _unhurried(robot: Robot) -> Robot:
 
 
 def _roll_period(robot: Robot, conditions: Conditions) -> Scalar:
-    """Period of rolling over that of bouncing, of a robot on contacts at ±B/2 [-]."""
+    """Period of rolling over that of bouncing, for a robot on contacts at ±B/2 [-]."""
     zero = jnp.zeros_like(conditions.voltage)
     mass = balances.begin(robot, conditions, State(zero, zero, zero, zero)).mass
     parts = mjcf.bodies(robot, masses.masses(robot, conditions, mass), conditions)
@@ -69,8 +69,8 @@ def largest_step(robot: Robot, conditions: Conditions) -> Float[np.ndarray, " ru
 
     Three quarters of the step that, linearised about the robot standing and rolling, would make a small disturbance
     grow; the quarter is for the ripple of the contacts. A small V_s is no limit: friction is implicit in a step, and
-    what is left of its chatter stays within V_s. A robot free to turn has that of one that travels straight, less by
-    as much as it rolls faster on its contacts than it bounces.
+    its remaining chatter stays within V_s. For a robot free to turn, the step of straight travel is reduced by the
+    ratio of the frequencies of rolling and bouncing on its contacts.
     """
     if conditions.turns:
         slower = np.asarray(jax.vmap(lambda c: _roll_period(robot, c))(conditions))
@@ -83,8 +83,8 @@ def largest_step(robot: Robot, conditions: Conditions) -> Float[np.ndarray, " ru
         return np.where(usable, found, 0.0)
 
     low, high = np.full((*conditions.shape, 2), -7.0), np.full((*conditions.shape, 2), -2.0)  # powers of ten
-    # What grows in continuous time too (a robot about to tip, friction that falls with speed) is no matter of
-    # the step; slow drifts neither.
+    # Growth in continuous time (a robot about to tip, friction that falls with speed) does not depend on the step;
+    # slow drifts do not either.
     rates = (maps(np.full_like(low, PROBE)) - np.eye(11)) / PROBE
     physical = 20.0 + 2 * np.maximum(np.linalg.eigvals(rates).real.max(axis=-1), 0.0)
     for _ in range(16):
@@ -96,7 +96,7 @@ def largest_step(robot: Robot, conditions: Conditions) -> Float[np.ndarray, " ru
 
 
 def refuse(robot: Robot, conditions: Conditions, step: float, sample: float) -> None:
-    """Raise for what no run can be made of.
+    """Raises for conditions and steps that the track model cannot compute.
 
     Args:
         robot, conditions: a batch of runs.
@@ -104,12 +104,12 @@ def refuse(robot: Robot, conditions: Conditions, step: float, sample: float) -> 
 
     Raises:
         ValueError: a lever reaches below the ground, or the step is too large for the stiffness; the message
-            then names a step that is neither too large nor at odds with `sample`.
+            then suggests a smaller step that divides `sample`.
     """
     on_tracks = np.array([float(chassis.on_tracks) for chassis in robot.configurations.members])
     tracked = on_tracks[np.asarray(conditions.configuration, int)] > 0.5
     gear = robot.running_gear
-    height = float(robot.radius_pulley + gear.grouser_height)  # levers are on tracks alone
+    height = float(robot.radius_pulley + gear.grouser_height)  # levers exist only on tracks
     for name, (_, up) in zip(("lever_front", "lever_rear"), lever_tips(gear, conditions), strict=True):
         tips = np.ravel(np.asarray(up))
         tip = float(np.min(tips))
@@ -133,7 +133,7 @@ def refuse(robot: Robot, conditions: Conditions, step: float, sample: float) -> 
 
 
 def _whole(sample: float, limit: float) -> float:
-    # The largest step up to `limit` that divides `sample` and that six digits write down in full.
+    # The largest step up to `limit` that divides `sample` and can be written with six digits.
     count = math.ceil(sample / limit)
     while abs(float(f"{sample / count:.6g}") * count / sample - 1) > 1e-12:
         count += 1

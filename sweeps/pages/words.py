@@ -123,7 +123,7 @@ LOOP_VERDICTS = {
     "named": "one law of the library is established for each thing that is missing",
 }
 
-#: What a page's reader meets and may not know; docs/glossary.md is made of it.
+#: Words of the pages, for docs/reference/glossary.md.
 GLOSSARY = {
     "balance": "one of the model's equations, such as volts along the motor's circuit or torque at the "
     "driving wheel; every effect enters one",
