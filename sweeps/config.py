@@ -594,7 +594,7 @@ class Export(RobotPart, OutputPart):
 
     robot: str = about("nominal", "nominal, sm1, sm2, or a robot's TOML file", metavar="[ROBOT.toml]", format="path")
     to: Literal["mujoco", "jax", "onnx", "mjlab", "table", "randomization"] = about(
-        "mujoco", "Format (docs/export.md)"
+        "mujoco", "Format (docs/howto/export.md)"
     )
     data: str | None = about(
         None, "A table of runs or a log, with which the exported drive is compared", usual="a grid without readings"

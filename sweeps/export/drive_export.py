@@ -32,7 +32,7 @@ def export(
 
     Args:
         robot: a robot, the name of a packaged one, or its TOML file; the posterior next to it is read.
-        to: `mujoco`, `jax`, `onnx`, `mjlab`, `table` or `randomization` (docs/export.md).
+        to: `mujoco`, `jax`, `onnx`, `mjlab`, `table` or `randomization` (docs/howto/export.md).
         out: folder for the files and `LAW.md`, made if it does not exist; None: no files are written.
         data: runs to compare with, or the file of a table or log; None: a grid of operating points.
         configuration: which of the robot's; None: its first.
