@@ -1,7 +1,7 @@
 """Speed of an exported actuator: environments in parallel, gradients, and a step against MJX's own `<motor>`.
 
     python benchmarks/actuator.py                              # 4096 environments, 1000 steps
-    python benchmarks/actuator.py --environments 64 --steps 200
+    python benchmarks/actuator.py --law drive/actuator.py      # of an export, where only JAX is installed
 
 Times are the best of several, compilation apart, in single precision. Prints a line of JSON.
 """
@@ -10,18 +10,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import runpy
 import time
+import types
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
-from mujoco import mjx
-
-from calibration.data import robot_file
-from sweeps.export.joint import joint
-from sweeps.export.law_source import Constant, executed, jax_source
 
 #: One joint whose motor is MJX's own, and the same for an actuator from outside.
 MODEL = """<mujoco><option timestep="0.001"/><worldbody><body><joint name="drive" axis="0 1 0" armature="0.006"/>
@@ -29,8 +25,14 @@ MODEL = """<mujoco><option timestep="0.001"/><worldbody><body><joint name="drive
 DT, REPEATS = 1e-3, 5
 
 
-def law() -> Any:
-    """Module of the packaged robot's exported actuator."""
+def law(file: str | None) -> Any:
+    """Module of an exported actuator, of the packaged robot's if there is no file."""
+    if file is not None:
+        return types.SimpleNamespace(**runpy.run_path(file))
+    from calibration.data import robot_file
+    from sweeps.export.joint import joint
+    from sweeps.export.law_source import Constant, executed, jax_source
+
     drive = joint(robot_file.find("nominal"))
     known = [Constant(n, float(p.value), "", "", "") for n, p in drive.parameters().items()]
     known += [Constant(n, 30.0, "N", "", "") for n in drive.surroundings()]
@@ -73,7 +75,12 @@ def in_parallel(module: Any, environments: int, steps: int) -> dict[str, float]:
 
 
 def against_motor(module: Any, environments: int, steps: int) -> dict[str, float]:
-    """Times of a joint in MJX with its own `<motor>`, and with the exported actuator [s]."""
+    """Times of a joint in MJX with its own `<motor>`, and with the exported actuator [s]; none without MJX."""
+    try:
+        import mujoco
+        from mujoco import mjx
+    except ImportError:
+        return {}
     motor = '<actuator><motor joint="drive"/></actuator>'
     own = mjx.put_model(mujoco.MjModel.from_xml_string(MODEL.format(actuator=motor)))
     bare = mjx.put_model(mujoco.MjModel.from_xml_string(MODEL.format(actuator="")))
@@ -103,11 +110,12 @@ def against_motor(module: Any, environments: int, steps: int) -> dict[str, float
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--law", help="actuator.py of an export; else the packaged robot's drive")
     parser.add_argument("--environments", type=int, default=4096)
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--joints", type=int, default=64, help="Environments of the comparison with <motor>")
     told = parser.parse_args()
-    module = law()
+    module = law(told.law)
     found = {
         "device": str(jax.devices()[0].device_kind), "environments": told.environments, "steps": told.steps,
         **in_parallel(module, told.environments, told.steps), "joints": told.joints,
