@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from sweeps import sweep as sweep
     from sweeps.compilation_cache import keep_programs as keep_programs
     from sweeps.export.drive_export import export as export
+    from sweeps.report.words.note_words import describe as describe
 
 #: Module of each public name.
 _HOME = {
@@ -60,6 +61,7 @@ _HOME = {
 #: Names of the layers above `mmrjax`; each is imported when it is first used.
 _ABOVE = {
     "calibrate": "calibration",
+    "describe": "sweeps.report.words.note_words",
     "discover": "calibration",
     "export": "sweeps.export.drive_export",
     "keep_programs": "sweeps.compilation_cache",
@@ -78,6 +80,7 @@ __all__ = [
     "UsageError",
     "__version__",
     "calibrate",
+    "describe",
     "discover",
     "export",
     "initial_state",

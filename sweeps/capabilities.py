@@ -1,6 +1,8 @@
-"""What of the numbers of a run a robot has: a shaft has no ground, and a rig only what its file states."""
+"""Numbers that a robot has: a shaft has no ground, and a rig only what its file states."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -14,6 +16,7 @@ from mmrjax.model.channels import EVERY, HEAT, SIDES, VOLTAGE, WARMING
 from mmrjax.model.paper_robots import blank
 from mmrjax.model.power import Battery
 from mmrjax.model.robot import Robot
+from sweeps.pages import words
 
 #: Columns of runs and histories that are of the ground.
 OF_GROUND = (
@@ -89,8 +92,8 @@ def without_idle(robot: Robot, table: dict[str, np.ndarray]) -> dict[str, np.nda
     return {column: values for column, values in table.items() if column not in gone}
 
 
-def parameters(file: RobotFile) -> list[dict[str, str]]:
-    """Parameters of a rig: those that its file states, and all else that is not as nothing is; with the source."""
+def parameters(file: RobotFile) -> list[tuple[str, float, str, str, str]]:
+    """Parameters that a rig's file states, and others with an effect: name, value, unit, meaning, source."""
     robot = file.robot
     nothing, found = _nothing(robot), []
     for p in params.walk(robot):
@@ -104,8 +107,27 @@ def parameters(file: RobotFile) -> list[dict[str, str]]:
             continue
         of_file = own or head in file.linear
         source = f"stated in {file.name}" if of_file else "default" if not moved or load else "changed"
-        found.append(
-            {"name": p.name, "meaning": p.spec.meaning, "unit": p.spec.unit, "value": f"{float(p.value):.6g}"}
-            | {"source": source}
-        )
+        found.append((p.name, float(p.value), p.spec.unit, p.spec.meaning, source))
     return found
+
+
+def changed_parameters(robot: Robot, nominal: Robot) -> list[tuple[Any, ...]]:
+    """Parameters of `robot` that differ from the nominal robot's: name, both values, unit, meaning."""
+    base = {p.name: float(p.value) for p in params.walk(nominal)}
+    return [
+        (p.name, float(p.value), base.get(p.name, "not in the paper's model"), p.spec.unit, p.spec.meaning)
+        for p in params.walk(robot)
+        if p.name not in base or not np.isclose(float(p.value), base[p.name], rtol=1e-9, atol=0.0)
+    ]
+
+
+def shown_name(file: RobotFile) -> str:
+    """A robot's name as pages show it; a packaged robot with other parameters is called changed."""
+    from mmrjax.model.paper_robots import ROBOTS
+
+    name = file.name
+    if not file.robot.rig.inherits:
+        return name
+    if name in ROBOTS and changed_parameters(file.robot, ROBOTS[name]()):
+        return f"{name}, changed"
+    return words.words_shown(name)

@@ -1,4 +1,4 @@
-"""What a command says to the person who runs it: results on stdout, everything else on stderr."""
+"""Output of commands: results on stdout, everything else on stderr."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def say(what: Any) -> None:
 
 
 def tell(text: str) -> None:
-    """Print a line to stderr, where what is not the result goes, in the place of one that is written again."""
+    """Print a line to stderr, in place of a progress line."""
     again("")
     _err.print(wrapped(text) if sys.stderr.isatty() else text)
 
@@ -82,16 +82,16 @@ def working(name: str) -> Iterator[None]:
 def pulse(
     tell: Callable[[str], None], doing: str, silence: float = SILENCE, again: Callable[[str], None] = again
 ) -> Iterator[Callable[[str], None]]:
-    """A function that says what goes on; where nothing has been said for a while, the latest is said again, with how
-    long it has gone on and what was compiled meanwhile.
+    """A function that prints the current step; after a silence the step is repeated with its time and the number of
+    programs compiled.
 
     Args:
-        tell: says a line; doing: what goes on until the first; silence: the longest [s].
-        again: says how long something has gone on.
+        tell: prints a line; doing: step before the first call; silence: longest time without output [s].
+        again: rewrites the progress line.
     """
     import jax
 
-    from calibration.words.step_words import still
+    from sweeps.report.words.step_words import still
 
     compiled, said = 0, [(doing, time.monotonic(), 0)]
     spoke, over = threading.Event(), threading.Event()
@@ -122,6 +122,19 @@ def pulse(
         over.set()
         spoke.set()
         thread.join()
+
+
+@contextmanager
+def stage(number: int, total: int, doing: str, silent: bool = False) -> Iterator[None]:
+    """Report a stage of a command and, while it lasts, its time; `silent`: without the time, next to a bar."""
+    text = f"{number} of {total}, {doing}"
+    if silent:
+        tell(text)
+        yield
+        return
+    with pulse(tell, doing) as heard:
+        heard(text)
+        yield
 
 
 class RateColumn(ProgressColumn):

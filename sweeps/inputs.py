@@ -7,8 +7,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from calibration.data import effect_file, robot_file, surface_labels
-from calibration.data import posterior_file as posterior
+from calibration.data import effect_file, posterior_file, robot_file, surface_labels
 from calibration.data import runs as records
 from calibration.data.columns import IMPOSED, Layout
 from calibration.data.contradictions import misplaced
@@ -20,7 +19,7 @@ from mmrjax.derived.turning_figures import by_itself
 from mmrjax.model.paper_tables import BENCH, SURFACES
 from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot, cannot_turn
-from sweeps import capabilities
+from sweeps import capabilities, store
 from sweeps.config import FidelityPart, OneRun, RobotPart
 from sweeps.console import tell
 from sweeps.flags import flags
@@ -80,10 +79,16 @@ def beside_robot(file: RobotFile) -> Posterior:
         raise BadConfiguration(
             f"--posterior: {file.source} has none; expected --robot FOLDER/robot.toml of calibrate or loop"
         )
-    path = Path(file.source).with_name(posterior.FILE)
-    found = posterior.read(path)
+    path = Path(file.source).with_name(posterior_file.FILE)
+    found = posterior_file.read(path)
     found.check(file.robot, str(path))
     return found
+
+
+def fit_of(file: RobotFile, runs: records.Runs) -> str:
+    """`these` if the robot's folder records a fit to these rows, `others` if one to others, "" if none."""
+    fitted = store.rows_of_fit(Path(file.source))
+    return "" if not fitted else "these" if runs.digest in fitted else "others"
 
 
 def check_configurations(robot: Robot, names: tuple[str, ...], where: str) -> None:

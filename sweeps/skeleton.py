@@ -1,4 +1,4 @@
-"""How every command ends that leaves a run folder, once it has loaded, computed, written and printed."""
+"""The common end of commands that write a run folder."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from sweeps import config as configuration
 from sweeps.config import RobotPart
 from sweeps.console import say
+from sweeps.report import terminal_renderer
+from sweeps.report.document import Document
 from sweeps.store import DONE, SOLVER_FAILED, Folder
 
 Page = Callable[[Path], Any]
@@ -24,6 +27,12 @@ def page(name: str, *found: Any, **known: Any) -> Page:
     return lambda folder: importlib.import_module(f"sweeps.pages.{name}_page").write(folder, *found, **known)
 
 
+def report(document: Document, file: RobotFile | None = None) -> Page:
+    """Print a document and return its page, which ends with the robot's parameters if its file is given."""
+    terminal_renderer.show(document)
+    return lambda folder: importlib.import_module("sweeps.report.page_renderer").write(folder, document, file)
+
+
 def leave(
     folder: Folder,
     config: RobotPart,
@@ -33,12 +42,12 @@ def leave(
     page: Page | None = None,
     runs: Runs | None = None,
 ) -> int:
-    """Write the configuration and, unless it is not wanted, the page; move the folder into place and say where it is.
+    """Write the configuration and the page (if wanted), move the folder into place and print its path.
 
     Args:
         folder: with the command's own files, `robot.toml` among them.
-        manifest: what it says beside program, versions and hashes; runs: the table whose file's hash it has, if any.
-        solved: whether every solver gave an answer.
+        manifest: entries besides program, versions and hashes; runs: the table whose hash is recorded, if any.
+        solved: True if every solver gave an answer.
 
     Returns:
         The exit code: 0, or 3 where a solver failed.

@@ -36,6 +36,8 @@ DONE, SOLVER_FAILED = 0, 3
 #: Schemas of a finished run folder, and of the file that marks an unfinished one and is locked while it is worked on.
 MANIFEST, UNFINISHED = "mmrjax.manifest/1", "mmrjax.unfinished/1"
 LOCK, CHUNKS = "lock", "chunks"
+#: First arguments of commands that fit a robot.
+FITS = (["calibrate"], ["loop"])
 #: Largest manifest or mark that is read [bytes].
 LARGEST = 2**20
 #: Packages whose versions are part of a result.
@@ -420,6 +422,16 @@ def provenance() -> dict[str, Any]:
         "devices": [str(d) for d in jax.devices()],
         "float": jnp.result_type(float).name,
     }
+
+
+def rows_of_fit(robot: Path) -> frozenset[str]:
+    """Hashes of the tables that a robot was fitted to, by the manifest in its folder; empty if none is recorded."""
+    found = _json(robot.parent / "manifest.json") if robot.is_file() else {}
+    hashes, arguments = found.get("hashes"), found.get("arguments")
+    if not isinstance(hashes, dict) or not isinstance(arguments, list) or arguments[:1] not in FITS:
+        return frozenset()
+    fitted = robot.name != "robot.toml" or hashes.get("robot") == digest(robot.read_bytes())
+    return frozenset(str(value) for name, value in hashes.items() if name != "robot") if fitted else frozenset()
 
 
 def digest(content: bytes) -> str:

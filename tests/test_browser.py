@@ -10,7 +10,8 @@ from browser import MEASURE, PAPER, Browser, found
 from test_loop_command import commanded, few_effects, mmrjax, starts_churning
 from test_settle import made as made_log
 
-from sweeps.pages import loop_page as loop_page
+from sweeps import pages
+from sweeps.pages import loop_page
 
 pytestmark = [
     pytest.mark.slow,
@@ -52,6 +53,13 @@ FAULTY = """<html><body style="margin:0"><p style="white-space:nowrap">{long}</p
 <div style="overflow:hidden;width:60px;white-space:nowrap">what is cut off at its end</div>
 <figure id="f"><svg width="100" height="50"><text x="70" y="20">beyond the edge</text></svg></figure>
 <script>console.error("no"); fetch("http://localhost:1234/x").catch(() => 0); undefinedThing()</script></body></html>"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def for_phones():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pages, "FOR_PHONES", True)
+        yield
 
 
 @pytest.fixture(scope="module")

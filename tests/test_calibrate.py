@@ -502,13 +502,6 @@ def test_a_configuration_that_the_robot_lacks_lists_those_that_it_has(measured, 
         quick(measured, robot_file.read(tmp_path / "rover.toml"))
 
 
-def test_former_names_are_taken_and_told(measured):
-    told = []
-    with pytest.raises(BadConfiguration, match=r"--free 6T2A\.mu: no such parameter"):
-        quick(measured, free=["tracked.mu"], fix=["wheeled.*"], tell=told.append)
-    assert told == ["tracked.mu is now 6T2A.mu", "wheeled.* is now 4W2T.*"]
-
-
 FOURTH_CHANNEL = """
 import dataclasses, jax
 jax.config.update("jax_enable_x64", True)

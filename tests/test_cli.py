@@ -663,12 +663,6 @@ def test_robot_with_one_configuration_is_compared(mmrjax, tmp_path, crawler):
     assert code == 4 and re.search(r"measured row \d+, configuration: got \w+;.* allowed: crawler", err)
 
 
-def test_former_names_of_parameters_load_with_a_note(mmrjax, tmp_path):
-    code, _, err = mmrjax("simulate", "--set", "tracked.mass=12", "--no-report", "--out", "o")
-    assert code == 0 and "6T2A" in err
-    assert table(tmp_path / "o" / "runs.csv")[0]["total_mass_kg"] == "12"
-
-
 @pytest.mark.slow
 def test_missing_readings_weigh_nothing_and_are_said(mmrjax, tmp_path):
     full = f"{HEADER}\n6T2A,15,13.1,0,0,2.3,4930,420\n6T2A,15,13.1,0,5,2.75,4800,400\n6T2A,15,13.1,0,10,3,4745,390\n"

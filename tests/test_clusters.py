@@ -5,7 +5,7 @@ import pytest
 
 from calibration.discovery import clusters
 from calibration.discovery.clusters import cluster
-from calibration.words import loop_words as words
+from sweeps.report.words import loop_words as words
 
 ERROR = 0.01
 RNG = np.random.default_rng(0)
@@ -65,9 +65,7 @@ def test_outliers_on_a_stretch_are_found_there(case):
     assert got.low <= x.min() and got.high >= x.max() and got.inside >= len(inside)
     assert got.high - got.low <= max(clusters.WINDOWS) * np.ptp(AXES[axis])
     assert got.of == len(np.union1d(inside, alone))
-    assert words.cluster(got).startswith(
-        f"{got.inside} of {got.of} rows that lie off stand together at {axis} {got.low:.3g} to"
-    )
+    assert words.cluster(got).startswith(f"{got.inside} of {got.of} outlying rows cluster at {axis} {got.low:.3g} to")
 
 
 def test_outliers_of_one_level_are_found_there():
@@ -76,7 +74,7 @@ def test_outliers_of_one_level_are_found_there():
     # 10 of 10 from a quarter of the rows, at one of four levels, in one of five columns
     expected = np.prod([(60 - k) / (ROWS - k) for k in range(10)]) * 4 * (len(AXES) + len(LEVELS))
     assert got.p == pytest.approx(expected, rel=1e-9)
-    assert "stand together at supply_voltage_V 24.0" in words.cluster(got)
+    assert "cluster at supply_voltage_V 24.0" in words.cluster(got)
 
 
 def test_the_least_probable_cluster_is_told():

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import pytest
 
 from calibration.inference.fit_notes import Step
-from calibration.words import step_words as steps
-from calibration.words.step_words import still
 from sweeps import console
 from sweeps.console import pulse
+from sweeps.report.words import step_words as steps
+from sweeps.report.words.step_words import still
 
 
 def test_silence_is_broken_by_what_goes_on():
@@ -65,3 +65,10 @@ def test_a_command_says_soon_that_it_works(monkeypatch, capsys):
     with console.working("size"):
         time.sleep(0.4)
     assert capsys.readouterr().err == "size: working\n"
+
+
+def test_a_stage_is_reported_as_it_begins(capsys):
+    with console.stage(2, 3, "posture"):
+        assert capsys.readouterr().err == "2 of 3, posture\n"
+    with console.stage(3, 3, "a bar", silent=True):
+        assert capsys.readouterr().err == "3 of 3, a bar\n"

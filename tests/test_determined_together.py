@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from calibration.data.posterior_file import LOG, NORMAL, Posterior
+from calibration.described import described
+from calibration.inference.fit_notes import Determination
 from calibration.inference.fit_posterior import determined_together, undetermined
-from calibration.words.fit_words import determined
 
 
 def posterior(correlation, kinds, spread=(1.0, 1.0), value=(3.0, 5.0)):
@@ -38,12 +39,12 @@ def test_the_combination_is_the_one_that_varies_least(correlation, kinds, spread
     combined = {"ratio": np.log(a / b), "product": np.log(a * b), "linear": a + pair.weight * b}[form]
     alone = a if form == "linear" else np.log(a)
     assert np.std(combined) < 0.2 * np.std(alone)
-    assert [determined(n, False, (pair,)) for n in "abc"] == ["only with b", "only with a", "yes"]
+    assert [described(Determination.of(n, False, (pair,))) for n in "abc"] == ["only with b", "only with a", "yes"]
 
 
 def test_a_pair_that_priors_hold_or_that_hardly_trades_is_none():
     assert determined_together(posterior(0.94, (LOG, LOG))) == ()
     assert determined_together(posterior(0.99, (LOG, LOG)), held=("a", "b")) == ()
     (pair,) = determined_together(posterior(0.99, (LOG, LOG)), held=("a",))  # b is known by the prior of a
-    assert determined("a", True, (pair,)) == "only with b" and determined("b", False, (pair,)) == "only with a"
-    assert determined("c", True, (pair,)) == "no" and undetermined(("a", "c"), (pair,)) == ("c",)
+    assert described(Determination.of("a", True, (pair,))) == "only with b"
+    assert described(Determination.of("c", True, (pair,))) == "no" and undetermined(("a", "c"), (pair,)) == ("c",)

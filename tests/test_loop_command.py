@@ -333,11 +333,6 @@ WRONG = {
     "contract": (["--effects", "mine.py"], "mine.py, PayloadBinding, balance: got trakc; did you mean track?"),
     "few replicates": (["--replicates", "10"], "--replicates: got 10"),
     "prior twice": (["--prior", "motor.resistance=1±0.1"] * 2, "--prior motor.resistance: given twice"),
-    "prior of a former name": (["--prior", "tracked.mu=1±0.1"], "6T2A.mu"),
-    "prior by both names": (
-        ["--prior", "tracked.ground.friction.static=1±0.1", "--prior", "6T2A.ground.friction.static=1±0.1"],
-        "--prior, tracked.ground.friction.static: its new name 6T2A.ground.friction.static is stated too",
-    ),
     "forbidden nothing": (
         ["--forbid", "stall,one moter"],
         "--forbid one moter: no such experiment or configuration; did you mean one motor? allowed: weigh, ",

@@ -103,7 +103,9 @@ def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypat
 
     monkeypatch.setattr(os, "_exit", leave)
     monkeypatch.setattr(command, "discover", first)
-    monkeypatch.setattr(command.said_of, "verdict", lambda found: f"verdict: {found.verdict}, iron_loss or windage")
+    monkeypatch.setattr(
+        command.loop_words, "verdict", lambda found: f"verdict: {found.verdict}, iron_loss or windage"
+    )
     code, _, err = mmrjax(*rig, "--within", "5min")
     assert at_once == [ends]
     assert ("no verdict within 300 s\n" in err) == (end is OutOfTime)
@@ -127,7 +129,7 @@ def test_what_cannot_be_kept_is_not_said_to_be(rig, mmrjax, monkeypatch, tmp_pat
         raise KeyboardInterrupt
 
     monkeypatch.setattr(command, "discover", first)
-    monkeypatch.setattr(command.said_of, "verdict", lambda found: found.verdict)
+    monkeypatch.setattr(command.loop_words, "verdict", lambda found: found.verdict)
     code, _, err = mmrjax(*rig)
     assert code == 130 and "nothing could be kept of verdict; the same command begins anew" in err
     assert "kept: verdict" not in err and not (tmp_path / "found.partial").exists()

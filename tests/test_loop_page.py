@@ -23,12 +23,12 @@ from calibration.discovery.loop_notes import Asked, NameSupport, NameTest, Ruled
 from calibration.discovery.result import Alternative, Estimate, HiddenEffect, Resolved, StatedValue
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference.identifiability import HELD
-from calibration.words import loop_words as words
 from mmrjax.model import channels
 from sweeps.commands import loop as room
 from sweeps.pages import loop_figures
 from sweeps.pages import loop_page as loop_page
 from sweeps.pages import page as page_room
+from sweeps.report.words import loop_words as words
 
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "loop.schema.json").read_text("utf-8"))
 
@@ -286,7 +286,7 @@ def test_errors_better_and_worse_are_marked_with_the_rows_that_are_reached(shown
     head, *lines = got.page.tables["errors"]
     assert [line[0] for line in lines] == [
         "seen by the fit",
-        *(f"unseen: another {words.blocks_room.in_words(k)}" for k in got.found.errors_held_out),
+        *(f"unseen: another {words.blocks.in_words(k)}" for k in got.found.errors_held_out),
         "unseen: another configuration",  # each has friction of its own
     ]
     assert lines.pop()[-1] == "not predictable from the others" and got.document["held_out_unpredictable"] == [

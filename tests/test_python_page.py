@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import re
+import runpy
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 
 from calibration.data import effect_file
@@ -65,3 +68,21 @@ def test_a_tutorial_runs(page, tmp_path, monkeypatch):
     with jax.enable_x64(False):
         for code in blocks(page):
             exec(compile(code, page, "exec"), names)
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_the_tutorial_about_a_log_finds_the_fan(tmp_path, mmrjax):
+    """What the page says: 24 settled runs, and windage in the class."""
+    bench = DOCS / "start" / "bench"
+    made = runpy.run_path(str(bench / "make.py"))["log"]()
+    packed = np.loadtxt(bench / "log.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(packed, made, atol=0.51, rtol=0)
+    np.testing.assert_allclose(packed[:, 2], made[:, 2], atol=6e-4)
+    assert mmrjax("rig", "new", "rig.toml", "--kind", "bench")[0] == 0
+    assert mmrjax("settle", bench / "log.csv", "--robot", "rig.toml", "--out", "settled", "--no-report")[0] == 0
+    assert len((tmp_path / "settled" / "settled.csv").read_text().splitlines()) == 25
+    assert mmrjax("loop", "settled/settled.csv", "--robot", "rig.toml", "--out", "found", "--no-report")[0] == 0
+    found = json.loads((tmp_path / "found" / "result.json").read_text("utf-8"))
+    assert found["verdict"] == "class" and "loss torque that changes with speed" in found["statement"]
+    assert "windage" in found["statement"]

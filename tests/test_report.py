@@ -25,11 +25,12 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_robots import ROBOTS
 from mmrjax.model.signals import GRAVITY
 from sweeps.commands import compare
-from sweeps.pages import comparison_page as comparison_page
 from sweeps.pages import power_figures, sweep_figures, words
 from sweeps.pages import runs_page as runs_page
 from sweeps.pages import sweep_page as sweep_page
 from sweeps.points import run
+from sweeps.report import comparison_report, page_renderer
+from sweeps.results.comparison_results import Comparison
 
 SWEEP_FIGURES = {f"sweep_{name}" for name in channels.USUAL}
 
@@ -247,44 +248,18 @@ def test_report_shows_the_runs_own_history_with_its_peak(driven):
     assert float(rows[0][5]) > 90  # the inrush is resolved, some 33 V over two windings in parallel
 
 
-@pytest.mark.slow
-def test_report_escapes_a_title(tmp_path):
-    path = comparison_page.write(
-        tmp_path,
-        RobotFile(ROBOTS["nominal"](), "<b>x.toml"),
-        model="steady",
-        data_name="a&b.csv",
-        **_comparison(),
-    )
-    page = path.read_text()
-    assert "<b>x.toml" not in page and "&lt;b&gt;x.toml" in page and "a&amp;b.csv" in page
-
-
-def _comparison():
+def test_comparison_shows_its_rows_and_escapes_its_title(tmp_path):
     measured = records.read("measured")
     table, summary = compare.compared(measured, _table(measured))
-    return {"table": table, "summary": summary, "notes": []}
-
-
-def test_comparison_shows_its_summary_and_rows(tmp_path):
-    given = _comparison()
-    path = comparison_page.write(
-        tmp_path, RobotFile(ROBOTS["nominal"](), "nominal"), model="steady", data_name="measured", **given
-    )
-    page = path.read_text()
+    found = Comparison(table, summary, measured.channels, "a&b.csv", "steady", "<b>x.toml", False)
+    page = page_renderer.write(tmp_path, comparison_report.document(found)).read_text()
+    assert "<b>x.toml" not in page and "&lt;b&gt;x.toml" in page and "a&amp;b.csv" in page
     assert drawn(page) == {"parity", "errors"} and outside(tmp_path) == []
     tables = Tables(page).tables
-    for row, (group, cells) in zip(tables["errors"][2:], given["summary"].items(), strict=True):
-        values = [group]
-        for cell in cells.values():
-            values += [
-                str(cell["rows"]),
-                f"{cell['rms_percent']:.1f}",
-                f"{cell['max_percent']:.1f}",
-                f"{cell['r2']:.3f}",
-            ]
-        assert row == values
+    assert [row[4] for row in tables["errors"][1:]] == [
+        f"{cell['rms_percent']:.1f}" for cells in summary.values() for cell in cells.values()
+    ]
     rows = tables["rowtable"][2:]
     assert len(rows) == 20
     assert sum("slides" in row for row in rows) == 6
-    assert rows[0][7] == f"{given['table']['simulated_total_current_A'][0]:.2f}"
+    assert rows[0][7] == f"{table['simulated_total_current_A'][0]:.2f}"

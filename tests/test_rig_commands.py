@@ -493,14 +493,14 @@ def test_a_channel_without_readings_has_no_error_and_no_warning():
 
 def test_parameters_of_a_rig_say_where_they_come_from(tmp_path):
     rig = of_kind(tmp_path, "wheeled")
-    found = {p["name"]: p["source"] for p in capabilities.parameters(robot_file.parse(rig))}
+    found = {name: source for name, *_, source in capabilities.parameters(robot_file.parse(rig))}
     assert found["motor.resistance"] == "stated in wheeled.toml"
     assert found["rover.ground.friction.speed_static"] == "default" and "battery.voltage_full" not in found
     linear = of_kind(tmp_path, "linear")
-    found = {p["name"]: p["source"] for p in capabilities.parameters(robot_file.parse(linear))}
+    found = {name: source for name, *_, source in capabilities.parameters(robot_file.parse(linear))}
     assert found["carriage.inertia"] == "stated in linear.toml"  # by its mass and lead
     bench = of_kind(tmp_path, "bench")
-    assert "bench.radius" not in {p["name"] for p in capabilities.parameters(robot_file.parse(bench))}
+    assert "bench.radius" not in {p[0] for p in capabilities.parameters(robot_file.parse(bench))}
 
 
 def test_the_packaged_robots_parameters_keep_their_sources(tmp_path):

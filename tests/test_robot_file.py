@@ -97,31 +97,6 @@ def test_movers_start_from_the_defaults_of_the_fields(tmp_path):
     assert float(crawler.track.guide_friction) == 0.20 and float(crawler.ground.friction.speed_static) == 0.02
 
 
-def test_former_names_load_with_a_note(tmp_path):
-    path, notes = tmp_path / "old.toml", []
-    path.write_text(
-        'schema = "mmrjax.robot/1"\n[tracked]\nmass = 12.5\n[tracked.ground]\nrolling_resistance = 0.05\n'
-        "[wheeled]\nmass = 11\n"
-    )
-    robot = robot_file.load(str(path), notes=notes)
-    assert float(robot.configurations["6T2A"].mass) == 12.5 and float(robot.configurations["4W2T"].mass) == 11.0
-    assert notes == [
-        "tracked.mass is now 6T2A.mass, and so with 1 more of tracked",
-        "wheeled.mass is now 4W2T.mass",
-    ]
-    notes.clear()
-    robot = robot_file.change(robot, {"tracked.mass": 12.0, "sides": 3.0}, where="--set", notes=notes)
-    assert float(robot.configurations["6T2A"].mass) == 12.0 and robot.sides == 3
-    assert notes == ["tracked.mass is now 6T2A.mass"]
-
-
-def test_a_configuration_may_have_a_former_name(tmp_path):
-    (tmp_path / "mine.toml").write_text('configurations = ["tracked"]\n[tracked]\nlike = "6T2A"\nmass = 9\n')
-    notes = []
-    robot = robot_file.read(tmp_path / "mine.toml", notes=notes)
-    assert float(robot.configurations["tracked"].mass) == 9.0 and notes == []
-
-
 def test_set_on_a_configuration_that_is_not_there_lists_those_that_are(robot):
     with pytest.raises(
         BadConfiguration, match=r"--set, rover\.mass: no such parameter; .*the robot has .*, 6T2A, 4W2T"
@@ -198,11 +173,7 @@ REFUSED = {
     "half a side": ("sides = 2.5", r"sides: got 2\.5; expected a whole number"),
     "sides as a boolean": ("sides = true", r"sides: got True; expected a whole number"),
     "cells as a word": ("[battery]\ncells = 'x'", r"battery\.cells: got 'x'; expected a whole number, 1 to 100"),
-    "old and new name": (
-        "[tracked]\nmass = 12\n[6T2A]\nmass = 11",
-        r"tracked\.mass: its new name 6T2A\.mass is stated too; state it once",
-    ),
-    "old name of what is not there": (
+    "a configuration that is not there": (
         "configurations = ['4W2T']\n[tracked]\nmass = 12",
         r"tracked\.mass: no such parameter; the robot has battery, motor, gearbox, 4W2T",
     ),

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from calibration.data import cell_values
 from calibration.data import runs as records
 from calibration.data.input_errors import BadData
+from calibration.data.named_arrays import NamedArrays
 from calibration.data.table import Runs
 from mmrjax.model import channels, paper_robots
 from mmrjax.model.conditions import Conditions
@@ -86,19 +88,89 @@ def test_a_reading_without_its_stated_sd_is_refused(tmp_path):
 
 
 def test_cells_of_a_sound_table_are_read_at_once(tmp_path, monkeypatch):
-    """A log may have a million rows: a cell is looked at alone only where it may be wrong."""
-    cell = records._cell
+    """A log may have a million rows: a sentence is made of a cell alone only where it is refused, and of few."""
+    looked_at = []
 
-    def looked_at(where, *told):
-        assert not where, f"{where} is looked at alone"
-        return cell(where, *told)
+    def refusal(where, *told):
+        looked_at.append(where)
+        return f"{where}: refused"
 
-    monkeypatch.setattr(records, "_cell", looked_at)
+    monkeypatch.setattr(cell_values, "refusal", refusal)
     runs = records.read(write(tmp_path, f"{HEADER},speed_sd_mm_s\n{ROW},4\n{ROW[:-3]}n/a,\n"))
     assert runs["payload_kg"].tolist() == [0, 0] and runs["configuration"].tolist() == ["6T2A"] * 2
     np.testing.assert_array_equal(runs["speed_mm_s"], [400, np.nan])
-    with pytest.raises(AssertionError, match=r"row 2 is looked at alone"):
-        records.read(write(tmp_path, f"{HEADER},speed_sd_mm_s\n{ROW},4\n{ROW},0\n"))
+    assert not looked_at
+    with pytest.raises(BadData, match=r"row 2: refused; .*; and 12 more$"):
+        records.read(write(tmp_path, "\n".join([f"{HEADER},speed_sd_mm_s", f"{ROW},4", *[f"{ROW},0"] * 20])))
+    assert len(looked_at) == 8
+
+
+ARRAYS = {
+    "configuration": ["6T2A", "4W2T"], "supply_voltage_V": np.array([15.0, 33.0]), "total_mass_g": [13100, 21100],
+    "payload_kg": [0, 8], "slope_percent": [100.0, 0.0], "total_current_A": [np.nan, 4.0], "motor_speed_rpm": [4800, 11000],
+    "speed_km_h": [1.44, 4.32], "run_id": [1, 2], "room_C": [21.5, np.nan],
+}  # fmt: skip
+
+
+def of_arrays(columns, **stated):
+    values = tuple(v if isinstance(v, list) and isinstance(v[0], str) else np.asarray(v) for v in columns.values())
+    return NamedArrays("log.bag", tuple(columns), values, **stated)
+
+
+def test_arrays_of_numbers_are_read_as_their_texts_are(tmp_path):
+    numbers = records.of_arrays(of_arrays(ARRAYS))
+    rows = zip(*([str(x) for x in np.asarray(values).tolist()] for values in ARRAYS.values()), strict=True)
+    texts = records.read(write(tmp_path, "\n".join([",".join(ARRAYS), *map(",".join, rows)])))
+    assert numbers.unknown == texts.unknown == ("room_C",) and numbers.headings == texts.headings
+    for column in texts.columns:
+        np.testing.assert_array_equal(numbers[column], texts[column], column)
+    np.testing.assert_array_equal(numbers.extras["room_C"], texts.extras["room_C"])
+    assert numbers["slope_deg"] == pytest.approx([45.0, 0.0]) and numbers["total_mass_kg"].tolist() == [13.1, 21.1]
+    assert [note.removeprefix("log.bag") for note in numbers.notes] == [
+        n.removeprefix("runs.csv") for n in texts.notes
+    ]
+
+
+@pytest.mark.parametrize(
+    ("column", "values", "says"),
+    [
+        ("slope_percent", [0.0, 101.0], "log.bag row 2, slope_percent: got 101; expected -100 to 100"),
+        ("payload_kg", [0, 400], "log.bag row 2, payload_kg: got 400; expected 0 to 300"),
+        ("supply_voltage_V", [15.0, np.nan], "log.bag row 2, supply_voltage_V: got nan; expected -100 to 100"),
+        ("speed_km_h", ["fast", "1"], r"log.bag row 1, speed_km_h: got fast; expected a number, -36 to 36"),
+        ("total_mass_g", [13100, 7000], r"row 2, total_mass_kg: got 7; expected more than the payload of 8"),
+    ],
+)
+def test_arrays_out_of_range_are_refused_with_their_row(column, values, says):
+    with pytest.raises(BadData, match=says):
+        records.of_arrays(of_arrays(ARRAYS | {column: values}))
+
+
+def test_a_unit_that_a_source_states_has_to_be_its_columns():
+    units = {"speed_km_h": "km_h", "motor_speed_rpm": "rpm"}
+    for wrong, says in (
+        ({}, ""),
+        ({"motor_speed_rpm": "rad_s"}, "states rad_s in the topic, and is read in rpm; name it motor_speed_rad_s"),
+        ({"payload_kg": "Nm"}, "log.bag, payload_kg: got Nm in the topic; expected one of kg, g; correct or remove"),
+    ):
+        stated = tuple((units | wrong).get(column, "") for column in ARRAYS)
+        arrays = of_arrays(ARRAYS, units=stated, units_from="the topic")
+        if not says:
+            assert len(records.of_arrays(arrays)) == 2
+            continue
+        with pytest.raises(BadData, match=says):
+            records.of_arrays(arrays)
+
+
+def test_a_clock_of_numbers_counts_from_the_first_row_of_its_run():
+    time = np.array([5.0, 7.5, 1.7e9, 5.25, 1.7e9 + 0.125])
+    columns = {name: np.resize(values, 5) for name, values in ARRAYS.items()} | {
+        "configuration": ["6T2A"] * 5, "run_id": np.array([1, 1, 2, 1, 2]), "time_s": time,
+    }  # fmt: skip
+    with pytest.raises(BadData, match=r"log.bag row 3, time_s: got 1700000000; expected 0 to 1e"):
+        records.of_arrays(of_arrays(columns))
+    found = records.of_arrays(of_arrays(columns | {"time_s": np.where(time < 1e6, 1.7e9 + time, time)}))
+    assert found["time_s"].tolist() == [0.0, 2.5, 0.0, 0.25, 0.125] and found["run_id"].tolist() == list("11212")
 
 
 def test_unknown_columns_are_reported_and_kept_out(tmp_path):

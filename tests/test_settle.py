@@ -20,9 +20,9 @@ from calibration.data.input_errors import BadData
 from calibration.inference import checks, observers
 from calibration.inference import noise as noises
 from calibration.inference.foresight import Foresight
-from calibration.words import settle_words as words
 from sweeps.commands import rig_check
 from sweeps.commands.settle import rolling
+from sweeps.report.words import settle_words as words
 
 
 def made(tmp_path, seed=1, kind="bench", imposed="voltage", **options):
@@ -523,7 +523,7 @@ def test_the_command_leaves_a_table_that_is_read_as_settled_runs(tmp_path, mmrja
     page = (tmp_path / "found" / "report.html").read_text(encoding="utf-8")
     assert (
         "The log." in page
-        and "<th>voltage [V]</th>" in page
+        and '<th rowspan="2">voltage [V]</th>' in page
         and (tmp_path / "found" / "figures" / "log.svg").is_file()
     )
 

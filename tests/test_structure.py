@@ -212,11 +212,10 @@ REPRODUCTION = ("sweeps", "paper")
 #: what shows slip.
 SPELLED = {
     ("calibration/discovery/menu.py", "TURNING, STANDING"),
-    ("calibration/words/effect_words.py", "CHECKED_BY"),  # which act checks which instrument
+    ("sweeps/report/words/effect_words.py", "CHECKED_BY"),  # which act checks which instrument
     ("calibration/inference/bases.py", "VARIABLES"),
     ("calibration/inference/blocks.py", "BLOCKS"),  # what is imposed may be a channel's column
     ("calibration/inference/observers/settled_ends.py", "_sliding"),  # the two that show slip
-    ("sweeps/pages/loop_figures.py", "VARIABLE_WORDS"),  # words of the same variables
 }
 
 
@@ -236,13 +235,10 @@ def channels_are_counted_in_one_place(path: PurePosixPath, tree: ast.Module) -> 
                 yield node.lineno, "spells several channels"
 
 
-#: Who knows the configurations of the paper's robot, beside its reproduction: tables, that robot, and of the reader
-#: of robot files its import and the names that files formerly had.
+#: Who knows the configurations of the paper's robot, beside its reproduction: tables and that robot.
 CONFIGURED = {
     "mmrjax/model/paper_tables.py",
     "mmrjax/model/paper_robots.py",
-    "calibration/data/robot_file.py:",
-    "calibration/data/robot_file.py:OLD_NAMES",
 }
 
 
@@ -404,7 +400,7 @@ def _rebound(function: Function) -> set[str]:
     return {name for n in walked(function) if isinstance(n, ast.Global) for name in n.names}
 
 
-#: Rooms that compute, and most words of a string of theirs; what is said in more is said in `calibration/words`.
+#: Rooms that compute, and most words of a string of theirs; what is said in more is said in `sweeps/report/words`.
 COMPUTING = tuple(f"calibration/{room}/" for room in ("inference", "discovery", "sensitivity", "sizing"))
 MOST_WORDS = 5
 
@@ -606,15 +602,13 @@ GOOD = {
     "mmrjax/model/paper_tables.py": "TRACKED, WHEELED = '6T2A', '4W2T'\n",
     "calibration/__init__.py": "",
     "calibration/data/table.py": "'''On 6T2A and 4W2T.'''\ndef f(t):\n    return {'time_s': t['time_s'], 'row': 1}\n",
-    "calibration/data/robot_file.py": "from tables import TRACKED\nOLD_NAMES = {'tracked': TRACKED}\n",
     "calibration/sizing/said.py": "def why(x):\n    return f'{x} is one two three four five six'\ndef f(x, y):\n"
     "    '''One two three four five six.'''\n    cure = 'one two three four five six' if y else 'seven'\n"
     "    if x:\n        raise BadData(why(x))\n    return BadConfiguration(f'one two three {x} four five six {cure}')\n",
-    "calibration/words/loop_words.py": "X = 'one two three four five six seven'\n",
+    "sweeps/report/words/loop_words.py": "X = 'one two three four five six seven'\n",
     "calibration/discovery/menu.py": "TURNING, STANDING = ('total_current', 'motor_speed'), ('total_current',)\n",
     "calibration/discovery/search.py": "def f(space: CandidateSpace) -> int: ...\n",
     "calibration/inference/observers/one.py": "def f(runs, o):\n    return runs.has('time_s') or isinstance(o, Histories)\n",
-    "calibration/inference/bases.py": "VARIABLES = {'a': 'speed_mm_s', 'b': 'motor_speed_rpm'}\n",
     "sweeps/__init__.py": "",
     "sweeps/points/cluster.py": "_compiled = {}\ndef f(k):\n    _compiled[k] = 1\n",
     "sweeps/local.py": "import numpy as np\nX = {}\nX[1] = 2\ndef f(X, y):\n    X[1] = y\n    z = np.append(y, 1)\n    z[0] = 1\n",

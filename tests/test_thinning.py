@@ -17,9 +17,9 @@ from calibration.inference import foresight
 from calibration.inference.fit_notes import Thinned
 from calibration.inference.noise import inferred
 from calibration.inference.observers import Histories
-from calibration.words.note_words import sentence
 from mmrjax.model import paper_robots
 from sweeps.commands import rig_check
+from sweeps.report.words.note_words import describe
 
 EVERY, ROWS = 0.01, 300
 
@@ -141,7 +141,7 @@ def test_that_a_log_is_thinned_is_said():
         n for x in (some, runs) for n in Histories.check(x, inferred(x, Histories.sizes(x))) if type(n) is Thinned
     ]
     assert said == [Thinned("log.csv", len(runs), len(some))]
-    assert f"{len(some)} of {len(runs)} rows" in sentence(said[0])
+    assert f"{len(some)} of {len(runs)} rows" in describe(said[0])
 
 
 def test_rig_check_says_how_many_rows_are_used(tmp_path, monkeypatch, capsys):

@@ -400,9 +400,9 @@ def test_a_film_begins_at_the_start_and_a_start_that_still_gains_speed_is_done(m
     from sweeps.commands import render
 
     drawn = []
-    monkeypatch.setattr(render.pictures, "scene", lambda *a: None)
+    monkeypatch.setattr(render.rendering, "scene", lambda *a: None)
     monkeypatch.setattr(
-        render.pictures, "render", lambda view, file, begin, *rest: (file.touch(), drawn.append(begin))
+        render.rendering, "render", lambda view, file, begin, *rest: (file.touch(), drawn.append(begin))
     )
     code, out, _ = mmrjax("render", "start.gif", "--slope", 10, "--duration", 0.1)
     assert (code, drawn) == (0, [0.0]) and "not_settled" in out

@@ -10,7 +10,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from calibration.discovery import discover
 from calibration.inference import noise, observers, ranges, uninformative
-from calibration.words.note_words import sentence
+from sweeps.report.words.note_words import describe
 
 RIG = """
 base = "none"
@@ -85,7 +85,7 @@ def test_independent_readings_are_no_copies(tmp_path, robot):
 def test_a_channel_that_is_a_line_of_another_is_refused_by_the_loop(tmp_path, robot, foreseen, copy, column, said):
     runs = table(tmp_path, robot, **copy)
     (found,) = uninformative.copied(runs, robot)
-    assert (found.column, found.tied) == (column, False) and said in sentence(found)
+    assert (found.column, found.tied) == (column, False) and said in describe(found)
     foreseen(shown(runs))
     with pytest.raises(BadData, match=rf"t\.csv, {column}: in every row .* remove it from channels and table"):
         discover.prepared(runs, robot, replicates=192)
@@ -107,7 +107,7 @@ def test_readings_that_a_rigid_gear_ties_are_said_and_not_refused(tmp_path, robo
     rows = (",".join(f"{x:.6g}" for x in row) for row in zip(*columns.values(), strict=True))
     path.write_text("\n".join([",".join(columns), *rows]) + "\n", encoding="utf-8")
     (found,) = uninformative.copied(records.read(path, robot=driven), driven)
-    assert found.tied and found.slope == pytest.approx(0.05) and "counts twice" in sentence(found)
+    assert found.tied and found.slope == pytest.approx(0.05) and "counts twice" in describe(found)
 
 
 @pytest.mark.parametrize(("spread", "varies"), [(0.5, False), (3.0, True)])

@@ -1,10 +1,15 @@
-"""Units of columns against a table written out by hand."""
+"""Units of columns against a table written out by hand, and quantities that are one row each."""
 
 import math
 
 import pytest
 
+from calibration.data import robot_file
+from calibration.data import runs as records
+from calibration.data.input_errors import BadData
+from mmrjax.fidelities import outputs
 from mmrjax.model import channels, quantities
+from sweeps.commands import explain
 
 #: One of each unit, in SI.
 BY_HAND = {
@@ -42,3 +47,51 @@ def test_per_cent_of_a_slope_are_those_of_its_tangent():
 )  # fmt: skip
 def test_units_as_people_write_them_are_those_of_columns(written, column):
     assert quantities.spelled(written) == column
+
+
+# --- a quantity is one row -----------------------------------------------------------------------------------
+
+CHANNEL = channels.Channel(
+    name="terminal_voltage", unit="V", factor=1.0, label="terminal voltage", word="terminal", range=(0.0, 100.0),
+    sd_largest=10.0, read=lambda robot, signals: signals.voltage, sd_share=0.01, other_units=(("mV", 1e-3),),
+)  # fmt: skip
+CONDITION = quantities.Condition(
+    "air_pressure", "kPa", 1e3, "pressure of the air", (50.0, 120.0), in_tables=True, other_units=(("Pa", 1.0),)
+)
+TABLE = (
+    "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,{}\n"
+    "6T2A,15,13.1,0,5,{},2000\n6T2A,24,13.1,0,5,101300,4000\n"
+)
+
+
+@pytest.fixture
+def two_rows_more(monkeypatch):
+    monkeypatch.setattr(channels, "EVERY", (*channels.EVERY, CHANNEL))
+    monkeypatch.setattr(quantities, "SET", (*quantities.SET, CONDITION))
+
+
+def test_a_quantity_is_read_written_and_explained_by_its_row(two_rows_more, tmp_path):
+    path = tmp_path / "runs.csv"
+    path.write_text(TABLE.format("air_pressure_Pa,terminal_voltage_mV", 98000))
+    runs = records.read(path)
+    assert runs.unknown == () and runs.channels[-1] is CHANNEL
+    assert runs["air_pressure_kPa"].tolist() == [98.0, 101.3] and runs["terminal_voltage_V"].tolist() == [2.0, 4.0]
+    path.write_text(TABLE.format("air_pressure_kPa,terminal_voltage_V", 40))
+    with pytest.raises(BadData, match=r"row 1, air_pressure_kPa: got 40; expected 50 to 120; also row 1, terminal_"):
+        records.read(path)
+    path.write_text(TABLE.format("Air_Pressure_Pa,terminal_voltage_mV", 98000))
+    assert "Air_Pressure_Pa is read as air_pressure_Pa" in records.read(path).notes[0]
+    (output,) = (o for o in outputs.table(runs.channels) if o.name == CHANNEL.name)
+    assert (output.column, output.unit, output.label) == ("terminal_voltage_V", "V", "terminal voltage")
+    for kind, name in (("channel", "terminal_voltage"), ("condition", "air_pressure_kPa")):
+        assert dict(explain.EXPLAINED[kind](name, {}))["column"].startswith(f"{name.removesuffix('_kPa')}_")
+
+
+def test_a_rig_states_a_channel_by_its_row(two_rows_more, tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text('channels = ["terminal_voltage"]\n[columns]\nair_pressure_Pa = "p"\nterminal_voltage_mV = "Ut"\n')
+    robot = robot_file.read(path)
+    (tmp_path / "runs.csv").write_text(TABLE.format("p,Ut", 98000))
+    runs = records.read(tmp_path / "runs.csv", robot=robot)
+    assert runs["air_pressure_kPa"].tolist() == [98.0, 101.3] and runs.measured().tolist() == [[2.0], [4.0]]
+    assert robot.channels == (CHANNEL,) and runs.headings["terminal_voltage_V"] == "Ut"

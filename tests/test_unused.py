@@ -8,11 +8,11 @@ from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.columns import LOAD, Layout
 from calibration.data.input_errors import BadData
+from calibration.described import sentences
 from calibration.discovery import description
 from calibration.inference import noise
 from calibration.inference.observers import SettledRuns
 from calibration.inference.unused import no_load_gives, unused
-from calibration.words.note_words import sentences
 
 RIG = IDEAL.replace("loss_coulomb = 0.0", "loss_coulomb = 0.1")
 #: Of an ideal motor at 24 V, R 0.5, k 0.05, M0 0.01: torque of a brake [N·m], speed [rpm], current [A].

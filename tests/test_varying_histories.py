@@ -10,9 +10,10 @@ import pytest
 from synthetic import Analyst
 
 from calibration.data import runs as records
+from calibration.data.columns import DRIVEN
 from calibration.data.courses import applied, courses, stretches, varies
 from calibration.data.input_errors import BadData
-from calibration.data.runs import DRIVEN, Runs
+from calibration.data.runs import Runs
 from calibration.discovery.reach import reach
 from calibration.discovery.settings import settings_for
 from calibration.inference import checks

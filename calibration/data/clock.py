@@ -7,18 +7,20 @@ import math
 import re
 from collections.abc import Sequence
 
-from calibration.data import delimited
-from calibration.data.columns import Meaning
-from calibration.data.input_errors import number
+import numpy as np
 
-#: What follows a day where a cell holds a time alone, and how long a day lasts [s].
+from calibration.data.columns import Column
+from calibration.data.input_errors import number
+from calibration.data.named_arrays import Raw, numbers
+
+#: Day of a cell that holds a time alone, and length of a day [s].
 _SOME_DAY, _DAY = "1970-01-01T", 86400.0
 #: A date as 25.11.2026.
 _WITH_POINTS = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})(?=[ T])")
 
 
-def from_the_first(name: str, meaning: Meaning, cells: Sequence[str], runs: Sequence[str]) -> tuple[list[str], str]:
-    """Returns cells of a column of time as the time since the first of their run, and a note where that changes them.
+def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | None) -> tuple[Raw, str]:
+    """Returns a column of time as the time since the first row of each run, and a note where that changes it.
 
     A run begins at its first row, whatever its clock shows there: the time since a controller started, or a time of
     day. Times of day follow ISO 8601, or have a date as 25.11.2026, or are numbers beyond the largest time (seconds
@@ -26,42 +28,53 @@ def from_the_first(name: str, meaning: Meaning, cells: Sequence[str], runs: Sequ
     cell that is no time is returned as it is, and the reader refuses that cell.
 
     Args:
-        name: of the file; meaning: of the column; runs: `run_id` of each cell.
+        name: of the source; meaning: of the column; runs: `run_id` of each cell; None: all are of one run.
     """
-    clock, factor = [_seconds(cell) for cell in cells], meaning.value(1.0)
-    of_day = all(map(math.isfinite, clock))
+    factor = meaning.value(1.0)
+    clock = (
+        np.array([_seconds(cell) for cell in raw]) if isinstance(raw, list) and ":" in raw[0] else np.full(1, np.nan)
+    )
+    of_day = bool(np.isfinite(clock).all())
     if not of_day:
         low, high = (limit * factor for limit in meaning.limits())
-        clock = [delimited.number(cell) * factor for cell in cells]
-        of_day = all(x > high for x in clock)
-        if not of_day and not all(low <= x <= high for x in clock):
-            return list(cells), ""
-    first: dict[str, float] = {}
-    last: dict[str, float] = {}
-    for k, (x, run) in enumerate(zip(clock, runs, strict=True)):
-        if _alone(cells[k]) and run in last:
-            clock[k] = x = x + _DAY * max(math.floor((last[run] - x) / _DAY + 0.5), 0)
-        last[run], first[run] = x, min(x, first.get(run, x))
-    if not any(first.values()):
-        return list(cells), ""
-    passed = [repr(round(x - first[r], 9) / factor) for x, r in zip(clock, runs, strict=True)]
+        clock = numbers(raw) * factor
+        of_day = bool((clock > high).all())
+        if not of_day and not ((low <= clock) & (clock <= high)).all():
+            return raw, ""
+    names, run = (np.array([""]), np.zeros(len(clock), int)) if runs is None else np.unique(runs, return_inverse=True)
+    if isinstance(raw, list):
+        _past_midnight(clock, raw, run)
+    first = np.full(len(names), np.inf)
+    np.minimum.at(first, run, clock)
+    if not first.any():
+        return raw, ""
+    passed = np.round(clock - first[run], 9) / factor
     if of_day:
         return passed, f"{name}: {meaning.shown} is a time of day; counted from the first of each run"
-    run, begins = next((r, x) for r, x in first.items() if x)
-    where = f"{number(begins / factor)}{f' in run {run}' if run else ''}"
+    which = run[np.flatnonzero(first[run])[0]]
+    where = f"{number(first[which] / factor)}{f' in run {names[which]}' if names[which] else ''}"
     return passed, (
         f"{name}: {meaning.shown} begins at {where}; a run begins at its first row, and its time counts from there; "
         "if it began earlier, add a row at that time without readings"
     )
 
 
+def _past_midnight(clock: np.ndarray, cells: Sequence[str], run: np.ndarray) -> None:
+    """Adds a day [s] to times without a date that fall back by more than half a day within their run."""
+    last: dict[int, float] = {}
+    for k, (x, which) in enumerate(zip(clock.tolist(), run.tolist(), strict=True)):
+        if _alone(cells[k]) and which in last:
+            clock[k] = x = x + _DAY * max(math.floor((last[which] - x) / _DAY + 0.5), 0)
+        last[which] = x
+
+
 def _alone(cell: str) -> bool:
-    """Whether a cell has a time without a date."""
+    """True if a cell has a time without a date."""
     return cell[2:3] == ":"
 
 
 def _seconds(cell: str) -> float:
-    """Since some day of a date and time, NaN of what is none."""
+    """Seconds of a date and time since a fixed day, NaN for other cells."""
     if ":" not in cell:
         return math.nan
     dated = _WITH_POINTS.sub(r"\3-\2-\1", cell)

@@ -19,7 +19,7 @@ from mmrjax.model.robot import Load, Robot
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.track_friction import Track
 
-#: What a configuration moves on, and its `on_tracks`.
+#: Kinds of movers, and the `on_tracks` of each.
 MOVERS = {"tracks": 1.0, "wheels": 0.0}
 #: Names that a configuration cannot have: the other keys of a robot file.
 TAKEN = (
@@ -208,7 +208,7 @@ def _names(stated: Any, where: str) -> list[str]:
 
 
 def _chassis(robot: Robot, name: str, table: dict[str, Any], where: str) -> Chassis:
-    """What a configuration of a robot with a base starts from, before the parameters that its table states."""
+    """Configuration of a robot with a base, before the parameters of its table apply."""
     like, movers = table.pop("like", None), table.pop("movers", None)
     have = robot.configurations
     if like is not None and movers is not None:
@@ -248,7 +248,7 @@ def _defaults(component: eqx.Module, prefix: str = "") -> Iterator[tuple[str, fl
 
 
 def _states(table: Mapping[str, Any], name: str) -> bool:
-    """Whether a table states a parameter by its dotted name."""
+    """True if a table states a parameter by its dotted name."""
     head, _, rest = name.partition(".")
     if not rest:
         return head in table

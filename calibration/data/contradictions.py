@@ -1,4 +1,4 @@
-"""What a table of a rig's runs cannot all be true of, each said in one sentence."""
+"""Contradictions within a table of a rig's runs, one sentence for each."""
 
 from __future__ import annotations
 

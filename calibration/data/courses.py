@@ -42,7 +42,7 @@ class Stretch:
 
 
 def changing(runs: Runs) -> tuple[str, ...]:
-    """Those of `CHANGING`, and what is imposed, that a table has."""
+    """Columns of a table that are among `CHANGING` or are imposed."""
     return tuple(c for c in dict.fromkeys((runs.layout.imposed_column, *CHANGING)) if runs.has(c))
 
 
@@ -58,7 +58,7 @@ def applied(runs: Runs) -> np.ndarray:
 
 
 def varies(runs: Runs, columns: tuple[str, ...] | None = None) -> np.ndarray:
-    """Whether one of these columns, or of those that may, changes within the run of a row, shape (rows,)."""
+    """True for rows in whose run one of these columns changes, shape (rows,); by default the columns that may."""
     columns = changing(runs) if columns is None else columns
     found = np.zeros(len(runs), bool)
     if not runs.sampled:
@@ -72,7 +72,7 @@ def varies(runs: Runs, columns: tuple[str, ...] | None = None) -> np.ndarray:
 
 
 def differs(rows: np.ndarray, conditions: Iterable[np.ndarray]) -> np.ndarray:
-    """Whether a condition at each of these rows is another than at the one before it, shape (rows,)."""
+    """True for rows with a condition that differs from the row before, shape (rows,)."""
     found = np.zeros(len(rows), bool)
     for condition in conditions:
         found[1:] |= condition[rows][1:] != condition[rows][:-1]

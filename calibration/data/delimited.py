@@ -4,24 +4,74 @@ from __future__ import annotations
 
 import codecs
 import csv
+import hashlib
 import math
 import re
 from collections.abc import Sequence
+from pathlib import Path
 
-from calibration.data.input_errors import BadData, parsed
+from calibration.data import input_files
+from calibration.data.columns import WORDS
+from calibration.data.input_errors import BadData
+from calibration.data.named_arrays import NamedArrays, number
+from mmrjax.errors import counted
+from mmrjax.model import channels, quantities
 
-#: What may separate cells beside a comma, and how it is called.
+#: Separators of cells other than a comma, and a word for each.
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
 #: Bytes that no text has.
 _CONTROLS = re.compile(rb"[\0-\x08\x0e-\x1f]")
 _COMMA, _POINT = (re.compile(rf"[+-]?\d*{mark}\d+(?:[eE][+-]?\d+)?") for mark in (",", r"\."))
-#: What may be a number of thousands with a mark between, and one below a thousand without.
+#: Possible numbers of thousands with a mark between, and numbers below a thousand.
 _THOUSANDS, _BELOW = re.compile(r"[+-]?[1-9]\d{0,2}[,.]\d{3}"), re.compile(r"[+-]?[1-9]\d{0,2}")
 
 
+def arrays(path: Path, name: str) -> NamedArrays:
+    """Returns the columns of a CSV file as texts.
+
+    Args:
+        name: of the file, for messages.
+
+    Raises:
+        BadData: as `input_files.table`, `text` and `cells`, or a row of another length than the header.
+    """
+    content = input_files.table(path, name)
+    decoded, encoded = text(name, content)
+    rows, notes = cells(name, below_comments([line for line in decoded.splitlines() if line.strip()]))
+    header, body = (rows[0], rows[1:]) if rows else ([], [])
+    units = row_of_units(header, body[0]) if body else ()
+    if units:
+        body = body[1:]
+        notes = (*notes, f"{name}: the row below the header states units; rows are counted from the next")
+    for k, row in enumerate(body, 1):
+        if len(row) != len(header):
+            raise BadData(
+                f"{name} row {k}: got {counted(len(row), 'cell')}; the header has {counted(len(header), 'column')}"
+            )
+    return NamedArrays(
+        name,
+        tuple(column or f"column {k}" for k, column in enumerate(header, 1)),
+        tuple(map(list, zip(*body, strict=True))) if body else tuple([] for _ in header),
+        units,
+        notes=(*encoded, *notes),
+        digest=hashlib.sha256(content).hexdigest(),
+    )
+
+
+def row_of_units(header: Sequence[str], first: Sequence[str]) -> tuple[str, ...]:
+    """Returns the units that the first row below a header states, empty where it states none; () if it is a run: a
+    cell of it is a number, or no cell of a column of numbers is a unit."""
+    if len(first) != len(header) or any(math.isfinite(number(cell)) for cell in first):
+        return ()
+    units = tuple(quantities.spelled(cell.strip("[]()")).strip("-") for cell in first)
+    known = {unit for quantity in (*quantities.SET, *channels.EVERY) for unit in quantity.columns().values()} - {""}
+    stated = any(unit in known for column, unit in zip(header, units, strict=True) if column not in WORDS)
+    return units if stated else ()
+
+
 def text(name: str, content: bytes) -> tuple[str, tuple[str, ...]]:
-    """What a file says: UTF-8, UTF-16 that begins with its mark, or else what Windows writes in the West (code page
-    1252); and sentences on what was read otherwise than as UTF-8.
+    """Returns the text of a file in UTF-8, in UTF-16 that begins with its mark, or in Windows-1252; and a note if it
+    is not in UTF-8.
 
     Raises:
         BadData: bytes that are no text.
@@ -41,8 +91,8 @@ def text(name: str, content: bytes) -> tuple[str, tuple[str, ...]]:
 
 
 def below_comments(lines: Sequence[str]) -> list[str]:
-    """Lines of a table, its header first, without those above that begin with #; where no other header stands above
-    the numbers, the last of them is it."""
+    """Returns the lines of a table, its header first, without comments above; the last comment is the header if
+    numbers follow it."""
     first = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
     below = list(lines[first:])
     if first and below and any(map(math.isfinite, map(number, re.split(r"[,;\t]", below[0])))):
@@ -51,7 +101,7 @@ def below_comments(lines: Sequence[str]) -> list[str]:
 
 
 def cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], tuple[str, ...]]:
-    """Rows of cells without blanks around them, numbers with points; and sentences on what was read otherwise.
+    """Returns rows of cells without blanks around them, numbers with points; and notes on separators and marks.
 
     Semicolons or tabs separate cells where the header has no comma; numbers may have decimal commas then.
 
@@ -106,11 +156,3 @@ def cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], tuple[str, 
 
 def _column(rows: list[list[str]], j: int) -> str:
     return rows[0][j] if j < len(rows[0]) else "a column"
-
-
-def number(cell: str) -> float:
-    """A cell's number, NaN of what is none."""
-    try:
-        return parsed(cell)
-    except ValueError:
-        return math.nan

@@ -53,7 +53,7 @@ _STATED = {
     "driver": str,
 }
 _MOVERS = ("tracks", "wheels")
-#: What the left side of a turn has that straight travel has not; with the other sign in the mirror image.
+#: Signals of the left side in a turn that are zero in straight travel; they change sign in the mirror image.
 TURN: dict[str, Any] = {
     "side": 1.0,
     "yaw_rate": 0.8,

@@ -53,7 +53,7 @@ def rounded(value: float) -> str:
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value of a TOML file or of Python is a number; true and false are none."""
+    """True if a value of a TOML file or of Python is a number; true and false are not."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 

@@ -18,7 +18,7 @@ BINARY = {
     b"ARROW1": "an Arrow file", b"SQLite format 3\0": "an SQLite file", b"#ROSBAG": "a ROS bag",
     b"\x89MCAP": "an MCAP file", b"ULog\x01": "a ULog file", b"\x93NUMPY": "a NumPy file", b"%PDF": "a PDF",
 }  # fmt: skip
-#: How JSON and web pages begin.
+#: Beginnings of JSON and of web pages.
 TEXTS = {
     re.compile(rb"\s*(\{|\[\s*[\[{\"\d-])"): "JSON",
     re.compile(rb"\s*<(!doctype|html|\?xml)", re.I): "a web page or XML",

@@ -40,12 +40,12 @@ class StatedMass:
 
     @property
     def varies(self) -> bool:
-        """Whether no single mass is right for every row."""
+        """True if no single mass is right for every row."""
         return self.high - self.low > ROUNDING
 
 
 def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
-    """What a table states of each configuration that it has; empty where it has no `total_mass_kg`.
+    """Returns the masses that a table states of its configurations; none if it has no `total_mass_kg`.
 
     Raises:
         BadData: a mass beyond the bounds of the robot's, or a configuration that the robot does not have.
@@ -84,7 +84,7 @@ def with_table_mass(robot: Robot, runs: Runs) -> Robot:
 
 
 def remarks(robot: Robot, runs: Runs) -> list[str]:
-    """What the table states otherwise than the robot, and what follows for the robot that is written.
+    """Returns notes on masses of the table that differ from the robot's, and on the mass that is written.
 
     Args:
         robot: as given, before `with_table_mass`.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 SCHEMA = "mmrjax.posterior/1"
 FILE = "posterior.nc"
-#: How a coordinate u becomes a parameter: as it is, its exponential, or as an angle within half a turn.
+#: Maps from a coordinate u to a parameter: the identity, the exponential, or an angle within half a turn.
 NORMAL, LOG, ANGLE = "normal", "log-normal", "angle"
 #: Largest difference, in posterior sds, between the centre of a posterior and the robot beside it.
 APART = 0.05
@@ -50,7 +50,7 @@ class Posterior:
     tied: tuple[tuple[str, int, float], ...] = ()
 
     def __len__(self) -> int:
-        """How many coordinates there are: columns of normal scores."""
+        """Number of coordinates, which are columns of normal scores."""
         return len(self.coordinates)
 
     @property

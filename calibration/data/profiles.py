@@ -21,7 +21,18 @@ from calibration.data.columns import LOAD, SUPPLY
 from calibration.data.input_errors import BadConfiguration, BadData, choices, is_number, number
 from mmrjax.errors import counted
 from mmrjax.missions.mission import Start
-from mmrjax.missions.profile import APART, MODES, MOTOR_SPEED, PAIRS, SPEED, VOLTAGE, Profile, profile, sides_refused
+from mmrjax.missions.profile import (
+    APART,
+    MODES,
+    MOTOR_SPEED,
+    PAIRS,
+    SPEED,
+    VOLTAGE,
+    YAW_RATE,
+    Profile,
+    profile,
+    sides_refused,
+)
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
@@ -36,27 +47,18 @@ CONTROLLED = tuple(mode for mode in MODES if mode in channels.USUAL)
 BETWEEN = ("held", "linear")
 #: Most rows in all, cycles included.
 LONGEST = 1_000_000
-#: What columns can hold, by the field of `mmrjax.missions.profile.Profile` that it becomes; demands become `demand`.
+#: Quantities of columns, by field of `mmrjax.missions.profile.Profile`; demands become `demand`.
 QUANTITIES: dict[str, Quantity] = {
-    "time": quantities.named("time"),
-    "voltage": quantities.CONDITIONS["voltage"],
-    "duty": quantities.CONDITIONS["duty"],
-    **{name: channels.find(name) for name in CONTROLLED},
-    **{name: quantities.named(name) for name in (*PAIRS[0], *PAIRS[1])},
-    "yaw_rate": channels.find("yaw_rate"),
-    "slope_deg": quantities.CONDITIONS["slope_deg"],
-    "payload": quantities.CONDITIONS["payload"],
-    "load_torque": quantities.CONDITIONS["load_torque"],
-    "current_other": quantities.named("current_other"),
+    quantity.key: quantity
+    for quantity in (quantities.named("time"), *quantities.SET, *channels.EVERY)
+    if quantity.in_profiles
 }
 #: Columns of which a row has at most one, and the mode that each means.
 DEMANDS = {
     **dict.fromkeys(("duty", *PAIRS[0], *PAIRS[1]), MODES[VOLTAGE]),
     **{mode: mode for mode in CONTROLLED},
 }
-#: Demanded beside a speed.
-YAW_RATE = "yaw_rate"
-#: What a row may not leave empty where the file has the column.
+#: Columns of a file that no row may leave empty.
 HELD = ("voltage", "slope_deg", "payload", "load_torque", "current_other")
 MODE, SURFACE = "mode", "surface"
 #: What a comment line may set of the state that a mission begins in: field of `Start`, least, greatest, and the SI
@@ -110,12 +112,12 @@ class ProfileTable:
 
     @property
     def duration(self) -> float:
-        """Of the whole mission [s]."""
+        """Duration of the whole mission [s]."""
         return self.cycles * float(self.time[-1] - self.time[0])
 
     @property
     def turns(self) -> bool:
-        """Whether it drives the sides apart."""
+        """True if it drives the sides apart."""
         return any(name in self.values for name in APART)
 
     @property
@@ -245,7 +247,7 @@ def _parsed(content: bytes, name: str) -> ProfileTable:
 
 
 def _settings(name: str, comments: list[str]) -> dict[str, Any]:
-    """What the comment lines at the top set: `cycles = 40`, `between_rows = "linear"`; other lines are remarks."""
+    """Settings in the comment lines at the top: `cycles = 40`, `between_rows = "linear"`; other lines are remarks."""
     stated: dict[str, Any] = {}
     for line in comments:
         text = line.lstrip("#").strip()
@@ -421,7 +423,7 @@ def _driven(cells: _Cells) -> tuple[tuple[str, ...], dict[str, np.ndarray]]:
 
 
 def _demands_yaw(cells: _Cells, row: int, before: str, mode: str) -> bool:
-    """Whether a row states a yaw rate, which a demanded speed has beside it and nothing else."""
+    """True if a row states a yaw rate, which only a row with a demanded speed may."""
     speed, stated = MODES[SPEED], bool(cells.text(YAW_RATE, row))
     if stated and mode != speed and not (cells.linear and before == speed):
         cells.refuse(

@@ -31,7 +31,7 @@ RANGES: dict[str, tuple[float, float, str]] = {
 }
 #: Keys of an envelope.
 KEYS = ("configuration", "surface", "battery", *RANGES)
-#: How the battery is used, for the endurance.
+#: Uses of the battery, for the endurance.
 DUTIES = ("standing", "driving")
 #: Least and greatest that a requirement may state, in the unit of its name.
 STATED = (0.0, 1e6)
@@ -44,7 +44,7 @@ RATINGS = ("winding_C", "motor_speed_rpm", "gearbox_speed_rpm", "gearbox_Nm")
 
 @dataclasses.dataclass(frozen=True)
 class Envelope:
-    """Where a requirement has to be met: ranges, each from its least to its greatest value.
+    """Conditions under which a requirement has to be met: ranges, each from its least to its greatest value.
 
     Attributes:
         configuration: of the robot, by name; empty: its first.
@@ -74,7 +74,7 @@ class Envelope:
         return low if low < high else 0.0
 
     def meets(self, other: Envelope) -> bool:
-        """Whether some use is in both."""
+        """True if the two have some use in common."""
         if (self.configuration, self.surface, self.battery) != (other.configuration, other.surface, other.battery):
             return False
         pairs = [(getattr(self, key), getattr(other, key)) for key in RANGES]
@@ -104,7 +104,7 @@ class Requirement:
 
     @property
     def quantity(self) -> Quantity:
-        """What it is about."""
+        """The quantity that is required."""
         return QUANTITIES[self.name]
 
     @property
@@ -190,7 +190,7 @@ def _stem(name: str) -> str:
 
 
 def _unknown(name: str, known: Iterable[str]) -> str:
-    """What is wrong with a name that is none of the known."""
+    """Message about an unknown name."""
     known = tuple(known)
     stems = {_stem(k): k for k in known if _stem(k) != k}
     if name in stems:

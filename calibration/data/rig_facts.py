@@ -1,4 +1,4 @@
-"""What follows from a rig's numbers, and whether it is what such a thing mostly has."""
+"""Facts that follow from a rig's numbers, and doubts about unusual ones."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FAR, RISING = 100.0, 3
 
 @dataclasses.dataclass(frozen=True)
 class Fact:
-    """What follows from a rig's numbers.
+    """Returns facts that follow from a rig's numbers.
 
     Attributes:
         what: in words; value: with its unit; odd: why its numbers should be looked at again, else empty.
@@ -43,7 +43,7 @@ class Fact:
 
 
 def facts(robot: Robot) -> list[Fact]:
-    """What follows from the numbers of a robot: of its motor, gearbox and each load."""
+    """Returns facts that follow from the numbers of a robot's motor, gearbox and loads."""
     found = [*_motor(robot), *_gearbox(robot)]
     for name, load in robot.configurations.items():
         found += _shaft(robot, name, load) if isinstance(load, Shaft) else _vehicle(robot, name)
@@ -379,7 +379,7 @@ def doubts(runs: Runs, robot: Robot) -> tuple[str, ...]:
 
 
 def time_constant(robot: Robot) -> float:
-    """Of the speed of the motors with the slowest of their loads J R/k² [s]; infinite where that is not known."""
+    """Time constant J R/k² of the motors' speed with the slowest load [s]; infinite where it is not known."""
     motor, sides, found = robot.motor, float(robot.sides), 0.0
     if not robot.knows(VOLTAGE):
         return math.inf
@@ -394,7 +394,7 @@ def time_constant(robot: Robot) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Origin:
-    """Where a number of a robot comes from.
+    """Origin of a number of a robot.
 
     Attributes:
         name: of the parameter; value [unit]; sd: stated, None where the file states none.
@@ -409,7 +409,7 @@ class Origin:
 
 
 def origins(file: RobotFile) -> list[Origin]:
-    """Where the numbers of a robot come from, those that its file leaves open last of each part."""
+    """Returns the origin of each number of a robot; in each part, numbers that no file states come last."""
     robot, stated = file.robot, file.stated
     priors = {name: sd for name, _, sd in robot.rig.priors}
     found = []

@@ -1,4 +1,4 @@
-"""What a robot file states of a rig: its loads, what is imposed, its channels, their columns and instruments."""
+"""Statements of a robot file on a rig: its loads, the imposed quantity, channels, columns and instruments."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from mmrjax.model.signals import GRAVITY
 NONE = "none"
 #: Keys and tables of a robot file that state the rig.
 KEYS = ("imposed", "channels", "start", "between_rows", "columns", "instruments", "surfaces")
-#: What may be imposed, in short: `current` for `motor_current`.
+#: Quantities that may be imposed, by their short names: `current` for `motor_current`.
 SHORT = {word.removeprefix("motor_"): word for word in IMPOSED}
-#: What a configuration may be.
+#: Kinds of configurations.
 LOADS = ("shaft", "linear", "vehicle")
 
 #: Keys of a linear unit: unit and meaning. It has a lead or a drum.
@@ -66,7 +66,7 @@ VEHICLE: dict[str, tuple[float, str]] = {
 WIDTH, WHEELBASE = "turning.width", "running_gear.wheelbase"
 #: The same of what an example has where nothing is stated.
 CENTRE, CENTRE_WHY = "running_gear.centre_height", "not stated: an example's; in turns it moves load"
-#: Those of VEHICLE that tracks have to state.
+#: Parameters of VEHICLE that tracks have to state.
 _OF_TRACKS = ("track.loss_coulomb",)
 DYNAMIC = "ground.friction.dynamic"
 #: Share of a vehicle's mass that turns with its wheels, as disks, where none is stated: over time a shaft has to have
@@ -144,7 +144,7 @@ def _shaft(at: Mapping[str, float], sides: float) -> dict[str, float]:
 
 
 def vehicle_defaults(on_tracks: bool, table: Mapping[str, Any], sides: float) -> dict[str, float]:
-    """What a vehicle that starts from nothing has where its file says nothing.
+    """Returns default values of a vehicle that starts from nothing.
 
     Args:
         table: that its file states of it; sides: drives that move it together.
@@ -226,7 +226,7 @@ def _surfaces(stated: Any, loads: Sequence[str], where: str) -> tuple[tuple[str,
     return tuple(stated.items())
 
 
-#: What a file says of an instrument that its table tells.
+#: Word for a property of an instrument that is found in its table.
 FREE = "free"
 
 
@@ -391,6 +391,6 @@ def value_text(name: str, value: float, rig: Rig) -> str:
 
 
 def same_rig(rig: Rig) -> bool:
-    """Whether a rig is driven and measured as a robot whose file states nothing of it."""
+    """True if a rig is driven and measured as a robot with a file that states nothing about it."""
     usual = Rig()
     return all(getattr(rig, key) == getattr(usual, key) for key in KEYS)

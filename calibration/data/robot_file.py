@@ -6,9 +6,9 @@ import dataclasses
 import difflib
 import json
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import jax.numpy as jnp
 
@@ -25,17 +25,10 @@ from mmrjax.effects.scaled import scaled
 from mmrjax.errors import some
 from mmrjax.model import paper_robots, params, power
 from mmrjax.model.driver import DECAYS
-from mmrjax.model.paper_tables import TRACKED, WHEELED
 from mmrjax.model.robot import Configurations, Robot
 from mmrjax.model.shaft import Shaft
 
-T = TypeVar("T")
-
 SCHEMA = "mmrjax.robot/2"
-#: Schemas that are read; in the first, configurations had the names of OLD_NAMES.
-SCHEMAS = ("mmrjax.robot/1", SCHEMA)
-#: Former name of a configuration's parameters, and the configuration.
-OLD_NAMES = {"tracked": TRACKED, "wheeled": WHEELED}
 #: Whole numbers of a robot, which no fit can free: least, greatest, meaning.
 COUNTS = {
     "sides": (1, 12, "(motors driven alike)"),
@@ -45,7 +38,7 @@ COUNTS = {
 #: Key of an effect's table by which a file brings the library's priors and limits to the rig's size.
 FACTORS = "scaled"
 
-#: What makers allow, which no fit can free: least, greatest, unit and meaning. Experiments stay within it.
+#: Ratings by makers, which no fit can free: least, greatest, unit and meaning. Experiments stay within them.
 RATINGS = {
     "motor.voltage_limit": (0.1, 1000.0, "V", "highest supply voltage; not stated: what the table used"),
     "motor.speed_limit": (1.0, 1e5, "rad/s", "permissible speed of the motor"),
@@ -61,12 +54,12 @@ RATINGS = {
 }
 #: The parabola of a cell's no-load voltage; stated beside a capacity it is that of a cell of this capacity.
 CURVE = {"battery.curvature", "battery.slope"}
-#: What a robot has or has not, which no fit can free: meaning.
+#: Switches of a robot, which no fit can free: meaning.
 SWITCHES = {
     "gearbox.mesh_theory": "load driving the motor loses 2 - 1/η of the mesh's theory, else η",
     "driver.returns_current": "supply and driver take back what the motors return, else a diode blocks it",
 }
-#: What a robot is, in words, which no fit can free: those that there are, meaning.
+#: Choices by word, which no fit can free: allowed words, meaning.
 CHOICES = {"driver.decay": (DECAYS, "between pulses the driver shorts the motors (slow) or lets them coast (fast)")}
 
 
@@ -91,7 +84,7 @@ class RobotFile:
 
     @property
     def name(self) -> str:
-        """Of a file the last part of its path."""
+        """Name of the robot, or name of its file."""
         return Path(self.source).name
 
 
@@ -118,7 +111,7 @@ def find(name_or_path: str, library: Library = effects.BY_NAME, notes: list[str]
     """A robot by its name (`nominal`, `sm1`, `sm2`) or from a TOML file, with effects of `library`.
 
     Args:
-        notes: is given a sentence for each former name that stands for a new one.
+        notes: receives a sentence for each value that is allowed and unlikely.
 
     Raises:
         BadConfiguration: no such name or file, or what `parse` raises.
@@ -165,7 +158,7 @@ def parse(path: Path, library: Library = effects.BY_NAME, notes: list[str] | Non
             'base = "nominal"'
         )
     schema = content.pop("schema", SCHEMA)
-    if schema not in SCHEMAS:
+    if schema != SCHEMA:
         raise BadConfiguration(f"{path.name}, schema: got {schema}; expected {SCHEMA}")
     base = content.pop("base", "nominal")
     if base not in (*paper_robots.ROBOTS, rig_file.NONE):
@@ -274,46 +267,6 @@ def with_effects(
     return dataclasses.replace(robot, effects=tuple(present))
 
 
-def current_names(names: Iterable[str], robot: Robot, notes: list[str] | None = None) -> list[str]:
-    """Names of parameters, or of groups ending in `.*`, with former names of configurations brought up to date.
-
-    A former name stands for the configuration of OLD_NAMES where the robot has that one, and none of the former name.
-
-    Args:
-        notes: is given a sentence for each former name of a configuration.
-    """
-    found: list[str] = []
-    changed: dict[str, list[str]] = {}
-    for name in names:
-        head, dot, rest = name.partition(".")
-        new = OLD_NAMES.get(head, "")
-        if dot and new in robot.configurations and head not in robot.configurations:
-            changed.setdefault(head, []).append(f"{name} is now {new}.{rest}")
-            name = f"{new}.{rest}"
-        found.append(name)
-    for head, sentences in changed.items():
-        others = f", and so with {len(sentences) - 1} more of {head}" if len(sentences) > 1 else ""
-        if notes is not None:
-            notes.append(f"{sentences[0]}{others}")
-    return found
-
-
-def current_values(values: Mapping[str, T], robot: Robot, where: str, notes: list[str] | None = None) -> dict[str, T]:
-    """What is stated of parameters, by their names as `current_names` brings them up to date.
-
-    Args:
-        where: opens the message of an error; notes: as for `current_names`.
-
-    Raises:
-        BadConfiguration: a parameter is stated by its former and its new name.
-    """
-    names = current_names(values, robot, notes)
-    for old, name in zip(values, names, strict=True):
-        if names.count(name) > 1:
-            raise BadConfiguration(f"{where}, {old}: its new name {name} is stated too; state it once")
-    return dict(zip(names, values.values(), strict=True))
-
-
 def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str] | None = None) -> Robot:
     """The robot with parameters replaced, each checked; `sides`, `battery.cells`, RATINGS, SWITCHES and CHOICES too.
 
@@ -323,7 +276,7 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
     Raises:
         BadConfiguration: as `parse`.
     """
-    stated = current_values(values, robot, where, notes)
+    stated = dict(values)
     counts = {name: _count(where, name, stated.pop(name)) for name in COUNTS if name in stated}
     ratings: dict[str, Any] = {name: _rating(where, name, stated.pop(name)) for name in RATINGS if name in stated}
     if CURVE & stated.keys() and "battery.capacity" in stated:  # all of one cell, unless it is said otherwise
@@ -420,7 +373,7 @@ def _count(where: str, name: str, value: Any) -> int:
 
 
 def _parameters(name: str, known: Collection[str]) -> str:
-    """What to choose from in place of an unknown parameter."""
+    """List of parts and parameters to choose from, for the message about an unknown parameter."""
     head = name.partition(".")[0]
     heads = list(dict.fromkeys(n.partition(".")[0] for n in known))
     near = difflib.get_close_matches(name, known, n=5, cutoff=0.4)
@@ -494,7 +447,7 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
 
 
 def _lines_of_effect(effect: Effect) -> list[str]:
-    """What the table of an effect states beside its parameters."""
+    """Keys of an effect's table other than its parameters."""
     named = effect.configurations or type(effect)().configurations
     lines = [f"configurations = {json.dumps(effect.configurations)}  # on which it acts"] if named else []
     if type(effect).plain is not None:
@@ -555,7 +508,7 @@ def _lines_of_ratings(robot: Robot, nothing: Robot, stated: set[str]) -> Iterato
 
 
 def _start(robot: Robot) -> Robot:
-    """What the file of a robot starts from."""
+    """Robot that the file of a robot starts from."""
     if robot.rig.inherits:
         return paper_robots.nominal()
     nothing = paper_robots.blank(robot.configurations)

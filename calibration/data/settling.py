@@ -47,7 +47,7 @@ FAR = 6.0
 #: Share of glitches in a stretch up to which the other readings have a mean; samples beside which a reading is held.
 MOST_GLITCHES, BESIDE = 0.25, (21, 101)
 #: Channels that a robot that travels straight reads as zero.
-OF_YAW = ("yaw_rate", "lateral_speed")
+OF_YAW = tuple(c.name for c in channels.OF_TURNS if c.directed and c.side is None)
 #: Conditions whose every change ends a stretch.
 EXACT = ("configuration", "surface", "mode", "slope_deg", "payload_kg", "total_mass_kg")
 #: Why samples are left out.
@@ -58,7 +58,7 @@ REASONS = (
 
 @dataclasses.dataclass(frozen=True)
 class Signal:
-    """What a channel shows of settled travel, sample by sample.
+    """Readings of a channel in settled travel, sample by sample.
 
     Attributes:
         channel: that the table of settled runs has; shown: its readings [unit of the column], NaN where missing and
@@ -83,7 +83,7 @@ class Signal:
 
 @dataclasses.dataclass(frozen=True)
 class Inertia:
-    """What acceleration takes of the current of a configuration's motors.
+    """Current that the acceleration of a configuration's motors takes.
 
     Attributes:
         speed, current: names of channels, `current` empty where it is what is imposed.
@@ -131,7 +131,7 @@ class Stretch:
 
 @dataclasses.dataclass(frozen=True)
 class Settled:
-    """What a log holds of settled travel.
+    """Settled travel of a log.
 
     Attributes:
         runs: of the log; stretches: all of them, in the order of the log; signals: of its channels.
@@ -149,7 +149,7 @@ class Settled:
 
     @property
     def kept(self) -> tuple[Stretch, ...]:
-        """Those that are settled runs."""
+        """Stretches that are settled runs."""
         return tuple(s for s in self.stretches if not s.why)
 
     def settled_runs(self) -> Runs:
@@ -304,7 +304,7 @@ def _in_order(runs: Runs) -> list[np.ndarray]:
 def _signals(
     runs: Runs, each: list[np.ndarray], levels: list[np.ndarray], half: int, drift: float
 ) -> tuple[Signal, ...]:
-    """What settled travel shows of each channel of a log; of an angle its rate, where no channel reads that."""
+    """Returns the settled readings of each channel of a log; of an angle its rate, if no channel reads the rate."""
     none, width = np.zeros(0), min(max(6 * half, BESIDE[0]), BESIDE[1])
     found = []
     for c in runs.channels:
@@ -596,20 +596,23 @@ def _accelerates(
 
 
 def _scale(signal: Signal, mean: float) -> float:
-    """What shares of a channel's change are of [unit]: its mean, at least a tenth of its largest readings."""
+    """Scale of a channel's change [unit]: its mean, at least a tenth of its largest readings."""
     return max(abs(mean), 0.1 * signal.largest)
 
 
 def _certain(signal: Signal, mean: float, sd: float, change: float) -> float:
-    """What of the change along a stretch is no noise, as a share of `_scale`."""
+    """Part of the change along a stretch that is not noise, as a share of `_scale`."""
     if not math.isfinite(mean):
         return 0.0
     return max(abs(change) - OF_CHANGE * sd, 0.0) / _scale(signal, mean)
 
 
 def _to_come(signal: Signal, rows: np.ndarray, mean: float) -> float:
-    """What of the change along a level is still to come at its end, as a share of `_scale`: of a lag's tail, of which
-    quarters of the level show how fast it fades; where noise hides the last change, what those before leave of it."""
+    """Change along a level that is still to come at its end, as a share of `_scale`.
+
+    It is the tail of a lag. Changes between quarters of the level show its decay; where noise hides the last change,
+    it follows from those before.
+    """
     quarters = [signal.shown[q] for q in np.array_split(rows, 4)]
     quarters = [q[np.isfinite(q)] for q in quarters]
     if min(map(len, quarters)) < PART:
@@ -627,7 +630,7 @@ def _to_come(signal: Signal, rows: np.ndarray, mean: float) -> float:
 
 
 def _size(shown: np.ndarray) -> float:
-    """Of the largest readings of a channel, but for the last two in a hundred."""
+    """Size of the largest readings of a channel, without the largest two in a hundred."""
     sizes = np.abs(shown[np.isfinite(shown)])
     return float(np.quantile(sizes, 0.98)) if len(sizes) else 0.0
 
@@ -721,7 +724,7 @@ def _mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[float, fl
 
 
 def _scatter(runs: Runs, found: list[Stretch], signals: tuple[Signal, ...], largest: float) -> dict[str, float]:
-    """What stretches under the same conditions differ by beyond their own sds, of each channel [unit]; 0 with too few
+    """Scatter of stretches under the same conditions beyond their own sds, for each channel [unit]; 0 with too few
     repeats."""
     alike = [c for c in EXACT if runs.has(c)]
     groups: list[list[Stretch]] = []
@@ -775,7 +778,7 @@ NEAR = 0.03
 
 
 def _shows(found: Settled, s: Stretch, channel: Channel) -> str:
-    """Where a stretch is, and what a channel shows there at what is imposed."""
+    """Place of a stretch, with a channel's reading there and the imposed value, for a message."""
     shown, unit = number(_digits(s.mean[channel.name], 4)), found.runs.layout.imposed_column.rpartition("_")[2]
     return (
         f"{found.runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {channel.column}: shows {shown} "
@@ -838,7 +841,7 @@ def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> 
 
 
 def _read(runs: Runs, channel: str) -> bool:
-    """Whether a channel is read itself, and is no rate of an angle."""
+    """True if a channel is read itself, and is not the rate of an angle."""
     return runs.has(channels.find(channel).column)
 
 

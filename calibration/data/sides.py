@@ -1,4 +1,4 @@
-"""What a table of turns cannot be true of: sides exchanged, a yaw rate of the other sign, currents without theirs."""
+"""Checks of tables of turns: exchanged sides, a yaw rate of the other sign, currents without signs."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from calibration.data.columns import DUTY, SIDES, SUPPLY, VOLTS, Layout
 from calibration.data.input_errors import BadData, number
 from calibration.data.table import Runs, driven
 from mmrjax.model import channels
+from mmrjax.model.quantities import TURN
 from mmrjax.model.rig import Instrument
 
 #: Of rows that tell: what drives the sides apart, or one backward, as a share of the most that does so [-].
@@ -21,7 +22,7 @@ ROUNDED = 0.01
 
 
 def shares(volts: np.ndarray, supply: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """The supply's voltage [V], where none is stated the larger of both sides', and their shares of it.
+    """Returns the supply's voltage [V], by default the larger of both sides', and the share of each side.
 
     Args:
         volts: of left and right side [V], shape (2, rows); supply: shape (rows,).
@@ -31,10 +32,10 @@ def shares(volts: np.ndarray, supply: np.ndarray | None = None) -> tuple[np.ndar
 
 
 def of_volts(name: str, columns: dict[str, np.ndarray], battery: bool) -> tuple[str, ...]:
-    """Put the shares of the supply's voltage in the place of the sides' voltages that a table states.
+    """Replaces the sides' voltages of a table by their shares of the supply's voltage.
 
     Returns:
-        A sentence that says so; none where it states none.
+        A note on the replacement; none if the table has no such column.
 
     Raises:
         BadData: a battery feeds the motors, one side's is missing, shares beside, or more than the supply has.
@@ -68,7 +69,7 @@ def of_volts(name: str, columns: dict[str, np.ndarray], battery: bool) -> tuple[
 
 
 def check(runs: Runs) -> None:
-    """Refuse a table of turns whose sides or yaw rates are not what they are called.
+    """Refuses a table of turns with exchanged sides or a yaw rate of the other sign.
 
     Raises:
         BadData: readings of a side that go with what drives the other one, or a yaw rate against both.
@@ -87,8 +88,7 @@ def check(runs: Runs) -> None:
             runs, columns, (one, other), other - one, drive,
             "the larger one on the side that is driven faster: the sides of one pair of columns are exchanged",
         )  # fmt: skip
-    yaw = channels.find("yaw_rate").column
-    if runs.has(yaw):
+    for yaw in (c.column for c in channels.EVERY if c.sign == TURN and runs.has(c.column)):
         _refuse_against(
             runs, yaw, (runs[yaw],), runs[yaw], right - left,
             "a positive one where the right side is the faster: turn its sign, in the robot's file by [columns] "
@@ -99,7 +99,7 @@ def check(runs: Runs) -> None:
 def _refuse_against(
     runs: Runs, column: str, shown: tuple[np.ndarray, ...], readings: np.ndarray, drive: np.ndarray, expected: str
 ) -> None:
-    """Refuse readings most of which are against what drives them; said of the clearest row.
+    """Refuses readings that mostly have the other sign than their drive; the message names the clearest row.
 
     Args:
         shown: what the columns hold in every row.

@@ -13,7 +13,7 @@ _SIGNS = r"(?:±|\+/-|\+-)"
 
 
 def is_stated(value: Any) -> bool:
-    """Whether a value of a file is text with ±."""
+    """True if a value of a file is text with ±."""
     return isinstance(value, str) and re.search(_SIGNS, value) is not None
 
 

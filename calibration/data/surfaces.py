@@ -27,7 +27,7 @@ V = TypeVar("V")
 
 
 def common(configurations: Sequence[str], labels: Iterable[str]) -> str | None:
-    """The only one of configurations, or the one of which they are the surfaces with these labels; else None."""
+    """Returns the only configuration, or the one that has all of these labels as its surfaces; otherwise None."""
     if len(configurations) == 1:
         return configurations[0]
     stems = [
@@ -38,7 +38,7 @@ def common(configurations: Sequence[str], labels: Iterable[str]) -> str | None:
 
 
 def refused(label: str, layout: Layout) -> str:
-    """What is allowed in place of a label, empty where it is fine."""
+    """Allowed labels for the message about a label; empty if the label is allowed itself."""
     if not layout.inherits:
         return "" if label else "the name of a surface"
     if label in SURFACES:

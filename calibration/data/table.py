@@ -8,9 +8,22 @@ from collections.abc import Mapping
 import numpy as np
 
 from calibration.data import surface_labels
-from calibration.data.columns import CIRCUITS, DRIVEN, DUTY, HEADING, IMPOSED, LEVERS, LOAD, SUPPLY, TIME, Layout
+from calibration.data.columns import (
+    CIRCUITS,
+    CONDITIONS,
+    DRIVEN,
+    DUTY,
+    HEADING,
+    IMPOSED,
+    LEVERS,
+    LOAD,
+    SUPPLY,
+    TIME,
+    WHEN,
+    Layout,
+)
 from calibration.data.input_errors import BadData, choices
-from mmrjax.model import channels
+from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import adhesion_ratio, lateral_ratio
@@ -71,12 +84,12 @@ class Runs:
         return self.columns[column]
 
     def has(self, column: str) -> bool:
-        """Whether the table has this column."""
+        """True if the table has this column."""
         return column in self.columns
 
     @property
     def turns(self) -> bool:
-        """Whether its robot is free to turn: its sides are driven apart, or it heads elsewhere than uphill."""
+        """True if its robot is free to turn: its sides are driven apart, or it does not head uphill."""
         return any(self.has(name) for name in (*self.layout.sides, *HEADING))
 
     @property
@@ -86,7 +99,7 @@ class Runs:
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """That its readings are of, in the order of arrays."""
+        """Channels of its readings, in the order of arrays."""
         return self.layout.channels
 
     def of(self, robot: Robot) -> Runs:
@@ -118,19 +131,24 @@ class Runs:
     def axes(self) -> tuple[str, ...]:
         """Columns of the conditions that its runs have, what is imposed first."""
         duty = () if self.sampled else DUTY
-        further = (*duty, *self.layout.sides, *HEADING, *LEVERS, LOAD)
-        return tuple(c for c in (*self.layout.axes, *further) if self.has(c))
+        usual = (*CONDITIONS, *DUTY, *WHEN)
+        others = (c.column for c in quantities.SET if c.in_tables and c.field and c.column not in usual)
+        every = (*self.layout.axes, *duty, *self.layout.sides, *HEADING, *LEVERS, *others)
+        return tuple(dict.fromkeys(c for c in every if self.has(c)))
 
     @property
     def pulled(self) -> bool:
-        """Whether gravity, a constant torque or a motor as the load may drive the motors."""
+        """True if gravity, a constant torque or a motor as the load may drive the motors."""
         sloped = self.has("slope_deg") and bool(self["slope_deg"].any())
         return self.layout.weight or sloped or bool(driven_on(self.columns, self.layout).any())
 
     def turns_round(self, channel: Channel) -> bool:
-        """Whether a channel's readings have the sign of what drives the motors: a speed's do, and a current's where
-        nothing else drives them; a bridge that turns the voltage turns the supply's current back. In a turn each side
-        has its own sign, and the yaw rate that of their difference (`sides.check`)."""
+        """True if a channel's readings have the sign of what drives the motors.
+
+        A speed has it, and so has a current if nothing else drives the motors. A bridge that reverses the voltage
+        reverses the supply's current. In a turn each side has its own sign, and the yaw rate has the sign of their
+        difference (`sides.check`).
+        """
         if (
             self.turns
             or not channel.directed
@@ -143,7 +161,7 @@ class Runs:
 
     @property
     def sampled(self) -> bool:
-        """Whether a row is a sample of a run."""
+        """True if a row is a sample of a run."""
         return all(self.has(column) for column in TIME)
 
     @property
@@ -171,7 +189,7 @@ class Runs:
         return self._stacked(tuple(c.column for c in self.channels))
 
     def deviations(self) -> np.ndarray:
-        """Stated sds of the readings [SI], NaN where none is stated, shape (rows, channels)."""
+        """Stated sds of the readings [SI], NaN for others, shape (rows, channels)."""
         return self._stacked(tuple(c.sd_column for c in self.channels))
 
     def _stacked(self, columns: tuple[str, ...]) -> np.ndarray:
@@ -180,7 +198,7 @@ class Runs:
         return np.stack(found, 1) * np.asarray(channels.factors(self.channels))
 
     def missing(self) -> list[str]:
-        """A sentence for each channel of which readings are missing."""
+        """Returns a note on each channel with missing readings."""
         said = []
         for k, channel in enumerate(self.channels):
             lost = np.flatnonzero(np.isnan(self.measured()[:, k]))
@@ -213,7 +231,7 @@ class Runs:
         return which
 
     def configurations_named(self, robot: Robot) -> np.ndarray:
-        """As `configurations`, by name; of those that the robot does not have as the table does."""
+        """Names of `configurations`; a configuration that the robot does not have keeps the table's name."""
         stated = self["configuration"]
         if not self.has("surface"):
             return stated
@@ -250,28 +268,22 @@ class Runs:
             ]
         column, factor = IMPOSED[robot.rig.imposed]
         imposed = robot.rig.imposed != "voltage"
-        apart = {name: self[name] for name in HEADING if self.has(name)}
-        for side, name in zip(channels.SIDES, self.layout.sides, strict=False):
-            if self.has(name):
-                apart[f"{robot.rig.imposed if imposed else 'duty'}_{side}"] = factor * self[name]
         if imposed and not self.has(column):
             raise BadData(f"{self.source}: no {column}, which the robot's file says is imposed; give it in a table")
+        stated = {c.field: self[c.column] for c in quantities.SET if c.in_tables and c.field and self.has(c.column)}
+        stated["duty"] = np.where(held, 0.0, stated.get("duty", 1.0))
+        stated["voltage"] = np.zeros(len(self)) if battery or imposed else self[SUPPLY]
+        if imposed:
+            stated[robot.rig.imposed] = self[column] * factor
+            for side, name in zip(channels.SIDES, self.layout.sides, strict=False):
+                if self.has(name):
+                    stated[f"{robot.rig.imposed}_{side}"] = self[name] * factor
         return Conditions(
             which,
-            np.zeros(len(self)) if battery or imposed else self[SUPPLY],
-            self.columns.get("slope_deg", 0.0),
-            self.columns.get("payload_kg", 0.0),
             battery=battery,
             discharge=discharge,
             adhesion=adhesion,
-            adhesion_lateral=lateral if apart else None,
-            **apart,
-            **{name: self[name] for name in LEVERS if self.has(name)},
-            load_torque=self[LOAD] if self.has(LOAD) else None,
-            total_mass=self["total_mass_kg"] if self.has("total_mass_kg") else None,
-            order=self["order"] if self.has("order") else 0.0,
-            duty=np.where(held, 0.0, self["duty"] if self.has("duty") else 1.0),
+            adhesion_lateral=lateral if self.turns else None,
             open=[CIRCUITS[mode] for mode in self["mode"]] if self.has("mode") else 0.0,
-            motor_speed=self[column] * factor if robot.rig.imposed == "motor_speed" else None,
-            motor_current=self[column] * factor if robot.rig.imposed == "motor_current" else None,
+            **stated,
         )

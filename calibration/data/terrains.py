@@ -8,7 +8,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import delimited, input_files
+from calibration.data import delimited, input_files, named_arrays
 from calibration.data.input_errors import BadConfiguration, BadData
 from mmrjax.climbing import terrain
 from mmrjax.climbing.climb_simulation import ON_GROUND, Sequence, clearance
@@ -31,7 +31,7 @@ def stairs(text: str) -> tuple[float, float, int]:
         BadConfiguration: something else, or a stair without rise or tread.
     """
     cells = text.lower().replace("×", "x").split("x")
-    numbers = [delimited.number(c) for c in cells]
+    numbers = [named_arrays.number(c) for c in cells]
     if len(cells) != 3 or not np.isfinite(numbers).all():
         raise BadConfiguration(f"--stairs: got {text}; expected RISExTREADxCOUNT in mm, such as 170x290x3")
     rise, tread, count = numbers
@@ -65,7 +65,7 @@ def _read(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[dict[str, n
         for name in names:
             j = header.index(name)
             cell = row[j] if j < len(row) else ""
-            if not np.isfinite(value := delimited.number(cell)):
+            if not np.isfinite(value := named_arrays.number(cell)):
                 raise BadData(f"{path.name} row {k}, {name}: got {cell!r}; expected a number")
             found[name].append(value)
     if len(rows) < 2:

@@ -16,7 +16,7 @@ import numpy as np
 
 @contextlib.contextmanager
 def naming(path: Path | str) -> Iterator[None]:
-    """What the system refuses while a file is written names it: a full disk does not."""
+    """Adds the file's name to an error of the system while it is written, since a full disk does not name it."""
     try:
         yield
     except OSError as error:

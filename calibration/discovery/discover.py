@@ -22,6 +22,7 @@ from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.posterior_file import Posterior
 from calibration.data.runs import Runs
 from calibration.data.thinning import thinned
+from calibration.described import described, in_words
 from calibration.discovery import findings, kept, menu, prediction, preference, scales
 from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
@@ -99,7 +100,6 @@ from calibration.inference.linearization import Linearization
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
 from calibration.inference.residual_clusters import residual_clusters
-from calibration.words.note_words import in_words, sentence
 from mmrjax import effects
 from mmrjax.compile.precision import SINGLE, Threads, in_double, is_double
 from mmrjax.effects import Effect
@@ -284,9 +284,9 @@ def prepared(
     ready = preparation.prepare(distinct, robot, noise, stated)
     for note in ready.checked:
         if isinstance(note, NothingVaries) or (isinstance(note, Copied) and not note.tied):
-            raise BadData(sentence(note))
+            raise BadData(described(note))
     at_first = (*ready.foreign, *ready.doubted)
-    said: Notes = (*notes, *ready.former, *ready.checked, *ready.begins, *ready.weighed, *at_first)
+    said: Notes = (*notes, *ready.checked, *ready.begins, *ready.weighed, *at_first)
     turned = scales.turned_in(distinct, ready.robot)
     own = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
     library = {**library, **kind.library, **own}

@@ -47,9 +47,7 @@ from calibration.discovery.screening import Beforehand
 from calibration.discovery.search import own_p, without_each
 from calibration.discovery.settings import Settings
 from calibration.discovery.stated_values import Shift
-from calibration.inference import bases as bases_room
-from calibration.inference import blocks as blocks_room
-from calibration.inference import priors
+from calibration.inference import bases, blocks, priors
 from calibration.inference.held_out import unseen
 from calibration.inference.identifiability import held_by_prior
 from calibration.inference.linearization import Linearization, amplitude_of, shape_of, shape_scales, shaped
@@ -161,11 +159,11 @@ def unnamed(
     Args:
         linear: the fit with the curve, linearised.
     """
-    f, lacks, happens = found.proposal, None, bases_room.window(where.variable)
+    f, lacks, happens = found.proposal, None, bases.window(where.variable)
     x, way = linear.in_travel(found.balance, where.variable if happens is None else happens.axis)
     if found.defect is not None:
         lacks = defect(linear, found.balance)
-        turn = 2 * np.pi if where.variable in bases_room.ORDERS else None
+        turn = 2 * np.pi if where.variable in bases.ORDERS else None
         lacks = Defect(np.interp(x, found.grid, found.curve, period=turn) + way * lacks.value, lacks.sd)
     return UnnamedDiscrepancy(
         **dataclasses.asdict(where),
@@ -175,7 +173,7 @@ def unnamed(
         effect=found.effect,
         p_value=p_value,
         score=float(found.chi2[0] - found.chi2[1]),
-        score_free_in_each_run=where.explained if where.variable in bases_room.ORDERS else None,
+        score_free_in_each_run=where.explained if where.variable in bases.ORDERS else None,
         at=found.grid,
         value=found.curve,
         sd=found.sd,
@@ -418,7 +416,7 @@ def readings(
         return unseen(fitted.problem, fitted.z, masks, fitted.active).reading
 
     held, labels = {}, {}
-    for kind, by in blocks_room.predictable(runs, before.problem).items():
+    for kind, by in blocks.predictable(runs, before.problem).items():
         masks = list(by.values())
         first = left_out(before, masks) if known_before is None else known_before[kind]
         later = first

@@ -11,7 +11,7 @@ from calibration.discovery.projection import Projection
 from calibration.discovery.smooth import Smooth
 from calibration.inference.bases import ORDERS, signature
 from calibration.inference.linearization import Linearization
-from mmrjax.effects.curve import PLACES, READINGS
+from mmrjax.effects.curve import EVERY_VARIABLE, PLACES, READINGS
 from mmrjax.model import channels
 
 #: What a formula is called, in the symbols of the paper.
@@ -59,13 +59,11 @@ class Ratio:
         return (np.sin(x) if self.of == "slope" else x) / self.over
 
 
-RATIOS = (
-    Ratio("ω_m", "rad/s", "speed_motor"),
-    Ratio("I", "A", "current"),
-    Ratio("U", "V", "voltage"),
-    Ratio("sin α", "", "slope"),
-    Ratio("m_c", "kg", "payload"),
-    Ratio("ω", "rad/s", "yaw_rate"),
+#: Ratios of the dictionary; of formulas that are equally good, the first is proposed.
+RATIOS = tuple(
+    Ratio(variable.symbol, "" if name == "slope" else variable.unit, name)
+    for name, variable in {name: EVERY_VARIABLE[name] for name in ("speed_motor", "current", *EVERY_VARIABLE)}.items()
+    if variable.symbol
 )
 #: Rise of the BIC for each variable but the one that the curve is over: one of so many is looked for.
 FOREIGN = 2 * float(np.log(len(RATIOS)))

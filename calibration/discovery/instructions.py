@@ -1,4 +1,4 @@
-"""Instructions for the next experiment, as data; `calibration/words` makes English of them."""
+"""Instructions for the next experiment, as data; `mmrjax.describe` makes their sentences."""
 
 from __future__ import annotations
 
@@ -67,4 +67,5 @@ class TooWeak:
     sigma: float
 
 
+KINDS = (NothingPossible, NoMenu, NothingTells, CarryOut, MoreRuns, TooWeak)
 Instruction = NothingPossible | NoMenu | NothingTells | CarryOut | MoreRuns | TooWeak

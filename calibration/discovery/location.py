@@ -9,8 +9,9 @@ import numpy as np
 
 from calibration.data.columns import SUPPLY
 from calibration.data.runs import Runs
-from calibration.inference import bases as bases_room
-from mmrjax.effects.base import EQUATION, THE_SIDE
+from calibration.inference import bases
+from mmrjax.effects.base import EQUATION
+from mmrjax.effects.curve import EVERY_VARIABLE
 
 #: Balances in which the current stands for the load that the motors carry.
 OF_LOAD = ("motor", "gearbox", "track", "ground", "slip", "yaw")
@@ -53,28 +54,28 @@ class DiscrepancyLocation:
     @property
     def balance(self) -> str:
         """The balance, `sensor` where it is in what an instrument shows."""
-        return bases_room.balance_of(self.place)
+        return bases.balance_of(self.place)
 
     @property
     def channel(self) -> str:
         """The channel whose readings are off, empty for none."""
-        return self.place if bases_room.in_readings(self.place) else ""
+        return self.place if bases.in_readings(self.place) else ""
 
     @property
     def balances_alike(self) -> tuple[str, ...]:
         """Balances of the places that act alike."""
-        return tuple(dict.fromkeys(map(bases_room.balance_of, self.alike)))
+        return tuple(dict.fromkeys(map(bases.balance_of, self.alike)))
 
     @property
     def family(self) -> str:
         """Its equation and what drives it, in the words of `Effect.family`."""
-        happens = bases_room.window(self.variable)
+        happens = bases.window(self.variable)
         variable = self.variable if happens is None else happens.axis
-        what = bases_room.in_words(self.place) if self.channel else EQUATION[self.balance]
-        drivers = {"speed_motor": "speed", "current": "load" if self.balance in OF_LOAD else "current"}
+        what = bases.in_words(self.place) if self.channel else EQUATION[self.balance]
+        drivers = {name: v.driver for name, v in EVERY_VARIABLE.items() if v.driver}
+        drivers |= {"current": "load" if self.balance in OF_LOAD else "current"}
         drivers |= {"payload": "load", "slope": "demand" if self.balance == "slip" else "slope"}
         drivers |= {"voltage": "duty"} if self.by_duty else {}
-        drivers |= {"yaw_rate": "speed", "side": THE_SIDE}
         return f"{what} that changes with {drivers.get(variable, variable)}"
 
     def to_json(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What the loop has to say, as data: verdict, reasons, remarks. `calibration/words` makes English of it."""
+"""Verdict, reasons and remarks of the loop, as data. `mmrjax.describe` makes their sentences."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class NameTest:
 
     @property
     def fails(self) -> tuple[str, ...]:
-        """Rows of `words.loop.DOUBTS`: what speaks against it; empty where it is established."""
+        """Reasons against the name, rows of `loop_words.DOUBTS`; empty for an established one."""
         doubts = {
             "chance": self.root < self.needed,
             "curve": self.evidence < -BETTER,
@@ -115,7 +115,7 @@ class NameSupport:
 
     Attributes:
         stands: whether one at least does.
-        why: a row of `words.loop.REASONS`: why not, or `beside` what; "" where there is nothing to say.
+        why: reason for the verdict, a row of `loop_words.REASONS`; "" for none.
         effects: that this is said of; curves: that were put beside, or do as well; tests: of each effect.
     """
 
@@ -217,7 +217,7 @@ class Mechanism:
 
     @property
     def fails(self) -> tuple[str, ...]:
-        """Rows of `words.loop.NO_MECHANISM`: what speaks against it; empty where it is established."""
+        """Reasons against the mechanism, rows of `loop_words.NO_MECHANISM`; empty for an established one."""
         doubts = {
             "share": self.share < HALF,
             "gain": not self.gain > SURE * self.se,

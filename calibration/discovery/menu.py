@@ -68,7 +68,7 @@ class Run:
 
     Attributes:
         name: of them; kinds: of `KINDS`, and the configuration where there is one.
-        doing: a row of `words.experiments.DOING`; where: the configuration's name, "" for none; motors: of the robot.
+        doing: a row of `experiment_words.DOING`; where: the configuration's name, "" for none; motors: of the robot.
         setup: how the robot is set up.
         voltage [V], slope [deg], payload [kg]: conditions of each run, shape (runs,).
         channels: names of what is read.

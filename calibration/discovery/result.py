@@ -14,6 +14,7 @@ from calibration.data.columns import DRIVING
 from calibration.data.posterior_file import Posterior
 from calibration.data.runs import WHEN, Runs
 from calibration.data.writing import write_json, write_table
+from calibration.described import described, sentences
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.headline import headline
 from calibration.discovery.instructions import Instruction
@@ -26,9 +27,6 @@ from calibration.inference.fit_notes import HeldByPrior, Notes, Pair
 from calibration.inference.fit_posterior import determined_together
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.simulation_errors import OF_SIZE
-from calibration.words import experiment_words, fit_words
-from calibration.words import loop_words as words
-from calibration.words.note_words import sentence, sentences
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 
@@ -121,7 +119,7 @@ class Formula:
     @property
     def formula(self) -> str:
         """Its expression, or that there is none."""
-        return self.expression or words.NO_FORMULA
+        return described(self)
 
     def to_json(self) -> dict[str, Any]:
         """As in result.json."""
@@ -194,8 +192,8 @@ class Alternative:
 
     @property
     def why(self) -> str:
-        """Why they are not plausible, in words."""
-        return words.why_ruled_out(self.reasons)
+        """Reasons for not being plausible, as a sentence."""
+        return described(self)
 
     def to_json(self) -> dict[str, Any]:
         """As in result.json."""
@@ -314,7 +312,7 @@ class NextExperiment:
     @property
     def description(self) -> str:
         """What to do and what to read."""
-        return experiment_words.instruction(self.instruction)
+        return described(self.instruction)
 
     def to_json(self) -> dict[str, Any]:
         """As in result.json."""
@@ -426,7 +424,7 @@ class Resolved:
     @property
     def statement(self) -> str:
         """In a sentence or two."""
-        return words.resolved(self)
+        return described(self)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -436,7 +434,7 @@ class Resolved:
     def to_json(self) -> dict[str, Any]:
         """As in result.json."""
         return {
-            "asked": words.asked(self.asked),
+            "asked": described(self.asked),
             "statement": self.statement,
             "explains": self.explains,
             "rows": self.rows,
@@ -545,12 +543,12 @@ class DiscoveryResult:
 
     @property
     def statement(self) -> str:
-        """The verdict in one sentence."""
-        return words.statement(self.summary)
+        """The verdict as a sentence."""
+        return described(self.summary)
 
     @property
     def headline(self) -> Headline:
-        """What holds at every noise that was tried."""
+        """Claim that holds at every noise factor tried."""
         return headline(self.summary, [(s.factor, s.summary) for s in self.sensitivity])
 
     @property
@@ -560,12 +558,12 @@ class DiscoveryResult:
 
     @property
     def standing(self) -> str:
-        """Why names do not stand, or beside what they do, in words; "" where there is nothing to say."""
-        return words.why(self)
+        """Reasons for or against the names, as a sentence; "" for none."""
+        return described(self, "standing")
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences worth saying."""
+        """Remarks as sentences."""
         return sentences(self.remarks)
 
     @property
@@ -624,7 +622,7 @@ class DiscoveryResult:
             "verdict": self.verdict,
             "mechanism": None if self.summary.mechanism is None else _mechanism(self.summary.mechanism, self.unnamed),
             "missed": [m._asdict() for m in self.summary.missed],
-            "headline": dataclasses.asdict(self.headline) | {"statement": words.headline(self.headline)},
+            "headline": dataclasses.asdict(self.headline) | {"statement": described(self.headline)},
             "statement": self.statement,
             "rows": len(self.runs),
             "rows_used": int(self.included.sum()),
@@ -660,7 +658,7 @@ class DiscoveryResult:
                 "of_readings": dict(zip(("before", "after"), self.chi2_of_readings, strict=True)),
             },
             "base_shift": {name: dataclasses.asdict(p) for name, p in self.base_shift.items()},
-            "together": [fit_words.pair(pair) for pair in self.together],
+            "together": [pair.to_json() for pair in self.together],
             "scores": [dataclasses.asdict(s) for s in self.scores],
             "bootstrap": {
                 "replicates": self.replicates,
@@ -727,10 +725,10 @@ class DiscoveryResult:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "result.json", self.to_json())
         write_table(folder / "rows.csv", self.rows_table())
-        held = [sentence(HeldByPrior(self.held_by_prior))] if self.held_by_prior else []
-        note = "\n".join([words.header(self, robot_name), *held])
+        held = [described(HeldByPrior(self.held_by_prior))] if self.held_by_prior else []
+        note = "\n".join([described(self, "header", robot_name), *held])
         robot_file.write(self.robot, folder / "robot.toml", note=note)
-        robot_file.write(self.refit, folder / REFIT_FILE, note=words.refit_header(self, robot_name))
+        robot_file.write(self.refit, folder / REFIT_FILE, note=described(self, "refit header", robot_name))
         posterior.write(self.posterior, folder / posterior.FILE)
         if self.resolved is not None:
             robot_file.write(self.resolved.robot, folder / TRACK_FILE, note=self.resolved.statement)
@@ -750,8 +748,8 @@ class Sensitivity:
 
     @property
     def statement(self) -> str:
-        """The verdict in one sentence."""
-        return words.statement(self.summary)
+        """The verdict as a sentence."""
+        return described(self.summary)
 
     def to_json(self) -> dict[str, Any]:
         """As in result.json."""
@@ -795,7 +793,7 @@ def _mechanism(m: Mechanism, curve: UnnamedDiscrepancy | None) -> dict[str, Any]
         **found,
         "errors": errors,
         "established": not m.fails,
-        "course": "" if curve is None else words.course(curve),
+        "course": "" if curve is None else described(curve),
     }
 
 
@@ -819,7 +817,7 @@ def _unnamed(d: UnnamedDiscrepancy) -> dict[str, Any]:
         "effect": d.effect,
         "score_free_in_each_run": d.score_free_in_each_run,
         "curve": curve,
-        "course": words.course(d),
+        "course": described(d),
         "proposal": d.proposal.to_json(),
     }
 

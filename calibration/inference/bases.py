@@ -16,7 +16,7 @@ from numpy.polynomial import legendre
 
 from calibration.data.columns import CURRENT, LOAD, SPEED, Layout
 from calibration.inference.linearization import Linearization
-from mmrjax.effects.curve import DRIFT, READ_BY, WAYS, acts_along, counted_by, in_travel
+from mmrjax.effects.curve import DRIFT, EVERY_VARIABLE, READ_BY, WAYS, acts_along, counted_by, in_travel
 from mmrjax.model import channels
 from mmrjax.model.balances import absent
 from mmrjax.model.channels import Channel
@@ -28,18 +28,7 @@ BALANCES = ("electrical", "track", "ground", "slip")
 STANDS_FOR = {"electrical": ("supply",), "track": ("gearbox", "motor")}
 #: Variables of a curve, fields of `Signals` (and the time of histories and the order of runs), with the column that
 #: measures each.
-VARIABLES = {
-    "voltage": "supply_voltage_V",
-    "current": "total_current_A",
-    "speed_motor": "motor_speed_rpm",
-    "slope": "slope_deg",
-    "payload": "payload_kg",
-    "speed": "speed_mm_s",
-    "time": "time_s",
-    "order": "order",
-    "yaw_rate": "yaw_rate",
-    "side": "side",
-}
+VARIABLES = {name: variable.column for name, variable in EVERY_VARIABLE.items()}
 #: Balances of turns that carry curves, beside those of straight travel.
 OF_TURNS = ("yaw",)
 #: Terms of a curve of one variable (Legendre polynomials), and degree of the polynomial in all conditions.
@@ -50,12 +39,7 @@ CONDITIONS = "conditions"
 AXES, WINDOWS, FEWEST = DRIFT, (1 / 4, 1 / 8, 1 / 16), 3
 #: Conditions of which a level may differ from the others, the SI value of their column's unit, and the unit; most
 #: levels that each may have.
-LEVELS = {
-    "voltage": (1.0, "V"),
-    "speed_motor": (channels.RPM, "rpm"),
-    "slope": (np.pi / 180, "deg"),
-    "payload": (1.0, "kg"),
-}
+LEVELS = {name: (v.shown, v.unit_shown) for name, v in EVERY_VARIABLE.items() if v.levels}
 #: Columns of conditions that a run may have.
 EVERY_AXIS = ("supply_voltage_V", "slope_deg", "payload_kg")
 MOST_LEVELS = 6

@@ -11,11 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import robot_file, surfaces
+from calibration.data import surfaces
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.data.thinning import thinned
+from calibration.described import in_words
 from calibration.inference import blocks as holdout
 from calibration.inference import (
     checks,
@@ -24,12 +25,12 @@ from calibration.inference import (
     lack_of_fit,
     multistart,
     observers,
+    optimizers,
     population,
     priors,
     scans,
     solvers,
 )
-from calibration.inference import optimizers as fit
 from calibration.inference.fit_notes import Elsewhere, Fact, Note, OfRows, PriorOfProduct, Step
 from calibration.inference.fit_posterior import of_coordinates
 from calibration.inference.multistart import Found
@@ -41,7 +42,6 @@ from calibration.inference.problem import Problem
 from calibration.inference.remarks import numbers, remarks
 from calibration.inference.residual_clusters import residual_clusters
 from calibration.inference.result import CalibrationResult
-from calibration.words.note_words import in_words
 from mmrjax import fidelities
 from mmrjax.compile.precision import SINGLE, in_double, is_double
 from mmrjax.model.robot import Robot
@@ -73,7 +73,7 @@ def calibrate(
     profiles: bool | None = None,
     blocks: Sequence[str] | bool | None = None,
     rows: int = ROWS,
-    solver: str | fit.Solver | None = None,
+    solver: str | optimizers.Solver | None = None,
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> CalibrationResult:
     """Calibrate `robot` to measured runs.
@@ -110,9 +110,9 @@ def calibrate(
     solver = solvers.solver(solver) if isinstance(solver, str) else solver
     runs, told = thinned(runs.of(robot), rows), in_words(tell)
     plan = _planned(runs, model, starts, profiles, blocks)
-    choose = functools.partial(_free_names, runs, plan, free, fix, tell)
+    choose = functools.partial(_free_names, runs, plan, free, fix)
     ready = prepare(runs, robot, noise, stated, assume=False, choose=choose)
-    for note in (*ready.former, *ready.foreign, *ready.doubted):
+    for note in (*ready.foreign, *ready.doubted):
         told(note)
     base, of_product = _guided(runs, ready, plan)
     setting = _Setting(runs, plan, ready, base, of_product)
@@ -161,7 +161,6 @@ def _free_names(
     plan: _Plan,
     free: Sequence[str],
     fix: Sequence[str],
-    tell: Callable[[str], None],
     prepared: Prepared,
 ) -> tuple[str, ...]:
     """Names of the free parameters.
@@ -170,11 +169,7 @@ def _free_names(
         BadConfiguration: an unknown name, or one that the fidelity does not read.
     """
     robot, fidelity, computes = prepared.robot, plan.fidelity, observers.facts(plan.fidelity).computes
-    former: list[str] = []
     words = [surfaces.names_of_surfaces(names, robot, runs) for names in (free, fix)]
-    words = [robot_file.current_names(names, robot, former) for names in words]
-    for sentence in former:  # before a name is refused that nobody has typed
-        tell(sentence)
     present = _present(runs, robot)
     default = priors.default_names(present, robot, computed=computes, turns=runs.turns)
     owned = priors.stated_names(robot, present, () if plan.observe.axis else priors.OVER_TIME)
@@ -270,7 +265,7 @@ def _searched(
     evolved: _Evolved,
     seed: int,
     tell: Callable[[Step], None],
-    solver: fit.Solver | None,
+    solver: optimizers.Solver | None,
 ) -> tuple[Found, np.ndarray | None]:
     """The searches of a problem, and where they began at the optimum of `steady`, that optimum."""
     rng, size = np.random.default_rng(seed), len(posed.coordinates)
@@ -347,7 +342,7 @@ class _Optimum:
 
     z: np.ndarray
     robot: Robot
-    after: fit.Observation
+    after: optimizers.Observation
     status: np.ndarray
     status_before: np.ndarray
     seen: np.ndarray
@@ -362,7 +357,7 @@ def _optimum(setting: _Setting, found: Found) -> _Optimum:
     """
     posed, z = found.problem, np.asarray(found.best.z)
     fitted = posed.robot(jnp.asarray(z))
-    after, before = fit.observation(posed, jnp.asarray(z)), fit.read(posed, posed.base)
+    after, before = optimizers.observation(posed, jnp.asarray(z)), optimizers.read(posed, posed.base)
     status, status_before = np.asarray(after.status), np.asarray(before.status)
     lost = multistart.unreachable(posed, status)
     if lost.any():

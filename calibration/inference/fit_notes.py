@@ -1,25 +1,23 @@
-"""What a table or a fit has to say, as data: which name, which test, which numbers. `calibration/words` says it."""
+"""Notes on a table or a fit, as data: names, tests and numbers. `mmrjax.describe` makes their sentences."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from typing import NamedTuple, dataclass_transform
+
+from calibration.described import described
 
 
 @dataclass_transform(frozen_default=True)
 class Note:
-    """Something worth saying; `words.notes.sentence` makes English of it, where it has no sentence of its own.
+    """A note; `mmrjax.describe` makes its sentence.
 
-    A kind is a class with its fields, which makes a frozen dataclass of it.
+    Each subclass with its fields becomes a frozen dataclass.
     """
 
     def __init_subclass__(cls) -> None:
         dataclasses.dataclass(frozen=True)(cls)
-
-    @property
-    def statement(self) -> str:
-        """In one sentence."""
-        raise NotImplementedError
 
 
 #: Notes as results hold them: sentences of the room of data are words already.
@@ -30,7 +28,7 @@ class Step(Note):
     """What a long computation does next.
 
     Attributes:
-        name: a row of `words.steps.STEPS`; about: what fills its sentence, in order.
+        name: a row of `step_words.STEPS`; about: values for its sentence, in order.
     """
 
     name: str
@@ -57,6 +55,26 @@ class Pair(NamedTuple):
     correlation: float
     form: str
     weight: float
+
+    def to_json(self) -> dict[str, object]:
+        """As in `together` of result.json."""
+        return {"a": self.one, "b": self.other, "correlation": self.correlation, "determined": described(self)}
+
+
+class Determination(NamedTuple):
+    """Whether data determine a parameter.
+
+    Attributes:
+        held: True if only its prior does; others: parameters that it is determined together with.
+    """
+
+    held: bool
+    others: tuple[str, ...]
+
+    @classmethod
+    def of(cls, name: str, held: bool, pairs: Iterable[Pair]) -> Determination:
+        """From the pairs that data determine only in combination."""
+        return cls(held, tuple(p.other if p.one == name else p.one for p in pairs if name in (p.one, p.other)))
 
 
 class OnlyTogether(Note):
@@ -91,7 +109,7 @@ class NoiseOff(Note):
 
 
 class Fact(Note):
-    """What is so of a table or a fit, without a name or a number: a row of `words.fits.FACTS`."""
+    """A fact about a table or a fit without a name or a number: a row of `fit_words.FACTS`."""
 
     what: str
 

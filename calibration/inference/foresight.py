@@ -11,8 +11,7 @@ from calibration.data.columns import ROWS
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.data.thinning import thinned
-from calibration.inference import identifiability, observers, priors
-from calibration.inference import optimizers as fit
+from calibration.inference import identifiability, observers, optimizers, priors
 from calibration.inference.fit_notes import (
     Copied,
     LargerNoise,
@@ -104,7 +103,7 @@ def foresee(runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS
     coordinates = priors.coordinates(robot, names, any_surface=robot.rig.inherits)
     posed = observers.pose(runs, robot, coordinates, known.sd)
     z = jnp.zeros(len(names))
-    seen = fit.observation(posed, z)
+    seen = optimizers.observation(posed, z)
     reached = np.isfinite(np.asarray(seen.reading)).all(1) & ~posed.observe.unreachable(np.asarray(seen.status))
     data = dataclasses.replace(posed.data, weight=posed.data.weight * jnp.asarray(reached, float)[:, None])
     about = identifiability.analyse(posed, z, data)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from calibration.inference import optimizers as fit
+from calibration.inference import optimizers
 from calibration.inference.optimizers import Pin
 from calibration.inference.problem import Data, Problem
 from mmrjax.compile.compiling import compiled
@@ -120,10 +120,10 @@ def analyse(problem: Problem, z: Array, data: Data | None = None, slope: np.ndar
     if slope is not None:
         whole, readings = np.concatenate([slope, np.eye(len(z))]), slope
     elif problem.observe.long:
-        jacobian = np.asarray(fit.linearised(problem, z, data)[1])
-        whole, readings = jacobian[fit.informing(data)], jacobian[: data.measured.size]
+        jacobian = np.asarray(optimizers.linearised(problem, z, data)[1])
+        whole, readings = jacobian[optimizers.informing(data)], jacobian[: data.measured.size]
     else:
-        whole, readings = (np.asarray(j) for j in _jacobians(fit.rooted(problem, z), z, data))
+        whole, readings = (np.asarray(j) for j in _jacobians(optimizers.rooted(problem, z), z, data))
     _, s, v = np.linalg.svd(whole, full_matrices=False)
     covariance = (v.T / s**2) @ v
     _, singular, directions = np.linalg.svd(readings, full_matrices=False)
@@ -166,8 +166,8 @@ class Profile:
 
 
 @compiled
-def _profiles(problem: Problem, data: Data, starts: Array, pins: Pin) -> fit.Optimum:
-    return jax.vmap(lambda z, pin: fit.levenberg_marquardt(problem, z, data, pin)[0])(starts, pins)
+def _profiles(problem: Problem, data: Data, starts: Array, pins: Pin) -> optimizers.Optimum:
+    return jax.vmap(lambda z, pin: optimizers.levenberg_marquardt(problem, z, data, pin)[0])(starts, pins)
 
 
 def profile(problem: Problem, z: Array, cost: float, about: Identifiability, data: Data | None = None) -> Profile:

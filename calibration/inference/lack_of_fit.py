@@ -18,10 +18,10 @@ from scipy.special import chdtrc, fdtrc, ndtr
 
 from calibration.data.courses import courses
 from calibration.data.runs import DUTY, Runs
+from calibration.described import described
 from calibration.inference.fit_notes import Shown
 from calibration.inference.observers import Observer
 from calibration.inference.simulation_errors import share_of_measured
-from calibration.words import fit_words
 
 #: Family-wise error of «not adequate».
 LEVEL = 0.05
@@ -79,13 +79,13 @@ class Adequacy:
     @property
     def statement(self) -> str:
         """In one sentence; opens a calibration's output."""
-        return fit_words.adequacy(self)
+        return described(self)
 
     def to_json(self) -> dict[str, object]:
         """As in `adequate` of result.json."""
         return {
             **dataclasses.asdict(self),
-            "shown_by": fit_words.shown_by(self.shown_by),
+            "shown_by": described(self.shown_by),
             "statement": self.statement,
         }
 

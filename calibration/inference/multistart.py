@@ -12,14 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.inference import identifiability, scans, series_noise
+from calibration.described import described
+from calibration.inference import identifiability, optimizers, scans, series_noise
 from calibration.inference import noise as noise_room
-from calibration.inference import optimizers as fit
 from calibration.inference.fit_notes import Agreement, Step
 from calibration.inference.noise import Noise
 from calibration.inference.population import Population, Searched, most_probable
 from calibration.inference.problem import Data, Observation, Problem
-from calibration.words import fit_words
 from mmrjax.model.robot import Robot
 
 #: Costs closer than this to the best [½σ²] are the same optimum.
@@ -67,7 +66,7 @@ class Starts:
 
     def statement(self) -> str:
         """Whether the starts agree, as a sentence."""
-        return fit_words.agreement(self.agreement)
+        return described(self.agreement)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +81,7 @@ class Found:
     """
 
     problem: Problem
-    best: fit.Optimum
+    best: optimizers.Optimum
     starts: Starts
     shares: np.ndarray
     searched: Searched | None = None
@@ -93,7 +92,7 @@ def unreachable(posed: Problem, status: np.ndarray) -> np.ndarray:
     return posed.observe.unreachable(np.asarray(status)) & (np.asarray(posed.data.weight).max(1) > 0)
 
 
-def search(posed: Problem, noise: Noise, points: np.ndarray, solver: fit.Solver | None = None) -> Found:
+def search(posed: Problem, noise: Noise, points: np.ndarray, solver: optimizers.Solver | None = None) -> Found:
     """Search from all points in one batch; where the noise is not known, estimate it and search again until it
     settles.
 
@@ -102,7 +101,7 @@ def search(posed: Problem, noise: Noise, points: np.ndarray, solver: fit.Solver 
     Args:
         solver: of optimistix; None for ours.
     """
-    by = functools.partial(fit.searches, solver=solver)
+    by = functools.partial(optimizers.searches, solver=solver)
     z = points[0]
     shares = first_shares(noise)
     for _ in range(ROUNDS):
@@ -123,7 +122,7 @@ def search_one_by_one(
     points: np.ndarray,
     shares: np.ndarray,
     tell: Callable[[Step], None],
-    solver: fit.Solver | None = None,
+    solver: optimizers.Solver | None = None,
 ) -> Found:
     """As `search`, one search at a time: the noise settles on the first point's optimum, then the others start once
     each. One that ends lower takes its place, and the noise settles again.
@@ -137,11 +136,11 @@ def search_one_by_one(
     def minutes() -> float:
         return (time.perf_counter() - begun) / 60
 
-    def step(posed: Problem, points: np.ndarray, data: Data) -> tuple[fit.Optimum, np.ndarray, np.ndarray]:
-        def one(z: np.ndarray) -> tuple[fit.Optimum, Observation, Observation]:
+    def step(posed: Problem, points: np.ndarray, data: Data) -> tuple[optimizers.Optimum, np.ndarray, np.ndarray]:
+        def one(z: np.ndarray) -> tuple[optimizers.Optimum, Observation, Observation]:
             if solver is not None:
-                return _member(fit.searches_by(posed, jnp.asarray(z)[None], data, solver), 0)
-            return fit.search_long(
+                return _member(optimizers.searches_by(posed, jnp.asarray(z)[None], data, solver), 0)
+            return optimizers.search_long(
                 posed, jnp.asarray(z), data, tell=lambda *done: tell(Step("search", (*done, minutes())))
             )
 
@@ -205,7 +204,7 @@ def at_best(
     shares: np.ndarray,
     searched: Searched,
     tell: Callable[[Step], None],
-    solver: fit.Solver | None = None,
+    solver: optimizers.Solver | None = None,
 ) -> Found:
     """What a population found, its best member searched on by gradients where those are to be trusted."""
     z = searched.found.z[searched.at]
@@ -217,7 +216,7 @@ def at_best(
     )))  # fmt: skip
     error = np.concatenate([np.asarray(posed.whitened(seen, posed.data)), z - np.asarray(posed.data.centre)])
     rows = np.zeros((posed.data.measured.shape[0], len(z)))  # of the penalty on adhesion
-    best = fit.optimum(np.concatenate([searched.slope, rows, np.eye(len(z))]), error, z, posed.data)
+    best = optimizers.optimum(np.concatenate([searched.slope, rows, np.eye(len(z))]), error, z, posed.data)
     settled = np.array([searched.found.settled])
     best = dataclasses.replace(best, converged=jnp.asarray(searched.found.settled))
     ended = Starts(np.array([float(best.cost)]), settled, sum(g.failed for g in searched.found.generations))
@@ -239,7 +238,7 @@ def _member(found: T, k: int) -> T:
     return jax.tree.map(lambda x: x[k], found)
 
 
-def _ended(found: fit.Optimum, feasible: np.ndarray) -> Starts:
+def _ended(found: optimizers.Optimum, feasible: np.ndarray) -> Starts:
     cost = np.where(np.isfinite(found.cost), found.cost, np.inf)
     return Starts(cost, np.asarray(found.converged), int(np.sum(~feasible)), np.asarray(found.z))
 
@@ -259,7 +258,7 @@ def _noisier(posed: Problem, noise: Noise, shares: np.ndarray) -> Problem:
 
 def _tighten(
     posed: Problem, points: np.ndarray, search: Callable[..., Any]
-) -> tuple[Problem, fit.Optimum, np.ndarray]:
+) -> tuple[Problem, optimizers.Optimum, np.ndarray]:
     """Search from all points, with the penalty on adhesion stiffer until no row slides at the best.
 
     Returns:
@@ -284,7 +283,7 @@ def _shares(posed: Problem, noise: Noise, z: np.ndarray) -> np.ndarray:
     data = posed.data
     size = noise.sd / noise_room.START  # what an estimated share is of
     weight = np.asarray(data.weight)
-    error = np.asarray(fit.observation(posed, jnp.asarray(z)).reading - data.measured) / size
+    error = np.asarray(optimizers.observation(posed, jnp.asarray(z)).reading - data.measured) / size
     error = np.where(weight > 0, error, 0.0)
     leverage = identifiability.analyse(posed, jnp.asarray(z)).leverage
     left = np.maximum(weight.sum(0) - leverage.sum(0), 1.0)

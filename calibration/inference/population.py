@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from calibration.data.input_errors import BadConfiguration
+from calibration.described import described
 from calibration.inference import noise as noise_room
 from calibration.inference import series_noise
 from calibration.inference.fit_notes import (
@@ -38,7 +39,6 @@ from calibration.inference.fit_notes import (
 from calibration.inference.noise import Noise
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import MISSING, Observation, Problem
-from calibration.words import fit_words
 from mmrjax.compile.compiling import compiled
 from mmrjax.model.signals import FLAGS, STATUSES
 
@@ -401,7 +401,7 @@ class Searched:
             "settled": self.found.settled,
             "generations": [dataclasses.asdict(g) for g in self.found.generations],
             "outcomes": self.outcomes(),
-            "at_edge": {name: fit_words.edge(at) for name, at in self.edge.items()},
+            "at_edge": {name: described(at) for name, at in self.edge.items()},
             "derivatives_apart": list(self.apart),
             "regression_rms_sd": self.left if np.isfinite(self.left) else None,
         }

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 
-from calibration.data import instruments, own_mass, rig_facts, robot_file, surfaces
+from calibration.data import instruments, own_mass, rig_facts, surfaces
 from calibration.data.runs import Runs
 from calibration.inference import checks, observers, repeats
 from calibration.inference import noise as noise_room
@@ -28,11 +28,10 @@ class Prepared:
     Attributes:
         robot: with the instruments, the configurations and the mass that the table shows, and its runs' beginnings.
         observe: the kind of the data; noise: of the readings.
-        stated: priors by the names that parameters now have, (mean, sd) [SI].
+        stated: priors by name of parameter, (mean, sd) [SI].
         names: free parameters that were chosen, see `prepare`.
-        former: remarks on names as they were called before; foreign: on priors of another robot; checked: on the
-            table; begins: on how its runs begin; weighed: on the masses that it states; doubted: on units that may be
-            others, to be said before a fit.
+        foreign: remarks on priors of another robot; checked: on the table; begins: on the beginnings of its runs;
+            weighed: on the masses that it states; doubted: on units that may be others.
     """
 
     robot: Robot
@@ -40,7 +39,6 @@ class Prepared:
     noise: Noise
     stated: dict[str, tuple[float, float]]
     names: tuple[str, ...]
-    former: Notes
     foreign: Notes
     checked: Notes
     begins: Notes
@@ -70,16 +68,14 @@ def prepare(
     """
     observe = observers.kind(runs)
     robot = surfaces.with_surface_configurations(instruments.with_inferred_instruments(robot, runs), runs)
-    former: list[str] = []
     priors = surfaces.of_surfaces(stated or {}, robot, runs)
-    priors = robot_file.current_values(priors, robot, "--prior", former)
     own_mass.check_priors(priors, robot, runs)
     as_stated, weighed = robot, own_mass.remarks(robot, runs)
     robot = own_mass.with_table_mass(robot, runs)
     known = (noise_room.inferred if assume else noise_room.from_table)(runs, observe.sizes(runs), noise)
     known, larger = repeats.enlarged(known, runs)
     robot = observe.with_initial_states(robot, runs, known)
-    found = Prepared(robot, observe, known, priors, (), tuple(former), (), (), (), tuple(weighed))
+    found = Prepared(robot, observe, known, priors, (), (), (), (), tuple(weighed))
     names = tuple(choose(found))
     # Its masses are compared with those of the file, which the table's have not yet replaced there.
     checked = checks.check(runs, as_stated, names, known)

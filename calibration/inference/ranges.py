@@ -9,10 +9,10 @@ import numpy as np
 
 from calibration.data.input_errors import BadData, number
 from calibration.data.runs import Runs
+from calibration.described import described
 from calibration.inference import observers
 from calibration.inference.fit_notes import Note, OffBy, SlopesIn, Turned
 from calibration.inference.operating import operating_readings
-from calibration.words import table_words
 from mmrjax.model import channels, params
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
@@ -90,7 +90,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
             runs.layout.imposed_column,
         )
         if off > REFUSED:
-            raise BadData(f"{runs.source}, {table_words.off_by(found)}")
+            raise BadData(f"{runs.source}, {described(found)}")
         said.append(found)
     return [*said, *_turned(runs, measured, possible), *_slopes(runs, measured, possible[1], robot)]
 

@@ -21,9 +21,9 @@ import numpy as np
 from scipy.special import fdtrc
 
 from calibration.data.runs import CONDITIONS, WHEN, Runs
+from calibration.described import described
 from calibration.inference.fit_notes import Note
 from calibration.inference.lack_of_fit import CLEAR, Residuals
-from calibration.words import fit_words
 
 #: Family-wise error of reporting a cluster where there is none.
 LEVEL = 0.005
@@ -97,7 +97,7 @@ class ResidualCluster(Note):
     @property
     def statement(self) -> str:
         """In a sentence."""
-        return fit_words.residual_cluster(self)
+        return described(self)
 
     def to_json(self) -> dict[str, object]:
         """As in `residual_clusters` of result.json."""

@@ -12,7 +12,8 @@ import numpy as np
 from calibration.data import posterior_file as posterior
 from calibration.data import writing
 from calibration.data.posterior_file import Posterior
-from calibration.inference.fit_notes import HeldByPrior, Notes, Pair
+from calibration.described import described, sentences
+from calibration.inference.fit_notes import Determination, HeldByPrior, Notes, Pair
 from calibration.inference.fit_posterior import determined_together, undetermined
 from calibration.inference.identifiability import Identifiability
 from calibration.inference.lack_of_fit import Adequacy
@@ -20,8 +21,6 @@ from calibration.inference.multistart import Starts
 from calibration.inference.population import Searched
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.simulation_errors import OF_SIZE
-from calibration.words import fit_words as words
-from calibration.words.note_words import sentence, sentences
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
@@ -39,7 +38,7 @@ class Prior:
     Attributes:
         family: `normal` or `log-normal`.
         median: [SI]; interval: that holds 95 % [SI].
-        source: where it comes from, of a field in words; else a row of `words.fits.PRIORS`, or `stated`.
+        source: source of a field, in words; else a row of `fit_words.PRIORS`, or `stated`.
     """
 
     family: str
@@ -49,7 +48,7 @@ class Prior:
 
     def to_json(self) -> dict[str, Any]:
         """As in result.json."""
-        return {**dataclasses.asdict(self), "source": words.PRIORS.get(self.source, self.source)}
+        return {**dataclasses.asdict(self), "source": described(self)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -318,7 +317,7 @@ class CalibrationResult:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences worth saying."""
+        """Remarks as sentences."""
         return sentences(self.remarks)
 
     @property
@@ -333,7 +332,7 @@ class CalibrationResult:
 
     @property
     def together(self) -> tuple[Pair, ...]:
-        """Pairs of parameters of which these data determine a combination alone."""
+        """Pairs of parameters that these data determine only in combination."""
         return determined_together(self.posterior, self.held_by_prior)
 
     @property
@@ -343,7 +342,7 @@ class CalibrationResult:
 
     def determined(self, name: str) -> str:
         """`yes`, `no`, or with which parameters together these data determine one."""
-        return words.determined(name, self.parameters[name].held_by_prior, self.together)
+        return described(Determination.of(name, self.parameters[name].held_by_prior, self.together))
 
     @property
     def counts(self) -> dict[str, int]:
@@ -424,7 +423,7 @@ class CalibrationResult:
                         {"singular_value": s, "components": main} for s, main in about.weak_directions()
                     ],
                     "correlated": [{"a": a, "b": b, "correlation": r} for a, b, r in about.correlated()],
-                    "together": [words.pair(pair) for pair in self.together],
+                    "together": [pair.to_json() for pair in self.together],
                 },
                 "statuses_before": _counts(self.status_before),
                 "statuses": self.counts,
@@ -463,8 +462,8 @@ class CalibrationResult:
 
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        held = [sentence(HeldByPrior(self.undetermined))] if self.undetermined else []
-        note = "\n".join([words.header(self, robot_name), *held])
+        held = [described(HeldByPrior(self.undetermined))] if self.undetermined else []
+        note = "\n".join([described(self, "header", robot_name), *held])
         robot_file.write(self.robot, folder / "robot.toml", note=note)
         writing.write_json(folder / "result.json", self.to_json())
         writing.write_table(folder / "rows.csv", self.rows())

@@ -30,12 +30,6 @@ def sized_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
         return np.asarray(100.0 * (simulated - measured) / size)
 
 
-def percent_error(simulated: np.ndarray, measured: np.ndarray, *, crosses_zero: bool) -> np.ndarray:
-    """Errors of a comparison [%]: of the channel's size where readings may cross zero, else (35)."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return (sized_error if crosses_zero else relative_error)(simulated, measured)
-
-
 def share_of_measured(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """rms of simulated less measured over the rms of what is measured [-], by channel over the rows that have both;
     NaN without such a row; shape (channels,).

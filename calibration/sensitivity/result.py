@@ -9,11 +9,10 @@ import numpy as np
 from scipy import stats
 
 from calibration.data.runs import Runs
+from calibration.described import described, sentences
 from calibration.inference.fit_notes import Note
 from calibration.sensitivity.model import OutputRow
 from calibration.sensitivity.replicates import LEVEL, REPLICATES, Estimate
-from calibration.words import sensitivity_words as words
-from calibration.words.note_words import sentences
 
 SCHEMA = "mmrjax.sensitivity/1"
 #: Methods.
@@ -268,7 +267,7 @@ class SensitivityResult:
 
     def statement(self) -> str:
         """What decides these outputs, in one sentence."""
-        return words.statement(self)
+        return described(self)
 
     @property
     def notes(self) -> tuple[str, ...]:

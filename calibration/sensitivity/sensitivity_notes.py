@@ -1,4 +1,4 @@
-"""What a study has to say, as data. `calibration/words` makes English of it."""
+"""Remarks on a study, as data. `mmrjax.describe` makes their sentences."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from calibration.data.input_errors import BadConfiguration, choices
 from calibration.data.parts import CellSheet
 from calibration.data.requirements_file import Requirements
+from calibration.inference.fit_notes import Note, Step
 from calibration.sizing import sheet
 from calibration.sizing.design import CONTINUOUS, OBJECTIVES, Design, Task, build, evaluate, task
 from calibration.sizing.part_options import Drive, Options, options
@@ -236,12 +237,14 @@ def size(
     starts: int = 256,
     motors: tuple[str, ...] = (),
     seed: int = 0,
+    tell: Callable[[Note], None] = lambda note: None,
 ) -> Sizing:
     """Search ratio, radius, cells and motor of a robot so that it meets requirements.
 
     Args:
         objectives: of `OBJECTIVES`, one to make small, or two for a Pareto front.
         starts: searches in the batch; motors: names of those to choose from, empty: all; seed: of the starts.
+        tell: callback for progress.
 
     Raises:
         BadConfiguration: what `sheet.refuse` raises; an unknown objective or motor.
@@ -254,13 +257,17 @@ def size(
     problem = task(robot, asked, chosen)
     choice = space(robot, problem, chosen)
     columns = [list(OBJECTIVES).index(name) for name in objectives]
+    tell(Step("designs"))
     drawn = _drawn(problem, choice, "cost" in objectives, np.random.default_rng(seed))
     kept = drawn.g.max(axis=0) >= 0
     unmeetable = tuple(label for label, k in zip(problem.labels, kept, strict=True) if not k)
     search = _Search(problem, choice, kept, columns)
     weights = search.weights(starts)
+    tell(Step("descents", (starts,)))
     free = search.descended(drawn, weights)
+    tell(Step("whole"))
     real = search.real(drawn, free, weights)
+    tell(Step("refined", (REFINED,)))
     # The best of these with any ratio and parts of a cell: no search may have begun from their choice of parts.
     top = np.argsort(search.cost(real))[:REFINED]
     free = free + search.refined(real.rows[top], real.x[top], search.first(len(top)), np.ones(3))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from calibration.data.contradictions import cannot_stand
 from calibration.data.input_errors import BadConfiguration, choices
 from calibration.data.requirements_file import STAIRS, TREAD, Envelope, Requirement, Requirements
+from calibration.inference.fit_notes import Note, Step
 from mmrjax.compile.compiling import compiled
 from mmrjax.derived.requirements import AMBIENT, AXES, CHARGE, PAYLOAD, SLOPE, Point, Ratings, evaluate, ratings
 from mmrjax.model import params
@@ -277,7 +278,7 @@ class _Held:
 
 
 def _computed(requirement: Requirement) -> str:
-    """Of several names of one quantity the one that it is computed by: one program for both."""
+    """Name by which a quantity is computed; the same for several names of one quantity, to share a program."""
     return "speed_m_s" if requirement.name == "speed_end_of_charge_m_s" else requirement.name
 
 
@@ -288,11 +289,18 @@ def parameters(robot: Robot, configuration: str) -> dict[str, params.Parameter]:
     return {name: known[name] for name in names if name in known}
 
 
-def check(robot: Robot, asked: Requirements, *, changes: bool = True) -> tuple[Outcome, ...]:
-    """Hold a robot against requirements.
+def check(
+    robot: Robot,
+    asked: Requirements,
+    *,
+    changes: bool = True,
+    tell: Callable[[Note], None] = lambda note: None,
+) -> tuple[Outcome, ...]:
+    """Compare a robot with requirements.
 
     Args:
-        changes: whether to look for what would meet the missed ones.
+        changes: True to search for changes that would meet the missed ones.
+        tell: callback for progress.
 
     Raises:
         BadConfiguration: see `refuse` and `rated`.
@@ -304,10 +312,17 @@ def check(robot: Robot, asked: Requirements, *, changes: bool = True) -> tuple[O
         configuration = _configuration(robot, r.envelope)
         of_levers = OF_LEVERS if r.quantity.group == "posture" else ()
         held.append(_Held(robot, r, (*parameters(robot, configuration), *of_levers, CELLS)))
-    found = [_outcome(h) for h in held]
-    if changes:
-        found = [o if o.met else _with_changes(h, o, held, found) for h, o in zip(held, found, strict=True)]
-    return tuple(found)
+    found = []
+    for k, h in enumerate(held, 1):
+        tell(Step("requirement", (k, len(held), h.requirement.quantity.label)))
+        found.append(_outcome(h))
+    if not changes:
+        return tuple(found)
+    missed, answer = [k for k, o in enumerate(found) if not o.met], list(found)
+    for n, k in enumerate(missed, 1):
+        tell(Step("changes", (n, len(missed), held[k].requirement.quantity.label)))
+        answer[k] = _with_changes(held[k], found[k], held, found)
+    return tuple(answer)
 
 
 def _now(held: _Held) -> np.ndarray:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mmrjax.climbing import belt_loop as loop
+from mmrjax.climbing import belt_loop
 from mmrjax.climbing.belt_loop import Loop
 from mmrjax.climbing.terrain import Terrain
 from mmrjax.model import contact
@@ -141,7 +141,7 @@ def _belt(shape: Shape, terrain: Terrain, belt: Loop, frame: Frame, drawn: Scala
     """Grousers on the ground, and corners of the ground on the belt between grousers and on their flanks."""
     radius, main = shape.main.first, frame.turns is None
     place = belt.places(drawn)
-    tips = loop.tips(belt, place)
+    tips = belt_loop.tips(belt, place)
     at = frame.world(tips.at)
     gap, normal = terrain.distance(at)
 
@@ -152,7 +152,7 @@ def _belt(shape: Shape, terrain: Terrain, belt: Loop, frame: Frame, drawn: Scala
     groups = [group(at, gap, normal, frame.along(tips.rate), place)]
     corners = terrain.corners
     local = frame.within(corners)
-    for near in (loop.surface(belt, local), loop.teeth(belt, drawn, local)):
+    for near in (belt_loop.surface(belt, local), belt_loop.teeth(belt, drawn, local)):
         normal = -frame.along(near.normal)
         at = corners + terrain.nose * -normal
         groups.append(group(at, near.gap - terrain.nose, normal, frame.along(near.rate), near.place))
@@ -178,7 +178,7 @@ def _wheels(shape: Shape, terrain: Terrain, body: Frame) -> list[_Group]:
         normal = jnp.concatenate([normals, arm / to_corner[:, None]])
         at = centre - (shape.wheel + jnp.minimum(gap, 0.0))[:, None] * normal
         none = jnp.zeros_like(gap)
-        rate = shape.wheel * loop.tangent(-normal)
+        rate = shape.wheel * belt_loop.tangent(-normal)
         groups.append(_Group(at, gap, normal, rate, None, none, none + 1 - shape.on_tracks))
     return groups
 
@@ -213,7 +213,7 @@ def footing(shape: Shape, terrain: Terrain, q: Array, v: Array) -> Footing:
     at, normal, rate = (jnp.concatenate([getattr(g, name) for g in groups]) for name in ("at", "normal", "rate"))
     gap, guided, bears = (jnp.concatenate([getattr(g, name) for g in groups]) for name in ("gap", "guided", "bears"))
     rolls = np.concatenate([np.full(len(g.gap), g.rolls) for g in groups])
-    along = loop.tangent(normal)
+    along = belt_loop.tangent(normal)
     carried, own = [], []
     for direction in (normal, along):
         columns = [direction[:, 0], direction[:, 1], _turned(direction, at - body.origin)]

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mmrjax.climbing import resting_posture as posture
+from mmrjax.climbing import resting_posture
 from mmrjax.climbing.resting_posture import BELTS, FRONT_ROLLER, REAR_ROLLER, Outline, Posture
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
@@ -159,7 +159,7 @@ def best_levers(robot: Robot, conditions: Conditions, pitch: Scalar) -> tuple[Sc
     They would be upright without their mass, a share μ of the total with its centre c from their axle, which
     favours a position further ahead. Both angles are limited to the levers' range.
     """
-    gear, half = robot.running_gear, posture.parts(robot, conditions)
+    gear, half = robot.running_gear, resting_posture.parts(robot, conditions)
     moved = gear.lever_mass * gear.lever_centre / (half.chassis + 2 * half.pulley)
     rear = pitch - jnp.pi / 2 - jnp.arctan2(moved * jnp.sin(pitch), gear.lever_length * jnp.cos(pitch))
     least, most = gear.levers.angle_least, gear.levers.angle_most
@@ -177,7 +177,7 @@ def best_step(robot: Robot, conditions: Conditions) -> tuple[Step, Scalar, Scala
     still, run = jax.lax.stop_gradient((robot, conditions))
 
     def height(pitch: Scalar) -> Scalar:
-        return step_at(posture.outline(still, with_levers(run, *best_levers(still, run, pitch))), pitch)
+        return step_at(resting_posture.outline(still, with_levers(run, *best_levers(still, run, pitch))), pitch)
 
     best, apart = _highest(height, *_POSTURES)
     for _ in range(2):  # smooth here: vertices of parabolas
@@ -189,7 +189,7 @@ def best_step(robot: Robot, conditions: Conditions) -> tuple[Step, Scalar, Scala
         )
         apart = apart / 16
     front, rear = best_levers(still, run, best)
-    return step(posture.outline(robot, with_levers(conditions, front, rear)), best), front, rear
+    return step(resting_posture.outline(robot, with_levers(conditions, front, rear)), best), front, rear
 
 
 def stairs_rise(robot: Robot, conditions: Conditions, tread: Scalar, friction: Scalar) -> Scalar:
@@ -202,7 +202,7 @@ def stairs_rise(robot: Robot, conditions: Conditions, tread: Scalar, friction: S
     far apart. Grousers that catch a nose hold more, and a robot that rocks may still climb.
     """
     angle = flush(robot)
-    rests = posture.level(robot, with_levers(conditions, angle, angle))
+    rests = resting_posture.level(robot, with_levers(conditions, angle, angle))
     tail, nose = rests.centre_ahead - rests.rear, rests.front - rests.centre_ahead
     # ℓ cos α - h sin α = t
     reach = jnp.sqrt(tail**2 + rests.centre_height**2)
@@ -214,7 +214,7 @@ def stairs_rise(robot: Robot, conditions: Conditions, tread: Scalar, friction: S
 
 def limits(robot: Robot, conditions: Conditions) -> Limits:
     """The static limits of a robot, for one run on level ground, with its tipping slopes."""
-    side, rests = posture.outline(robot, conditions), posture.level(robot, conditions)
+    side, rests = resting_posture.outline(robot, conditions), resting_posture.level(robot, conditions)
     highest, lies = step(side), side.pitched(rests.pitch)
     tops, tracked = lies.up + lies.radius + rests.height, jnp.asarray(side.tracked) > 0.5
     bridged: Scalar = jnp.minimum(rests.front - rests.centre_ahead, rests.centre_ahead - rests.rear)
@@ -237,8 +237,8 @@ def limits(robot: Robot, conditions: Conditions) -> Limits:
 def _over_levers(robot: Robot, conditions: Conditions, angles: Float[Array, "n 2"]) -> tuple[Step, Array]:
     def at(pair: Array) -> tuple[Step, Array]:
         here = dataclasses.replace(conditions, levers_front_deg=pair[0], levers_rear_deg=pair[1])
-        side = posture.outline(robot, here)
-        return step(side), jnp.asarray(posture.rest(side, here.slope, 0.0).margin)
+        side = resting_posture.outline(robot, here)
+        return step(side), jnp.asarray(resting_posture.rest(side, here.slope, 0.0).margin)
 
     return jax.lax.map(at, angles, batch_size=256)
 
@@ -263,7 +263,7 @@ def standing(robot: Robot, conditions: Conditions) -> tuple[Posture, Limits, Out
     """
 
     def of_one(one: Conditions) -> tuple[Posture, Limits, Outline, Step]:
-        side, rests = posture.outline(robot, one), posture.posture(robot, one)
+        side, rests = resting_posture.outline(robot, one), resting_posture.posture(robot, one)
         return rests, limits(robot, one), side.pitched(rests.pitch), step(side)
 
     return jax.vmap(of_one)(conditions)

@@ -55,7 +55,7 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
 
     found: optx.Solution = optx.root_find(
         lambda slope, _: margin(still_robot, still, slope),
-        optx.Bisection(rtol=0.0, atol=0.0, flip=True),
+        optx.Bisection(rtol=0.0, atol=0.0, flip=True),  # type: ignore[call-arg]  # its norm is no field
         jnp.full_like(conditions.slope_deg, STEEPEST / 2),
         options={"lower": 0.0, "upper": STEEPEST},
         max_steps=HALVINGS,

@@ -8,12 +8,12 @@ from mmrjax.effects import (
     inertia_effects,
     mass_effects,
     motor_effects,
+    sensor_effects,
     slip_effects,
     supply_effects,
     track_effects,
     turning_effects,
 )
-from mmrjax.effects import sensor_effects as sensor
 from mmrjax.effects.base import Effect, amplitude, defined_in
 from mmrjax.effects.curve import CURVES, CURVES_ROUND, CURVES_SHOWN, WAVES
 from mmrjax.effects.sensor_effects import OF_CHANNELS
@@ -29,7 +29,7 @@ _FILES = (
     track_effects,
     ground_effects,
     slip_effects,
-    sensor,
+    sensor_effects,
 )
 
 #: All effects of the library by balance, in the order of each file. Tables of scores and the random numbers of a

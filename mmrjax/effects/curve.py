@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Container
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -14,6 +15,7 @@ from mmrjax.effects.base import THE_SIDE, Effect, amplitude, made
 from mmrjax.effects.periodic import Periodic, phase_parameter
 from mmrjax.model import channels
 from mmrjax.model.params import Index, Scalar, parameter
+from mmrjax.model.quantities import DEG, MM, RPM, TRAVEL, TURN
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
 
@@ -38,23 +40,55 @@ READINGS = {
     if c.name not in {**BALANCES, **ROUND}
 }
 PLACES = {**BALANCES, **ROUND, **READINGS}
-#: Variables of a curve: signals that all these balances know, the time since the start of the run, and the place of a
-#: run in the sequence; each with unit and ordinary range.
+
+
+@dataclasses.dataclass(frozen=True)
+class Variable:
+    """Abscissa of a curve: a signal of every balance above, or the time, the order or the side of a run.
+
+    Attributes:
+        unit: SI; low, high: its ordinary range [unit].
+        column: of tables, or of points that stand for one; label: words of figures.
+        unit_shown: in figures; shown: SI value of it.
+        symbol: in formulas; empty: no formula has it.
+        driver: word for it as the driver of an effect; empty: its name.
+        sign: what turns its sign, see `quantities.Quantity`.
+        levels: True if a person sets it, so that one of its levels may differ from the rest.
+    """
+
+    unit: str
+    low: float
+    high: float
+    column: str
+    label: str
+    unit_shown: str = ""
+    shown: float = 1.0
+    symbol: str = ""
+    driver: str = ""
+    sign: str = TRAVEL
+    levels: bool = False
+
+
+#: Variables of curves.
 VARIABLES = {
-    "voltage": ("V", 10.0, 35.0),
-    "current": ("A", 0.0, 6.0),
-    "speed_motor": ("rad/s", 100.0, 1000.0),
-    "slope": ("rad", 0.0, 0.35),
-    "payload": ("kg", 0.0, 8.0),
-    "speed": ("m/s", 0.1, 1.0),
-    "time": ("s", 0.0, 2.0),
-    "order": ("-", 0.0, 100.0),
+    "voltage": Variable("V", 10.0, 35.0, "supply_voltage_V", "voltage at the motors", "V", symbol="U", levels=True),
+    "current": Variable("A", 0.0, 6.0, "total_current_A", "current of one motor", "A", symbol="I"),
+    "speed_motor": Variable(
+        "rad/s", 100.0, 1000.0, "motor_speed_rpm", "motor speed", "rpm", RPM, "ω_m", "speed", levels=True
+    ),
+    "slope": Variable("rad", 0.0, 0.35, "slope_deg", "slope", "deg", DEG, "sin α", levels=True),
+    "payload": Variable("kg", 0.0, 8.0, "payload_kg", "payload", "kg", symbol="m_c", sign="", levels=True),
+    "speed": Variable("m/s", 0.1, 1.0, "speed_mm_s", "speed", "mm/s", MM),
+    "time": Variable("s", 0.0, 2.0, "time_s", "time since the start", "s", sign=""),
+    "order": Variable("-", 0.0, 100.0, "order", "order of the runs", sign=""),
 }
 #: The same for a robot that turns only; and the variables above that turns have too.
-VARIABLES_ROUND = {"yaw_rate": ("rad/s", 0.0, 4.0), "side": ("-", -1.0, 1.0)}
+VARIABLES_ROUND = {
+    "yaw_rate": Variable("rad/s", 0.0, 4.0, "yaw_rate", "yaw rate", "rad/s", 1.0, "ω", "speed", TURN),
+    "side": Variable("-", -1.0, 1.0, "side", "side: 1 left, -1 right", driver=THE_SIDE, sign=""),
+}
+EVERY_VARIABLE = VARIABLES | VARIABLES_ROUND
 IN_TURNS = ("voltage", "current", "speed_motor", "payload", "speed", "order")
-#: Variables with a sign of their own; the others count along the motion of the shafts, or of the turn.
-SIGNED = ("payload", "time", "order", "side")
 #: The variable of the curves of each channel, and the axes of a drift.
 READ_BY = {
     "total_current": "current", "motor_current": "current", "output_torque": "current", "motor_speed": "speed_motor",
@@ -97,12 +131,12 @@ def in_travel(
     Args:
         x: the variable [its unit], an array of NumPy or JAX; way, magnitudes: as for `counted_by`.
     """
-    if variable not in VARIABLES | VARIABLES_ROUND:
+    if variable not in EVERY_VARIABLE:
         return x, 1.0
-    counts = counted_by(place, way, magnitudes)
-    if variable in SIGNED:
+    counts, sign = counted_by(place, way, magnitudes), EVERY_VARIABLE[variable].sign
+    if not sign:
         return x, counts
-    along = "direction_turn" if variable == "yaw_rate" else "direction" if place in ROUND else acts_along(place)
+    along = "direction_turn" if sign == TURN else "direction" if place in ROUND else acts_along(place)
     return x * way(along), counts
 
 
@@ -154,7 +188,7 @@ def _size(unit: str, size: float) -> Scalar:
 def _description(place: str, over: str) -> str:
     """Docstring of a curve: its equation with its units, and its source."""
     where = f"the readings of `{place}`" if place in READINGS else f"the balance `{place}`"
-    unit, unit_x = PLACES[place][0], (VARIABLES | VARIABLES_ROUND)[over][0]
+    unit, unit_x = PLACES[place][0], EVERY_VARIABLE[over].unit
     return f"""Δ = a y(x) along the travel in {where} [{unit}], x = {over} [{unit_x}].
 
     y is smooth through six ordinates equally spaced from `low` to `high`, and levels out beyond.
@@ -168,7 +202,8 @@ def _curve(place: str, over: str) -> type[Effect]:
     """The curve of one variable in one balance, or in the readings of one channel."""
     shown = place in READINGS
     unit, size, _ = PLACES[place]
-    unit_x, first, last = (VARIABLES | VARIABLES_ROUND)[over]
+    abscissa = EVERY_VARIABLE[over]
+    unit_x, first, last = abscissa.unit, abscissa.low, abscissa.high
 
     class Curve(Effect):
         name = f"curve_{place}_{over}"

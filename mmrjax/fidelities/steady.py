@@ -36,7 +36,7 @@ from mmrjax.model.signals import (
 from mmrjax.numerics.linear_equations import Vector
 from mmrjax.numerics.newton import root
 from mmrjax.numerics.rarely import rarely
-from mmrjax.turning import circling as turning
+from mmrjax.turning import circling
 
 # Units of the unknowns and of the torque residual, which scale them to the order of one.
 _SPEED, _CURRENT, _SPEED_MOTOR, _VOLTAGE, _TORQUE = 1.0, 10.0, 1000.0, 10.0, 100.0
@@ -117,7 +117,7 @@ def _root(robot: Robot, conditions: Conditions, large: bool = True) -> tuple[Vec
 
 @compiled
 def _circled(robot: Robot, conditions: Conditions) -> Signals:
-    return turning.circling(robot, conditions)[0].signals
+    return circling.circling(robot, conditions)[0].signals
 
 
 def operating_signals(robot: Robot, conditions: Conditions) -> Signals:
@@ -152,7 +152,7 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
         is not positive. A member without numbers has zero derivatives and does not affect the others.
     """
     if conditions.turns:
-        return turning.steady(robot, conditions)
+        return circling.steady(robot, conditions)
     point, sound = operating_point(robot, conditions)
     # Friction at rest holds a standing robot; the contact law alone would give it a creep.
     crept = jnp.abs(point.speed) >= robot.chassis(conditions.configuration).speed_still
@@ -184,7 +184,7 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
         The result, and whether robot and conditions are sound (see `_sound`).
     """
     if conditions.turns:
-        return turning.operating_point(robot, conditions)
+        return circling.operating_point(robot, conditions)
     signals, status, sound = operating(robot, conditions)
     return result(robot.within(conditions.configuration), signals, status), sound
 
@@ -317,7 +317,7 @@ def _settled(robot: Robot, conditions: Conditions) -> Result:
 
 def _solve(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " unknowns"], Bool[Array, ""]]:
     if conditions.turns:
-        return turning.solve(robot, conditions)
+        return circling.solve(robot, conditions)
     unknowns, found = _root(robot, conditions, large=False)
     return jax.lax.stop_gradient((jnp.stack(unknowns), found))
 
@@ -326,7 +326,7 @@ def _shown(
     robot: Robot, conditions: Conditions, unknowns: Float[Array, " unknowns"], found: Bool[Array, ""]
 ) -> tuple[Result, Signals, Float[Array, " unknowns"]]:
     if conditions.turns:
-        return turning.shown(robot, conditions, unknowns, found)
+        return circling.shown(robot, conditions, unknowns, found)
     signals, status, _, left = _operating_at(robot, conditions, tuple(unknowns), found, stands=False)
     return result(robot.within(conditions.configuration), signals, status), signals, jnp.stack(left)
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from mmrjax.compile.compiling import compiled
 from mmrjax.fidelities.rest import least
-from mmrjax.missions import mission_straight as straight
+from mmrjax.missions import mission_straight
 from mmrjax.missions.mission_steps import Asked
 from mmrjax.missions.profile import SPEED, VOLTAGE, Profile
 from mmrjax.model import balances, channels, energy
@@ -31,10 +31,19 @@ from mmrjax.turning.two_sides import SIDES, total
 #: Units of the unknowns, of each side: current, motor speed, temperatures of winding and housing, integral of the
 #: controller; of the robot: speed, lateral speed, yaw rate, heading, discharge, and time in the segment. The memories
 #: of effects follow, of each side.
-_EACH = tuple(straight.UNITS[k] for k in (
-    straight.CURRENT, straight.MOTOR, straight.WINDING, straight.HOUSING, straight.INTEGRAL
+_EACH = tuple(mission_straight.UNITS[k] for k in (
+    mission_straight.CURRENT, mission_straight.MOTOR, mission_straight.WINDING, mission_straight.HOUSING,
+    mission_straight.INTEGRAL,
 ))  # fmt: skip
-UNITS = (*(unit for unit in _EACH for _ in SIDES), 1.0, 1.0, 1.0, 1.0, straight.UNITS[straight.DISCHARGE], 1.0)
+UNITS = (
+    *(unit for unit in _EACH for _ in SIDES),
+    1.0,
+    1.0,
+    1.0,
+    1.0,
+    mission_straight.UNITS[mission_straight.DISCHARGE],
+    1.0,
+)
 CURRENT, MOTOR, WINDING, HOUSING, INTEGRAL = (slice(2 * k, 2 * k + 2) for k in range(len(_EACH)))
 GROUND, LATERAL, YAW, HEADING, DISCHARGE, CLOCK = range(2 * len(_EACH), len(UNITS))
 
@@ -44,12 +53,13 @@ LONG, AT_REST, RESULT = True, circling, circling.result_of
 #: Integrated quantities: name, and unit of a total; of current and torque the mean over both sides.
 OF_SIDES = tuple(f"current_squared_{side}" for side in channels.SIDES)
 TOTALS: dict[str, str] = {
-    **straight.TOTALS, "place_x": "m", "place_y": "m", "turned": "rad", **dict.fromkeys(OF_SIDES, "A²·s"),
+    **mission_straight.TOTALS, "place_x": "m", "place_y": "m", "turned": "rad", **dict.fromkeys(OF_SIDES, "A²·s"),
 }  # fmt: skip
 
 #: Largest values of a mission over all instants: of each side, and of one motor of each.
 PEAKS: dict[str, str] = {
-    **straight.PEAKS, "yaw_rate": "rad/s", "current_left": "A", "current_right": "A", "temperature_left": "°C",
+    **mission_straight.PEAKS,
+    "yaw_rate": "rad/s", "current_left": "A", "current_right": "A", "temperature_left": "°C",
     "temperature_right": "°C",
 }  # fmt: skip
 
@@ -85,15 +95,15 @@ def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
 
 def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> Asked:
     asked = segment.at(y[CLOCK])
-    robot, conditions = straight.with_consumers(robot, asked), asked.conditions(otherwise)
+    robot, conditions = mission_straight.with_consumers(robot, asked), asked.conditions(otherwise)
     motion, own = state_of(robot, y, stands), conditions.of_sides()
     state = balances.states_of_sides(robot, conditions, motion)
     if asked.voltage_left is not None and asked.voltage_right is not None:
         volts = jnp.stack([asked.voltage_left, asked.voltage_right])
-        share = own.polarity * volts / jnp.maximum(straight.source(robot, own, state.discharge), 1e-3)
+        share = own.polarity * volts / jnp.maximum(mission_straight.source(robot, own, state.discharge), 1e-3)
         own = dataclasses.replace(own, duty=jnp.where(asked.mode == VOLTAGE, share, own.duty))
     demand = demanded(robot, conditions, asked)
-    law = jax.vmap(functools.partial(straight.driven, robot, asked.mode))
+    law = jax.vmap(functools.partial(mission_straight.driven, robot, asked.mode))
     duty, rate, error = law(demand, own, state, y[INTEGRAL] * _EACH[-1])
     return Asked(robot, dataclasses.replace(conditions, duty_left=duty[0], duty_right=duty[1]), rate, error)
 
@@ -170,7 +180,7 @@ def stored(robot: Robot, found: Found) -> Scalar:
 
 
 def peaks(robot: Robot, found: Found) -> dict[str, Scalar]:
-    each = jax.vmap(lambda s: straight.peaks(robot, s))(found.signals)
+    each = jax.vmap(lambda s: mission_straight.peaks(robot, s))(found.signals)
     most: dict[str, Scalar] = {name: jnp.max(jnp.asarray(x)) for name, x in each.items()}
     most |= {"current": total(jnp.asarray(each["current"])) / 2, "speed": _size(found.motion)}
     return {**most, "yaw_rate": jnp.abs(found.motion.yaw_rate), **_of_sides(robot, each)}
@@ -191,11 +201,11 @@ def _of_sides(robot: Robot, each: dict[str, Any]) -> dict[str, Scalar]:
 
 
 def over(robot: Robot, found: Found) -> dict[str, Scalar]:
-    each = jax.vmap(lambda s: straight.over(robot, s))(found.signals)
+    each = jax.vmap(lambda s: mission_straight.over(robot, s))(found.signals)
     return {name: jnp.any(x) for name, x in each.items()}
 
 
-norm = functools.partial(rosenbrock.norm_of_sides, whole=slice(GROUND, CLOCK + 1), own=len(straight.UNITS))
+norm = functools.partial(rosenbrock.norm_of_sides, whole=slice(GROUND, CLOCK + 1), own=len(mission_straight.UNITS))
 
 
 def status(robot: Robot, conditions: Conditions, found: Found) -> Array:

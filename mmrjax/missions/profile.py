@@ -27,12 +27,14 @@ CONDITIONS = (
     "voltage", "duty", "duty_left", "duty_right", "slope_deg", "payload", "adhesion", "adhesion_lateral",
     "load_torque",
 )  # fmt: skip
+#: Demanded yaw rate next to a ground speed.
+YAW_RATE = "yaw_rate"
 #: Further fields of a profile that are no conditions.
-FURTHER = ("voltage_left", "voltage_right", "yaw_rate", "current_other")
+FURTHER = ("voltage_left", "voltage_right", YAW_RATE, "current_other")
 #: Fields that drive the sides apart, stated for both sides or for neither.
 PAIRS = (("duty_left", "duty_right"), ("voltage_left", "voltage_right"))
 #: Fields that make a robot free to turn if a profile states them.
-APART = (*PAIRS[0], *PAIRS[1], "yaw_rate")
+APART = (*PAIRS[0], *PAIRS[1], YAW_RATE)
 
 
 class Profile(eqx.Module):
@@ -203,6 +205,6 @@ def sides_refused(stated: Sequence[str], speed: bool, named: Callable[[str], str
     kinds = [named(name) for name in ("duty", PAIRS[0][0], PAIRS[1][0]) if name in stated]
     if len(kinds) > 1:
         return f"got {kinds[0]} together with {kinds[1]}; expected one of the two"
-    if "yaw_rate" in stated and not speed:
-        return f"got {named('yaw_rate')} without {named(MODES[SPEED])}; expected a demanded ground speed too"
+    if YAW_RATE in stated and not speed:
+        return f"got {named(YAW_RATE)} without {named(MODES[SPEED])}; expected a demanded ground speed too"
     return None

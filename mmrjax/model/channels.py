@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
-from mmrjax.model.quantities import DEG, MM, RPM, Quantity
+from mmrjax.model.quantities import DEG, MM, RPM, TRAVEL, TURN, Quantity
 
 if TYPE_CHECKING:
     from mmrjax.model.robot import Robot
@@ -36,7 +36,7 @@ class Channel(Quantity):
         sd_share: assumed standard deviation as a share of the reading, if no other is known [-].
         resolution: digits after the point in reports [unit].
         zero_at_rest: True if it shows 0 until the robot moves.
-        directed: True if its sign is that of the motion; an angle counts on from its last value.
+        sign: what turns it: the travel, or a turn; an angle counts on from its last value.
         settled, over_time: True if settled runs and histories can show it.
         zero_error: standard deviation of the instrument's zero [SI]; 0 for counters and clocks, which have none.
         side: 0 or 1 for a channel of the left or right side; None: a channel of both together.
@@ -50,13 +50,18 @@ class Channel(Quantity):
     sd_share: float
     resolution: int = 1
     zero_at_rest: bool = False
-    directed: bool = True
+    sign: str = dataclasses.field(default=TRAVEL, kw_only=True)
     settled: bool = True
     over_time: bool = True
     zero_error: float = 0.0
     side: int | None = None
     where: str = ""
     rests_on: tuple[str, ...] = ()
+
+    @property
+    def directed(self) -> bool:
+        """True if its sign is that of the motion."""
+        return bool(self.sign)
 
     @property
     def deviation(self) -> Quantity:
@@ -101,6 +106,7 @@ def _of_side(channel: Channel, side: int) -> Channel:
         label=f"{channel.label}, {SIDES[side]}",
         word=name,
         side=side,
+        in_profiles=False,
     )
 
 
@@ -130,6 +136,7 @@ _EITHER: tuple[Channel, ...] = (
         range=(-30_000.0, 30_000.0),
         sd_largest=10_000.0,
         read=lambda robot, signals: signals.speed_motor,
+        in_profiles=True,
         sd_share=0.005,
         unit_si="rad/s",
         zero_at_rest=True,
@@ -144,6 +151,7 @@ _EITHER: tuple[Channel, ...] = (
         range=(-10_000.0, 10_000.0),
         sd_largest=5_000.0,
         read=lambda robot, signals: signals.speed,
+        in_profiles=True,
         sd_share=0.01,
         unit_si="m/s",
         zero_at_rest=True,
@@ -193,7 +201,7 @@ _EITHER: tuple[Channel, ...] = (
         resolution=2,
         unit_si="rad",
         zero_at_rest=True,
-        directed=False,
+        sign="",
         settled=False,
         other_units=(("rad", 1.0), ("turns", 2 * math.pi)),
     ),
@@ -210,7 +218,7 @@ _EITHER: tuple[Channel, ...] = (
         resolution=2,
         unit_si="m",
         zero_at_rest=True,
-        directed=False,
+        sign="",
         settled=False,
         other_units=(("m", 1.0), ("cm", 1e-2), ("um", 1e-6)),
     ),
@@ -258,7 +266,7 @@ _EITHER: tuple[Channel, ...] = (
         sd_share=0.02,
         unit_si="°C",
         over_time=False,
-        directed=False,
+        sign="",
     ),
 )
 
@@ -275,6 +283,8 @@ OF_TURNS: tuple[Channel, ...] = (
         range=(-100.0, 100.0),
         sd_largest=10.0,
         read=lambda robot, signals: signals.yaw_rate,
+        sign=TURN,
+        in_profiles=True,
         zero_error=0.01,
         sd_share=0.02,
         resolution=3,
@@ -307,7 +317,7 @@ OF_TURNS: tuple[Channel, ...] = (
         sd_share=0.01,
         resolution=2,
         unit_si="rad",
-        directed=False,
+        sign="",
         settled=False,
         other_units=(("rad", 1.0),),
     ),
@@ -325,7 +335,7 @@ OF_TURNS: tuple[Channel, ...] = (
             sd_share=0.01,
             unit_si="m",
             zero_at_rest=True,
-            directed=False,
+            sign="",
             settled=False,
             other_units=(("m", 1.0), ("cm", 1e-2)),
         )

@@ -227,7 +227,7 @@ class Motor(eqx.Module):
         held = jax.lax.stop_gradient((self, current, begin))
         solution: optx.Solution = optx.root_find(
             lambda log_time, held: excess(jnp.exp(log_time), held),
-            optx.Bisection(rtol=0.0, atol=0.0, flip=False),
+            optx.Bisection(rtol=0.0, atol=0.0, flip=False),  # type: ignore[call-arg]  # its norm is no field
             jnp.asarray(sum(bounds.values()) / 2),
             held,
             options=bounds,

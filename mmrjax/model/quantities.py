@@ -1,8 +1,9 @@
-"""Table of the conditions of a run, one row each, and the spelling of units. Importable without jax.
+"""Table of labels and conditions of a run, one row each, and the spelling of units. Importable without jax.
 
-A quantity has a name, units, a range and a rule for its sign. `CONDITIONS` are set before a run; `channels.EVERY` are
-shown by instruments. Columns of tables and profiles, fields of `Conditions`, options, pages and `explain` read names,
-units, ranges and words from these rows, so a new condition needs a row here and a field of `Conditions`.
+A quantity has a name, units, a range, a rule for its sign and places where it may stand. `LABELS` name rows, `SET` is
+set before a run, and `channels.EVERY` are shown by instruments. Columns of tables and profiles, fields of
+`Conditions`, options, pages and `explain` read these rows, so a new condition needs a row here and a field of
+`Conditions`.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ MM = 1e-3  # m
 
 #: Unit of a slope in per cent, the tangent of its angle.
 PERCENT = "percent"
+#: Signs that are turned: by travel in the other direction, and by a turn to the other side.
+TRAVEL, TURN = "travel", "turn"
 #: Units as people write them, where a column's name has another spelling.
 WRITTEN = {
     "°": "deg", "v": "V", "volt": "V", "volts": "V", "a": "A", "amp": "A", "amps": "A", "ma": "mA", "mv": "mV",
@@ -53,6 +56,8 @@ class Quantity:
         other_units: further units that are accepted, with the SI value of each.
         percent: True if a slope in per cent is accepted too.
         stem: start of the names of its columns, if it differs from `name`.
+        sign: what turns its sign: `TRAVEL` or `TURN`; empty: nothing does.
+        in_profiles: True if a mission's profile may state it.
     """
 
     name: str
@@ -64,6 +69,13 @@ class Quantity:
     other_units: tuple[tuple[str, float], ...] = dataclasses.field(default=(), kw_only=True)
     percent: bool = dataclasses.field(default=False, kw_only=True)
     stem: str = dataclasses.field(default="", kw_only=True)
+    sign: str = dataclasses.field(default="", kw_only=True)
+    in_profiles: bool = dataclasses.field(default=False, kw_only=True)
+
+    @property
+    def key(self) -> str:
+        """Name of the field of Python that holds it."""
+        return self.name
 
     @property
     def column(self) -> str:
@@ -111,25 +123,60 @@ class Condition(Quantity):
     Attributes:
         field: field of `Conditions`; empty if there is none.
         heading: of its column on pages, empty if no page shows it; shown: format of a number there.
+        in_tables: True if a table of runs may state it, under its own column.
+        imposed: kinds of `rig.IMPOSED` whose tables may; empty: all of them.
+        acts: load on which it acts: `GROUND` or `SHAFT`; `VEHICLE`: on the ground too, and no other load has it;
+            empty: any.
+        usual: its value in a table that does not state it; None: none stands for it.
     """
 
     field: str = ""
     heading: str = dataclasses.field(default="", kw_only=True)
     shown: str = dataclasses.field(default="{:g}", kw_only=True)
+    in_tables: bool = dataclasses.field(default=False, kw_only=True)
+    imposed: tuple[str, ...] = dataclasses.field(default=(), kw_only=True)
+    acts: str = dataclasses.field(default="", kw_only=True)
+    usual: float | None = dataclasses.field(default=None, kw_only=True)
+
+    @property
+    def key(self) -> str:
+        """Its field of `Conditions`, or its name if it has none."""
+        return self.field or self.name
 
 
+@dataclasses.dataclass(frozen=True)
+class Label(Quantity):
+    """A word that tables of runs state of a row."""
+
+    def __init__(self, name: str, label: str) -> None:
+        """Makes a quantity without a unit and a range."""
+        super().__init__(name, "", 1.0, label, (-math.inf, math.inf))
+
+
+#: Words of a row of a table.
+LABELS: tuple[Label, ...] = (
+    Label("configuration", "name of the robot's configuration"),
+    Label("surface", "name of the ground"),
+    Label("run_id", "name of the run, of which a row is a sample"),
+    Label("mode", "mode of the motors' driver: voltage, brake or coast"),
+)
+
+#: Loads on which a condition acts.
+GROUND, SHAFT, VEHICLE = "ground", "shaft", "vehicle"
 _MILLIVOLT, _MILLIAMPERE = (("mV", 1e-3),), (("mA", 1e-3),)
 _GRAM, _RADIAN = (("g", 1e-3),), (("rad", 1.0),)
 _TIMES = (("ms", 1e-3), ("min", 60.0), ("h", 3600.0))
 _TORQUES = (("mNm", 1e-3), ("kNm", 1e3))
 _SHARES = ((PERCENT, 1e-2),)
 _VOLTS, _SHARE, _SWITCH = (-100.0, 100.0), (-1.0, 1.0), (-1.0, 1.0)
+_BY_VOLTAGE = ("voltage",)
 _RATIO, _RADIANS_PER_SECOND = (1e-3, 100.0), (-1e4, 1e4)
 
 #: All numbers that can be set for a run.
 SET: tuple[Condition, ...] = (
     Condition(
-        "supply_voltage", "V", 1.0, "supply voltage", _VOLTS, "voltage", other_units=_MILLIVOLT, heading="U [V]"
+        "supply_voltage", "V", 1.0, "supply voltage", _VOLTS, "voltage", other_units=_MILLIVOLT, heading="U [V]",
+        in_tables=True, usual=0.0, in_profiles=True,
     ),
     Condition(
         "motor_speed", "rad/s", 1.0, "motor speed imposed on the shafts", _RADIANS_PER_SECOND, "motor_speed",
@@ -141,24 +188,28 @@ SET: tuple[Condition, ...] = (
     ),
     Condition(
         "total_mass", "kg", 1.0, "total mass of robot and payload", (0.1, 500.0), "total_mass", other_units=_GRAM,
-        heading="M [kg]", shown="{:.1f}",
+        heading="M [kg]", shown="{:.1f}", in_tables=True, acts=GROUND,
     ),
-    Condition("payload", "kg", 1.0, "payload", (0.0, 300.0), "payload", other_units=_GRAM, heading="payload [kg]"),
+    Condition(
+        "payload", "kg", 1.0, "payload", (0.0, 300.0), "payload", other_units=_GRAM, heading="payload [kg]",
+        in_tables=True, acts=GROUND, usual=0.0, in_profiles=True,
+    ),
     Condition(
         "slope", "deg", DEG, "slope, positive uphill", (-45.0, 45.0), "slope_deg", other_units=_RADIAN, percent=True,
-        heading="slope [°]",
+        heading="slope [°]", in_tables=True, acts=GROUND, usual=0.0, in_profiles=True,
     ),
     Condition(
         "load_torque", "Nm", 1.0, "torque of a brake on the output of each drive, positive against forward rotation",
         (-1e4, 1e4), "load_torque", unit_si="N·m", other_units=_TORQUES, heading="load torque [N·m]", shown="{:.4g}",
+        in_tables=True, acts=SHAFT, in_profiles=True,
     ),
     Condition("battery", "", 1.0, "on-board battery instead of the external supply", (0.0, 1.0), "battery"),
     Condition("discharge", "C", 1.0, "charge already taken from the battery", (0.0, 360_000.0), "discharge"),
     Condition("adhesion", "", 1.0, "adhesion as a ratio to the one the robot is stated for", _RATIO, "adhesion"),
-    Condition("order", "", 1.0, "place in the sequence of runs", (0.0, 1e9), "order"),
+    Condition("order", "", 1.0, "place in the sequence of runs", (0.0, 1e9), "order", in_tables=True),
     Condition(
         "duty", "", 1.0, "share of the supply's voltage that the driver gives the motors", _SHARE, "duty",
-        other_units=_SHARES,
+        other_units=_SHARES, in_tables=True, imposed=_BY_VOLTAGE, in_profiles=True,
     ),
     Condition("open", "", 1.0, "1 where the motors' circuit is open", _SWITCH, "open"),
     Condition(
@@ -168,7 +219,8 @@ SET: tuple[Condition, ...] = (
     *(
         Condition(
             f"duty_{side}", "", 1.0, f"share of the supply's voltage at the {side} motor", _SHARE, f"duty_{side}",
-            other_units=_SHARES, heading=f"duty {side}", shown="{:.3g}",
+            other_units=_SHARES, heading=f"duty {side}", shown="{:.3g}", in_tables=True, imposed=_BY_VOLTAGE,
+            acts=VEHICLE, in_profiles=True,
         )
         for side in ("left", "right")
     ),
@@ -185,25 +237,31 @@ SET: tuple[Condition, ...] = (
     ),
     Condition(
         "heading", "deg", DEG, "heading at the start, from uphill, positive to the left", (-360.0, 360.0),
-        "heading_deg", other_units=_RADIAN, heading="heading from uphill [°]",
+        "heading_deg", other_units=_RADIAN, heading="heading from uphill [°]", in_tables=True,
+        imposed=(*_BY_VOLTAGE, "motor_speed"), acts=VEHICLE,
     ),
     Condition("adhesion_lateral", "", 1.0, "the same as adhesion, across the travel", _RATIO, "adhesion_lateral"),
     *(
         Condition(
             f"levers_{end}", "deg", DEG,
             f"angle of the {end} levers, 0 along the wheelbase outward, positive up, 180 folded", (-180.0, 180.0),
-            f"levers_{end}_deg", other_units=_RADIAN,
+            f"levers_{end}_deg", other_units=_RADIAN, in_tables=True, acts=VEHICLE,
         )
         for end in ("front", "rear")
     ),
-    Condition("time", "s", 1.0, "time since the start", (0.0, 1e6), other_units=_TIMES),
+    Condition(
+        "time", "s", 1.0, "time since the start", (0.0, 1e6), other_units=_TIMES, in_tables=True, in_profiles=True
+    ),
     *(
-        Condition(f"voltage_{side}", "V", 1.0, f"voltage of the {side} motor", _VOLTS, other_units=_MILLIVOLT)
+        Condition(
+            f"voltage_{side}", "V", 1.0, f"voltage of the {side} motor", _VOLTS, other_units=_MILLIVOLT,
+            in_tables=True, imposed=_BY_VOLTAGE, acts=VEHICLE, in_profiles=True,
+        )
         for side in ("left", "right")
     ),
     Condition(
         "current_other", "A", 1.0, "current of other consumers on the battery", (0.0, 50.0),
-        other_units=_MILLIAMPERE,
+        other_units=_MILLIAMPERE, in_profiles=True,
     ),
 )  # fmt: skip
 

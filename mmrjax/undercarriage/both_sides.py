@@ -30,8 +30,7 @@ from mmrjax.numerics.linear_equations import factorise, solution
 from mmrjax.numerics.trigonometry import cosine, sine
 from mmrjax.turning import circling
 from mmrjax.turning.two_sides import SIDES, Grip, Law
-from mmrjax.undercarriage import half_robot
-from mmrjax.undercarriage import side_contacts as undercarriage
+from mmrjax.undercarriage import half_robot, side_contacts
 from mmrjax.undercarriage.belt import Path
 from mmrjax.undercarriage.half_robot import Average, Motion, Steady, System
 from mmrjax.undercarriage.mjcf import mjx
@@ -62,9 +61,9 @@ class _Sides(eqx.Module):
 
     def pull(self, chassis: Chassis, signals: Signals) -> Pull:
         def side(signals: Signals, at: Touch, aside: Array, height: Scalar) -> Pull:
-            along = undercarriage.sliding(signals, at)
+            along = side_contacts.sliding(signals, at)
             held = signals.adhesion * at.force * self.law.per_speed(along**2, aside**2)
-            pulled = undercarriage.pull(self.path, chassis, signals, at, height, held * along)
+            pulled = side_contacts.pull(self.path, chassis, signals, at, height, held * along)
             return dataclasses.replace(pulled, aside=-self.lateral * held * aside)
 
         return jax.vmap(side)(signals, self.at, self.aside, self.height)
@@ -107,7 +106,7 @@ def _contacts(run: System, motion: Motion) -> _Sides:
     nothing = jnp.zeros_like(y)
     of_q = jnp.stack([nothing, heights, q[PITCH] + nothing, *q[PULLEYS].T], axis=1)
     of_v = jnp.stack([speed - v[YAW] * y, rises, v[PITCH] + nothing, *v[PULLEYS].T], axis=1)
-    at = jax.vmap(lambda q, v: undercarriage.touch(run.path, run.chassis, q, v))(of_q, of_v)
+    at = jax.vmap(lambda q, v: side_contacts.touch(run.path, run.chassis, q, v))(of_q, of_v)
     own, ratio = run.chassis.turning, balances.lateral_friction(run.conditions, run.chassis)
     law = Law(run.chassis.ground.friction, ratio ** (2 * own.rule - 2), run.chassis.on_tracks, own.nodes)
     aside = lateral + v[YAW] * at.lever_x - v[ROLL] * at.lever_z
@@ -193,7 +192,7 @@ def resistance(
     """
     levers, at = _levers(run, motion, sides.at), sides.at
     assert pulled.aside is not None
-    sliding = jax.vmap(undercarriage.sliding)(signals, at)
+    sliding = jax.vmap(side_contacts.sliding)(signals, at)
     weight = jnp.asarray(signals.adhesion)[:, None] * at.force
     rises = jnp.stack([jnp.stack(row) for row in sides.law.rises(sliding, -sides.aside)])
     rises = rises * jnp.stack([weight, sides.lateral * weight])[:, None]

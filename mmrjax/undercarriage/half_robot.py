@@ -39,8 +39,7 @@ from mmrjax.model.signals import (
 )
 from mmrjax.numerics.linear_equations import Factors, Vector, factorise, solution
 from mmrjax.numerics.newton import root
-from mmrjax.undercarriage import contact_sums, mjcf
-from mmrjax.undercarriage import side_contacts as undercarriage
+from mmrjax.undercarriage import contact_sums, mjcf, side_contacts
 from mmrjax.undercarriage.belt import Path, runs
 from mmrjax.undercarriage.contact_sums import Linearized
 from mmrjax.undercarriage.mjcf import mjx
@@ -138,12 +137,12 @@ class _Mover(eqx.Module):
         return self.at.normal
 
     def pull(self, chassis: Chassis, signals: Signals) -> Pull:
-        return undercarriage.pull(self.path, chassis, signals, self.at, self.height)
+        return side_contacts.pull(self.path, chassis, signals, self.at, self.height)
 
 
 def instant(run: System, motion: Motion) -> tuple[Signals, Touch, Pull]:
     """All signals, contacts and forces of an instant."""
-    at = undercarriage.touch(run.path, run.chassis, motion.q, motion.v)
+    at = side_contacts.touch(run.path, run.chassis, motion.q, motion.v)
     signals, pulled = _resolved(run, motion, _Mover(run.path, at, motion.q[1]), motion.v[0], motion.v[3])
     return signals, at, pulled
 
@@ -214,7 +213,7 @@ def resistance(run: System, motion: Motion, signals: Signals, at: Touch, pulled:
     out. The drive's losses and the resistance of the ground rise steeply from rest and are on K's diagonal.
     """
     losses = _losses(run, motion, _Mover(run.path, at, motion.q[1]))
-    rises = jnp.maximum(undercarriage.friction_rise(run.chassis, signals, at), 0.0)
+    rises = jnp.maximum(side_contacts.friction_rise(run.chassis, signals, at), 0.0)
     front, rear = run.path.radius * (1 - at.weight), run.path.radius * at.weight
     one, none = jnp.ones_like(rises), jnp.zeros_like(rises)
     along = jnp.stack([one, none, at.lever_z, at.rate_x * front, at.rate_x * rear], axis=1)
@@ -435,7 +434,7 @@ def stand(run: System, turned: Scalar = 0.0) -> Motion:
 
     def unbalanced(y: Vector, _: None, given: tuple[Any, ...]) -> Vector:
         path, chassis, turned, weight, forward, up, axle, cos, sin = given
-        at = undercarriage.touch(path, chassis, placed(turned, axle - y[0], y[1]), jnp.zeros_like(rest))
+        at = side_contacts.touch(path, chassis, placed(turned, axle - y[0], y[1]), jnp.zeros_like(rest))
         moment = weight * (cos * (forward + y[1] * up) - sin * (up + axle)) - jnp.sum(at.force * at.lever_x)
         return (at.normal - weight * cos) / weight, moment / weight
 
@@ -471,7 +470,7 @@ def roll(run: System) -> Motion:
 
 def loads(run: System, at: Touch, pulled: Pull) -> Reactions:
     """Loads inside the running gear at an instant."""
-    return undercarriage.reactions(run.path, at, pulled)
+    return side_contacts.reactions(run.path, at, pulled)
 
 
 def away(q: Array, reactions: Reactions) -> tuple[Array, Reactions | None]:

@@ -1,4 +1,4 @@
-"""The command `check`: a robot held against requirements, a sheet of pass or fail with margins."""
+"""The command `check`: compare a robot with requirements; each passes or fails by a margin."""
 
 from __future__ import annotations
 
@@ -6,33 +6,31 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
-from rich.table import Table
 
 from calibration.data import requirements_file, robot_file
-from calibration.data.input_errors import BadConfiguration, rounded
+from calibration.data.input_errors import BadConfiguration
+from calibration.described import in_words
 from calibration.sizing import sheet
 from mmrjax.derived.requirements import CHARGE, OF_HEAT
 from mmrjax.model.channels import HEAT
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps import config as configuration
-from sweeps.console import say
+from sweeps.console import pulse, tell
 from sweeps.inputs import load_robot
 from sweeps.pages import words
 from sweeps.points import imposed
+from sweeps.report import check_report
 from sweeps.results import posture_results
-from sweeps.results.check_results import CheckResult, changed, corner, label, limit, reached, wanted
-from sweeps.skeleton import leave, page
+from sweeps.results.check_results import CheckResult, corner, limit
+from sweeps.skeleton import leave, report
 from sweeps.store import RunFolder, open_folder
-
-#: Changes that the console shows of each missed requirement.
-SHOWN = 3
 
 
 def check(config: configuration.Check, out: Path | None, force: bool) -> int:
-    """Hold a robot against requirements and leave a run folder; returns the exit code.
+    """Compare a robot with requirements and write a run folder; returns the exit code.
 
-    0 done, with what is missed said; 3 where the solver failed at a worst corner.
+    The code is 0 whether or not requirements are missed, and 3 if the solver failed at a worst corner.
     """
     asked = requirements_file.load(Path(config.requirements))
     file = load_robot(config)
@@ -42,22 +40,18 @@ def check(config: configuration.Check, out: Path | None, force: bool) -> int:
     _check_charge(robot, asked)
     _check_heat(robot, asked)
     with open_folder("check", config, robot, out, force) as folder:
-        outcomes = sheet.check(robot, asked, changes=config.changes)
-        found = CheckResult(asked, robot, outcomes, posture_results.of_requirements(robot, outcomes))
+        with pulse(tell, "reading the requirements") as heard:
+            outcomes = sheet.check(robot, asked, changes=config.changes, tell=in_words(heard))
+            found = CheckResult(asked, robot, outcomes, posture_results.of_requirements(robot, outcomes))
         _write(folder, config, found)
-        print_check(found, changes=config.changes)
+        shown = report(check_report.document(found, capabilities.shown_name(file), config.changes), file)
         manifest = {"seed": None, **sheet.counts(found.outcomes)}
-        return leave(
-            folder,
-            config,
-            manifest,
-            solved=words.solved(Counter(o.status for o in found.outcomes)),
-            page=page("check", found, file),
-        )
+        solved = words.solved(Counter(o.status for o in found.outcomes))
+        return leave(folder, config, manifest, solved=solved, page=shown)
 
 
 def _check_charge(robot: Robot, asked: requirements_file.Requirements) -> None:
-    """Refuse requirements on a battery that the robot's file does not state."""
+    """Raise if a requirement needs a battery that the robot's file does not state."""
     for r in asked.each:
         depends = CHARGE in r.quantity.axes or r.quantity.group == "endurance"
         if depends and r.envelope.battery and not capabilities.battery(robot):
@@ -68,8 +62,7 @@ def _check_charge(robot: Robot, asked: requirements_file.Requirements) -> None:
 
 
 def _check_heat(robot: Robot, asked: requirements_file.Requirements) -> None:
-    """Refuse requirements on a winding after long running of which the robot's file does not state how warm it
-    becomes."""
+    """Raise if a requirement on the winding's final temperature needs a heat number that the file does not state."""
     lacking = robot.unknown(HEAT)
     for r in asked.each:
         if lacking and r.name in OF_HEAT:
@@ -87,7 +80,7 @@ def _write(folder: RunFolder, config: configuration.Check, found: CheckResult) -
 
 
 def table(found: CheckResult) -> dict[str, np.ndarray]:
-    """The sheet as a table, a row a requirement."""
+    """Outcomes as a table, one row for each requirement."""
     nan = float("nan")
     return {
         "name": np.array([o.requirement.name for o in found.outcomes]),
@@ -100,24 +93,3 @@ def table(found: CheckResult) -> dict[str, np.ndarray]:
         "status": np.array([o.status for o in found.outcomes]),
         "at": np.array([corner(o) for o in found.outcomes]),
     }
-
-
-def print_check(found: CheckResult, changes: bool = True) -> None:
-    """The sheet, and what would meet what is missed; for a person."""
-    shown = Table(title=f"requirements of {found.asked.source}", box=None, pad_edge=False)
-    shown.title_justify = "left"
-    for name, side in (("", "left"), ("requirement", "left"), ("required", "right"), ("value", "right")):
-        shown.add_column(name, justify=side)  # type: ignore[arg-type]
-    shown.add_column("margin", justify="right")
-    shown.add_column("at its worst corner")
-    for o in found.outcomes:
-        margin = "" if o.margin is None else f"{'+' if o.margin >= 0 else '−'}{rounded(abs(o.margin))}"
-        shown.add_row("met" if o.met else "MISSED", label(o), wanted(o), reached(o), margin, corner(o))
-    say(shown)
-    say(found.statement())
-    for o in found.missed if changes else ():
-        if o.change:
-            more = f"; {len(o.change) - SHOWN} more in result.json" if len(o.change) > SHOWN else ""
-            say(f"{label(o)} {wanted(o)} would be met by: {'; or '.join(changed(c) for c in o.change[:SHOWN])}{more}")
-        else:
-            say(f"{label(o)} {wanted(o)}: no change of one parameter within its bounds was found that meets it")

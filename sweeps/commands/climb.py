@@ -15,8 +15,7 @@ from rich.table import Table
 from calibration.data import robot_file, terrains
 from calibration.data.contradictions import without_levers
 from calibration.data.input_errors import BadConfiguration
-from mmrjax.climbing import climb_simulation as fidelity
-from mmrjax.climbing import terrain
+from mmrjax.climbing import climb_simulation, terrain
 from mmrjax.climbing.climb_derivatives import Derivatives, Given, climb_derivatives
 from mmrjax.climbing.climb_simulation import Climb, Sequence, climb_batch
 from mmrjax.climbing.terrain import Terrain
@@ -249,7 +248,7 @@ def _sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
             raise BadConfiguration(f"{option}: {why}")
         angles.append(float(np.radians(angle)))
     if config.sequence is None:
-        found = fidelity.still(*angles)
+        found = climb_simulation.still(*angles)
     else:
         found = terrains.read_sequence(config.sequence, robot, (angles[0], angles[1]))
         if found.begins is None and stated[1:] != (None, None):

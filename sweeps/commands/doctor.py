@@ -1,4 +1,4 @@
-"""Whether this installation works: versions, devices, a run with a known answer, a folder to write to."""
+"""Checks of this installation: versions, devices, a run with a known answer, a writable folder."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from rich.console import Console
 from rich.table import Table
 
 from sweeps import compilation_cache
+from sweeps.console import stage
 from sweeps.store import PACKAGES
 
 
 def doctor() -> int:
-    """Print one line a check; returns 0 when all pass, 1 otherwise."""
+    """Print one line for each check; returns 0 if all pass, else 1."""
     checks: dict[str, Callable[[], str]] = {
         "Python": _python, "packages": _packages, "devices": _devices, "compilation cache": _cache,
         "a solved run": _run,
@@ -27,9 +28,10 @@ def doctor() -> int:
     for heading in ("check", "", "found"):
         table.add_column(heading)
     healthy = True
-    for name, check in checks.items():
+    for k, (name, check) in enumerate(checks.items(), 1):
         try:
-            found, passed = check(), True
+            with stage(k, len(checks), name):
+                found, passed = check(), True
         except Exception as error:
             found, passed = f"{type(error).__name__}: {error}", False
         healthy &= passed

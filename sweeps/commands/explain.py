@@ -12,7 +12,6 @@ import numpy as np
 
 from calibration.data import effect_file
 from calibration.data.input_errors import BadConfiguration, number
-from calibration.words import effect_words as words_of
 from mmrjax import derived, effects
 from mmrjax.effects import Effect
 from mmrjax.errors import near
@@ -23,6 +22,7 @@ from mmrjax.model.params import Parameter, Spec
 from mmrjax.model.signals import Result
 from sweeps.console import say
 from sweeps.pages import words
+from sweeps.report.words import effect_words
 from sweeps.results.climb_results import VERDICTS
 
 #: A line of an explanation: heading and text.
@@ -79,7 +79,7 @@ def names(library: dict[str, type[Effect]]) -> dict[str, list[str]]:
         "verdicts of a climb": list(VERDICTS),
         "flags": list(words.FLAGS),
         "channels": [c.name for c in channels.EVERY],
-        "conditions": [c.field for c in quantities.SET if c.field],
+        "conditions": [*(c.name for c in quantities.LABELS), *(c.field for c in quantities.SET if c.field)],
         "outputs": list(dict.fromkeys(o.name for o in EVERY_OUTPUT)),
         "parameters": [p.name for p in params.walk(paper_robots.nominal())],
     }
@@ -89,7 +89,7 @@ def _effect(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     effect = library.get(name)
     if effect is None:
         return
-    equation, meaning, source = words_of.about(effect)
+    equation, meaning, source = effect_words.about(effect)
     yield "equation", equation
     yield "stands for", meaning
     yield "enters", f"the {effect.balance} balance{f', channel {effect.channel}' if effect.channel else ''}"
@@ -100,12 +100,12 @@ def _effect(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
             yield "bounds", _bounds(p.spec)
         else:
             yield f"  {p.name}", f"{float(p.value):g} {p.spec.unit}: {p.spec.meaning}"
-    if said := ", ".join(words_of.declared(effect)):
+    if said := ", ".join(effect_words.declared(effect)):
         yield "declares", said
     yield "in data", f"{effect.family()}{_histories(effect)}"
     for line in _changes(made):
         yield "", line
-    for k, test in enumerate(words_of.tests(effect)):
+    for k, test in enumerate(effect_words.tests(effect)):
         yield "" if k else "on a bench", test
     if source:
         yield "source", source
@@ -188,11 +188,14 @@ def _channel(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     wrong = [e for e in library.values() if e.channel == c.name and e.name not in effects.UNNAMED]
     if wrong:
         yield "its errors", ", ".join(e.name for e in wrong)
-        for k, test in enumerate(words_of.tests(wrong[0])):
+        for k, test in enumerate(effect_words.tests(wrong[0])):
             yield "" if k else "on a bench", test
 
 
 def _condition(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+    if label := next((label for label in quantities.LABELS if label.name == name), None):
+        yield "is", label.label
+        yield "column", label.column
     c = next((c for c in quantities.SET if name in (c.name, c.field, c.column)), None)
     if c is None:
         return

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from calibration.data import effect_file, robot_file
 from calibration.data.columns import Layout
+from calibration.described import in_words
 from calibration.discovery import findings
 from calibration.discovery.discover import discover
 from calibration.discovery.kept import OutOfTime
@@ -23,13 +24,12 @@ from calibration.discovery.result import REFIT_FILE, DiscoveryResult, Ranking
 from calibration.discovery.settings import fewest_replicates
 from calibration.inference import blocks, observers, priors
 from calibration.inference.simulation_errors import OF_SIZE
-from calibration.words import loop_words as said_of
-from calibration.words.note_words import in_words
-from calibration.words.step_words import expected
 from sweeps import config as configuration
 from sweeps.console import pulse, say, tell
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
+from sweeps.report.words import loop_words
+from sweeps.report.words.step_words import expected
 from sweeps.skeleton import leave, page
 from sweeps.store import SOLVER_FAILED, RunFolder, open_folder
 
@@ -93,7 +93,7 @@ def _loop(
             if name == "ranking":
                 _show_ranking(stages[name], folder, timed)
             if name == "verdict":
-                timed(f"{said_of.verdict(stages[name])}; next, errors held out and other noises")
+                timed(f"{loop_words.verdict(stages[name])}; next, errors held out and other noises")
             return found
 
         try:
@@ -166,7 +166,7 @@ def _alarm(seconds: float | None, wanted: Callable[[], bool]) -> Iterator[None]:
 
 def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None]) -> None:
     """Say what regression makes of the library, and leave it in the run folder: the first answer."""
-    first, *lines = said_of.ranking(found)
+    first, *lines = loop_words.ranking(found)
     timed(first)
     for line in lines:
         tell(line)
@@ -185,15 +185,15 @@ def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> Non
     tell(f"kept: {', '.join(kept)}; to continue, run the same command with --out {folder.path}")
     if "verdict" in stages:
         traced = stages["verdict"]
-        tell(f"{said_of.verdict(traced)}; errors held out and other noises are outstanding")
+        tell(f"{loop_words.verdict(traced)}; errors held out and other noises are outstanding")
         return
     if "ranking" in stages:
-        for line in said_of.ranking(stages["ranking"]):
+        for line in loop_words.ranking(stages["ranking"]):
             tell(line)
     searches = [found for name, found in stages.items() if name.startswith("search")]
     if searches and (best := searches[-1][2].best) is not None:
         library = searches[-1][0].base.space.library
-        tell(said_of.so_far(best.effects, [library[n].family() for n in best.effects]))
+        tell(loop_words.so_far(best.effects, [library[n].family() for n in best.effects]))
     if "base" not in stages:
         return
     base = stages["base"][0].base
@@ -211,9 +211,9 @@ def _effects(found: DiscoveryResult) -> Table:
         shown.add_column(heading, justify="right" if number else "left", no_wrap=number or heading == "effect")
     for e in found.effects:
         shown.add_row(
-            said_of.called(found, e), ", or ".join(e.families), said_of.size(e),
-            f"{said_of.misfit(e.score)} ({100 * e.share:.0f} %)", f"{e.p_value:.2g}",
-            said_of.alike(found, e) or "-",
+            loop_words.called(found, e), ", or ".join(e.families), loop_words.size(e),
+            f"{loop_words.misfit(e.score)} ({100 * e.share:.0f} %)", f"{e.p_value:.2g}",
+            loop_words.alike(found, e) or "-",
         )  # fmt: skip
     return shown
 
@@ -239,14 +239,14 @@ def print_discovery(found: DiscoveryResult) -> None:
     """Verdict, effects, errors and remarks, for a person; the answer and the next step last."""
     first = found.headline
     if len(first.factors) > 1:
-        say(f"{first.level}: {said_of.headline(first)}.")
+        say(f"{first.level}: {loop_words.headline(first)}.")
     say(f"{found.verdict}: {found.statement}")
     if not found.robot.has_ground and found.effects:
         say("The track balance of a shaft is what its load loses.")
-    for said in (said_of.standing(found), said_of.ruled_out(found)):
+    for said in (loop_words.standing(found), loop_words.ruled_out(found)):
         if said:
             say(said)
-    rise = said_of.worse(found.held_out_worse, found.predicted)
+    rise = loop_words.worse(found.held_out_worse, found.predicted)
     if rise:
         say(rise)
     if found.effects:
@@ -256,9 +256,9 @@ def print_discovery(found: DiscoveryResult) -> None:
             "the strongest of the library"
         )
     if found.hidden:
-        say(said_of.hidden(found))
+        say(loop_words.hidden(found))
     if found.unnamed is not None:
-        say(said_of.proposed_formula(found.unnamed))
+        say(loop_words.proposed_formula(found.unnamed))
     if found.resolved is not None:
         say(found.resolved.statement)
         for note in found.resolved.notes:
@@ -268,10 +268,10 @@ def print_discovery(found: DiscoveryResult) -> None:
         shown_fits = {when: by for when, by in found.rms.items() if not (found.refit_alone and "after" in when)}
         say(words.describe_rms(shown_fits))
     if found.sensitivity:
-        say(f"{said_of.at_other_noise(found.sensitivity)}")
+        say(f"{loop_words.at_other_noise(found.sensitivity)}")
     for note in found.notes:
         say(f"- {note}")
-    say(said_of.answer(found))
+    say(loop_words.answer(found))
     after = found.next_experiment
     if after is not None:
         sigma = f" (expected {after.expected_sigma:.1f} σ)" if after.separates else ""

@@ -18,7 +18,7 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.data.profiles import ProfileTable
 from mmrjax.errors import counted
 from mmrjax.fidelities import outputs
-from mmrjax.missions import mission_batch as missions
+from mmrjax.missions import mission_batch
 from mmrjax.missions.mission import Mission
 from mmrjax.missions.mission_batch import JOULE_PER_WH
 from mmrjax.missions.mission_steps import MARKS
@@ -47,7 +47,7 @@ _LASTING = MARKS.index("battery_empty")  # events from here on are kept in histo
 _PRINTED = (
     "energy_Wh", "energy_per_metre_Wh", "distance_m", "duration_s", "rms_current_A", "peak_current_A",
     "rms_torque_Nm", "winding_peak_C", "housing_end_C", "state_of_charge", "endurance_s", "range_m",
-    *(output.column for output in missions.OF_TURNS),
+    *(output.column for output in mission_batch.OF_TURNS),
 )  # fmt: skip
 
 
@@ -176,7 +176,7 @@ def _check_cutoff(robot: Robot, runs: records.Runs, source: ProfileTable, config
     if not config.battery:
         return
     conditions = run.commanded(robot, runs, config)
-    cell = missions.begins_below(robot, conditions, source.profile(robot, conditions), source.start)
+    cell = mission_batch.begins_below(robot, conditions, source.profile(robot, conditions), source.start)
     below = np.flatnonzero(np.isfinite(cell))
     if len(below):
         raise BadConfiguration(
@@ -196,12 +196,14 @@ def simulated(robot: Robot, runs: records.Runs, source: ProfileTable, config: co
     courses: list[dict[str, np.ndarray]] = []
     done, whole = 0, True
     with progress(len(runs), quiet=False) as advance:
-        for found in missions.simulate_in_parts(robot, conditions, profile, source.start):
+        for found in mission_batch.simulate_in_parts(robot, conditions, profile, source.start):
             count = len(found.steps)
             own = slice(done, done + count)
             at = jax.tree.map(lambda x, own=own: x[own], conditions)
-            numbers = jax.device_get(missions.numbers(robot, at, found))
-            tables.append({**missions.columns(numbers), **outputs.codes(found.result.status, found.result.flags)})
+            numbers = jax.device_get(mission_batch.numbers(robot, at, found))
+            tables.append(
+                {**mission_batch.columns(numbers), **outputs.codes(found.result.status, found.result.flags)}
+            )
             segments.append(_segments(robot, at, source, found, names[own]))
             courses += [_course(robot, at, source, found, k, str(names[done + k]), rows) for k in range(count)]
             assert found.course is not None  # it was asked for
@@ -234,7 +236,7 @@ def _segments(
     robot: Robot, conditions: Conditions, source: ProfileTable, found: Mission, names: np.ndarray
 ) -> dict[str, np.ndarray]:
     """A row for each segment of each cycle of each run, up to where the run has ended."""
-    numbers = missions.columns(jax.device_get(missions.totals(found.segments, found.segment_peaks)))
+    numbers = mission_batch.columns(jax.device_get(mission_batch.totals(found.segments, found.segment_peaks)))
     (runs, cycles, segments) = found.status.shape
     time = np.asarray(found.segments.time).reshape(runs, -1)
     begun = np.cumsum(time, 1) - time
@@ -257,7 +259,14 @@ def _segments(
         "state_of_charge": charge.ravel(),
         **outputs.codes(found.status.ravel(), found.flags.ravel()),
     }
-    order = ["run_id", "cycle", "segment", "time_s", "mode", *(c for c in missions.names(source.turns) if c in rows)]
+    order = [
+        "run_id",
+        "cycle",
+        "segment",
+        "time_s",
+        "mode",
+        *(c for c in mission_batch.names(source.turns) if c in rows),
+    ]
     reached = time.ravel() > 0
     return {column: rows[column][reached] for column in (*order, "status", "flags")}
 
@@ -365,7 +374,7 @@ def _charge_left(table: dict[str, np.ndarray], status: str) -> str:
 
 def print_missions(found: Missions, idle: Collection[str] = ()) -> None:
     """What missions come to, one a column, without `idle` columns; statuses and flags in words."""
-    about = {output.column: output for output in (*missions.OUTPUTS, *missions.OF_TURNS)}
+    about = {output.column: output for output in (*mission_batch.OUTPUTS, *mission_batch.OF_TURNS)}
     table, source = found.table, found.source
     count = len(table["status"])
     cycles, each = (f", {source.cycles} cycles", " each") if source.cycles > 1 else ("", "")

@@ -11,8 +11,7 @@ import jax
 from calibration.data.input_errors import BadConfiguration
 from mmrjax.fidelities.track import track_batch
 from mmrjax.model.signals import STATUSES
-from mmrjax.undercarriage import rendering as pictures
-from mmrjax.undercarriage import rendering_from_above
+from mmrjax.undercarriage import rendering, rendering_from_above
 from sweeps import config as configuration
 from sweeps.commands import turn
 from sweeps.console import progress, say
@@ -33,7 +32,7 @@ def render(
     """
     options = config.options
     try:
-        pictures.instants(file, begin, end, slow, options["duration"])
+        rendering.instants(file, begin, end, slow, options["duration"])
     except ValueError as error:
         raise BadConfiguration(f"render: {error}") from error
     _check_free(file, force)
@@ -51,8 +50,8 @@ def render(
     trajectory, conditions = jax.tree.map(lambda x: x[0], (trajectory, conditions))
 
     def draw(aside: Path) -> None:
-        view = (rendering_from_above if config.turns else pictures).scene(robot, conditions, trajectory)
-        pictures.render(view, aside, begin, end, slow)
+        view = (rendering_from_above if config.turns else rendering).scene(robot, conditions, trajectory)
+        rendering.render(view, aside, begin, end, slow)
 
     _write(file, draw)
     status = STATUSES[int(trajectory.result.status)]

@@ -17,11 +17,11 @@ from calibration.data.rig_facts import Fact, Origin
 from calibration.data.rig_file import FREE
 from calibration.data.runs import Runs
 from calibration.data.writing import finite
+from calibration.described import described, sentences
 from calibration.inference import foresight, identifiability, priors
+from calibration.inference.fit_notes import Determination
 from calibration.inference.fit_posterior import undetermined
 from calibration.inference.foresight import Determined, Foresight
-from calibration.words import fit_words
-from calibration.words.note_words import sentences
 from mmrjax.errors import counted
 from mmrjax.model import channels
 from mmrjax.model.channels import HEAT, Channel
@@ -33,6 +33,7 @@ from sweeps.config import RobotPart
 from sweeps.console import say
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
+from sweeps.report.words import fit_words
 
 #: Of the templates: what stands beside a number that is not the user's yet.
 EXAMPLE = "example: yours"
@@ -197,7 +198,7 @@ class RigCheck:
     def determined(self, parameter: Determined) -> str:
         """`yes`, `no`, or with which parameters together the table determines one."""
         assert self.foresight is not None
-        return fit_words.determined(parameter.name, parameter.held, self.foresight.together)
+        return described(Determination.of(parameter.name, parameter.held, self.foresight.together))
 
     def to_json(self) -> dict[str, Any]:
         """The whole, for machines."""
@@ -215,7 +216,7 @@ class RigCheck:
                     {**dataclasses.asdict(p), "determined": self.determined(p)} for p in self.foresight.parameters
                 ],
                 "alike": [list(pair) for pair in self.foresight.alike],
-                "together": [fit_words.pair(pair) for pair in self.foresight.together],
+                "together": [pair.to_json() for pair in self.foresight.together],
             }
         return {
             "schema": "mmrjax.rig_check/1",

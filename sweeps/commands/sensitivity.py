@@ -14,16 +14,15 @@ from calibration.data.columns import Layout
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
+from calibration.described import in_words
 from calibration.inference import noise
-from calibration.sensitivity import uncertain_inputs as room
+from calibration.sensitivity import uncertain_inputs
 from calibration.sensitivity.analyse import analyse
 from calibration.sensitivity.model import chosen_outputs
 from calibration.sensitivity.next_runs import Candidates
 from calibration.sensitivity.result import METHODS, NEGLIGIBLE, Points, SensitivityResult
 from calibration.sensitivity.study import Study, Supply
 from calibration.sensitivity.uncertain_inputs import Inputs
-from calibration.words import sensitivity_words as words
-from calibration.words.note_words import in_words
 from mmrjax.model.conditions import OF_TURNS
 from mmrjax.model.paper_tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
 from mmrjax.model.power import COULOMB_PER_MAH
@@ -40,6 +39,7 @@ from sweeps.points import imposed
 from sweeps.points.grid import configurations, grid
 from sweeps.points.job import showing_turns
 from sweeps.points.run import refuse
+from sweeps.report.words import sensitivity_words
 from sweeps.skeleton import leave, page
 from sweeps.store import open_folder
 
@@ -165,11 +165,11 @@ def _inputs(
     if config.posterior:
         if config.parameters:
             raise BadConfiguration("--posterior: says what is uncertain, and so does --parameters; give one of them")
-        return room.of_posterior(robot, beside_robot(file), ranges)
-    names = config.parameters or room.default_names(
+        return uncertain_inputs.of_posterior(robot, beside_robot(file), ranges)
+    names = config.parameters or uncertain_inputs.default_names(
         robot, present, config.battery, config.model, not {*OF_TURNS}.isdisjoint(ranges)
     )
-    return room.of_priors(robot, names, ranges)
+    return uncertain_inputs.of_priors(robot, names, ranges)
 
 
 def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs, turns: bool) -> Candidates:
@@ -194,7 +194,7 @@ def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs, t
 def print_sensitivity(found: SensitivityResult) -> None:
     """What decides which output, what does not matter, what to measure next; for a person."""
     say(found.statement())
-    title = f"{words.METHODS[found.method]}, {len(found.points)} operating points"
+    title = f"{sensitivity_words.METHODS[found.method]}, {len(found.points)} operating points"
     if found.evaluations:
         title += f", {found.evaluations:,} model evaluations"
     shown = Table(title=title, title_justify="left", box=None, pad_edge=False)

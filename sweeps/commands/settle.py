@@ -1,4 +1,4 @@
-"""The command `settle`: from a log over time to a table of settled runs, and a page that shows them over the log."""
+"""The command `settle`: find the settled runs of a log over time."""
 
 from __future__ import annotations
 
@@ -8,28 +8,27 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from rich.table import Table
 
 from calibration.data import robot_file, settling
 from calibration.data.settling import Inertia, Settled
+from calibration.described import sentences
 from calibration.inference import ranges
 from calibration.inference.observers import SettledRuns
-from calibration.words import settle_words as words
-from calibration.words.note_words import sentences
 from mmrjax.model import balances
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import State
 from sweeps import config as configuration
-from sweeps.console import say
 from sweeps.inputs import load_robot, read_runs
-from sweeps.skeleton import leave, page
+from sweeps.report import settle_report
+from sweeps.report.words import settle_words
+from sweeps.skeleton import leave, report
 from sweeps.store import open_folder
 
 
 def settle(config: configuration.Settle, source: str, out: Path | None, force: bool) -> int:
-    """Find what of a log has settled, and leave a run folder with the table; returns the exit code, 0."""
+    """Find the settled runs of a log and write a run folder with their table; returns the exit code, 0."""
     robot = load_robot(config).robot
     runs = read_runs(source, robot, measured=True, series=True)
     loop = shlex.join(["mmrjax", "loop", source, "--robot", config.robot])
@@ -41,22 +40,22 @@ def settle(config: configuration.Settle, source: str, out: Path | None, force: b
         rolling=rolling(robot),
         loop=loop,
     )
-    few = words.too_few(found, SettledRuns.fewest, loop)
+    few = settle_words.too_few(found, SettledRuns.fewest, loop)
     with open_folder("settle", config, robot, out, force, runs) as folder:
         robot_file.write(robot, folder.partial / "robot.toml", note=f"the rig of this log, from {config.robot}")
         folder.write_table("settled.csv", found.table())
         folder.write_table("stretches.csv", stretches(found))
         folder.write_json("result.json", to_json(found, few))
-        print_settled(found, few)
-        for sentence in sentences(ranges.turned_signs(found.settled_runs(), robot)):
-            say(f"- {sentence}")
-        shown = page("settle", found, few=few)
+        turned = sentences(ranges.turned_signs(found.settled_runs(), robot))
+        shown = report(settle_report.document(found, few, turned))
         return leave(folder, config, {"seed": None, "settled": len(found.kept)}, page=shown, runs=runs)
 
 
 def rolling(robot: Robot) -> dict[str, dict[str, float]]:
-    """Of each configuration what speeds show while the motors turn by 1 rad/s and the load rolls with them, by
-    channel [unit of the column]; of a vehicle, which slips, those of the shafts."""
+    """Readings of speeds in each configuration at 1 rad/s of the motors, the load rolling [unit of the column].
+
+    By channel; only speeds of shafts for a vehicle, which slips.
+    """
     found = {}
     for k, (name, load) in enumerate(robot.configurations.items()):
         none, turns = jnp.zeros(()), float(load.radius) / float(robot.gearbox.ratio)
@@ -67,7 +66,7 @@ def rolling(robot: Robot) -> dict[str, dict[str, float]]:
 
 
 def inertia(robot: Robot) -> dict[str, Inertia]:
-    """What acceleration takes of the motors' current in each configuration, where that is known."""
+    """Current that acceleration takes in each configuration, where it is known."""
     constant, ratio = float(robot.motor.torque_constant), float(robot.gearbox.ratio)
     found = {}
     for k, (name, load) in enumerate(robot.configurations.items()):
@@ -88,7 +87,7 @@ def inertia(robot: Robot) -> dict[str, Inertia]:
 
 
 def _shown(robot: Robot, configuration: int, channel: Channel, state: State) -> float:
-    """What a channel shows of a state [unit of its column] that follows from it alone, 0 of others."""
+    """Reading of a channel that follows from a state alone [unit of its column]; 0 for others."""
     signals = balances.begin(robot, Conditions(configuration), state)
     try:
         return float(channel.read(robot, signals)) / channel.factor
@@ -106,7 +105,7 @@ def stretches(found: Settled) -> dict[str, np.ndarray]:
         "first_row": np.array([s.rows[0] + 1 for s in every]),
         "last_row": np.array([s.rows[-1] + 1 for s in every]),
         "imposed": np.array([s.imposed for s in every]),
-        "left_out": np.array([words.reason(s) if s.why else "" for s in every]),
+        "left_out": np.array([settle_words.reason(s) if s.why else "" for s in every]),
     }
     for signal in found.signals:
         channel = signal.channel
@@ -122,10 +121,10 @@ def stretches(found: Settled) -> dict[str, np.ndarray]:
 
 def to_json(found: Settled, few: str = "") -> dict[str, Any]:
     """`result.json`; `few` is the sentence of `words.too_few`."""
-    left = words.left_out(found.stretches, bool(few))
+    left = settle_words.left_out(found.stretches, bool(few))
     return {
         "schema": "mmrjax.settle/1",
-        "statement": words.statement(found),
+        "statement": settle_words.statement(found),
         "samples": len(found.runs),
         "settled": len(found.kept),
         "shortest_s": found.shortest,
@@ -136,22 +135,5 @@ def to_json(found: Settled, few: str = "") -> dict[str, Any]:
             s.channel.name: sum(k.glitches.get(s.channel.name, 0) for k in found.kept) for s in found.signals
         },
         "left_out": [dict(zip(("why", "stretches", "samples", "rows", "do"), row, strict=True)) for row in left],
-        "notes": [*filter(None, [few]), *words.remarks(found)],
+        "notes": [*filter(None, [few]), *settle_words.remarks(found)],
     }
-
-
-def print_settled(found: Settled, few: str = "") -> None:
-    """Print what was found, the log's own command where that is too few, and what was left out."""
-    say(words.statement(found))
-    if few:
-        say(few)
-    left = words.left_out(found.stretches, bool(few))
-    if left:
-        shown = Table(title="left out", title_justify="left", box=None, pad_edge=False)
-        for heading in ("why", "stretches", "samples", "rows, as", "what to do"):
-            shown.add_column(heading, justify="right" if heading in ("stretches", "samples") else "left")
-        for row in left:
-            shown.add_row(*map(str, row))
-        say(shown)
-    for sentence in words.remarks(found):
-        say(f"- {sentence}")

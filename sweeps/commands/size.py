@@ -1,34 +1,35 @@
-"""The command `size`: a robot searched for that meets requirements."""
+"""The command `size`: search for a robot that meets requirements."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from pathlib import Path
-
-from rich.table import Table
 
 from calibration.data import requirements_file, robot_file
 from calibration.data.input_errors import BadConfiguration, choices
 from calibration.data.parts import motors
+from calibration.described import in_words
 from calibration.sizing import sheet
+from calibration.sizing.chart import Chart, chart, extent
 from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.design_search import size as search
-from mmrjax.errors import counted
+from sweeps import capabilities
 from sweeps import config as configuration
-from sweeps.console import say
+from sweeps.console import pulse, tell
 from sweeps.inputs import load_robot
 from sweeps.pages import words
 from sweeps.points import imposed
-from sweeps.results import check_results as check_result
-from sweeps.results.size_results import SizeResult, described, missed, objective, verdict
-from sweeps.skeleton import leave, page
+from sweeps.report import size_report
+from sweeps.results.size_results import SizeResult, described
+from sweeps.skeleton import leave, report
 from sweeps.store import RunFolder, open_folder
 
 
 def size(config: configuration.Size, out: Path | None, force: bool) -> int:
-    """Search, and leave a run folder; returns the exit code.
+    """Search for a design and write a run folder; returns the exit code.
 
-    0 done, whether or not a design meets everything; 3 where the solver failed at a worst corner of the best.
+    The code is 0 whether or not a design meets everything, and 3 if the solver failed at a worst corner of the best.
     """
     asked = requirements_file.load(Path(config.requirements))
     file = load_robot(config)
@@ -47,19 +48,26 @@ def size(config: configuration.Size, out: Path | None, force: bool) -> int:
             raise BadConfiguration(f"--motors: got {name}; {choices(name, known)}")
     sheet.refuse(robot, asked)
     with open_folder("size", config, robot, out, force) as folder:
-        sizing = search(robot, asked, objectives, starts=config.starts, motors=config.motors, seed=config.seed)
-        outcomes = () if sizing.best is None else sheet.check(sizing.best.robot, asked, changes=False)
-        found = SizeResult(asked, robot, sizing, objectives, outcomes)
+        with pulse(tell, "drawing designs") as heard:
+            sizing = search(
+                robot, asked, objectives, starts=config.starts, motors=config.motors, seed=config.seed,
+                tell=in_words(heard),
+            )  # fmt: skip
+            best = robot if sizing.best is None else sizing.best.robot
+            outcomes = () if sizing.best is None else sheet.check(best, asked, changes=False, tell=in_words(heard))
+            charts: tuple[Chart, ...] = ()
+            if config.report:
+                heard("charts of the limits")
+                drawn = (robot,) if sizing.best is None else (best, robot)
+                charts = tuple(chart(r, asked, extent(asked)) for r in drawn)
+        found = SizeResult(asked, robot, sizing, objectives, outcomes, charts)
         _write(folder, config, found)
-        print_size(found)
-        manifest = {"seed": config.seed, "feasible": sizing.best is not None}
-        return leave(
-            folder,
-            config,
-            manifest,
-            solved=words.solved(Counter(o.status for o in outcomes)),
-            page=page("size", found, file),
+        shown = report(
+            size_report.document(found, capabilities.shown_name(file)), dataclasses.replace(file, robot=best)
         )
+        manifest = {"seed": config.seed, "feasible": sizing.best is not None}
+        solved = words.solved(Counter(o.status for o in outcomes))
+        return leave(folder, config, manifest, solved=solved, page=shown)
 
 
 def _write(folder: RunFolder, config: configuration.Size, found: SizeResult) -> None:
@@ -70,34 +78,3 @@ def _write(folder: RunFolder, config: configuration.Size, found: SizeResult) -> 
         note = f"sized for {found.asked.source} from {config.robot}: {described(best)}"
     robot_file.write(found.robot if best is None else best.robot, folder.partial / "robot.toml", note=note)
     folder.write_json("result.json", found.to_json())
-
-
-def print_size(found: SizeResult) -> None:
-    """The best, the alternatives and what binds each motor; for a person."""
-    s = found.sizing
-    say(found.statement())
-    shown = Table(title="by motor, the best design found of each", box=None, pad_edge=False)
-    shown.title_justify = "left"
-    shown.add_column("")
-    shown.add_column("motor and gearbox")
-    for name in ("ratio", "radius [mm]", "cells", "mass [kg]", "energy [Wh/m]", "cost [EUR]"):
-        shown.add_column(name, justify="right")
-    shown.add_column("what binds, or is missed")
-    for f in s.motors.values():
-        values = [f"{f.objectives[k]:.4g}" if k in f.objectives else "" for k in OBJECTIVES]
-        shown.add_row(
-            verdict(f, s.unmeetable), f.drive.name, f"{f.ratio:.3g}", f"{1000 * f.radius:.1f}",
-            f"{f.in_series} × {f.parallel:.3g} {f.cell.name}", *values,
-            ", ".join(f.binds if f.feasible else missed(f)),
-        )  # fmt: skip
-    say(shown)
-    if s.front:
-        first, second = found.objectives
-        say(f"{counted(len(s.front), 'design')} on the front of {first} and {second}, from "
-            f"{objective(s.front[0], first)} to {objective(s.front[-1], second)}")  # fmt: skip
-    lacking = [o for o in found.outcomes if not o.met]
-    if lacking:
-        say(
-            "the best as `check` has it misses: "
-            + "; ".join(f"{check_result.label(o)} {check_result.shortfall(o)}" for o in lacking)
-        )

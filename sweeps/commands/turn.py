@@ -16,7 +16,7 @@ from calibration.data.columns import SIDES, SUPPLY
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.table import Runs
 from mmrjax import fidelities
-from mmrjax.derived import turning_figures as derived
+from mmrjax.derived import turning_figures
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.rest import voltage_at_rest
@@ -26,7 +26,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps import config as configuration
-from sweeps.console import progress, say
+from sweeps.console import progress, say, stage
 from sweeps.inputs import load_robot, one_run
 from sweeps.pages import posture_words, turn_words
 from sweeps.points import imposed, run, scale
@@ -47,7 +47,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         BadConfiguration: runs of a file, a robot that cannot turn, a turn without a steady state.
     """
     if isinstance(given, str):
-        raise BadConfiguration("--runs: got a file beside --left, --right or --heading; state columns duty_left and "
+        raise BadConfiguration("--runs: got a file and --left, --right or --heading; state columns duty_left and "
                                "duty_right in it, or one run by options")  # fmt: skip
     file = load_robot(config)
     robot = file.robot
@@ -58,17 +58,21 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         asked = run.commanded(robot, runs, config)
         run.refuse(robot, asked, config)
         shown = _channels(robot, settled)
+        stages = 2 + config.demands
         if config.demands:
-            asked, runs = _demanded(robot, asked, runs, config)
+            with stage(1, stages, "duties of the demanded turn"):
+                asked, runs = _demanded(robot, asked, runs, config)
         if settled:
-            batch, swept = _with_others(robot, asked)
+            with stage(stages - 1, stages, "settled turns over the duties of the inner side"):
+                batch, swept = _with_others(robot, asked)
             turns = {**_duties(swept), **_columns(robot, shown, swept, batch)}
             folder.write_table("turns.csv", capabilities.without_idle(robot, turns))
             first, history = jax.tree.map(lambda x: x[:1], batch), None
         else:
             fidelity = fidelities.get(config.model)
             assert fidelity.histories is not None  # of `drive` and `track`
-            with progress(1, quiet=not fidelity.facts.slow) as advance:
+            slow = fidelity.facts.slow
+            with stage(stages - 1, stages, "the turn over time", slow), progress(1, quiet=not slow) as advance:
                 told = scale.shares(advance, 1)
                 first = jax.device_get(fidelity.histories(robot, asked, config.options, told))
                 told(1.0)
@@ -77,14 +81,16 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
             folder.write_table("history.csv", history_table(history, shown))
         own = {name: np.asarray(values) for name, values in first.columns.items()}
         table = {**run.conditions(robot, runs), **_columns(robot, shown, asked, first), **own}
-        turn = {name: _number(table[name][0]) for name in derived.COLUMNS}
+        turn = {name: _number(table[name][0]) for name in turning_figures.COLUMNS}
         facts = turn_words.turn(robot, {name: values[0] for name, values in table.items()}, _ended(history))
         say(facts.answer)
         if facts.sides:
             print_sides(facts.sides)
         for note in facts.notes:
             say(f"- {note}")
-        if (stands := posture_results.postures(robot, runs, asked)) is not None:
+        with stage(stages, stages, "posture"):
+            stands = posture_results.postures(robot, runs, asked)
+        if stands is not None:
             folder.write_table("posture.csv", stands.table)
             say(posture_words.stands(stands))
         result = run.SimulationResult("simulate", config.model, robot, runs, table, {"turn": turn})
@@ -224,7 +230,7 @@ def _columns(robot: Robot, shown: tuple[Channel, ...], conditions: Conditions, b
     reading = batch.result.reading
     return {
         **outputs.columns(batch.result, shown),
-        **derived.columns(robot, reading, radii[np.asarray(conditions.configuration)]),
+        **turning_figures.columns(robot, reading, radii[np.asarray(conditions.configuration)]),
     }
 
 

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from calibration.data.table import Runs
 from calibration.inference import blocks
 from calibration.inference.identifiability import Z95
 from calibration.inference.result import CalibrationResult
-from mmrjax.model.channels import Channel
-from sweeps.pages.figure_style import BLUE, FAINT, INK, ORANGE, VERMILION, axis_label, figure
+from sweeps.pages.figure_style import BLUE, FAINT, INK, ORANGE, VERMILION, figure
 from sweeps.pages.words import short_name
 
-#: Runs of which histories are drawn.
-HISTORIES = 6
+#: Most panels of a pair plot, and radii that hold 68 % and 95 % of a normal distribution of two [sds].
+PAIRED, RADII = 6, (1.515, 2.448)
 
 
 def parameters(found: CalibrationResult) -> Figure:
@@ -90,6 +86,34 @@ def correlations(found: CalibrationResult) -> Figure:
     return fig
 
 
+def pairs(found: CalibrationResult) -> Figure:
+    """Posterior of the most correlated pairs of parameters: contours that hold 68 % and 95 %."""
+    posterior = found.posterior
+    sd = np.sqrt(np.diag(posterior.covariance))
+    correlation = np.abs(posterior.covariance / np.outer(sd, sd))
+    every = [(i, j) for i in range(len(posterior)) for j in range(i)]
+    chosen = sorted(every, key=lambda pair: -np.nan_to_num(correlation[pair]))[:PAIRED]
+    fig, grid = figure(-(-len(chosen) // 3), min(3, len(chosen)), 2.9 * -(-len(chosen) // 3))
+    turn = np.linspace(0, 2 * np.pi, 120)
+    circle = np.stack([np.cos(turn), np.sin(turn)], 1)
+    for axes in grid.ravel()[len(chosen) :]:
+        axes.set_axis_off()
+    for axes, (i, j) in zip(grid.ravel(), chosen, strict=False):
+        pair = [j, i]
+        root = np.linalg.cholesky(posterior.covariance[np.ix_(pair, pair)] + 1e-18 * np.eye(2))
+        for radius, shade in zip(RADII, (1.0, 0.45), strict=True):
+            z = np.tile(posterior.mean, (len(turn), 1))
+            z[:, pair] += radius * circle @ root.T
+            axes.plot(*np.asarray(posterior.at(z))[:, pair].T, color=BLUE, alpha=shade, lw=1.4)
+        axes.plot(*np.asarray(posterior.at(posterior.mean))[pair], "o", ms=4, color=INK)
+        axes.ticklabel_format(style="sci", scilimits=(-2, 4), useMathText=True)
+        axes.locator_params(nbins=4)
+        x, y = (f"{short_name(posterior.coordinates[k])} [{posterior.units[k]}]" for k in pair)
+        axes.set_xlabel(x, loc="left")
+        axes.set(ylabel=y, title=f"correlation {posterior.covariance[j, i] / (sd[j] * sd[i]):.2f}")
+    return fig
+
+
 def before_after(found: CalibrationResult) -> Figure:
     """rms errors by channel: before, fitted, and with each kind of block held out."""
     lines = {"before": found.errors_before, "fitted": found.errors_after}
@@ -112,19 +136,4 @@ def before_after(found: CalibrationResult) -> Figure:
         axes.grid(axis="y", visible=False)
     grid[0, 0].set_yticks(range(len(lines)), list(lines))
     grid[0, 0].invert_yaxis()
-    return fig
-
-
-def histories(table: dict[str, np.ndarray], channels: Sequence[Channel]) -> Figure:
-    """Time histories: measured dots and the fitted line, a row of panels for each run (six at most)."""
-    runs = Runs("a table", {name: table[name] for name in ("run_id", "time_s") if name in table})
-    names = list(dict.fromkeys(runs.run_names.tolist()))[:HISTORIES]
-    fig, grid = figure(len(names), len(channels), 2.2 * len(names))
-    for row, name in zip(grid, names, strict=True):
-        order = runs.in_order(name)
-        for axes, channel in zip(row, channels, strict=True):
-            axes.plot(table["time_s"][order], table[channel.column][order], "o", ms=3, color=INK)
-            axes.plot(table["time_s"][order], table[f"after_{channel.column}"][order], color=BLUE)
-            axes.set(xlabel="time [s]", ylabel=axis_label(channel))
-        row[0].set_title(name or "the run")
     return fig

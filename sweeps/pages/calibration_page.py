@@ -8,7 +8,10 @@ from calibration.data.columns import Layout
 from calibration.inference.identifiability import HELD
 from calibration.inference.result import CalibrationResult
 from sweeps.pages import calibration_figures, cluster_figures, comparison_figures
-from sweeps.pages.page import Album, columns, conditions, curves, first_rows, render, words_shown
+from sweeps.pages.page import Album, columns, curves, first_rows, render
+from sweeps.pages.time_overlay import time_overlay
+from sweeps.pages.words import words_shown
+from sweeps.report.condition_columns import conditions
 
 
 def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
@@ -27,7 +30,8 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
     album.add("parameters", lambda: calibration_figures.parameters(found))
     album.add("before_after", lambda: calibration_figures.before_after(found))
     if found.axis:
-        album.add("histories", lambda: calibration_figures.histories(table, found.channels))
+        simulated = {"after_": "calibrated", "before_": "before"}
+        album.add_overlay("histories", time_overlay(table, found.channels, simulated))
     along = {found.axis: "time [s]"} if found.axis else {}
     sized = Layout.of(found.robot).crosses_zero
     album.add("parity", lambda: comparison_figures.parity(table, found.channels, band=not sized))
@@ -37,6 +41,8 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
     if found.profiled:
         album.add("profiles", lambda: calibration_figures.profiles(found))
     album.add("correlations", lambda: calibration_figures.correlations(found))
+    if len(found.posterior) > 1:
+        album.add("pairs", lambda: calibration_figures.pairs(found))
     return render(
         folder,
         "calibration.html.j2",

@@ -13,7 +13,7 @@ from matplotlib.patches import Polygon
 from mmrjax.climbing import belt_loop, footing
 from mmrjax.climbing.footing import PITCH, SHAFT
 from mmrjax.model.paper_tables import BODY_HEIGHT
-from mmrjax.undercarriage import rendering as pictures
+from mmrjax.undercarriage import rendering
 from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, figure, style
 from sweeps.results.climb_results import SHOWN as IN_TITLE
 from sweeps.results.climb_results import ClimbResult, Seen, coordinates
@@ -184,4 +184,4 @@ def render(
     view = Film(found)
     if begin is None:
         begin = float(view.time[np.argmax(np.abs(found.table["pitch_deg"]))]) if file.suffix == ".png" else 0.0
-    return pictures.render(view, file, begin, end, SLOW if slow is None else slow, RATE)
+    return rendering.render(view, file, begin, end, SLOW if slow is None else slow, RATE)

@@ -104,4 +104,4 @@ def errors_over(
 
 def _dots(axes: Axes, x: np.ndarray, y: np.ndarray, marker: str, **look: Any) -> None:
     """Readings of a configuration; very many of them as a picture."""
-    axes.plot(x, y, marker, ms=5, mec="white", mew=0.5, rasterized=len(x) > 2000, **look)
+    axes.plot(x, y, marker, ms=5, mec="white", mew=0.5, rasterized=len(x) > 500, **look)

@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 import matplotlib
@@ -15,13 +16,16 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import QuadMesh
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.text import Text
 from matplotlib.ticker import LogFormatter, NullFormatter, ScalarFormatter
 
 from mmrjax.model.channels import Channel
+from sweeps import pages
 
 WIDTH = 10.0  # inches, the width of the page's text
 INK, FAINT = "#222222", "#8a8a8a"
@@ -72,11 +76,68 @@ def style() -> Iterator[None]:
         yield
 
 
+#: True while figures are drawn for a phone: one panel below the other.
+_STACKED: ContextVar[bool] = ContextVar("stacked", default=False)
+#: Width of a figure with stacked panels [inches].
+NARROW = 4.3
+
+
+@contextmanager
+def stacked_panels() -> Iterator[None]:
+    """Figures drawn in the block have one column of panels."""
+    token = _STACKED.set(True)
+    try:
+        yield
+    finally:
+        _STACKED.reset(token)
+
+
 def figure(rows: int, columns: int, height: float, **keywords: Any) -> tuple[Figure, np.ndarray]:
-    """A figure of the page's width and its axes, shape (rows, columns)."""
-    fig = Figure(figsize=(WIDTH, height), layout=ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.06))
+    """A figure of the page's width and its axes, shape (rows, columns); within `stacked_panels` one column wide."""
+    stacked = _STACKED.get()
+    size = (
+        (NARROW, (max(height / rows, 2.2) * columns if columns > 1 else height / rows) * rows)
+        if stacked
+        else (WIDTH, height)
+    )
+    fig = Figure(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.06))
     FigureCanvasAgg(fig)
-    return fig, fig.subplots(rows, columns, squeeze=False, **keywords)
+    if not stacked or columns == 1:
+        grid = fig.subplots(rows, columns, squeeze=False, **keywords)
+    else:
+        grid = fig.subplots(rows * columns, 1, squeeze=False).reshape(rows, columns)
+        for axis in ("x", "y"):
+            shared = keywords.get(f"share{axis}", False)
+            groups: Any = {"row": grid, "col": grid.T, True: [grid.ravel()], "all": [grid.ravel()]}.get(shared, [])
+            for group in groups:
+                for other in group[1:]:
+                    getattr(other, f"share{axis}")(group[0])
+    fig.panels = grid  # type: ignore[attr-defined]
+    return fig, grid
+
+
+def can_stack(fig: Figure) -> bool:
+    """True for a figure that `figure` made, which can be drawn for a phone."""
+    return pages.FOR_PHONES and hasattr(fig, "panels")
+
+
+def with_labels(fig: Figure) -> Figure:
+    """A stacked figure in which each panel has the labels that its row or column shared."""
+    grid: Any = vars(fig)["panels"]
+    for i, j in np.ndindex(grid.shape):
+        axes = grid[i, j]
+        if not axes.axison:
+            continue
+        if not axes.get_ylabel():
+            axes.set_ylabel(grid[i, 0].get_ylabel())
+        if not axes.get_xlabel():
+            axes.set_xlabel(grid[-1, j].get_xlabel())
+    return fig
+
+
+def has_colour_scale(fig: Figure) -> bool:
+    """True for a figure whose colours stand for numbers, which a dark page must not invert."""
+    return bool(fig.findobj(lambda artist: isinstance(artist, AxesImage | QuadMesh)))
 
 
 #: Least size of text in a figure [pt], and least contrast of a text's colour to white paper (WCAG 2, AA).

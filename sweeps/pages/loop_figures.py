@@ -14,8 +14,8 @@ from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import blocks
 from calibration.inference.bases import in_words
 from calibration.inference.details import TimeStatistics
+from mmrjax.effects.curve import EVERY_VARIABLE, Variable
 from mmrjax.model.channels import EVERY, SIDES, Channel
-from mmrjax.model.quantities import MM, RPM
 from sweeps.pages.figure_style import (
     BLUE,
     FAINT,
@@ -417,7 +417,9 @@ def base_shift(found: DiscoveryResult) -> Figure:
 def curve(found: UnnamedDiscrepancy) -> Figure:
     """The defect that has no name, run by run over the variable that shows it, with the smooth curve and its band."""
     variable = found.variable if found.window is None else str(found.window["axis"])
-    words, scale = VARIABLE_WORDS.get(variable, (f"phase of the wave, {variable} [rad]", 1.0))
+    abscissa = EVERY_VARIABLE.get(variable, Variable("rad", 0.0, 0.0, "", f"phase of the wave, {variable}", "rad"))
+    words, scale = abscissa.label, 1 / abscissa.shown
+    words += f" [{abscissa.unit_shown}]" if abscissa.unit_shown else ""
     fig, grid = figure(1, 1, 3.4)
     axes = grid[0, 0]
     axes.axhline(0, color=FAINT, lw=0.8)
@@ -434,18 +436,3 @@ def curve(found: UnnamedDiscrepancy) -> Figure:
     axes.set(xlabel=words, ylabel=f"missing in the {in_words(found.place)} [{found.unit}]")
     axes.legend(loc="best")
     return fig
-
-
-#: Words of the variable of a curve, and factor from SI to the unit of the figure.
-VARIABLE_WORDS = {
-    "voltage": ("voltage at the motors [V]", 1.0),
-    "current": ("current of one motor [A]", 1.0),
-    "speed_motor": ("motor speed [rpm]", 1 / RPM),
-    "slope": ("slope [deg]", 180 / np.pi),
-    "payload": ("payload [kg]", 1.0),
-    "speed": ("speed [mm/s]", 1 / MM),
-    "time": ("time since the start [s]", 1.0),
-    "order": ("order of the runs", 1.0),
-    "yaw_rate": ("yaw rate [rad/s]", 1.0),
-    "side": ("side: 1 left, -1 right", 1.0),
-}

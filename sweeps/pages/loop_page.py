@@ -10,20 +10,22 @@ import numpy as np
 
 import mmrjax as mm
 from calibration.data.columns import Layout
+from calibration.described import described
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference import blocks
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
-from calibration.inference.fit_notes import Copied, FarFromPrior, Repeats
+from calibration.inference.fit_notes import Copied, Determination, FarFromPrior, Repeats
 from calibration.inference.simulation_errors import root_mean_square
-from calibration.words import fit_words
-from calibration.words import loop_words as words
-from calibration.words.note_words import sentence
 from mmrjax.effects import BY_NAME
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from sweeps.pages import cluster_figures, loop_figures
-from sweeps.pages.page import Album, columns, conditions, curves, first_rows, render, words_shown
-from sweeps.pages.words import GLOSSARY
+from sweeps.pages.page import Album, columns, curves, first_rows, render
+from sweeps.pages.time_overlay import time_overlay
+from sweeps.pages.words import GLOSSARY, words_shown
+from sweeps.report.condition_columns import conditions
+from sweeps.report.words import loop_words
+from sweeps.report.words.note_words import describe
 
 #: Change of an rms error that is marked [%].
 NOTABLE = 0.05
@@ -53,6 +55,10 @@ def _run_by_run(album: Album, found: DiscoveryResult) -> None:
 def _over_time(album: Album, found: DiscoveryResult) -> None:
     assert isinstance(found.detail, TimeStatistics)
     detail = found.detail
+    simulated = {"after_": "with what was found", "before_": "before"}
+    if _drawn(found) == "none":
+        simulated = {"after_": "simulated"}
+    album.add_overlay("overlay", time_overlay(rows_of(found), found.channels, simulated))
     album.add(
         "before_after", lambda: loop_figures.over_time(found.runs, rows_of(found), found.channels, _drawn(found))
     )
@@ -67,17 +73,17 @@ def alike(found: DiscoveryResult) -> list[str]:
     """Of each effect, and of a discrepancy without a name, what these data cannot tell from it, in words."""
     curve = [] if found.unnamed is None else [found.unnamed]
     without_name = [", ".join(b for b in c.balances_alike if b != c.balance) for c in curve]
-    return [*(words.alike(found, e) for e in found.effects), *without_name]
+    return [*(loop_words.alike(found, e) for e in found.effects), *without_name]
 
 
 def findings(found: DiscoveryResult, changed: Mapping[str, loop_figures.Change]) -> list[dict[str, str]]:
     """Each effect of the model for the first screen: what it is, how large, how sure, what else it could be."""
     listed = []
     for e in found.effects:
-        size = words.size(e)
+        size = loop_words.size(e)
         if (change := changed.get(e.name)) is not None:
             size += f", which changes the {change.channel.label} by {change.rms:.2g} %"
-        sure, other = words.how_sure(found, e), words.alike(found, e)
+        sure, other = loop_words.how_sure(found, e), loop_words.alike(found, e)
         listed.append({"name": e.name, "what": ", or ".join(e.families), "size": size, "sure": sure, "alike": other})
     return listed
 
@@ -169,9 +175,9 @@ def summary(found: DiscoveryResult) -> list[dict[str, Any]]:
 def check_first(found: DiscoveryResult) -> list[str]:
     """What to look at before the robot is used: the reading that weighs most, parameters that moved too far, and what
     the table contradicts."""
-    far = [sentence(note) for note in found.remarks if isinstance(note, FarFromPrior | Repeats | Copied)]
+    far = [describe(note) for note in found.remarks if isinstance(note, FarFromPrior | Repeats | Copied)]
     against = [note for note in found.remarks if isinstance(note, str)]
-    said = [words.largest_share(found), *far, *against[:1]]
+    said = [loop_words.largest_share(found), *far, *against[:1]]
     # a sentence begins with a capital, a parameter's name does not
     return [f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in said if text]
 
@@ -208,7 +214,7 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         album,
         of_channels=found.channels,
         title=f"Is the {words_shown(Path(robot_name).name)} model complete?",
-        answer=words.answer(found),
+        answer=loop_words.answer(found),
         findings=findings(found, changed),
         summary=summary(found),
         unseen=unseen(found),
@@ -220,17 +226,17 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
             "fitted.toml": "the robot refitted, with nothing added",
         },
         seen_by=next((blocks.in_words(kind) for kind in found.errors_held_out), "nothing"),
-        use_it=words.use_it(found),
+        use_it=loop_words.use_it(found),
         check_first=check_first(found),
         document=found.to_json(),
-        p=words.p_value(found.before.p_value),
-        cluster="" if found.cluster is None else words.cluster(found.cluster),
-        standing=words.standing(found),
-        ruled_out=words.ruled_out(found),
+        p=loop_words.p_value(found.before.p_value),
+        cluster="" if found.cluster is None else loop_words.cluster(found.cluster),
+        standing=loop_words.standing(found),
+        ruled_out=loop_words.ruled_out(found),
         alike=alike(found),
-        doubts=[words.tentative(found, e) for e in found.effects] + [""] * (found.unnamed is not None),
-        other_noise=words.at_other_noise(found.sensitivity),
-        worse=words.worse(found.held_out_worse, found.predicted),
+        doubts=[loop_words.tentative(found, e) for e in found.effects] + [""] * (found.unnamed is not None),
+        other_noise=loop_words.at_other_noise(found.sensitivity),
+        worse=loop_words.worse(found.held_out_worse, found.predicted),
         rows=first_rows(rows_of(found)),
         conditions=conditions(rows_of(found)),
         columns=columns(found.channels),
@@ -239,6 +245,8 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         sides=max(1, len(loop_figures.defects_of(table, "before", "track"))),
         closed=loop_figures.closed(table) if sized and isinstance(found.detail, EquationDefects) else [],
         rms=found.rms,
-        determined={n: fit_words.determined(n, p.held_by_prior, found.together) for n, p in found.base_shift.items()},
+        determined={
+            n: described(Determination.of(n, p.held_by_prior, found.together)) for n, p in found.base_shift.items()
+        },
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",
     )

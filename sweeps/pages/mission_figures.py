@@ -26,6 +26,11 @@ _BARS = {
 }  # fmt: skip
 
 
+def label_of_sink(name: str) -> str:
+    """Name of a place where energy goes, as in the bars of `energy`."""
+    return _BARS[name][0]
+
+
 def course(rows: Mapping[str, np.ndarray], cycle: float | None, limit: float, linear: bool, sides: float) -> Figure:
     """A run over its profile, a row a subject; beside it its first cycle, where it has several.
 

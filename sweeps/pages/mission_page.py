@@ -10,6 +10,7 @@ import numpy as np
 from calibration.data.robot_file import RobotFile
 from mmrjax.missions import mission_batch
 from mmrjax.model.channels import WARMING
+from mmrjax.model.energy import SINKS
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import FLAGS
 from sweeps import capabilities
@@ -61,6 +62,7 @@ def write(folder: Path, file: RobotFile, found: Missions) -> Path:
         first=names[0],
         run=first,
         on_battery=on_battery,
+        answer=answer(first),
         cards=_cards({key: value for key, value in first.items() if key not in idle}),
         limits=_limits(robot, first),
         flagged=_flags(first, found, name),
@@ -86,6 +88,23 @@ def _names(runs: dict[str, np.ndarray]) -> list[str]:
         head, *parts = label.split(", ")
         answer.append(", ".join([head, *(p for p in parts if not p.startswith("nan"))]))
     return answer
+
+
+def answer(run: dict[str, Any]) -> str:
+    """One sentence: energy of the mission, its largest shares, and how long the battery lasts."""
+    drawn = float(run["energy_drawn_Wh"])
+    text = f"The mission takes {float(run['energy_Wh']):.3g} Wh"
+    if np.isfinite(run.get("distance_m", np.nan)) and run["distance_m"] > 0:
+        text += f" over {run['distance_m']:.0f} m"
+    if drawn > 0:
+        shares = {mission_figures.label_of_sink(name): float(run[f"energy_to_{name}_Wh"]) / drawn for name in SINKS}
+        largest = sorted(shares, key=lambda label: -shares[label])[:2]
+        parts = [f"{label} {100 * shares[label]:.0f} %" for label in largest if shares[label] > 0]
+        text += f" ({', '.join(parts)})"
+    if np.isfinite(run["endurance_s"]):
+        text += f"; a full battery lasts {run['endurance_s'] / 60:.0f} min"
+    status = str(run["status"])
+    return text + ("." if status == "converged" else f". It ends early: {words.meaning(status)}.")
 
 
 def _cards(run: dict[str, Any]) -> list[dict[str, str]]:

@@ -16,16 +16,16 @@ from markupsafe import Markup, escape
 from calibration.data.robot_file import RobotFile
 from calibration.data.writing import write_text
 from mmrjax import __version__, effects
-from mmrjax.model import channels, params
+from mmrjax.model import channels
 from mmrjax.model.channels import Channel
-from mmrjax.model.quantities import SET, Condition
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
-from sweeps.pages.figure_style import style, svg
-
-ROWS = 200  # of a table on a page
-_PAPERS_NAMES = {"nominal": "nominal (PM)", "sm1": "SM-1", "sm2": "SM-2"}
+from sweeps.pages.figure_style import can_stack, has_colour_scale, stacked_panels, style, svg, with_labels
+from sweeps.pages.time_overlay import TimeOverlay
+from sweeps.report.document import PAGE_ROWS as ROWS
+from sweeps.report.document import Column, Note, Section, Table, tone
+from sweeps.report.markup import download, marked
 
 
 class Album:
@@ -35,87 +35,83 @@ class Album:
         self.folder = Path(folder) / "figures"
         self.folder.mkdir(parents=True, exist_ok=True)
         self.pictures: dict[str, Markup] = {}
+        self.overlays = False
 
     def add(self, name: str, draw: Callable[[], Any]) -> Any:
-        """Draw one figure; `draw` returns it, alone or followed by numbers, which are returned."""
+        """Draw one figure, and a narrow one for phones if its panels stand side by side.
+
+        Args:
+            draw: returns the figure, alone or followed by numbers, which are returned; or an overlay over time.
+        """
         with style():
             drawn = draw()
+            if isinstance(drawn, TimeOverlay):
+                return self.add_overlay(name, drawn)
             figure, *numbers = drawn if isinstance(drawn, tuple) else (drawn,)
-            text = svg(figure)
+            text, narrow = svg(figure), ""
+            if can_stack(figure):
+                with stacked_panels():
+                    drawn = draw()
+                    narrow = svg(with_labels(drawn[0] if isinstance(drawn, tuple) else drawn))
         write_text(self.folder / f"{name}.svg", text)
-        self.pictures[name] = Markup(_inline(text, name))
+        looks = "scale " * has_colour_scale(figure)
+        picture = _inline(text, name, looks + ("wide" if narrow else "only"))
+        self.pictures[name] = Markup(
+            picture + (_inline(narrow, f"{name}-narrow", looks + "narrow") if narrow else "")
+        )
         return numbers[0] if numbers else None
 
+    def add_overlay(self, name: str, overlay: TimeOverlay) -> None:
+        """Draw readings over time, as a figure for print and with the data of an interactive one."""
+        self.add(name, overlay.draw)
+        self.overlays = True
+        self.pictures[name] += Markup(
+            f'<script type="application/json" data-overlay="{name}">{overlay.to_json()}</script>'
+        )
 
-def _inline(svg: str, name: str) -> str:
-    """An SVG document as an element of a page: only what is referred to has an id, which is of this figure alone."""
+
+def _inline(svg: str, name: str, looks: str) -> str:
+    """An SVG document as an element of a page, with the classes `looks`; ids that are referred to are its own."""
     element = re.sub(r' xmlns(?::\w+)?="[^"]*"', "", svg[svg.index("<svg") :])
+    element = element.replace("<svg ", f'<svg class="{looks}" ', 1)
     wanted = set(re.findall(r'(?:href="|url\()#([^")]+)', element))
     element = re.sub(r' id="([^"]+)"', lambda m: f' id="{name}-{m[1]}"' if m[1] in wanted else "", element)
     return re.sub(r'((?:href="|url\()#)(?=[^")]+)', rf"\g<1>{name}-", element)
 
 
 def named(file: RobotFile) -> dict[str, Any]:
-    """What a page says of the robot: the `robot`'s name, and the parameters `changed` from the nominal one's.
+    """The `robot`'s name and its section of a page (`about_robot`), with its remarks and unnamed curves.
 
-    Of a rig that starts from nothing its `own`, with where each comes from. A changed packaged robot is said to be
-    one.
+    A packaged robot with other parameters is called changed.
     """
     from mmrjax.model.paper_robots import ROBOTS
 
-    robot, name = file.robot, file.name
-    known: dict[str, Any] = {"robot": name, "changed": [], "own": [], "curves": curves(robot)}
-    known["remarks"] = file.remarks
-    if not robot.rig.inherits:
-        return known | {"own": capabilities.parameters(file)}
-    if name in ROBOTS and changed_parameters(robot, ROBOTS[name]()):
-        name = f"{name}, changed"
-    return known | {"robot": words_shown(name), "changed": changed_parameters(robot, ROBOTS["nominal"]())}
+    about = {"robot": capabilities.shown_name(file), "curves": curves(file.robot), "remarks": file.remarks}
+    return about | {"about_robot": _section(file, ROBOTS["nominal"]())}
+
+
+def _section(file: RobotFile, nominal: Robot) -> Section:
+    """Parameters of a rig, or those in which a robot differs from the nominal one."""
+    end = (Column("unit"), Column("meaning"))
+    first, value = Column("parameter"), "{:.6g}"
+    if not file.robot.rig.inherits:
+        columns = (first, Column("value", form=value), *end, Column("source"))
+        text = "Its parameters (SI units). A loss or limit that its file does not state is absent."
+        rows, table = capabilities.parameters(file), "own"
+    else:
+        columns = (first, Column("this robot", form=value), Column("nominal", form=value), *end)
+        text = "Parameters that differ from the nominal robot's (SI units):"
+        rows, table = capabilities.changed_parameters(file.robot, nominal), "changed"
+    if not rows:
+        text = "Every parameter is the nominal robot's (Tables 1-7 of the paper and the makers' sheets)."
+    return Section(
+        "The robot", (Note(text), Table(table, columns, [(f"`{name}`", *rest) for name, *rest in rows])), "robot"
+    )
 
 
 def curves(robot: Robot) -> list[str]:
     """Curves of a robot for what is missing without a name."""
     return [e.name for e in robot.effects if e.name in effects.UNNAMED]
-
-
-def words_shown(name: str) -> str:
-    """A robot's name as a page shows it."""
-    return _PAPERS_NAMES.get(name, name)
-
-
-def changed_parameters(robot: Robot, nominal: Robot) -> list[dict[str, str]]:
-    """Every parameter of `robot` that is not the nominal robot's, with both values."""
-    base = {p.name: float(p.value) for p in params.walk(nominal)}
-    answer = []
-    for p in params.walk(robot):
-        value = float(p.value)
-        if p.name not in base or not np.isclose(value, base[p.name], rtol=1e-9, atol=0.0):
-            before = f"{base[p.name]:.6g}" if p.name in base else "not in the paper's model"
-            answer.append(
-                {"name": p.name, "meaning": p.spec.meaning, "unit": p.spec.unit, "value": f"{value:.6g}"}
-                | {"nominal": before}
-            )
-    return answer
-
-
-def _column(condition: Condition) -> str:
-    """The column of a condition; an imposed speed or current stands in that of its channel."""
-    return next((c.column for c in channels.EVERY if c.name == condition.name), condition.column)
-
-
-#: Conditions of a run by their columns: heading, and format of a number.
-CONDITIONS = {_column(c): (c.heading, c.shown) for c in SET if c.heading}
-
-
-def conditions(table: dict[str, np.ndarray], *, mass: bool = False) -> dict[str, tuple[str, str]]:
-    """Heading and format of each condition that a table has, by column; readings of channels are none.
-
-    Args:
-        mass: whether the total mass is among them.
-    """
-    readings = {c for c in table if f"simulated_{c}" in table or f"after_{c}" in table}
-    shown = {c: about for c, about in CONDITIONS.items() if c in table and c not in readings}
-    return {c: about for c, about in shown.items() if mass or c != "total_mass_kg"}
 
 
 def label(table: dict[str, np.ndarray], row: int) -> str:
@@ -176,7 +172,7 @@ def supply(value: Any) -> str:
 
 
 def reading(value: Any, channel: str) -> str:
-    """A reading with the digits that matter beside others of its kind, one less than its resolution."""
+    """A reading with one digit less than its channel's resolution."""
     digits = max(channels.find(channel).resolution - 1, 0)
     return number(value, f"{{:.{digits}f}}")
 
@@ -202,15 +198,15 @@ def render(
     of_channels: Iterable[Channel] = (),
     **known: Any,
 ) -> Path:
-    """Write `report.html` from a template, the album's pictures and what the template asks for.
+    """Write `report.html` from a template, the album's pictures and the template's values.
 
-    What every page has comes here: contents after the answer, what lies beside the page (`files`: meanings that are
-    not the usual ones), tables that scroll in themselves.
+    Adds the parts of every page: contents after the answer, files of the folder (`files`: unusual meanings), tables
+    that scroll.
 
     Args:
-        curves: of the robot that the page is about, which nobody has named (see `curves`): it warns of them.
-        remarks: sentences on the robot, of which it warns too.
-        of_channels: that the page is about.
+        curves: unnamed curves of the robot, for a warning (see `curves`).
+        remarks: further warnings about the robot.
+        of_channels: channels of the page.
     """
     templates = resources.files("sweeps.pages") / "templates"
     environment = jinja2.Environment(
@@ -221,14 +217,16 @@ def render(
         lstrip_blocks=True,
     )
     environment.filters |= {"number": number, "reading": reading, "grade": _grade, "error": error, "winding": winding}
+    environment.filters |= {"marked": marked, "download": download, "tone": tone}
     environment.globals |= {
+        "page_rows": ROWS,
         "channels": {c.name: (c.label, c.unit) for c in of_channels},
         "status_words": {name: status.short for name, status in words.STATUSES.items()},
         "settled_words": words.SETTLED,
         "version": __version__,
     }
     known["files"] = _beside(Path(folder), words.FILES | known.get("files", {}))
-    page = environment.get_template(template).render(pictures=album.pictures, **known)
+    page = environment.get_template(template).render(pictures=album.pictures, overlays=album.overlays, **known)
     page = page.replace("<table", '<div class="scroll" tabindex="0"><table').replace("</table>", "</table></div>")
     warnings = {"curve-warning": words.of_curves(curves), "robot-warning": escape(". ".join(remarks))}
     page = _with_contents(page, warnings)

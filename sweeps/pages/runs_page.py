@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +11,15 @@ import numpy as np
 
 from calibration.data.robot_file import RobotFile
 from mmrjax.fidelities.base import Run
-from mmrjax.model.channels import VOLTAGE
+from mmrjax.model.channels import VOLTAGE, Channel
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import posture_words, power_figures, words
 from sweeps.pages.history_figures import Start
-from sweeps.pages.page import Album, columns, conditions, first_rows, label, named, render, statuses
+from sweeps.pages.page import Album, columns, first_rows, label, named, reading, render, statuses
 from sweeps.points.imposed import UNLIMITED
+from sweeps.report.condition_columns import conditions
 from sweeps.results.posture_results import Postures
 
 #: What the table of runs shows beside conditions and channels: heading, factor, format.
@@ -71,6 +72,7 @@ def write(
         album.add("power", lambda: power_figures.chain(picked, [names[k] for k in chain], robot.has_ground))
     single = len(names) == 1
     shown = capabilities.without_idle(robot, runs)
+    used = limits(robot, {key: value[0] for key, value in runs.items()}, known["starts"]) if single else []
     return render(
         folder,
         "runs.html.j2",
@@ -81,7 +83,9 @@ def write(
         total=len(names),
         rows=[{"label": name, **row} for name, row in zip(names, first_rows(runs), strict=False)],
         statuses=statuses(runs),
-        limits=limits(robot, {key: value[0] for key, value in runs.items()}, known["starts"]) if single else [],
+        limits=used,
+        answer=answer(runs, robot.channels, used),
+        within=not any(limit["percent"] is not None and limit["percent"] > 100 for limit in used),
         chained=len(chain),
         most=CHAINS,
         columns=columns(robot.channels),
@@ -93,6 +97,30 @@ def write(
         **known,
         **named(file),
     )
+
+
+def answer(runs: dict[str, np.ndarray], channels: Sequence[Channel], used: Sequence[Mapping[str, Any]]) -> str:
+    """One sentence: readings of a single run and its most used limit, or how many of several runs settle.
+
+    Args:
+        used: limits of a single run, as `limits` returns them.
+    """
+    settled = np.isin(runs["status"], words.SETTLED)
+    if len(settled) > 1:
+        over = int((settled & (runs["flags"] != "")).sum())
+        beyond = f"{over} of them {'exceeds' if over == 1 else 'exceed'} a limit"
+        rest = f"; {beyond if over else 'all within every limit'}" if settled.any() else ""
+        return f"{settled.sum()} of {len(settled)} runs have an operating point{rest}."
+    if not settled[0]:
+        return f"No operating point: {words.meaning(str(runs['status'][0]))}."
+    readings = ", ".join(f"{c.label} {reading(runs[c.column][0], c.name)} {c.unit}" for c in channels)
+    judged = [limit for limit in used if limit["percent"] is not None]
+    readings = readings[0].upper() + readings[1:]
+    if not judged:
+        return f"{readings}."
+    nearest = max(judged, key=lambda limit: limit["percent"])
+    verb = "exceeds its limit" if nearest["percent"] > 100 else "is the nearest limit"
+    return f"{readings}; {nearest['words']} {verb} ({nearest['percent']:.0f} % of {nearest['limit']})."
 
 
 def labels(runs: dict[str, np.ndarray]) -> list[str]:

@@ -10,9 +10,9 @@ import numpy as np
 
 from calibration.data.robot_file import RobotFile
 from calibration.sensitivity.result import NEGLIGIBLE, OutputStudy, SensitivityResult, interactions
-from calibration.words import sensitivity_words as words
 from sweeps.pages import sensitivity_figures
 from sweeps.pages.page import Album, named, number, render
+from sweeps.report.words import sensitivity_words
 
 #: Pairs of a table of interactions.
 PAIRS = 5
@@ -54,7 +54,7 @@ def write(folder: Path, found: SensitivityResult, file: RobotFile) -> Path:
         album,
         title="Which parameters matter",
         found=found,
-        method=words.METHODS[found.method],
+        method=sensitivity_words.METHODS[found.method],
         sections=sections,
         inputs=_inputs(found),
         runs=_next_runs(found),

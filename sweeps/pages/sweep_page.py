@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -49,9 +50,27 @@ def write(folder: Path, file: RobotFile, *, model: str, runs: Table) -> Path:
         of_channels=robot.channels,
         title=f"Sweep of {counted(len(runs['status']), 'run')}",
         model=model,
+        answer=answer(runs),
         counts=counts(capabilities.without_idle(robot, runs), robot.channels),
         volts_drawn=_drawn(runs),
         **named(file),
+    )
+
+
+def answer(runs: Table) -> str:
+    """One sentence: runs that have an operating point, and how many of them stay within every limit."""
+    total = len(runs["status"])
+    settled = np.isin(runs["status"], words.SETTLED)
+    over = settled & (runs["flags"] != "")
+    verb = "has" if 1 in (total, settled.sum()) else "have"
+    first = f"{settled.sum()} of {counted(total, 'run')} {verb} an operating point"
+    if not over.any():
+        return f"{first}; all within every limit." if settled.any() else f"{first}."
+    raised = Counter(flag for flags in runs["flags"][over] for flag in str(flags).split(";"))
+    most, times = raised.most_common(1)[0]
+    return (
+        f"{first}; {over.sum()} of them {'exceeds' if over.sum() == 1 else 'exceed'} a limit, most often: "
+        f"{words.FLAGS.get(most, most)} ({counted(times, 'run')})."
     )
 
 
@@ -59,6 +78,7 @@ def counts(runs: Table, channels: Sequence[Channel]) -> dict[str, Any]:
     """Counts of a finished sweep per status and limit, its axes in words, and the extremes of the settled runs."""
     status = statuses(runs)
     for s in status:
+        s["over"] = int(((runs["status"] == s["name"]) & (runs["flags"] != "")).sum())
         s["where"] = "" if s["name"] in words.SETTLED else _where(runs, runs["status"] == s["name"])
     flags = []
     known, which = np.unique(runs["flags"], return_inverse=True)

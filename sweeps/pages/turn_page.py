@@ -16,8 +16,9 @@ from mmrjax.fidelities.base import History
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.robot import Robot
 from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, figure
-from sweeps.pages.page import Album, columns, conditions, named, render
+from sweeps.pages.page import Album, columns, named, render
 from sweeps.pages.turn_words import FULL, Turn
+from sweeps.report.condition_columns import conditions
 
 SIDES = (("left", BLUE), ("right", VERMILION))
 #: Settled turns of a larger radius are drawn as an arc of so many lengths of the robot.

@@ -225,6 +225,14 @@ def describe_rms(rms: Mapping[str, Mapping[str, float]]) -> str:
     return "rms error: " + "; ".join(parts)
 
 
+_PAPERS_NAMES = {"nominal": "nominal (PM)", "sm1": "SM-1", "sm2": "SM-2"}
+
+
+def words_shown(name: str) -> str:
+    """A robot's name as a page shows it."""
+    return _PAPERS_NAMES.get(name, name)
+
+
 def short_name(name: str) -> str:
     """A parameter's name without the words that every such name has."""
     return name.replace("ground.friction.", "").replace("ground.", "").replace("track.", "").replace("effects.", "")

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from mmrjax.model.paper_tables import TRACKED, WHEELED
 from mmrjax.model.robot import Robot
 from sweeps.pages.figure_style import FAINT, INK, PURPLE, figure, label_end, note
-from sweeps.pages.page import words_shown
+from sweeps.pages.words import words_shown
 from sweeps.paper import data
 from sweeps.paper.look import CONFIGURATION, MODEL
 

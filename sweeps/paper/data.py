@@ -8,8 +8,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import runs as records
-from calibration.inference import simulation_errors as residual
+from calibration.data import runs
+from calibration.inference import simulation_errors
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import History
 from mmrjax.model.channels import Channel
@@ -68,7 +68,7 @@ def operating_points(robot: Robot, asked: Conditions) -> Columns:
 
 def channels_of_paper() -> tuple[Channel, ...]:
     """The channels that the paper's tables have."""
-    table = records.read("measured")
+    table = runs.read("measured")
     return tuple(c for c in table.channels if table.has(c.column))
 
 
@@ -90,7 +90,7 @@ class Rows:
         ratio: raised adhesion over the robot's own, by configuration.
     """
 
-    conditions: records.Runs
+    conditions: runs.Runs
     measured: np.ndarray
     paper: np.ndarray
     plain: Columns
@@ -112,7 +112,7 @@ def rows(robot: Robot) -> Rows | None:
         return None
     table, paper = (
         table.where(np.isin(table["configuration"], shared(robot)))
-        for table in map(records.read, ("measured", "simulated_by_paper"))
+        for table in map(runs.read, ("measured", "simulated_by_paper"))
     )
     kind = table["configuration"]
     asked: dict[str, Any] = {
@@ -151,7 +151,7 @@ def raised_words(robot: Robot, ratio: dict[str, float]) -> str:
 
 def errors(simulated: Columns, measured: np.ndarray) -> np.ndarray:
     """Errors (35) of the paper's channels [%], shape (rows, channels); NaN where there is no number."""
-    return residual.relative_error(stacked(simulated), measured)
+    return simulation_errors.relative_error(stacked(simulated), measured)
 
 
 # --- components ---------------------------------------------------------------------------------------
@@ -215,7 +215,7 @@ def idle_current(robot: Robot, configuration: str, speed_wheel: np.ndarray) -> n
 def fit_line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
     """Least-squares line through the points, evaluated at them, and its R² (A1)."""
     line = np.polyval(np.polyfit(x, y, 1), x)
-    return line, residual.certainty(y, line)
+    return line, simulation_errors.certainty(y, line)
 
 
 # --- runs ---------------------------------------------------------------------------------------------
@@ -327,7 +327,7 @@ def energy_split(robot: Robot, asked: Conditions) -> tuple[Columns, Columns]:
 def table(rows: Rows) -> Columns:
     """The paper's rows side by side: measured, the paper's simulation, and the robot three ways."""
     asked = rows.conditions
-    columns = {key: asked[key] for key in ("configuration", *records.CONDITIONS)}
+    columns = {key: asked[key] for key in ("configuration", *runs.CONDITIONS)}
     for k, channel in enumerate(channels_of_paper()):
         columns[channel.column] = rows.measured[:, k]
         columns[f"paper_{channel.column}"] = rows.paper[:, k]
@@ -339,8 +339,8 @@ def table(rows: Rows) -> Columns:
 def summary(rows: Rows) -> dict[str, dict[str, Any]]:
     """Errors (35) of every channel against the bench: of the robot three ways, and of the paper's simulation."""
     ways = {name: errors(getattr(rows, name), rows.measured) for name in ("plain", "raised", "weighed")}
-    ways["paper"] = residual.relative_error(rows.paper, rows.measured)
+    ways["paper"] = simulation_errors.relative_error(rows.paper, rows.measured)
     return {
-        way: {c.name: residual.summary(values[:, k]) for k, c in enumerate(channels_of_paper())}
+        way: {c.name: simulation_errors.summary(values[:, k]) for k, c in enumerate(channels_of_paper())}
         for way, values in ways.items()
     }

@@ -7,8 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import runs as records
-from calibration.inference import simulation_errors as residual
+from calibration.data import runs
+from calibration.inference import simulation_errors
 from mmrjax.model.paper_tables import CONFIGURATIONS, TRACKED, WHEELED
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.robot import Robot
@@ -23,14 +23,14 @@ def errors(variants: dict[str, np.ndarray], rows: data.Rows) -> list[dict[str, A
     for name, values in variants.items():
         for group in ("all", *rows.ratio):
             pick = np.ones(len(kind), bool) if group == "all" else kind == group
-            cells = [residual.summary(values[pick, k]) for k in range(values.shape[1])]
+            cells = [simulation_errors.summary(values[pick, k]) for k in range(values.shape[1])]
             answer.append(
                 {"variant": name, "group": group, "rows": cells[0]["rows"], "of": int(pick.sum()), "cells": cells}
             )
     return answer
 
 
-def implied_resistance(robot: Robot, table: records.Runs) -> np.ndarray:
+def implied_resistance(robot: Robot, table: runs.Runs) -> np.ndarray:
     """Resistance [Ω] in series with each motor that current and speed of each row imply by (15)."""
     current = table["total_current_A"]
     back = np.asarray(robot.motor.voltage_back(jnp.asarray(table["motor_speed_rpm"] * RPM)))
@@ -41,7 +41,7 @@ def row_by_row(nominal: Robot, rows: data.Rows) -> list[dict[str, Any]]:
     """The 20 rows: bench, the paper's simulation, the nominal robot three ways, and letters that say why."""
     table = rows.conditions
     own, raised, weighed = (data.stacked(t) for t in (rows.plain, rows.raised, rows.weighed))
-    resistance = implied_resistance(nominal, records.read("simulated_by_paper"))
+    resistance = implied_resistance(nominal, runs.read("simulated_by_paper"))
     limit = float(nominal.motor.resistance)
     answer = []
     for k in range(len(table)):
@@ -87,7 +87,7 @@ def row_by_row(nominal: Robot, rows: data.Rows) -> list[dict[str, Any]]:
     return answer
 
 
-def _same_mode(table: records.Runs, k: int) -> np.ndarray:
+def _same_mode(table: runs.Runs, k: int) -> np.ndarray:
     return (table["configuration"] == table["configuration"][k]) & (
         table["supply_voltage_V"] == table["supply_voltage_V"][k]
     )
@@ -101,17 +101,17 @@ def _cells(channel: str, measured: float, paper: float, own: float, raised: floa
         "own": reading(own, channel) if np.isfinite(own) else "slides",
         "raised": reading(raised, channel) if np.isfinite(raised) else "no number",
         "weighed": reading(weighed, channel) if np.isfinite(weighed) else "no number",
-        "to_paper": float(residual.relative_error(np.array(raised), np.array(paper))),
-        "to_paper_weighed": float(residual.relative_error(np.array(weighed), np.array(paper))),
-        "to_measured": float(residual.relative_error(np.array(raised), np.array(measured))),
-        "to_measured_weighed": float(residual.relative_error(np.array(weighed), np.array(measured))),
+        "to_paper": float(simulation_errors.relative_error(np.array(raised), np.array(paper))),
+        "to_paper_weighed": float(simulation_errors.relative_error(np.array(weighed), np.array(paper))),
+        "to_measured": float(simulation_errors.relative_error(np.array(raised), np.array(measured))),
+        "to_measured_weighed": float(simulation_errors.relative_error(np.array(weighed), np.array(measured))),
     }
 
 
 def facts(nominal: Robot, rows: data.Rows) -> dict[str, Any]:
     """The numbers behind the letters of `row_by_row`, for the page to put into words."""
     measured = rows.conditions
-    of_paper = implied_resistance(nominal, records.read("simulated_by_paper"))
+    of_paper = implied_resistance(nominal, runs.read("simulated_by_paper"))
     tracked = measured["configuration"] == TRACKED
     slow, slope = measured["supply_voltage_V"] == 15.0, measured["slope_deg"]
     used = rows.plain["adhesion_used"]

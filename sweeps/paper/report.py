@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from calibration.data.robot_file import RobotFile
-from calibration.inference import simulation_errors as residual
+from calibration.inference import simulation_errors
 from mmrjax.model.paper_robots import ROBOTS
 from mmrjax.model.paper_tables import TRACKED
 from mmrjax.model.robot import Robot
 from sweeps.pages import history_figures, page
-from sweeps.pages.page import words_shown
+from sweeps.pages.words import words_shown
 from sweeps.paper import components, data, error_tables, run_figures
 
 
@@ -94,7 +94,7 @@ def _variants(name: str, rows: dict[str, data.Rows]) -> dict[str, np.ndarray]:
         pick = np.isin(rows["nominal"].conditions["configuration"], list(mine.ratio))
         nominal = rows["nominal"]
         answer["nominal (PM): adhesion raised, its own mass"] = error(nominal.weighed, nominal.measured)[pick]
-    return answer | {"the paper's own simulation": residual.relative_error(mine.paper, mine.measured)}
+    return answer | {"the paper's own simulation": simulation_errors.relative_error(mine.paper, mine.measured)}
 
 
 def _sliding_rows(rows: data.Rows) -> tuple[np.ndarray, ...]:

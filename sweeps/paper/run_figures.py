@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from calibration.inference import simulation_errors as residual
+from calibration.inference import simulation_errors
 from mmrjax.model.paper_tables import TRACKED, WHEELED
 from mmrjax.model.robot import Robot
 from sweeps.pages import words
@@ -24,7 +24,7 @@ from sweeps.pages.figure_style import (
     label_end,
     note,
 )
-from sweeps.pages.page import words_shown
+from sweeps.pages.words import words_shown
 from sweeps.paper import data
 from sweeps.paper.look import CONFIGURATION, MODEL
 
@@ -62,10 +62,10 @@ def current_over_slope(robot: Robot, rows: data.Rows) -> tuple[Figure, list[dict
                         "configuration": kind,
                         "mode": mode,
                         "straight": straight,
-                        "own": residual.certainty(measured, rows.plain["total_current_A"][pick]),
+                        "own": simulation_errors.certainty(measured, rows.plain["total_current_A"][pick]),
                         "own_rows": int(np.isfinite(rows.plain["total_current_A"][pick]).sum()),
-                        "raised": residual.certainty(measured, rows.raised["total_current_A"][pick]),
-                        "weighed": residual.certainty(measured, rows.weighed["total_current_A"][pick]),
+                        "raised": simulation_errors.certainty(measured, rows.raised["total_current_A"][pick]),
+                        "weighed": simulation_errors.certainty(measured, rows.weighed["total_current_A"][pick]),
                     }
                 )
         axes.set(xlabel="slope [°]", xticks=[0, 5, 10, 15, 20], xlim=(-0.5, 20.9))
@@ -103,7 +103,7 @@ def model_errors(robots: dict[str, Robot], rows: dict[str, data.Rows]) -> tuple[
 
     handles = [Line2D([], [], color=MODEL.get(n, PURPLE), marker="o", ms=4, label=words_shown(n)) for n in robots]
     handles.append(Line2D([], [], color=INK, ls=":", marker="o", ms=4, label="on a full battery (mode 2)"))
-    paper = residual.relative_error(next(iter(rows.values())).paper, next(iter(rows.values())).measured)
+    paper = simulation_errors.relative_error(next(iter(rows.values())).paper, next(iter(rows.values())).measured)
     table = next(iter(rows.values())).conditions
     for mode, voltage in ((1, 15.0), (2, 33.0)):
         pick = (table["configuration"] == TRACKED) & (table["supply_voltage_V"] == voltage)

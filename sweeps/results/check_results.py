@@ -1,8 +1,9 @@
-"""What the command `check` found: requirements with what is reached, in words."""
+"""Result of the command `check`: requirements with their values, and words for both."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,21 +12,23 @@ import numpy as np
 from calibration.data.input_errors import rounded
 from calibration.data.requirements_file import Requirements
 from calibration.sizing import sheet
-from calibration.sizing.sheet import Change, Outcome
-from mmrjax.model.paper_tables import COULOMB_PER_MAH
+from calibration.sizing.sheet import Outcome
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import NOT_SETTLED, STATUSES
 from sweeps.pages import words
 from sweeps.results.posture_results import Drawn
 
+#: Missed requirements that the statement names.
+NAMED = 3
+
 
 @dataclasses.dataclass(frozen=True)
 class CheckResult:
-    """What the command found.
+    """Requirements and their outcomes for one robot.
 
     Attributes:
-        asked: the requirements; robot: that was held against them; outcomes: one each, in order.
-        drawn: the robot as requirements of its geometry ask about it, see `posture.of_requirements`.
+        asked: the requirements; robot: compared with them; outcomes: one for each requirement, in order.
+        drawn: the robot in the posture of each geometric requirement, see `posture_results.of_requirements`.
     """
 
     asked: Requirements
@@ -35,17 +38,19 @@ class CheckResult:
 
     @property
     def missed(self) -> list[Outcome]:
-        """What does not hold."""
+        """Outcomes of the missed requirements."""
         return [o for o in self.outcomes if not o.met]
 
     def statement(self) -> str:
-        """The sheet in a sentence."""
-        number = len(self.outcomes)
-        if not self.missed:
+        """The answer: how many requirements are met, and those missed by most in percent of their limits."""
+        number, missed = len(self.outcomes), sorted(self.missed, key=_share)
+        if not missed:
             return f"All {number} requirements are met." if number > 1 else "The requirement is met."
-        each = "; ".join(f"{label(o)} {shortfall(o)}" for o in self.missed)
-        verb = "is" if len(self.missed) == 1 else "are"
-        return f"{len(self.missed)} of {number} requirements {verb} missed: {each}."
+        verb = "is" if len(missed) == 1 else "are"
+        listed = "; ".join(f"{label(o)} {shortfall(o)}" for o in missed[:NAMED])
+        more = f"; and {len(missed) - NAMED} more" if len(missed) > NAMED else ""
+        worst = "" if len(missed) <= NAMED else "the worst "
+        return f"{len(missed)} of {number} requirements {verb} missed: {worst}{listed}{more}."
 
     def to_json(self) -> dict[str, Any]:
         """`result.json`."""
@@ -58,8 +63,13 @@ class CheckResult:
         }
 
 
+def _share(outcome: Outcome) -> float:
+    """Margin as a share of the limit [-]; the least for a requirement without a value."""
+    return -math.inf if outcome.margin is None else outcome.margin / max(abs(limit(outcome)), 1e-12)
+
+
 def label(outcome: Outcome) -> str:
-    """A requirement in words."""
+    """Name of a requirement, with its duty."""
     at = outcome.at
     duty = ""
     if "duty" in at:
@@ -68,20 +78,20 @@ def label(outcome: Outcome) -> str:
 
 
 def limit(outcome: Outcome) -> float:
-    """What is required, a rating in place."""
+    """Required value, or the rating of the part."""
     found = outcome.requirement.limit
     assert found is not None
     return found
 
 
 def wanted(outcome: Outcome) -> str:
-    """What is required."""
+    """Required value with its sense and unit, as in `≥ 0.9 m/s`."""
     r = outcome.requirement
     return f"{'≥' if r.least else '≤'} {rounded(limit(outcome))} {r.quantity.unit}"
 
 
 def reached(outcome: Outcome) -> str:
-    """The value with its unit, or why there is none."""
+    """Value with its unit, or the reason for having none."""
     quantity = outcome.requirement.quantity
     if outcome.value is not None:
         return f"{rounded(outcome.value)} {quantity.unit}"
@@ -90,7 +100,7 @@ def reached(outcome: Outcome) -> str:
 
 
 def shortfall(outcome: Outcome) -> str:
-    """By how much it is missed."""
+    """Value and its distance from the limit."""
     r = outcome.requirement
     if outcome.value is None or outcome.margin is None:
         return f"({reached(outcome)})"
@@ -112,11 +122,3 @@ def corner(outcome: Outcome) -> str:
             values = np.atleast_1d(outcome.at[key]) * (100 if key == "state_of_charge" else 1)
             parts.append(form.format(" to ".join(f"{v:g}" for v in values[::-1])))
     return ", ".join(parts)
-
-
-def changed(change: Change) -> str:
-    """A change in words."""
-    unit = "" if change.unit == "-" else f" {change.unit}"
-    unit += f" ({change.after / COULOMB_PER_MAH:.0f} mAh)" if change.unit == "C" else ""
-    breaks = f" (but then {', '.join(change.breaks)} would be missed)" if change.breaks else ""
-    return f"{change.parameter} {change.before:.4g} → {change.after:.6g}{unit}{breaks}"

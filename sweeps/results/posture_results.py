@@ -11,8 +11,7 @@ import numpy as np
 from calibration.data.columns import LEVERS
 from calibration.data.table import Runs
 from calibration.sizing.sheet import Outcome
-from mmrjax.climbing import resting_posture as posture
-from mmrjax.climbing import static_limits
+from mmrjax.climbing import resting_posture, static_limits
 from mmrjax.climbing.resting_posture import Outline
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.masses import lever_angles
@@ -130,7 +129,7 @@ def of_requirements(robot: Robot, outcomes: Sequence[Outcome]) -> dict[str, tupl
         else:
             front = rear = float(static_limits.flush(robot)) if name == "gap_mm" else np.pi
             stands = static_limits.with_levers(conditions, front, rear)
-            rests, side = posture.level(robot, stands), posture.outline(robot, stands)
+            rests, side = resting_posture.level(robot, stands), resting_posture.outline(robot, stands)
             drawn = Drawn(jax.device_get(side.pitched(rests.pitch)), float(rests.height), 0.0)
         found[name] = drawn, float(np.degrees(front)), float(np.degrees(rear))
     return found

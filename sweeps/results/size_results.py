@@ -1,4 +1,4 @@
-"""What the command `size` found: a design, its alternatives, and what binds."""
+"""Result of the command `size`: a design, its alternatives and the limits that bind."""
 
 from __future__ import annotations
 
@@ -6,19 +6,23 @@ import dataclasses
 from typing import Any
 
 from calibration.data.requirements_file import Requirements
+from calibration.sizing.chart import Chart
 from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.design_search import Found, Sizing
 from calibration.sizing.sheet import Outcome
+from mmrjax.errors import counted
 from mmrjax.model.robot import Robot
+from sweeps.results.check_results import label
 
 
 @dataclasses.dataclass(frozen=True)
 class SizeResult:
-    """What the command found.
+    """Designs for some requirements.
 
     Attributes:
-        asked: the requirements; robot: that was changed; sizing: what the search found; objectives: that were asked
-            for; outcomes: the best held against the requirements as `check` does, empty where there is none.
+        asked: the requirements; robot: where the search started; sizing: its result; objectives: minimised numbers.
+        outcomes: results of `check` for the best design; empty without one.
+        charts: limits over payload and slope of the best design, if any, and of `robot`; empty without a page.
     """
 
     asked: Requirements
@@ -26,16 +30,19 @@ class SizeResult:
     sizing: Sizing
     objectives: tuple[str, ...]
     outcomes: tuple[Outcome, ...]
+    charts: tuple[Chart, ...] = ()
 
     def statement(self) -> str:
-        """The answer in a sentence."""
+        """The answer: the best design and its binding limits, or the nearest one and its misses."""
         s = self.sizing
-        left_out = f" No choice of parts meets {', '.join(s.unmeetable)}, left out." if s.unmeetable else ""
+        left_out = f" No parts meet the requirement on {' or '.join(s.unmeetable)}; dropped." if s.unmeetable else ""
         if s.best is None:
             nearest = min(s.motors.values(), key=short, default=None)
             why = f" The nearest, {described(nearest)}, misses {', '.join(missed(nearest))}." if nearest else ""
             return f"No design of these parts meets the requirements.{why}{left_out}"
-        binds = f" What binds: {', '.join(s.best.binds)}." if s.best.binds else " Nothing binds."
+        missing = [label(o) for o in self.outcomes if not (o.met or label(o) in s.unmeetable)]
+        binds = f" Binding limits: {', '.join(s.best.binds) or 'none'}."
+        binds += f" It misses {', '.join(missing)}." if missing else ""
         return f"{described(s.best)}: {objective(s.best, s.objective)}.{binds}{left_out}"
 
     def to_json(self) -> dict[str, Any]:
@@ -59,23 +66,23 @@ class SizeResult:
 
 
 def verdict(found: Found, unmeetable: tuple[str, ...]) -> str:
-    """Whether a design meets the requirements; `unmeetable`: those that no choice of parts meets, left out of it."""
+    """Verdict on a design; `unmeetable`: requirements that no choice of parts meets, which were dropped."""
     return "misses" if not found.feasible else "meets the others" if unmeetable else "meets"
 
 
 def short(found: Found) -> float:
-    """By how much a design misses, all margins together [-]."""
+    """Sum of the margins that a design misses [-]."""
     return sum(max(-m, 0.0) for m in found.margins.values())
 
 
 def missed(found: Found) -> list[str]:
-    """What a design misses, by how much."""
+    """Limits that a design misses, with their margins."""
     return [f"{label} ({100 * m:+.1f} %)" for label, m in sorted(found.margins.items(), key=lambda x: x[1]) if m < 0]
 
 
 def described(found: Found) -> str:
-    """A design in words."""
-    stages = f"{found.drive.stages} stage{'s' if found.drive.stages > 1 else ''}"
+    """Motor, gearbox, ratio, radius and cells of a design."""
+    stages = counted(found.drive.stages, "stage")
     return (
         f"{found.drive.motor.name}, {found.drive.family} with {stages}, ratio {found.ratio:.4g}, radius "
         f"{1000 * found.radius:.1f} mm, {found.in_series} × {found.parallel:.3g} {found.cell.name}"
@@ -83,6 +90,6 @@ def described(found: Found) -> str:
 
 
 def objective(found: Found, name: str) -> str:
-    """An objective with its unit; what no sheet states is said."""
+    """An objective with its unit, or `not stated` if no sheet states it."""
     unit, words = OBJECTIVES[name]
     return f"{words} {found.objectives[name]:.4g} {unit}" if name in found.objectives else f"{words} not stated"

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from calibration.data.columns import CURRENT
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
+from calibration.described import described
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.details import EquationDefects
@@ -28,7 +29,6 @@ from calibration.inference.optimizers import Member, Numbers, Optimum, counted, 
 from calibration.inference.problem import Data, Observation, Problem
 from calibration.inference.repeats import same_conditions
 from calibration.inference.simulation_errors import root_mean_square
-from calibration.words import table_words
 from mmrjax import fidelities
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.effects import Effect
@@ -173,7 +173,7 @@ class SettledRuns(Observer):
                 near = runs.layout.nearest(others[0], runs.columns) if others else ""
                 found.append(Repeats(runs.source, (first + 1, second + 1), column, values, known, others, near=near))
         if found and len(alike) == 1:
-            raise BadData(f"{table_words.repeats(found[0])}; no condition varies, so nothing can be fitted")
+            raise BadData(f"{described(found[0])}; no condition varies, so nothing can be fitted")
         return [dataclasses.replace(found[0], more=len(found) - 1)] if found else []
 
     @classmethod

@@ -154,6 +154,6 @@ class SettledTurns(SettledRuns):
         points |= {c: np.tile(columns[c], 2) for c in ("configuration", "order") if c in columns}
         weight = np.tile(included.astype(float), 2)
         lacking = bases_room.balances_of(robot, (*bases_room.BALANCES, *bases_room.OF_TURNS))
-        axes = (bases_room.axes_of(robot)[0], bases_room.VARIABLES["payload"], "yaw_rate", "side")  # what is imposed
+        axes = (bases_room.axes_of(robot)[0], bases_room.VARIABLES["payload"], *VARIABLES_ROUND)  # what is imposed
         told = points, weight, robot, bases_room.Scope(lacking, axes), {way: seen[way] for way in WAYS}
         return (*bases_room.families(*told), *bases_room.windows(*told))

@@ -34,7 +34,9 @@ def log() -> np.ndarray:
     for step in range(len(LEVELS) * HOLD):
         voltage = float(LEVELS[step // HOLD])
         if step % EVERY == 0:
-            current = (voltage - CONSTANT * speed) / RESISTANCE + 0.004 * rng.standard_normal()
+            # A current does not jump with the voltage.
+            before = float(LEVELS[(step - 1) // HOLD]) if step else 0.0
+            current = (before - CONSTANT * speed) / RESISTANCE + 0.004 * rng.standard_normal()
             rows.append((step * STEP, voltage, current, speed * 30 / np.pi + 4 * rng.standard_normal()))
         middle = speed + 0.5 * STEP * acceleration(voltage, speed)
         speed += STEP * acceleration(voltage, middle)

@@ -1,69 +1,21 @@
-"""The page of `settle`: a log over time, what of it has settled, and why the rest is left out."""
+"""The figure of `settle`: a log over time with its settled stretches."""
 
 from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.data.courses import applied
 from calibration.data.settling import Settled
-from calibration.words import settle_words as words
 from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, figure
-from sweeps.pages.page import ROWS, Album, render
+from sweeps.report.settle_report import IMPOSED
 
-#: What is imposed, and the unit of `applied`.
-IMPOSED = {
-    "voltage": ("voltage", "V"),
-    "motor_speed": ("motor speed", "rpm"),
-    "motor_current": ("motor current", "A"),
-}
 #: Most points of a line of a figure, in pairs of the least and the greatest of as many samples.
 POINTS = 3000
 
 
-def write(folder: Path, found: Settled, *, few: str = "") -> Path:
-    """Write `report.html` and `figures/` for what of a log has settled; returns the path of the page.
-
-    Args:
-        few: sentence of `words.too_few`.
-    """
-    album = Album(folder)
-    album.add("log", lambda: over_log(found))
-    return render(
-        folder,
-        "settle.html.j2",
-        album,
-        curves=(),  # nothing is simulated
-        of_channels=tuple(s.channel for s in found.signals),
-        title=f"Settled runs of {Path(found.runs.source).name}",
-        statement=words.statement(found),
-        few=few,
-        notes=words.remarks(found),
-        left=words.left_out(found.stretches, bool(few)),
-        imposed="{} [{}]".format(*IMPOSED[found.runs.layout.imposed]),
-        settled=_rows(found),
-        count=len(found.kept),
-    )
-
-
-def _rows(found: Settled) -> list[dict[str, Any]]:
-    """The settled runs that the page has room for."""
-    return [
-        {
-            "where": f"{s.run or 'log'}, {s.begin:.4g} to {s.end:.4g} s",
-            "samples": len(s.rows),
-            "imposed": s.imposed,
-            "cells": [(s.mean[k.channel.name], s.sd[k.channel.name]) for k in found.signals],
-        }
-        for s in found.kept[:ROWS]
-    ]
-
-
 def over_log(found: Settled) -> Figure:
-    """What is imposed and each channel over the log, run after run; settled stretches and their means."""
+    """The imposed quantity and each channel over the log, with settled stretches and their means."""
     runs = found.runs
     rows = np.concatenate([s.rows for s in found.stretches]) if found.stretches else np.zeros(0, int)
     every = np.unique(np.concatenate([rows, np.arange(len(runs))]))
@@ -95,7 +47,7 @@ def over_log(found: Settled) -> Figure:
 
 
 def _thinned(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A line of few points that looks alike: of each group of samples the least and the greatest."""
+    """A line of few points that looks the same: the least and the greatest sample of each group."""
     size = -(-2 * len(x) // POINTS)
     if size <= 2:
         return x, y

@@ -22,17 +22,17 @@ WOULD_MEASURE = {
     ".guide_share": "the fidelities steady and drive (the track model puts it out; free guide_friction there)",
     ".mass": "a scale, or runs whose table does not state total_mass_kg",
 }
-#: Losses that act alike where a condition does not vary.
+#: Losses that data do not distinguish without variation of a condition.
 ALIKE = {
-    "guides": "rolling resistance, guide friction and Coulomb losses act alike without slopes",
-    "slope": "rolling resistance and Coulomb losses act alike without slopes",
-    "voltage": "losses that grow with speed and those that do not act alike at one voltage",
-    "speed": "losses that grow with speed and those that do not act alike at one speed",
+    "guides": "without slopes, rolling resistance, guide friction and Coulomb losses have the same effect",
+    "slope": "without slopes, rolling resistance and Coulomb losses have the same effect",
+    "voltage": "at one voltage, losses that grow with speed and constant losses have the same effect",
+    "speed": "at one speed, losses that grow with speed and constant losses have the same effect",
 }
 
 
 def would_measure(name: str) -> str:
-    """What would measure a parameter that nothing in the data does."""
+    """Runs or instrument that would measure a parameter that these data do not."""
     for key, what in WOULD_MEASURE.items():
         if name.startswith(key) or name.endswith(key):
             return what

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from calibration.words.experiment_words import ACTS, DOING
 from mmrjax.effects import OF_TURNS, Effect
 from mmrjax.effects.base import THE_SIDE
 from mmrjax.model.channels import find
+from sweeps.report.words.experiment_words import ACTS, DOING
 
 #: What isolates a balance: rows of `experiments.DOING`, `weigh`, and of a channel of `sensor` rows of `ACTS`.
 ISOLATED_BY = {
@@ -17,7 +17,7 @@ ISOLATED_BY = {
 }  # fmt: skip
 CHECKED_BY = {"total_current": ("zero current", "shunt"), "motor_speed": ("strobe",), "speed": ("timing",)}
 #: Of any other channel.
-COMPARE = "Read a second instrument beside that of the {}, at several values"
+COMPARE = "Read a second instrument next to that of the {}, at several values"
 #: What to change, all else alike, so that a term changes that goes with it.
 VARY = {
     "speed": "the speed (the supply voltage)", "current": "the current (slope or payload at one voltage)",
@@ -33,14 +33,14 @@ WEIGH = "Weigh the robot, unladen and laden, and take the stated mass from it"
 
 
 def about(effect: type[Effect]) -> tuple[str, str, str]:
-    """Equation, what it stands for, and source of an effect, each on one line."""
+    """Equation, meaning and source of an effect, each on one line."""
     text, _, source = (effect.__doc__ or "").partition("Source:")
     equation, meaning = ([" ".join(part.split()) for part in text.split("\n\n")] + [""])[:2]
     return equation.rstrip("."), meaning, " ".join(source.split())
 
 
 def declared(effect: type[Effect]) -> Iterator[str]:
-    """What it declares beside its equation."""
+    """Declarations of an effect in addition to its equation."""
     words = [
         "dissipative" * effect.dissipative,
         "in histories alone" * effect.transient,

@@ -1,4 +1,4 @@
-"""What a long computation does next, in words: a row each."""
+"""Steps of long computations, one row each."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from mmrjax.errors import counted
 STEPS = {
     # the loop
     "base": "fitting the base model",
-    "sds": "the sds are not as stated: the same with those that the residuals show",
+    "sds": "the stated sds do not fit: the same with sds from the residuals",
     "bootstrap": "bootstrap of {} tables: what would a complete model leave?",
     "effects": "something is missing: fitting every effect that could explain it",
-    "more effects": "{} leaves something: fitting further effects beside it",
-    "alone": "rows stand alone beside what was found: the same without them",
+    "more effects": "{} does not explain everything: fitting further effects",
+    "alone": "outlying rows found: the same without them",
     "mechanism": "which mechanism explains most of it?",
     "alike": "what else explains as much as {}?",
     "held out": "which of those predicts best what a fit has not seen?",
-    "factors": "the verdict with {} times the {} noise, beside:",
+    "factors": "the verdict with {} times the {} noise, next to:",
     "shape": "the shape of what is missing",
     "errors": "errors on data held out",
     "next": "the next experiment",
@@ -27,6 +27,13 @@ STEPS = {
     "points": "derivatives at every operating point",
     "sobol": "Sobol indices of the same points, to compare the bounds with",
     "evaluations": "{:,} model evaluations so far, {:,.0f} a second",
+    # requirements and sizing
+    "requirement": "requirement {} of {}: {}",
+    "changes": "changes that would meet missed requirement {} of {}: {}",
+    "designs": "1 of 4, random designs of every choice of parts",
+    "descents": "2 of 4, {} searches by gradients",
+    "whole": "3 of 4, ratios of the sheets and whole cells",
+    "refined": "4 of 4, the best {} with any ratio and fractions of a cell",
     # a calibration
     "optimum": "optimum found; now {}",
     "steady": "the same with steady first, to begin from its optimum",
@@ -61,7 +68,7 @@ def expected(text: str, seconds: float) -> float | None:
     """Time that a loop is expected to take yet, by what the stages before took [s]; None where that is not known.
 
     Args:
-        text: what is said of a stage that begins; seconds: since the loop began.
+        text: line of a stage that begins; seconds: since the loop began.
     """
     stage, _, rest = text.partition(f" of {OF}, ")
     over = OVER.get(int(stage)) if rest and stage.isdigit() else None

@@ -43,12 +43,12 @@ def noise_off(note: fit_notes.NoiseOff) -> str:
     """By what sds are off."""
     if not note.channel:
         return (
-            f"residuals are {note.factor:.2g} times the {note.source} sds in every channel, under all conditions "
-            "alike: are the sds right?"
+            f"residuals are {note.factor:.2g} times the {note.source} sds in every channel and under all "
+            "conditions: are the sds right?"
         )
     return (
         f"residuals of {channels.find(note.channel).label} are {note.factor:.2g} times the {note.source} sds, "
-        "under all conditions alike: are these sds right?"
+        "under all conditions: are these sds right?"
     )
 
 
@@ -62,21 +62,17 @@ def estimated_noise(note: fit_notes.EstimatedNoise) -> str:
 
 
 def combination(two: fit_notes.Pair) -> str:
-    """Which combination of two parameters data determine: `the ratio of a and b`, `a + 0.03 · b`."""
+    """Combination of two parameters that data determine: `the ratio of a and b`, `a + 0.03 · b`."""
     if two.form != "linear":
         return f"the {two.form} of {two.one} and {two.other}"
     return f"{two.one} {'-' if two.weight < 0 else '+'} {abs(two.weight):.2g} · {two.other}"
 
 
-def pair(two: fit_notes.Pair) -> dict[str, Any]:
-    """As in result.json."""
-    return {"a": two.one, "b": two.other, "correlation": two.correlation, "determined": combination(two)}
-
-
-def determined(name: str, held: bool, pairs: Sequence[fit_notes.Pair]) -> str:
+def determined(found: fit_notes.Determination) -> str:
     """Answer whether data determine a parameter: `yes`, `no`, or `only with motor.resistance` for both of a pair."""
-    others = [p.other if p.one == name else p.one for p in pairs if name in (p.one, p.other)]
-    return f"only with {', '.join(others)}" if others else "no" if held else "yes"
+    if found.others:
+        return f"only with {', '.join(found.others)}"
+    return "no" if found.held else "yes"
 
 
 def only_together(note: fit_notes.OnlyTogether) -> str:
@@ -99,7 +95,7 @@ def of_rows(note: fit_notes.OfRows) -> str:
 
 
 def product_alone(note: fit_notes.ProductAlone) -> str:
-    """A product of which one factor or both are free."""
+    """Sentence on two parameters that act only as a product."""
     if note.free:
         return f"only the product {note.friction} x {note.share} acts; the priors alone divide it"
     return f"{note.share} is found with {note.friction} held: only their product acts"
@@ -114,7 +110,7 @@ def no_prediction(note: fit_notes.NoPrediction) -> str:
 
 
 def same_predictions(note: fit_notes.SamePredictions) -> str:
-    """Kinds of blocks that tell nothing beside another."""
+    """Kinds of blocks that give the same predictions."""
     return (
         f"held out by {' or by '.join(blocks.in_words(k) for k in note.others)}: the same predictions as held out by "
         f"{blocks.in_words(note.kind)}, which stand for them; these runs do not vary them apart"
@@ -122,7 +118,7 @@ def same_predictions(note: fit_notes.SamePredictions) -> str:
 
 
 def agreement(note: fit_notes.Agreement) -> str:
-    """Whether searches from many starts agree."""
+    """Agreement of searches from many starts."""
     if note.starts == 1:
         return "one search, which did not converge" if note.open else "one search"
     if note.agree == note.starts:
@@ -136,7 +132,7 @@ def agreement(note: fit_notes.Agreement) -> str:
 
 
 def header(found: CalibrationResult, robot_name: str) -> str:
-    """What heads the calibrated robot's file."""
+    """Header of the calibrated robot's file."""
     return f"calibrated from {robot_name} with {found.source}; the free parameters: {', '.join(found.parameters)}"
 
 
@@ -167,7 +163,7 @@ def members_jump(note: fit_notes.MembersJump) -> str:
 
 
 def edge(at: fit_notes.Edge) -> str:
-    """Where a parameter is at the edge of what was allowed."""
+    """Bound of a parameter, or its distance from the middle of its prior."""
     if at.bound:
         return f"at its {at.bound} bound"
     return f"{abs(at.sds):.1f} prior sd {'below' if at.sds < 0 else 'above'} the middle of its prior"
@@ -236,7 +232,7 @@ def adequacy(found: Adequacy) -> str:
             "absorb it; run mmrjax loop to find it"
         )
     if found.noise_known:
-        return f"Adequate: the residuals are what the stated noise leaves ({chi2}, {p})"
+        return f"Adequate: the residuals are consistent with the stated noise ({chi2}, {p})"
     return (
         f"Adequate as far as can be tested: the residuals show no structure ({p}); the noise was estimated from "
         "them, so χ² tests nothing"

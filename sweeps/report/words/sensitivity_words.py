@@ -21,7 +21,7 @@ METHODS = {
 
 
 def statement(found: SensitivityResult) -> str:
-    """What decides these outputs, in one sentence."""
+    """Inputs that matter most for each output."""
     leaders = {
         name: [f"{label} ({100 * share:.0f} %)" for label, share in outputs]
         for name, outputs in found.leaders().items()
@@ -51,7 +51,7 @@ def points_left_out(note: sensitivity_notes.PointsLeftOut) -> str:
 
 
 def sample_left_out(note: sensitivity_notes.SampleLeftOut) -> str:
-    """Points at which some of the sample is left out."""
+    """Operating points with part of the sample left out."""
     return (
         f"at {note.points} operating points up to {100 * note.share:.1f} % of the sample is left out, since the "
         f"robot does not travel there: the indices are of robots that do ({', '.join(note.outputs)})"
@@ -59,7 +59,7 @@ def sample_left_out(note: sensitivity_notes.SampleLeftOut) -> str:
 
 
 def inert(note: sensitivity_notes.Inert) -> str:
-    """Inputs by which every derivative is zero."""
+    """Inputs with only zero derivatives."""
     names = ", ".join(note.inputs)
     if note.correlated:
         return (

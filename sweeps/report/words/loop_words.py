@@ -1,4 +1,4 @@
-"""What is said of the loop: its verdict, whether names stand, what is ruled out, hidden or worse, its remarks."""
+"""Sentences of the loop: verdict, support of names, ruled-out and hidden effects, worse errors, remarks."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from calibration.discovery import loop_notes
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME
-from calibration.inference import bases
-from calibration.inference import blocks as blocks_room
+from calibration.inference import bases, blocks
 from calibration.inference.series_noise import SeriesNoise
-from calibration.words import fit_words
 from mmrjax import effects
 from mmrjax.errors import counted
 from mmrjax.model import channels
+from sweeps.report.words import fit_words
 
 if TYPE_CHECKING:
     from calibration.discovery.discover import LoopStages
@@ -53,11 +52,11 @@ def statement(said: loop_notes.Summary) -> str:
     text = _verdict(said)
     if said.aside:
         share = 100 * said.aside / said.of
-        text = f"{said.aside} of {said.of} rows ({share:.0f} %) lie off alone and are set aside. {text}"
+        text = f"{said.aside} of {said.of} rows ({share:.0f} %) are outliers and are set aside. {text}"
     if said.noise:
         text = f"{text} But {'; '.join(map(fit_words.noise_off, said.noise))}"
     if said.cluster is not None:
-        text = f"{text} {cluster(said.cluster).capitalize()}: that is a finding, and none is set aside."
+        text = f"{text} {cluster(said.cluster).capitalize()}: that is a finding, so all of them are kept."
     return text
 
 
@@ -66,7 +65,7 @@ def _verdict(said: loop_notes.Summary) -> str:
     if said.verdict == "undescribed":
         return _undescribed(said)
     if said.verdict == "none":
-        return f"Nothing is missing: what the fitted model leaves is what noise leaves (family-wise p = {p:.2g})."
+        return f"Nothing is missing: the residuals are consistent with noise (family-wise p = {p:.2g})."
     if said.verdict in WITHOUT_NAME and where is not None:
         found = said.mechanism
         if said.verdict == "mechanism" and found is not None:
@@ -90,7 +89,7 @@ def _verdict(said: loop_notes.Summary) -> str:
 
 
 def headline(found: loop_notes.Headline) -> str:
-    """What holds at every noise that was tried, in a sentence."""
+    """Sentence on the claim that holds at every noise factor tried."""
     *first, last = [f"{f:g}" for f in found.factors]
     at = f"At {', '.join(first)} and {last} times the noise" if first else "At the stated noise"
     claims = " and ".join(
@@ -142,7 +141,7 @@ def _mechanism(found: loop_notes.Mechanism, within: str) -> str:
 
 
 def evidence(found: loop_notes.Mechanism) -> str:
-    """How large a mechanism is, what it predicts, and whether it is found again."""
+    """Evidence for a mechanism: share of the misfit, gain on held-out runs, and repeatability."""
     errors = f", {found.gain / found.se:.1f} standard errors" if 0 < found.se < math.inf else ""
     return (
         f"explains {100 * found.share:.0f} % of the excess misfit, gains {found.gain:.2g} nat a reading that it "
@@ -161,14 +160,14 @@ NO_MECHANISM = {
 
 
 def no_mechanism(found: loop_notes.Mechanism) -> str:
-    """What speaks against the mechanism that explains most."""
+    """Reasons against the best mechanism."""
     numbers = {"share": 100 * found.share, "again": 100 * found.again, "many": len(found.drivers)}
     why = [NO_MECHANISM[name].format(found, **numbers) for name in found.fails]
     return f"the best one is a {found.families[0]}, but {' and '.join(why)}"
 
 
 def course(d: UnnamedDiscrepancy) -> str:
-    """Course of a smooth curve in words, with its values at both ends; empty for one that is over no variable."""
+    """Course of a smooth curve with its values at both ends; empty without a variable."""
     if d.window is not None or d.variable not in bases.VARIABLES or len(d.at) < 2:
         return ""
     ends = [f"{d.value[k]:.2g} {d.unit} at {_level(d.variable, d.at[k])}" for k in (0, -1)]
@@ -275,7 +274,7 @@ def so_far(effects: Sequence[str], families: Sequence[str]) -> str:
 
 def _without_name(where: DiscrepancyLocation, p: float, no_effect: str) -> str:
     others = [bases.in_words(p).removesuffix(" balance") for p in where.alike if p != where.place]
-    also = f" (or {', '.join(others)}, which act alike in these data)" if others else ""
+    also = f" (or {', '.join(others)}, which these data do not distinguish)" if others else ""
     what = f": {where.family}" if where.variable in bases.VARIABLES else ""
     return (
         f"Something is missing in the {bases.in_words(where.place)}{also}, {_shown(where)}{what}; no effect of the "
@@ -284,7 +283,7 @@ def _without_name(where: DiscrepancyLocation, p: float, no_effect: str) -> str:
 
 
 def _shown(where: DiscrepancyLocation) -> str:
-    """Where a discrepancy shows, and where it is as improbable."""
+    """Variable over which a discrepancy shows, and equally significant others."""
     well = [shown_over(v, where.by_duty).removeprefix("best shown ") for v in where.variables_alike]
     return shown_over(where.variable, where.by_duty) + (f" (as well {', '.join(well)})" if well else "")
 
@@ -295,7 +294,7 @@ def _within(where: DiscrepancyLocation) -> str:
 
 
 def shown_over(variable: str, by_duty: bool = False) -> str:
-    """Where a discrepancy shows; `by_duty`: the motors' voltage varied with the duty alone."""
+    """Variable over which a discrepancy shows; `by_duty`: only the duty changed the motors' voltage."""
     variable = "duty" if by_duty and variable == "voltage" else variable
     happens = bases.window(variable)
     if variable == "side":
@@ -315,7 +314,7 @@ def freed_value(v: loop_notes.FreedValue) -> str:
 
 
 def p_value(p: float) -> str:
-    """A p-value; a small one, of which the bootstrap knows little, as a bound rounded up."""
+    """A p-value; a bound for a small one, since the bootstrap cannot resolve it."""
     if p > 0.01:
         return f"= {p:.2g}"
     step = 10.0 ** math.floor(math.log10(p))
@@ -323,18 +322,18 @@ def p_value(p: float) -> str:
 
 
 def cluster(c: Cluster) -> str:
-    """What rows that lie off have in common."""
+    """Sentence on the common level of outlying rows."""
     where = f"at {c.axis} {c.level}" if c.level else f"at {c.axis} {c.low:.3g} to {c.high:.3g}"
-    return f"{c.inside} of {c.of} rows that lie off stand together {where} (p = {c.p:.1g})"
+    return f"{c.inside} of {c.of} outlying rows cluster {where} (p = {c.p:.1g})"
 
 
 # --- the first screen -----------------------------------------------------------------------------------
 
 
 def answer(found: DiscoveryResult) -> str:
-    """Whether the model is complete, in a sentence."""
+    """Answer to the question if the model is complete."""
     if found.verdict == "none":
-        return "Yes, as far as these runs can show: what the fitted model leaves is noise."
+        return "Yes, as far as these runs can show: the residuals are consistent with noise."
     if found.verdict == "undescribed":
         return "No verdict: this model does not describe these runs."
     sure, weak = ([e for e in found.effects if is_established(found, e) == want] for want in (True, False))
@@ -360,15 +359,15 @@ def _kind_of(effect: FoundEffect) -> str:
 
 
 def is_established(found: DiscoveryResult, effect: FoundEffect) -> bool:
-    """Whether the name of an effect stands by itself."""
+    """True if the name of an effect is established."""
     return found.support is None or found.support.established(effect.name)
 
 
 def how_sure(found: DiscoveryResult, effect: FoundEffect) -> str:
-    """How sure an effect is, in a few words."""
+    """Standing of an effect, with its score and the threshold of chance."""
     test = None if found.support is None else found.support.test_of(effect.name)
     if is_established(found, effect):
-        known = "" if test is None else f": {test.root:.1f} σ, where chance reaches {test.needed:.1f}"
+        known = "" if test is None else f": {test.root:.1f} σ (chance: {test.needed:.1f})"
         if test is not None and test.shows_form:
             over = test.over.replace("_", " ")
             known += f"; accuracy of its form ±{100 * test.spread:.0f} % over {over}"
@@ -377,24 +376,22 @@ def how_sure(found: DiscoveryResult, effect: FoundEffect) -> str:
 
 
 def use_it(found: DiscoveryResult) -> list[str]:
-    """How well the robot that is written predicts runs that its fit has not seen, by kind of block."""
+    """Errors of the written robot on fitted and on held-out rows, by kind of block."""
     when = 1 if found.written else 0
-    lines = (
-        [f"Like these runs: errors up to {_worst(found.errors[when], len(found.runs))}."]
-        if found.errors[when]
-        else []
-    )
+    lines = [f"Within these conditions: {_rms(found.errors[when], len(found.runs))}."] * bool(found.errors[when])
     for kind, both in found.errors_held_out.items():
-        lines.append(f"Another {blocks_room.in_words(kind)}: {_worst(both[when], len(found.runs))}.")
+        lines.append(f"Another {blocks.in_words(kind)}: {_rms(both[when], len(found.runs))}.")
     return lines
 
 
-def _worst(errors: Errors, total: int) -> str:
-    """The largest rms error of any channel, and of how many rows where not all are reached: `16.7 % (14/20)`."""
-    rows = max(int(e["rows"]) for e in errors.values())
-    worst = max((float(e["rms_percent"]) for e in errors.values() if e["rows"]), default=math.nan)
-    few = f" ({rows}/{total} reached)" if rows < total else ""
-    return f"{worst:.1f} %{few}" if rows else "not reached"
+def _rms(errors: Errors, total: int) -> str:
+    """Largest rms error of any channel, the worst reading, and the rows reached if not all are."""
+    known = [e for e in errors.values() if e["rows"]]
+    if not known:
+        return "no row is reached"
+    rms, worst, rows = (max(float(e[name]) for e in known) for name in ("rms_percent", "max_percent", "rows"))
+    few = f" ({rows:.0f}/{total} reached)" if rows < total else ""
+    return f"rms up to {rms:.1f} %, worst reading {worst:.1f} %{few}"
 
 
 def largest_share(found: DiscoveryResult) -> str:
@@ -421,13 +418,13 @@ SHARE = 10.0
 
 
 def header(found: DiscoveryResult, robot_name: str) -> str:
-    """What heads the proposed robot's file."""
+    """Header of the proposed robot's file."""
     start = f" from {robot_name}" if robot_name else ""
     return f"found by the loop{start} with {found.runs.source}: {found.statement}"
 
 
 def refit_header(found: DiscoveryResult, robot_name: str) -> str:
-    """What heads the file of the robot with nothing added."""
+    """Header of the refitted robot's file."""
     start = f" from {robot_name}" if robot_name else ""
     return f"fitted by the loop{start} to {found.runs.source}, with nothing added"
 
@@ -437,7 +434,7 @@ NO_FORMULA = "no single term explains 90 % of it"
 
 # --- whether names stand --------------------------------------------------------------------------------
 
-#: Why names do not stand, or beside what they do.
+#: Reasons for or against names.
 REASONS = {
     "": "",
     "implausible": "no effect of the library that explains it is of a plausible size",
@@ -445,12 +442,12 @@ REASONS = {
     "better curve": "one {curves} is the better explanation than {effects}",
     "curve alone": "one {curves} leaves nothing",
     "none by itself": "{lost}",
-    "beside": "each by itself, at the fit of the others, explains more than chance would: {strengths}",
+    "beside": "each one, added to the fit of the others, explains more than chance would: {strengths}",
 }
 
 
 def reason(support: loop_notes.NameSupport | None) -> str:
-    """Why names do not stand, or beside what they do; empty where there is nothing to say."""
+    """Reasons for or against the names; empty for none."""
     if support is None:
         return ""
     return REASONS[support.why].format(
@@ -462,7 +459,7 @@ def reason(support: loop_notes.NameSupport | None) -> str:
 
 
 def why(found: DiscoveryResult) -> str:
-    """Why names do not stand, or beside what they do: a curve that leaves nothing comes first."""
+    """Reasons for or against the names; a curve that explains everything comes first."""
     said, lacks = reason(found.support), found.unnamed
     if lacks is None or not found.after.adequate or (found.support is not None and found.support.curves):
         return said
@@ -471,7 +468,7 @@ def why(found: DiscoveryResult) -> str:
 
 
 def _strength(test: loop_notes.NameTest) -> str:
-    """How much an effect explains by itself, and what chance and the loss of a row leave of that."""
+    """Score of an effect, with the threshold of chance and the score without its strongest row."""
     less = "" if test.row is None else f", without {test.what} {test.row} {test.root_without:.1f}"
     return f"{test.effect} {test.root:.1f} σ (chance {test.needed:.1f}{less})"
 
@@ -489,11 +486,11 @@ DOUBTS = {
 
 
 def doubts(test: loop_notes.NameTest | None) -> str:
-    """What speaks against an effect by itself; empty for nothing."""
+    """Reasons against an effect; empty for none."""
     if test is None or not test.fails:
         return ""
     over = ", ".join(_over(c.place, *c.variables) for c in test.curves)
-    said = {"beside": over and f" beside smooth curves ({over})", "larger": " and ".join(test.larger)}
+    said = {"beside": over and f" next to smooth curves ({over})", "larger": " and ".join(test.larger)}
     said |= {"over_variable": test.over.replace("_", " ")}
     said["spread"] = f" by ±{100 * test.spread:.0f} %" if math.isfinite(test.spread) else ""
     *first, last = [DOUBTS[d][1].format(test, **said, again=100 * test.again) for d in test.fails]
@@ -512,7 +509,7 @@ def _over(place: str, *variables: str) -> str:
 
 
 def standing(found: DiscoveryResult) -> str:
-    """Why names do not stand, or beside what they do, in a sentence; empty where there is nothing to say."""
+    """Sentence on the support of names; empty without one."""
     if not found.standing:
         return ""
     if found.verdict in WITHOUT_NAME:
@@ -548,7 +545,7 @@ def why_ruled_out(reasons: Sequence[loop_notes.RuledOut]) -> str:
 
 
 def ruled_out(found: DiscoveryResult) -> str:
-    """What would explain the data better than what is proposed, or as well, but for its size; empty for nothing."""
+    """Effects that explain the data at least as well but are ruled out by size or sign; empty for none."""
     candidates, same = found.implausible, found.settings.same
     if found.verdict not in WITHOUT_NAME:
         better = tuple(a for a in candidates if a.rise_chi2 < -same)
@@ -569,7 +566,7 @@ def ruled_out(found: DiscoveryResult) -> str:
 
 
 def hidden(found: DiscoveryResult) -> str:
-    """Which effects what was found could hide, and what would show them, in a sentence; empty for none."""
+    """Sentence on effects that the findings could hide, and on runs that would show them; empty for none."""
     if not found.hidden:
         return ""
     each = [
@@ -597,8 +594,7 @@ def _estimate(found: Estimate) -> str:
 
 
 def alike(found: DiscoveryResult, e: FoundEffect) -> str:
-    """What these data cannot tell from an effect: others, of settled runs also what settles to one of them, and
-    stated values that may be wrong instead."""
+    """Effects and stated values that these data do not distinguish from an effect."""
     settled = [x.name for x in effects.ALL if x.settles_to in e.members and not found.runs.sampled]
     others = ", ".join(
         [
@@ -612,7 +608,7 @@ def alike(found: DiscoveryResult, e: FoundEffect) -> str:
 
 
 def worse(found: Sequence[Worse], predicted: Mapping[str, tuple[int, int]]) -> str:
-    """Which errors rise, and where fewer rows are predicted, in a sentence; empty where none does.
+    """Sentence on errors that rise and on rows that are no longer predicted; empty for none.
 
     Args:
         predicted: kind of block → rows that are predicted before and after.
@@ -626,7 +622,7 @@ def worse(found: Sequence[Worse], predicted: Mapping[str, tuple[int, int]]) -> s
         if before > after:
             changes.append(f"{counted(before - after, 'row')} fewer predicted")
         if changes:
-            parts.append(f"by {blocks_room.in_words(kind)} {', '.join(changes)}")
+            parts.append(f"by {blocks.in_words(kind)} {', '.join(changes)}")
     return f"Held out, what was found predicts worse: {'; '.join(parts)}." if parts else ""
 
 
@@ -640,7 +636,7 @@ def _change(before: float, after: float) -> str:
 
 
 def asked(about: loop_notes.Asked) -> str:
-    """What the track model was asked about."""
+    """Question to the track model."""
     return {
         "missing": f"what is missing in the {about.balance} balance over {about.variable.replace('_', ' ')}",
         "found": f"{', '.join(about.effects)}, found by the lumped model",
@@ -649,7 +645,7 @@ def asked(about: loop_notes.Asked) -> str:
 
 
 def resolved(found: Resolved) -> str:
-    """What the track model says, in a sentence or two."""
+    """Answer of the track model."""
     before, after = found.slip_rms
     gear = ", ".join(
         f"{name.removeprefix('running_gear.')} {_estimate(e)}"
@@ -660,13 +656,13 @@ def resolved(found: Resolved) -> str:
     if not found.explains:
         why = f"; {', '.join(found.outside)} outside" if found.outside else ""
         return (
-            f"The track model was asked about {asked(found.asked)}: no running gear within its priors was found to "
+            f"Track model, {asked(found.asked)}: no running gear within its priors was found to "
             f"leave it ({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}{why}){on}"
         )
     held = len(found.constants) - len(found.known_from_rows)
     known = f"not determined by these rows: {held} of {len(found.constants)} constants"
     return (
-        f"The track model was asked about {asked(found.asked)}: a running gear within its priors leaves it ({slip}, "
+        f"Track model, {asked(found.asked)}: a running gear within its priors leaves it ({slip}, "
         f"χ² falls by {found.fall:.0f}, p = {found.p:.2g}): {gear}; {known}{on}"
     )
 
@@ -709,7 +705,7 @@ def kept_out(note: loop_notes.KeptOut) -> str:
     """Rows that do not count."""
     why = {
         "unusable": "are not used: the fitted model slides or fails there",
-        "outliers": "stand alone: outliers, which no effect explains; they are kept out",
+        "outliers": "are outliers, which no effect explains; they are left out",
     }
     return f"rows {', '.join(map(str, note.rows))} {why[note.why]}"
 
@@ -717,11 +713,11 @@ def kept_out(note: loop_notes.KeptOut) -> str:
 def still_lacks(note: loop_notes.StillLacks) -> str:
     """What the effects found leave."""
     place, over = bases.in_words(note.place), note.variable.replace("_", " ")
-    return f"what was found does not explain everything: the {place} still lacks something over {over}"
+    return f"not everything is explained: an error in the {place} that varies with {over} remains"
 
 
 def late(note: loop_notes.Late) -> str:
-    """How late what is imposed acts, and what to state."""
+    """Delay of the imposed quantity, and the line for the rig's file."""
     when = "later" if note.delay > 0 else "earlier"
     return (
         f"what is imposed acts {1e3 * abs(note.delay):.3g} ± {1e3 * note.sd:.2g} ms {when} than its column says, and "
@@ -749,7 +745,7 @@ def led(note: loop_notes.Led) -> str:
 
 
 def rests_on(note: loop_notes.RestsOn) -> str:
-    """An effect that stands by one run alone."""
+    """Sentence on an effect that depends on one run."""
     test = note.test
     at = _conditions(note.conditions)
     run = f"{test.what} {test.rests_on}{f' ({at})' * bool(at)}"
@@ -798,7 +794,7 @@ SAID: dict[type, str | Callable[[Any], str]] = {
     loop_notes.Led: led,
     loop_notes.NotPredictable: lambda note: (
         f"not predictable from the others, so neither scored nor tested: blocks by "
-        f"{' and by '.join(blocks_room.in_words(kind) for kind in note.kinds)} that hold all runs of a configuration "
+        f"{' and by '.join(blocks.in_words(kind) for kind in note.kinds)} that hold all runs of a configuration "
         "with parameters of its own"
     ),
     loop_notes.LostReplicates: "only {settled} of {asked} bootstrap tables could be fitted again; the thresholds are "

@@ -131,7 +131,7 @@ def _doing(run: menu.Run) -> str:
 
 
 def watch(about: Watch) -> str:
-    """What can be damaged, and what shows that it will be."""
+    """Part that can be damaged, and the sign of it."""
     if isinstance(about, Overspeed):
         return (
             f"the motor speed: about {about.speed / RPM:.0f} rpm without load at {about.voltage:g} V, and no more "
@@ -152,7 +152,7 @@ def watch(about: Watch) -> str:
 
 
 def _allowed(temperature: float) -> str:
-    """What a winding may reach, where somebody has stated it."""
+    """Temperature limit of a winding, if stated."""
     return f" ({temperature:.0f} °C is allowed)" if temperature < menu.UNLIMITED else ""
 
 
@@ -190,7 +190,7 @@ def more_runs(what: MoreRuns) -> str:
 
 
 def _steady_speeds(what: MoreRuns) -> str:
-    """How a wave is followed from speed to speed."""
+    """Speeds at which a wave is followed."""
     three = [f"{menu.round_significant(v):g}" for v in (what.low, 0.5 * (what.low + what.high), what.high)]
     return (
         f"Mark the driving shaft, start every run from the mark, and record steady travel at {', '.join(three[:2])} "

@@ -1,4 +1,4 @@
-"""What `settle` has to say: why samples of a log are no settled run, and what to do about it."""
+"""Sentences of `settle`: why samples of a log are left out, and what to do."""
 
 from __future__ import annotations
 
@@ -48,13 +48,22 @@ def left_out(stretches: Iterable[Stretch], few: bool = False) -> list[tuple[str,
 
 
 def statement(found: Settled) -> str:
-    """What a log holds, in a sentence."""
+    """Number of settled runs of a log, and its samples."""
     kept, rows = found.kept, sum(len(s.rows) for s in found.kept)
     back = sum(s.imposed < 0 for s in kept)
     ways = f", {len(kept) - back} forward and {back} backward" if back else ""
     return (
         f"{counted(len(kept), 'settled run')}{ways}, from {rows} of {len(found.runs)} samples "
         f"(each at least {found.shortest:.3g} s long, its means steady to {100 * found.drift:g} %)."
+    )
+
+
+def levels(found: Settled) -> str:
+    """Division of samples into levels, and the samples of a level that are used."""
+    return (
+        f"Neighbouring samples belong to one level if the imposed quantity differs by less than "
+        f"{50 * found.drift:g} % or by less than its noise. The first samples of a level are left out until every "
+        f"channel stays within {100 * found.drift:g} % of its value at the end, or within its noise."
     )
 
 

@@ -1,0 +1,187 @@
+"""Checks of the names of a table's columns, and of the units that they state."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import re
+from collections.abc import Sequence
+
+from calibration.data.columns import HEADING, SIDES, SPEED, SUPPLY, TIME, VOLTS, WORDS, Column, Layout
+from calibration.data.input_errors import BadData
+from calibration.data.named_arrays import NamedArrays
+from mmrjax.model import channels, quantities
+from mmrjax.model.channels import Channel
+
+#: Most columns of a table that a message names.
+NAMED = 8
+#: Other words for the sides.
+_SIDE = {"l": "left", "lh": "left", "lft": "left", "port": "left", "r": "right", "rh": "right", "starboard": "right"}
+
+
+def understood(
+    name: str, header: Sequence[str], layout: Layout, *, inferred: bool, of_turns: bool
+) -> tuple[list[str], Layout, tuple[str, ...]]:
+    """Returns the names of columns as this program spells them, the layout with the channels that they show, and a
+    note on each name that differs in case.
+
+    Raises:
+        BadData: a name that stands twice.
+    """
+    named, notes = _in_case(name, header, layout, inferred)
+    repeated = sorted({c for c in named if named.count(c) > 1})
+    if repeated:
+        raise BadData(f"{name}: column {repeated[0]} stands {named.count(repeated[0])} times; expected once")
+    if inferred:
+        layout = _with_channels(name, named, layout, channels.EVERY)
+    if of_turns and {*layout.sides, *VOLTS, *HEADING} & {m.column for m in layout.meanings(name, named) if m}:
+        layout = _with_channels(name, named, layout, channels.OF_TURNS)
+    return named, layout, tuple(notes)
+
+
+def _in_case(name: str, header: Sequence[str], layout: Layout, inferred: bool) -> tuple[list[str], tuple[str, ...]]:
+    """A header with the capitals of the columns' names, and sentences on what was read so."""
+    known = dataclasses.replace(layout, channels=channels.EVERY) if inferred else layout
+    spelled: dict[str, set[str]] = {}
+    for column in known.spellings():
+        spelled.setdefault(column.casefold(), set()).add(column)
+    found, said = [], []
+    for column in header:
+        meant = spelled.get(column.casefold(), set())
+        if column not in meant and len(meant) == 1 and not meant & set(header):
+            (right,) = meant
+            said.append(f"{name}: column {column} is read as {right}")
+            column = right
+        found.append(column)
+    return found, tuple(said)
+
+
+def _with_channels(name: str, header: list[str], layout: Layout, more: Sequence[Channel]) -> Layout:
+    """`layout` with each of `more` for which the file has a column."""
+    meanings = dataclasses.replace(layout, channels=channels.EVERY).meanings(name, header)
+    stated = {m.column for m in meanings if m is not None}
+    found = tuple(c for c in channels.EVERY if c in layout.channels or (c in more and c.column in stated))
+    return dataclasses.replace(layout, channels=found)
+
+
+def check_header(
+    name: str, header: list[str], meanings: list[Column | None], measured: bool, battery: bool, layout: Layout
+) -> None:
+    stated = {m.column for m in meanings if m is not None}
+    strange = [c for c, m in zip(header, meanings, strict=True) if m is None]
+    if not layout.complete:  # other channels' columns are not misspelt
+        strange = [c for c in strange if c not in {x for k in channels.EVERY for x in (k.column, k.sd_column)}]
+    _check_names_of_sides(name, strange, stated, layout)
+    required = layout.required(measured=measured, battery=battery)
+    if layout.imposed_column == SPEED and stated & set(layout.sides):  # theirs is imposed
+        required = tuple(c for c in required if c != SPEED)
+        if SPEED in stated:
+            raise BadData(f"{name}: column {SPEED} beside {', '.join(layout.sides)}; keep one of them")
+    if stated & set(VOLTS):  # of which the supply's is the larger
+        required = tuple(c for c in required if c != SUPPLY)
+    if not layout.complete and "surface" in stated:  # which says the configuration too, where it has those of one
+        required = tuple(c for c in required if c != "configuration")
+    for column in (c for c in (*required, *layout.measured_columns) if c not in stated):
+        close = difflib.get_close_matches(column, strange, 1, 0.6)
+        if column in required or (close and layout.complete):
+            got = f"; is {close[0]} meant?" if close else ""
+            if column == SUPPLY and {f"motor_{volts}" for volts in VOLTS} <= {*header}:  # which may be readings too
+                got = "; what drives the sides may be stated, in the robot's file: [columns] " + ", ".join(
+                    f'{volts} = "motor_{volts}"' for volts in VOLTS
+                )
+            raise BadData(
+                f"{name}: column {layout.expected(column)} is missing{got} (required: {', '.join(required)})"
+                + ("" if close else _other_names(strange, column))
+            )
+    if measured and not any(c in stated for c in layout.measured_columns):
+        expected = ", ".join(layout.measured_columns)
+        other = _other_names(strange, layout.measured_columns[0])
+        turning = {c.column: c.name for c in channels.OF_TURNS}
+        if found := [c for c in strange if c in turning]:
+            names = ", ".join(f'"{turning[c]}"' for c in found)
+            other = f"; {', '.join(found)}: state in the robot's file channels = [{names}]"
+        raise BadData(f"{name}: no column of a channel; expected at least one of {expected}{other}")
+    for column in strange:
+        close = difflib.get_close_matches(column, [c for c in layout.known() if c not in stated], 1, 0.85)
+        if close:
+            raise BadData(f"{name}: unknown column {column}; did you mean {close[0]}? rename or remove it")
+
+
+def check_time(name: str, header: list[str], meanings: list[Column | None], layout: Layout) -> None:
+    """Refuses readings of a log without a column of time."""
+    stated = {m.column: m.shown for m in meanings if m is not None}
+    over_time = [stated[c.column] for c in layout.channels if c.column in stated and not c.settled]
+    if over_time and stated.keys().isdisjoint(TIME):
+        strange = [c for c, m in zip(header, meanings, strict=True) if m is None]
+        raise BadData(
+            f"{name}: column {layout.expected('time_s')} is missing, and {over_time[0]} is read over time alone; of "
+            f"settled runs, remove {over_time[0]}{_other_names(strange, 'time_s')}"
+        )
+
+
+def _other_names(strange: list[str], column: str) -> str:
+    """Advice on columns with unknown names, for a message; empty if there are none."""
+    if not strange:
+        return ""
+    unit = column.rpartition("_")[2]
+    guess = next((c for c in strange if re.search(rf"\b{unit}\b", c)), "...")
+    shown = ", ".join(strange[:NAMED]) + (", ..." if len(strange) > NAMED else "")
+    return (
+        f"; other columns: {shown}; if one of them is it, say so in the robot's file, with the factor from its unit: "
+        f'[columns] {column} = {{column = "{guess}", factor = 1.0}}'
+    )
+
+
+def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layout: Layout) -> None:
+    """Refuses columns that name a side in other words, or elsewhere in the column's name."""
+
+    def words(column: str) -> list[str]:
+        return sorted(_SIDE.get(word.casefold(), word.casefold()) for word in column.split("_"))
+
+    known = {tuple(words(c)): c for c in layout.known() if set(channels.SIDES) & set(words(c))}
+    for column in strange:
+        meant = known.get(tuple(words(column)))
+        if meant is not None and meant not in stated:
+            raise BadData(
+                f"{name}: column {column}: the sides are called left and right; name it {meant}, or state [columns] "
+                f'{meant} = "{column}" in the robot\'s file'
+            )
+        side = next((side for side in channels.SIDES if side in words(column)), None)
+        turns = set(SIDES) <= set(known.values()) and not stated.isdisjoint(c.column for c in channels.OF_TURNS)
+        if side and turns and not stated & {*SIDES, *VOLTS} and column.endswith("V"):
+            raise BadData(
+                f"{name}: column {column}: if it is the voltage that drives the {side} side, name it "
+                f'voltage_{side}_V, or state [columns] voltage_{side}_V = "{column}" in the robot\'s file'
+            )
+
+
+def check_units(arrays: NamedArrays, meanings: Sequence[Column | None]) -> None:
+    """Refuses a column whose name, or whose source, states another unit than it is read in."""
+    below = [""] * len(meanings)
+    for j, (unit, meaning) in enumerate(zip(arrays.units, meanings, strict=bool(arrays.units))):
+        if meaning is None or meaning.column in WORDS:
+            continue
+        known = meaning.quantity.columns().values()
+        if unit and unit not in known:
+            allowed = ", ".join(filter(None, known))
+            raise BadData(
+                f"{arrays.name}, {meaning.shown}: got {unit} in {arrays.units_from}; "
+                f"expected {f'one of {allowed}' if allowed else 'none'}; correct or remove it"
+            )
+        below[j] = unit
+    for stated_below, meaning in zip(below, meanings, strict=True):
+        if meaning is None or abs(meaning.factor) != 1.0:
+            continue
+        named = {unit: column for column, unit in meaning.quantity.columns().items()}
+        for stated, where in (
+            (quantities.at_the_end(meaning.shown, named), "in its name"),
+            (stated_below, f"in {arrays.units_from}"),
+        ):
+            if stated and stated != meaning.unit:
+                mapped = meaning.shown not in (meaning.column, named[meaning.unit])
+                remedy = f'state [columns] {named[stated]} = "{meaning.shown}" in the robot\'s file'
+                raise BadData(
+                    f"{arrays.name}: column {meaning.shown} states {stated} {where}, and is read in "
+                    f"{meaning.unit or 'shares of 1'}; "
+                    f"{remedy if mapped else f'name it {named[stated]}'}, or correct the unit"
+                )

@@ -1,0 +1,81 @@
+"""Columns of a source by name with raw values, before they have a meaning. Every reader of a format makes them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from calibration.data.input_errors import parsed
+
+#: Raw values of a column: a list of texts as written, or an array of numbers with NaN where there is no reading.
+Raw = list[str] | np.ndarray
+#: Entries of programs for a missing reading.
+MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "<na>", "none", "null"})
+
+
+@dataclasses.dataclass(frozen=True)
+class NamedArrays:
+    """Named columns of one source. `runs.of_arrays` checks them and makes `Runs` of them.
+
+    Messages count rows from 1. A reader that leaves out rows says so in `notes`.
+
+    Attributes:
+        name: of the source, which opens every message.
+        header: names of the columns, as the source states them.
+        values: one for each column, all of one length.
+        units: one for each column, as `quantities.spelled` spells it, empty where the source states none; or none.
+        units_from: place where the source states them, for messages.
+        notes: sentences on reading.
+        digest: SHA-256 of the source's bytes; empty if it has none.
+    """
+
+    name: str
+    header: tuple[str, ...]
+    values: tuple[Raw, ...]
+    units: tuple[str, ...] = ()
+    units_from: str = "the row of units below the header"
+    notes: tuple[str, ...] = ()
+    digest: str = ""
+
+    def __len__(self) -> int:
+        return len(self.values[0]) if self.values else 0
+
+    def row(self, index: int) -> str:
+        """Name of a row in messages, by its index from 0."""
+        return f"{self.name} row {index + 1}"
+
+
+def texts(raw: Raw) -> list[str]:
+    """Returns the values of a column as texts, whole numbers without a point."""
+    if isinstance(raw, list):
+        return raw
+    return [f"{x:.15g}" if isinstance(x, float) else str(x) for x in raw.tolist()]
+
+
+def number(cell: str) -> float:
+    """Returns a cell's number, NaN where it states none."""
+    try:
+        return parsed(cell)
+    except ValueError:
+        return math.nan
+
+
+def numbers(raw: Raw) -> np.ndarray:
+    """Returns the numbers of a column's cells, NaN where a cell states none."""
+    if isinstance(raw, np.ndarray):
+        return raw.astype(float)
+    try:
+        if "_" not in (joined := "".join(raw)) and joined.isascii():
+            return np.array(list(map(float, raw)))
+    except ValueError:
+        pass  # some cell states no number
+    return np.array([number(cell) for cell in raw])
+
+
+def missing(raw: Raw, rows: np.ndarray) -> np.ndarray:
+    """Returns True for each of some rows in which there is no reading, shape (rows,)."""
+    if isinstance(raw, np.ndarray):
+        return np.isnan(raw[rows].astype(float))
+    return np.array([raw[row].lower() in MISSING for row in rows.tolist()], bool)

@@ -1,0 +1,291 @@
+"""Checks of rows: values of columns that contradict each other, and what a table leaves out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from calibration.data import surfaces
+from calibration.data.columns import (
+    DEFAULTS,
+    DRIVEN,
+    HEADING,
+    LOAD,
+    SPEED,
+    SPEEDS,
+    SUPPLY,
+    TIME,
+    WHEN,
+    Layout,
+)
+from calibration.data.input_errors import BadData, number
+from calibration.data.table import driven_on
+from mmrjax.model import channels
+from mmrjax.model.channels import Channel
+from mmrjax.model.rig import Instrument
+
+#: Excess of a reading beyond zero by its noise, in stated sds, and as a share of the channel's rms.
+SIGN_SDS, SIGN_SHARE = 4.0, 0.05
+#: Share of the largest reading of a speed below which a motor that nothing drives stands.
+STILL = 0.02
+
+
+def complete(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) -> None:
+    """Fills columns that a table may leave out, and refuses values that contradict each other."""
+    _fill(name, columns, rows, layout)
+    _check_driving(name, columns)
+    _check_sides(name, columns, layout)
+    _check_mass(name, columns)
+    _check_deviations(name, columns, layout.channels)
+
+
+def _fill(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) -> None:
+    """Adds columns that a table of a rig may leave out: its only configuration, and conditions with a usual value."""
+    if layout.complete:
+        return
+    if "configuration" not in columns and layout.configurations:
+        columns["configuration"] = np.full(rows, _only(name, columns, layout))
+    if layout.imposed_column == SPEED and set(SPEEDS) <= set(columns):
+        columns[SPEED] = np.mean([columns[c] for c in SPEEDS], 0)
+    for column, value in DEFAULTS.items():
+        columns.setdefault(column, np.full(rows, value))
+
+
+def _only(name: str, columns: dict[str, np.ndarray], layout: Layout) -> str:
+    """Returns the configuration of a table without that column: the only one, or the one that has its surfaces."""
+    labels = np.unique(columns.get("surface", np.zeros(0, str)))
+    found = surfaces.common(layout.configurations, labels)
+    if found is None:
+        raise BadData(
+            f"{name}: column configuration is missing, and the robot has {', '.join(layout.configurations)}"
+        )
+    return found
+
+
+def _check_driving(name: str, columns: dict[str, np.ndarray]) -> None:
+    if "mode" in columns and not set(TIME) <= set(columns):  # settled runs are driven
+        raise BadData(f"{name}: column mode is for time histories; add {', '.join(TIME)}, or remove it")
+    if "duty" not in columns:
+        return
+    duty, modes = columns["duty"], columns.get("mode", np.full(len(columns["duty"]), DRIVEN[0]))
+    driven = modes == DRIVEN[0]
+    wrong = np.where(driven, np.isnan(duty), ~np.isnan(duty) & (duty != 0))
+    if wrong.any():
+        at = int(np.argmax(wrong))
+        if driven[at]:
+            raise BadData(f"{name} row {at + 1}, duty: got an empty cell; expected a number, -1 to 1")
+        raise BadData(
+            f"{name} row {at + 1}, duty: got {number(duty[at])} in mode {modes[at]}; expected 0 or an empty cell"
+        )
+    columns["duty"] = np.nan_to_num(duty)
+
+
+def _check_sides(name: str, columns: dict[str, np.ndarray], layout: Layout) -> None:
+    stated = [c for c in layout.sides if c in columns]
+    if len(stated) == 1:
+        (other,) = set(layout.sides) - set(stated)
+        raise BadData(f"{name}: column {other} is missing beside {stated[0]}; state what drives both sides")
+    if stated and set(columns) & {"duty", "mode"}:
+        beside = min(set(columns) & {"duty", "mode"})
+        raise BadData(f"{name}: column {beside} beside {stated[0]}, which says how either side is driven; keep one")
+
+
+def _check_mass(name: str, columns: dict[str, np.ndarray]) -> None:
+    if "total_mass_kg" not in columns:
+        return
+    total, payload = columns["total_mass_kg"], columns["payload_kg"]
+    for at in np.flatnonzero(total <= payload)[:1]:
+        raise BadData(too_light(f"{name} row {at + 1}", total[at], payload[at]))
+
+
+def too_light(where: str, total: float, payload: float) -> str:
+    included = f"more than the payload of {number(payload)} kg that it includes"
+    return f"{where}, total_mass_kg: got {number(total)}; expected {included}"
+
+
+def _check_deviations(name: str, columns: dict[str, np.ndarray], shown: tuple[Channel, ...]) -> None:
+    for channel in shown:
+        if channel.column in columns and channel.sd_column in columns:
+            lost = np.isfinite(columns[channel.column]) & ~np.isfinite(columns[channel.sd_column])
+            if lost.any():
+                raise BadData(
+                    f"{name} row {int(np.flatnonzero(lost)[0]) + 1}, {channel.sd_column}: got an empty cell beside a "
+                    f"reading; expected its sd, more than 0 {channel.unit}"
+                )
+
+
+def driven_rows(
+    name: str, columns: dict[str, np.ndarray], layout: Layout
+) -> tuple[dict[str, np.ndarray], np.ndarray, tuple[str, ...]]:
+    """Returns the columns of settled runs in rows where something drives the motors, True for these rows, and a note
+    on the other ones.
+
+    Raises:
+        BadData: as `_driven`, turns on a slope, or a reading without its sign.
+    """
+    driven, note = _driven(name, columns, layout)
+    if note:
+        columns = {column: values[driven] for column, values in columns.items()}
+    if {*layout.sides, *HEADING} & set(columns):
+        _check_level(name, columns)
+    if not set(layout.sides) & set(columns):
+        _check_signs(name, columns, layout)
+    return columns, driven, (note,) if note else ()
+
+
+def _driven(name: str, columns: dict[str, np.ndarray], layout: Layout) -> tuple[np.ndarray, str]:
+    """True for rows of settled runs in which something drives the motors; a sentence on the other rows.
+
+    Raises:
+        BadData: no row is driven, or a speed is read where nothing drives the motors.
+    """
+    sides = [c for c in layout.sides if c in columns]
+    column = layout.imposed_column
+    size = np.max(np.abs([columns[c] for c in sides]), 0) if sides else np.abs(columns[column])
+    if layout.imposed == "voltage":
+        size = size * np.abs(columns[SUPPLY] if sides else columns.get("duty", 1.0))
+    idle = np.flatnonzero(size == 0)
+    if not idle.size:
+        return size != 0, ""
+    stated = (column, *sides, *(["duty"] if "duty" in columns else []))
+    zero = " and ".join(c for c in stated if not columns[c][idle].any())
+    for channel in (c for c in layout.channels if c.zero_at_rest and c.column in columns):
+        readings = np.nan_to_num(columns[channel.column])
+        moving = idle[np.abs(readings[idle]) > STILL * np.max(np.abs(readings))]
+        if moving.size and moving.size < len(readings):
+            raise BadData(
+                f"{name} row {moving[0] + 1}, {channel.column}: got {number(readings[moving[0]])} where "
+                f"{zero} is 0; expected what drives it, or remove the row"
+            )
+    if idle.size == len(size):
+        raise BadData(
+            f"{name}: {zero} is 0 in every row, so nothing drives the motors; expected rows that are driven"
+        )
+    which = f"row {idle[0] + 1} is" if idle.size == 1 else f"{idle.size} rows, the first row {idle[0] + 1}, are"
+    return size != 0, (
+        f"{name}: {which} left out, as nothing drives the motors ({zero or column} 0); rows are counted without them"
+    )
+
+
+def _check_level(name: str, columns: dict[str, np.ndarray]) -> None:
+    """Refuses readings of turns on a slope, since no turn is settled there."""
+    slope = columns["slope_deg"]
+    if slope.any():
+        row = int(np.flatnonzero(slope)[0])
+        more = f", and so in {np.count_nonzero(slope)} of {len(slope)} rows" if np.count_nonzero(slope) > 1 else ""
+        raise BadData(
+            f"{name} row {row + 1}, slope_deg: got {number(slope[row])} in a table of settled turns{more}; on a "
+            "slope the heading changes all the time, so that no turn is settled there: expected 0; remove such rows "
+            "(simulate --left, --right and --slope with --model drive follows one over time)"
+        )
+
+
+def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> None:
+    """Refuses readings without a sign in rows that drive the robot backward."""
+    column = layout.imposed_column
+    imposed, unit = columns[column], column.split("_")[-1]
+    if layout.imposed == "voltage":
+        imposed = imposed * columns.get("duty", 1.0)
+    for channel in layout.channels:
+        if channel.column not in columns or not channel.directed:
+            continue
+        readings = columns[channel.column]
+        if layout.magnitude(channel.name):
+            wrong = np.flatnonzero(readings < 0)
+            if wrong.size:
+                raise BadData(
+                    f"{name} row {wrong[0] + 1}, {channel.column}: got {number(readings[wrong[0]])}; expected no "
+                    "negative reading, as the robot's file says that the instrument shows magnitude alone"
+                )
+            continue
+        # Gravity may drive a motor: only up the slope, or on the flat, its current has the sign of its voltage.
+        backward = (imposed < 0) & ((columns["slope_deg"] <= 0) | channel.zero_at_rest)
+        if not channel.zero_at_rest and (layout.weight or "duty" in columns or driven_on(columns, layout).any()):
+            continue  # the load may drive a motor; a bridge that reverses the voltage reverses the supply's current
+        doubt = _doubt(columns, channel)
+        wrong = np.flatnonzero(backward & (readings > (doubt if layout.crosses_zero else 0.0)))
+        forward = (imposed > 0) & (columns["slope_deg"] >= 0) & (not channel.zero_at_rest)
+        forward &= channel.name != "motor_voltage"  # which is held against the back-EMF
+        against = np.flatnonzero(forward & (readings < -doubt))
+        if against.size:
+            at = int(against[0])
+            alike = "" if channel not in channels.OF_TURNS else f"; a turn has {' and '.join(layout.sides)} too"
+            raise BadData(
+                f"{name} row {at + 1}, {channel.column}: got {number(readings[at])} at {number(imposed[at])} {unit}; "
+                "nothing else drives the motors there, so expected a reading with the sign of what is imposed, the "
+                f"same in every row{alike}"
+            )
+        if wrong.size:
+            at = int(wrong[0])
+            alone = f"; or signed = false for {channel.name} in the robot's file, if it shows magnitude alone"
+            hint = alone if layout.crosses_zero else ""
+            raise BadData(
+                f"{name} row {at + 1}, {channel.column}: got {number(readings[at])} at "
+                f"{number(imposed[at])} {unit}; expected readings with their signs, negative backward{hint}"
+            )
+
+
+def _doubt(columns: dict[str, np.ndarray], channel: Channel) -> np.ndarray | float:
+    """Largest excess of a reading beyond zero by noise: SIGN_SDS of its sd, or a share of the channel's rms."""
+    readings = columns[channel.column]
+    share = SIGN_SHARE * float(np.sqrt(np.nanmean(readings**2))) if np.isfinite(readings).any() else 0.0
+    return np.fmax(share, SIGN_SDS * np.nan_to_num(columns.get(channel.sd_column, np.zeros(len(readings)))))
+
+
+def lacks(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
+    """Yields notes on missing channels and readings, on copies of rows, and on runs with several rows."""
+    for channel in layout.channels:
+        if channel.column not in columns:
+            if layout.complete:
+                yield f"{name}: no column {channel.column}; nothing is known of its channel"
+            continue
+        empty = np.flatnonzero(np.isnan(columns[channel.column]))
+        if empty.size:
+            count = f"{empty.size} of {len(columns[channel.column])}"
+            yield (
+                f"{name}: {count} cells of {channel.column} are empty, the first in row {empty[0] + 1}; they weigh "
+                "nothing"
+            )
+    alike: dict[tuple[Any, ...], list[int]] = {}
+    settled = [] if set(TIME) & set(columns) else [c for c in columns if c not in ("run_id", *WHEN)]
+    told = [columns[column].tolist() for column in settled]
+    for row, cells in enumerate(zip(*told, strict=True), 1):
+        alike.setdefault(cells, []).append(row)
+    if copied := [rows for rows in alike.values() if len(rows) > 1]:
+        others = f", and so {len(copied) - 1} more" if len(copied) > 1 else ""
+        yield (
+            f"{name}: rows {' and '.join(map(str, copied[0][:2]))} have the same conditions and readings{others}; "
+            "they count as repeats; remove copies, which make results look surer than they are"
+        )
+    if "run_id" in columns and not set(TIME) & set(columns):
+        runs, times = np.unique(columns["run_id"], return_counts=True)
+        several = times > 1
+        if several.any():
+            run = runs[np.argmax(several)]
+            rows = (np.flatnonzero(columns["run_id"] == run) + 1).tolist()
+            which = f"{', '.join(map(str, rows[:5]))}{' and more' if len(rows) > 5 else ''}"
+            others = f", and so {several.sum() - 1} more" if several.sum() > 1 else ""
+            yield (
+                f"{name}: run_id {run} stands in rows {which}{others}; without {', '.join(TIME)} every row is a run "
+                "of its own"
+            )
+
+
+def drives(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
+    """Yields a note on settled rows in which a load torque without a sign drives a shaft that runs backward."""
+    on = np.flatnonzero(driven_on(columns, layout))
+    if on.size and not set(TIME) & set(columns) and columns[LOAD].min() >= 0:
+        more = f", and so in {on.size} rows" if on.size > 1 else ""
+        yield (
+            f"{name} row {on[0] + 1}, {LOAD}: got {number(columns[LOAD][on[0]])} where the shaft is driven "
+            f"backward{more}: it turns the shaft on there; a brake's torque is negative backward"
+        )
+
+
+def shows_magnitude(name: str, instrument: Instrument) -> str:
+    return (
+        f"{name}: {channels.find(instrument.channel).column} is positive where its side is driven backward; it is "
+        "taken to show magnitude alone, and magnitudes are compared"
+    )

@@ -1,0 +1,142 @@
+"""Measured and simulated readings over time, with residuals: a static figure, and the data of an interactive one."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from mmrjax.model.channels import Channel
+from sweeps.pages.figure_style import BLUE, FAINT, INK, ORANGE, axis_label, figure
+
+#: Readings on a page, shared by all its runs and channels; a page stays below 1.5 MB.
+POINTS = 24_000
+COLOURS = (BLUE, ORANGE)
+
+
+@dataclasses.dataclass(frozen=True)
+class TimeOverlay:
+    """Readings of runs over time.
+
+    Attributes:
+        table: columns of the measured channels, of their simulations and `time_s`, each of shape (rows,).
+        channels: channels to show.
+        simulated: prefix of the columns of a simulation → its name in the legend; the first one has the residuals.
+        rows: rows of each run in the order of time.
+    """
+
+    table: Mapping[str, np.ndarray]
+    channels: Sequence[Channel]
+    simulated: Mapping[str, str]
+    rows: Mapping[str, np.ndarray]
+
+    @property
+    def worst(self) -> str:
+        """The run with the largest rms residual, relative to the channel's measured rms."""
+        return max(self.rows, key=lambda name: np.nan_to_num(self._misfit(self.rows[name])))
+
+    def _misfit(self, rows: np.ndarray) -> float:
+        shares = []
+        for channel in self.channels:
+            measured = self.table[channel.column]
+            size = np.sqrt(np.nanmean(np.square(measured))) if np.isfinite(measured).any() else np.nan
+            shares.append(np.nanmean(np.square(self._residual(channel)[rows]) / size**2) if size > 0 else np.nan)
+        return float(np.nanmean(shares)) if np.isfinite(shares).any() else float("nan")
+
+    def _residual(self, channel: Channel) -> np.ndarray:
+        first = next(iter(self.simulated))
+        return np.asarray(self.table[first + channel.column] - self.table[channel.column])
+
+    def draw(self) -> Figure:
+        """Figure of the worst run: for each channel the readings, and below them simulated minus measured."""
+        name = self.worst
+        rows = self._thinned(self.rows[name], POINTS // (4 * len(self.channels)))
+        time = self.table["time_s"][rows]
+        count = len(self.channels)
+        fig, grid = figure(2 * count, 1, 2.9 * count, sharex=True, height_ratios=[3, 1] * count)
+        for k, channel in enumerate(self.channels):
+            above, below = grid[2 * k, 0], grid[2 * k + 1, 0]
+            above.plot(
+                time,
+                self.table[channel.column][rows],
+                ".",
+                ms=3,
+                color=INK,
+                label="measured",
+                rasterized=len(rows) > 500,
+            )
+            for (prefix, words), colour in zip(self.simulated.items(), COLOURS, strict=False):
+                above.plot(time, self.table[prefix + channel.column][rows], color=colour, lw=1.3, label=words)
+            below.axhline(0, color=FAINT, lw=0.8)
+            below.plot(time, self._residual(channel)[rows], color=BLUE, lw=1)
+            above.set_ylabel(axis_label(channel))
+            below.set_ylabel("residual")
+        grid[0, 0].legend(loc="best")
+        grid[0, 0].set_title(f"run {name}" if len(self.rows) > 1 else "")
+        grid[-1, 0].set_xlabel("time [s]")
+        return fig
+
+    def to_json(self) -> str:
+        """Data of the interactive figure: for each run its times and, by channel, measured and simulated readings."""
+        most = max(200, POINTS // (len(self.rows) * len(self.channels) * (1 + len(self.simulated))))
+        runs: dict[str, Any] = {}
+        spent = 0
+        for name in sorted(self.rows, key=lambda name: name != self.worst):
+            rows = self._thinned(self.rows[name], most)
+            spent += len(rows) * len(self.channels) * (1 + len(self.simulated))
+            if runs and spent > 2 * POINTS:
+                break
+            runs[name] = {
+                "time": _numbers(self.table["time_s"][rows]),
+                "channels": [
+                    [_numbers(self.table[prefix + c.column][rows]) for prefix in ("", *self.simulated)]
+                    for c in self.channels
+                ],
+            }
+        about: dict[str, Any] = {
+            "labels": ["measured", *self.simulated.values()],
+            "channels": [{"label": c.label, "unit": c.unit} for c in self.channels],
+            "runs": runs,
+        }
+        return json.dumps(about, separators=(",", ":")).replace("<", "\\u003c")
+
+    def _thinned(self, rows: np.ndarray, most: int) -> np.ndarray:
+        """Up to about `most` rows in order: of each group the rows of the extreme readings of every channel."""
+        groups = max(1, most // (2 * len(self.channels)))
+        if len(rows) <= most:
+            return rows
+        kept = {0, len(rows) - 1}
+        for part in np.array_split(np.arange(len(rows)), groups):
+            for channel in self.channels:
+                readings = self.table[channel.column][rows[part]]
+                if np.isfinite(readings).any():
+                    kept |= {int(part[np.nanargmin(readings)]), int(part[np.nanargmax(readings)])}
+        return rows[np.array(sorted(kept))]
+
+
+def _numbers(values: np.ndarray) -> list[float | None]:
+    """Numbers with six digits; None for one that is missing."""
+    return [float(f"{v:.6g}") if np.isfinite(v) else None for v in values]
+
+
+def time_overlay(
+    table: Mapping[str, np.ndarray], channels: Sequence[Channel], simulated: Mapping[str, str]
+) -> TimeOverlay:
+    """Overlay of a table of time histories, run by run.
+
+    Args:
+        table: with `time_s`, `run_id` where there are several runs, measured and simulated columns.
+        channels: channels to show; those without any reading are left out.
+        simulated: prefixes of the simulated columns and their names, as in `TimeOverlay`.
+    """
+    names = np.asarray(table["run_id"]) if "run_id" in table else np.zeros(len(table["time_s"]), int)
+    shown = [c for c in channels if np.isfinite(table[c.column]).any()]
+    rows = {}
+    for name in dict.fromkeys(names.tolist()):
+        mine = np.flatnonzero(names == name)
+        rows[str(name)] = mine[np.argsort(table["time_s"][mine], kind="stable")]
+    return TimeOverlay(table, shown, simulated, rows)

@@ -1,0 +1,1 @@
+"""Reports: a document of sections, tables, figures and notes, with one renderer each for page and terminal."""

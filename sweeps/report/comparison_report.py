@@ -1,0 +1,163 @@
+"""The report of `compare`: errors of a simulation against measured runs or logs."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from mmrjax.errors import counted
+from sweeps.pages import words
+from sweeps.report.condition_columns import conditions
+from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table, drawing, missing
+from sweeps.results.comparison_results import Comparison
+
+_FITS = {
+    "these": "This robot was fitted to these rows: the errors are no prediction.",
+    "others": "This robot was fitted to other rows: the errors are a prediction.",
+    "": "",
+}
+_ERRORS = (
+    "Errors are simulated − measured; percent are of the channel's measured root mean square; "
+    "R² = 1 − Σ(error)² / Σ(measured − mean)² in each group."
+)
+_PARITY = (
+    "**Simulated against measured.** On the line both agree; above it the simulation is too high. Rows without a "
+    "simulated number are not drawn; the table gives the reason."
+)
+
+
+def document(found: Comparison) -> Document:
+    """The report of a comparison."""
+    known = found.table, found.channels
+    lead = (
+        f"Robot: **{found.robot_name}**. Fidelity: **{found.model}**. Measured: **{found.source}**, "
+        f"{counted(len(found.table['status']), 'row')}."
+    )
+    draw = drawing("comparison_figures.errors_over", *known, in_units=True, beside=found.over)
+    parity = Figure("parity", _bias(found), _PARITY, drawing("comparison_figures.parity", *known, band=False))
+    errors = Figure(
+        "errors",
+        _trend(found),
+        "**Errors.** A trend along a condition points at what the model lacks. Band: ±2 standard deviations of the "
+        "readings, where they are known.",
+        draw,
+    )
+    return Document(
+        f"{found.robot_name} against {found.source}",
+        answer(found),
+        (
+            Note(lead, "lead", terminal=False),
+            *(Note(text, "warn") for text in _unsolved(found)),
+            _summary(found),
+            Note(_ERRORS, "key"),
+            *([Note(found.notes, name="notes")] if found.notes else []),
+        ),
+        (
+            *_over_time(found),
+            Section("Parity", (parity,)),
+            Section("Errors over conditions", (errors,)),
+            Section("Rows", (_rows(found),)),
+        ),
+    )
+
+
+def _over_time(found: Comparison) -> tuple[Section, ...]:
+    """The section with readings over time of a log; none for a table of settled runs."""
+    if found.over is None:
+        return ()
+    caption = (
+        "**Measured and simulated readings over time, each with its residual below.** "
+        "The run with the largest residuals comes first."
+    )
+    draw = drawing("time_overlay.time_overlay", found.table, found.channels, {"simulated_": "simulated"})
+    return (Section("Over time", (Figure("overlay", answer(found), caption, draw),)),)
+
+
+def answer(found: Comparison) -> str:
+    """The rms errors with their rows, the worst reading, and if this robot was fitted to these rows."""
+    every, total = found.summary["all"], len(found.table["status"])
+    each = [(c, every[c.name]) for c in found.channels if every[c.name]["rows"]]
+    if not each:
+        return "No row has both a simulated and a measured number."
+    errors = ", ".join(f"{e['rms_percent']:.1f} % {c.label}" for c, e in each)
+    rows, worst = max(e["rows"] for _, e in each), max(e["max_percent"] for _, e in each)
+    what = f"{rows} of {total} rows" if rows < total else counted(total, "row")
+    if found.over is not None:
+        what = f"{_seconds(found):.3g} s of log"
+    return f"{what}: rms error {errors} (worst reading {worst:.1f} %). {_FITS[found.fit]}".rstrip()
+
+
+def _seconds(found: Comparison) -> float:
+    """Duration of all histories of a log [s]."""
+    time = found.table["time_s"]
+    runs = found.table.get("run_id", np.zeros(len(time)))
+    return float(sum(np.ptp(time[runs == name]) for name in np.unique(runs)))
+
+
+def _unsolved(found: Comparison) -> list[str]:
+    """A sentence for each status that gives no operating point."""
+    status = found.table["status"]
+    return [
+        f"{words.short(name).capitalize()}: {count} of {len(status)} rows; {words.meaning(name)}."
+        for name, count in Counter(map(str, status)).items()
+        if name not in words.SETTLED
+    ]
+
+
+def _summary(found: Comparison) -> Table:
+    columns = (
+        Column("rows of"), Column("channel"), Column("rows", form="{}"), Column("rms error", form="{}"),
+        Column("rms error", "%", "{:.1f}"), Column("worst", "%", "{:.1f}"), Column("R²", form="{:.3f}"),
+    )  # fmt: skip
+    rows = []
+    for group, by_channel in found.summary.items():
+        for c in found.channels:
+            e = by_channel[c.name]
+            rms = None if missing(e["rms"]) else f"{e['rms']:.{c.resolution}f} {c.unit}"
+            rows.append((group, c.label, e["rows"], rms, e["rms_percent"], e["max_percent"], e["r2"]))
+    return Table("errors", columns, rows)
+
+
+def _rows(found: Comparison) -> Table:
+    table, shown = found.table, conditions(found.table, mass=True)
+    columns = [Column("configuration"), *(Column(heading, form=form) for heading, form in shown.values())]
+    columns.append(Column("status"))
+    cells: list[Any] = [table["configuration"], *(table[c] for c in shown)]
+    cells.append([_status(str(s)) for s in table["status"]])
+    for c in found.channels:
+        measured, simulated = table[c.column], table[f"simulated_{c.column}"]
+        form = f"{{:.{max(c.resolution - 1, 0)}f}}"
+        columns += [Column(name, c.unit, form, c.label, terminal=False) for name in ("measured", "simulated")]
+        columns.append(Column("error", c.unit, f"{{:+.{c.resolution}f}}", c.label))
+        cells += [measured, simulated, simulated - measured]
+    return Table("rowtable", tuple(columns), list(zip(*cells, strict=True)), file="comparison.csv", wide=True)
+
+
+def _status(status: str) -> Cell:
+    return Cell(words.short(status), "" if status in words.SETTLED else "slides")
+
+
+def _bias(found: Comparison) -> str:
+    """Mean error of each channel, with its sign."""
+    return "Simulated less measured, on average: " + "; ".join(
+        f"{c.label} {np.nanmean(e):+.1f} %"
+        for c in found.channels
+        if np.isfinite(e := found.table[f"error_{c.name}_percent"]).any()
+    )
+
+
+def _trend(found: Comparison) -> str:
+    """The channel and condition whose errors correlate most."""
+    best, size = "No error changes with a condition", 0.0
+    headings = {column: heading for column, (heading, _) in conditions(found.table).items()} | dict(found.over or {})
+    for c in found.channels:
+        error = found.table[f"error_{c.name}_percent"]
+        for column, heading in headings.items():
+            both = np.isfinite(error) & np.isfinite(found.table[column])
+            x, y = found.table[column][both], error[both]
+            if both.sum() > 2 and np.ptp(x) > 0 and np.ptp(y) > 0 and abs(r := np.corrcoef(x, y)[0, 1]) > size:
+                best = f"The error of {c.label} changes most with {heading} (correlation {r:+.2f}, n = {len(x)})"
+                size = abs(r)
+    return best

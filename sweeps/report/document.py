@@ -1,0 +1,195 @@
+"""A report as data: `page_renderer` makes a page of it, `terminal_renderer` the text of the terminal.
+
+Texts may hold `**bold**` words and names in backticks. A command builds its document once, in `x_report.py`.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import importlib
+import io
+import math
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+#: Most rows of a table on a page, and on a terminal.
+PAGE_ROWS, TERMINAL_ROWS = 200, 60
+#: What a table shows for a missing number.
+DASH = "–"
+
+
+@dataclasses.dataclass(frozen=True)
+class Note:
+    """A paragraph, or a list of items.
+
+    Attributes:
+        text: the paragraph, or a tuple of items.
+        kind: its look on the page: "", `lead`, `key`, or `warn` for a warning.
+        name: of the element on the page; terminal: True if the terminal prints it too.
+    """
+
+    text: str | tuple[str, ...]
+    kind: str = ""
+    name: str = ""
+    terminal: bool = True
+
+
+@dataclasses.dataclass(frozen=True)
+class Column:
+    """One column of a table.
+
+    Attributes:
+        heading: its words; unit: unit of its numbers; group: heading above it and its neighbours of the same group.
+        form: format of its numbers, "" for a column of text; terminal: True if the terminal shows it too.
+    """
+
+    heading: str
+    unit: str = ""
+    form: str = ""
+    group: str = ""
+    terminal: bool = True
+
+    @property
+    def title(self) -> str:
+        """Heading with its unit, as in `mass [kg]`."""
+        return f"{self.heading} [{self.unit}]" if self.unit else self.heading
+
+    @property
+    def full_title(self) -> str:
+        """Heading with its group, for a terminal or a CSV file."""
+        return f"{self.group}: {self.title}" if self.group and self.heading else self.group or self.title
+
+    def text(self, cell: Any) -> str:
+        """Text of a cell, the same on page and terminal; a missing number is a dash."""
+        value = cell.value if isinstance(cell, Cell) else cell
+        if missing(value):
+            return DASH
+        if self.form and isinstance(value, int | float | np.number):
+            return re.sub(r"^-(?=0\.?0*$)", "", self.form.format(value))
+        return str(value)
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """A value with a tone: `good`, `fair`, `bad` or `slides`, shown as a colour on the page."""
+
+    value: Any
+    tone: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """A table; the page offers it as a CSV file.
+
+    Attributes:
+        name: of the element and its CSV file; columns: its columns; rows: values or `Cell`s, one for each column.
+        title: for the terminal; file: of the run folder with all rows, named where the table is cut.
+        wide: True for small print on the page; terminal: True if the terminal shows it too.
+        brief: numbers of the rows that the terminal shows; None for all.
+    """
+
+    name: str
+    columns: tuple[Column, ...]
+    rows: Sequence[Sequence[Any]]
+    title: str = ""
+    file: str = ""
+    wide: bool = False
+    terminal: bool = True
+    brief: Sequence[int] | None = None
+
+    @property
+    def groups(self) -> list[tuple[str, int]]:
+        """Headings above the columns, each with its number of columns; all empty for a table without groups."""
+        found: list[tuple[str, int]] = []
+        for column in self.columns:
+            if found and column.group and found[-1][0] == column.group:
+                found[-1] = column.group, found[-1][1] + 1
+            else:
+                found.append((column.group, 1))
+        return found
+
+    @property
+    def csv(self) -> str:
+        """The table as CSV with numbers in full; missing ones are empty cells."""
+        stream = io.StringIO()
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(plain(column.full_title) for column in self.columns)
+        for row in self.rows:
+            bare = (cell.value if isinstance(cell, Cell) else cell for cell in row)
+            writer.writerow("" if missing(v) else plain(v) if isinstance(v, str) else v for v in bare)
+        return stream.getvalue()
+
+
+@dataclasses.dataclass(frozen=True)
+class Figure:
+    """A figure of the page.
+
+    Attributes:
+        name: of its element and file; alternative: its finding in words, for who does not see it; caption: how to
+            read it; draw: returns the matplotlib figure.
+    """
+
+    name: str
+    alternative: str
+    caption: str
+    draw: Callable[[], Any]
+
+
+Block = Note | Table | Figure
+
+
+@dataclasses.dataclass(frozen=True)
+class Section:
+    """Blocks under a heading; `name`: of the heading's element."""
+
+    heading: str
+    blocks: tuple[Block, ...]
+    name: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Document:
+    """The report of a command.
+
+    Attributes:
+        title: of the page; answer: the result in a sentence or two; blocks: what follows it before the first heading.
+        sections: the rest, in order.
+    """
+
+    title: str
+    answer: str
+    blocks: tuple[Block, ...]
+    sections: tuple[Section, ...]
+
+    @property
+    def every_block(self) -> list[Block]:
+        """All blocks in the order of the page."""
+        return [*self.blocks, *(block for section in self.sections for block in section.blocks)]
+
+
+def tone(cell: Any) -> str:
+    """Tone of a cell, "" for a plain value."""
+    return cell.tone if isinstance(cell, Cell) else ""
+
+
+def missing(value: Any) -> bool:
+    """True for None and for numbers that are not finite."""
+    return value is None or (isinstance(value, float | np.floating) and not math.isfinite(value))
+
+
+def drawing(name: str, *known: Any, **options: Any) -> Callable[[], Any]:
+    """A function that draws `module.function` of `sweeps/pages`, imported when it is called.
+
+    matplotlib costs half a second, which a command without a page saves.
+    """
+    module, _, function = name.partition(".")
+    return lambda: getattr(importlib.import_module(f"sweeps.pages.{module}"), function)(*known, **options)
+
+
+def plain(text: str) -> str:
+    """A text without the marks of bold words and names."""
+    return re.sub(r"\*\*(.+?)\*\*|`([^`]+)`", lambda m: m[1] or m[2], text)

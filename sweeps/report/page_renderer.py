@@ -1,0 +1,24 @@
+"""A document as a page: one HTML file without network, its figures inlined, its tables offered as CSV."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from calibration.data.robot_file import RobotFile
+from sweeps.pages.page import Album, named, render
+from sweeps.report.document import Document, Figure
+
+
+def write(folder: Path, document: Document, file: RobotFile | None = None) -> Path:
+    """Write `report.html` and `figures/` of a document; returns the path of the page.
+
+    Args:
+        file: of the robot that the page is about: its parameters are the last section.
+    """
+    album = Album(folder)
+    for block in document.every_block:
+        if isinstance(block, Figure):
+            album.add(block.name, block.draw)
+    robot: dict[str, Any] = {"curves": (), "about_robot": None} if file is None else named(file)
+    return render(folder, "document.html.j2", album, title=document.title, document=document, **robot)

@@ -1,0 +1,89 @@
+"""`describe`: the sentence of each note of a table, a fit, the loop or a study, and of each result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from calibration.data.settling import Settled
+from calibration.discovery import instructions, loop_notes
+from calibration.discovery import result as loop_results
+from calibration.inference import fit_notes
+from calibration.inference import result as fit_results
+from calibration.inference.lack_of_fit import Adequacy
+from calibration.inference.residual_clusters import ResidualCluster
+from calibration.sensitivity.result import SensitivityResult
+from sweeps.report.words import (
+    experiment_words,
+    fit_words,
+    loop_words,
+    sensitivity_words,
+    settle_words,
+    step_words,
+    table_words,
+)
+
+Said = str | Callable[..., str]
+#: Kind of note → a sentence with its fields, or a function that makes one.
+NOTES: dict[type, Said] = {
+    fit_notes.Step: step_words.step,
+    **table_words.SAID,
+    **fit_words.SAID,
+    **loop_words.SAID,
+    **sensitivity_words.SAID,
+}
+#: The same of results and of their parts that are no notes.
+RESULTS: dict[type, Said] = {
+    **dict.fromkeys(instructions.KINDS, experiment_words.instruction),
+    fit_notes.Determination: fit_words.determined,
+    fit_notes.Edge: fit_words.edge,
+    fit_notes.Pair: fit_words.combination,
+    fit_notes.Shown: fit_words.shown_by,
+    Adequacy: fit_words.adequacy,
+    ResidualCluster: fit_words.residual_cluster,
+    fit_results.CalibrationResult: lambda found: fit_words.adequacy(found.adequacy),
+    fit_results.Prior: lambda prior: fit_words.PRIORS.get(prior.source, prior.source),
+    loop_notes.Asked: loop_words.asked,
+    loop_notes.Headline: loop_words.headline,
+    loop_notes.Summary: loop_words.statement,
+    loop_results.Alternative: lambda found: loop_words.why_ruled_out(found.reasons),
+    loop_results.DiscoveryResult: lambda found: loop_words.statement(found.summary),
+    loop_results.Formula: lambda found: found.expression or loop_words.NO_FORMULA,
+    loop_results.Resolved: loop_words.resolved,
+    loop_results.UnnamedDiscrepancy: loop_words.course,
+    SensitivityResult: sensitivity_words.statement,
+    Settled: settle_words.statement,
+}
+#: The same of parts of results, by name.
+PARTS: dict[tuple[type, str], Callable[..., str]] = {
+    (fit_results.CalibrationResult, "header"): fit_words.header,
+    (loop_results.DiscoveryResult, "header"): loop_words.header,
+    (loop_results.DiscoveryResult, "refit header"): loop_words.refit_header,
+    (loop_results.DiscoveryResult, "standing"): loop_words.why,
+}
+
+
+def describe(found: Any, part: str = "", *about: str) -> str:
+    """English sentence of a note or a result, such as a calibration's `remarks` or what `discover` returns.
+
+    Args:
+        found: a note, a result, or a sentence, which is returned as it is.
+        part: of a result: `header` of its robot's file, or `standing` of the loop's names; "": its answer.
+        about: the robot's name, for a header.
+
+    Returns:
+        The sentence; "" where there is nothing to report.
+
+    Raises:
+        TypeError: nothing is known about this kind of object or part.
+    """
+    if isinstance(found, str):
+        return found
+    said = PARTS.get((type(found), part)) if part else (NOTES | RESULTS).get(type(found))
+    if said is None:
+        kind = type(found).__name__ + (f", {part}" if part else "")
+        raise TypeError(f"describe: got {kind}; expected a note or a result of calibrate, discover or sensitivity")
+    if isinstance(said, str):
+        listed = {name: ", ".join(x) if isinstance(x, tuple) else x for name, x in vars(found).items()}
+        return said.format(**listed)
+    return said(found, *about)

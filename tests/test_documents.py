@@ -1,0 +1,225 @@
+"""Reports as documents: page, terminal and CSV show the same cells; one text of each document is kept.
+
+`python tests/test_documents.py` writes the texts in `tests/record/pages` anew.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+import re
+import urllib.parse
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pages import Tables, drawn, outside
+
+from calibration.data import requirements_file, settling
+from calibration.data import runs as records
+from calibration.data.parts import cells
+from calibration.data.robot_file import RobotFile
+from calibration.sizing import sheet
+from calibration.sizing.design_search import Found, Sizing
+from calibration.sizing.part_options import drives
+from mmrjax.model.paper_robots import nominal
+from sweeps import store
+from sweeps.inputs import fit_of
+from sweeps.report import (
+    check_report,
+    comparison_report,
+    page_renderer,
+    settle_report,
+    size_report,
+    terminal_renderer,
+)
+from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table
+from sweeps.results.check_results import CheckResult
+from sweeps.results.comparison_results import Comparison, compared
+from sweeps.results.size_results import SizeResult
+
+RECORD = Path(__file__).parent / "record" / "pages"
+
+
+def as_text(document: Document) -> str:
+    """A document as lines of text: headings, notes, alternative texts of figures, and tables with their headings."""
+    lines = [f"# {document.title}", document.answer]
+    for section in (Section("", document.blocks), *document.sections):
+        lines += [f"## {section.heading}"] * bool(section.heading)
+        for block in section.blocks:
+            if isinstance(block, Note):
+                lines += [block.text] if isinstance(block.text, str) else [f"- {item}" for item in block.text]
+            elif isinstance(block, Figure):
+                lines += [f"[{block.name}] {block.alternative}", block.caption]
+            elif block.rows:
+                lines.append(f"{block.name}: " + " | ".join(c.full_title for c in block.columns))
+                lines += [
+                    " | ".join(c.text(v) for c, v in zip(block.columns, row, strict=True)) for row in block.rows
+                ]
+    return "\n".join(lines) + "\n"
+
+
+def outcomes() -> tuple[sheet.Outcome, ...]:
+    """A requirement that is met, one missed with two changes, and one without a value."""
+    asked = requirements_file.read("speed_m_s = 1\nmass_kg = 15\nslope_deg = 20\n", "aims.toml")
+    at = {"configuration": "6T2A", "surface": "lacquered_wood", "payload_kg": 8.0, "slope_deg": 10.0}
+    changes = (
+        sheet.Change("gearbox.ratio", 48.0, 45.27, "-", -0.02),
+        sheet.Change("battery.capacity", 7920.0, 16210.0, "C", 1e-5, ("mass_kg",)),
+    )
+    speed, mass, slope = asked.each
+    return (
+        sheet.Outcome(speed, 0.947, -0.053, "converged", at, changes),
+        sheet.Outcome(mass, 13.1, 1.9, "converged", {k: at[k] for k in ("configuration", "surface")}),
+        sheet.Outcome(slope, None, None, "slides", at),
+    )
+
+
+def check() -> Document:
+    asked = requirements_file.read("speed_m_s = 1\nmass_kg = 15\nslope_deg = 20\n", "aims.toml")
+    return check_report.document(CheckResult(asked, nominal(), outcomes()), "nominal (PM)")
+
+
+def size() -> Document:
+    robot, drive = nominal(), drives(("RE 40 24 V",))[0]
+    asked = requirements_file.read("mass_kg = 15\n", "aims.toml")
+    best = Found(
+        drive, cells()[0], 12.5, 0.0414, 3, 4.0, {"mass": 14.14, "energy": 0.031},
+        {"winding": 0.002, "cell current": 0.4}, ("largest ratio",), robot,
+    )  # fmt: skip
+    short = dataclasses.replace(best, margins={"winding": -0.08}, objectives={"mass": 13.7}, bounds=())
+    sizing = Sizing(
+        None, None, "mass", ("steepest slope held",), best, best, (), {"a": best, "b": short}, (), 256, 31000
+    )  # fmt: skip
+    return size_report.document(SizeResult(asked, robot, sizing, ("mass",), outcomes()), "nominal (PM)")
+
+
+def comparison(log: bool = False) -> Document:
+    """The bench's rows with a simulation 4 % above them, the first row without one; of a log as its first 2.8 s."""
+    measured = records.read("measured")
+    error = np.where(np.arange(len(measured)) == 0, np.nan, 1.04 + 0.001 * measured["slope_deg"])
+    simulated = {c: measured[c] for c in ("configuration", *measured.axes)}
+    simulated |= {c.column: error * measured[c.column] for c in measured.channels}
+    simulated["status"] = np.where(np.isnan(error), "slides", "converged")
+    table, summary = compared(measured, simulated, sized=log)
+    time = {"time_s": 0.1 * np.arange(len(measured))} if log else {}
+    return comparison_report.document(
+        Comparison(
+            table | time, summary, measured.channels, "measured", "steady", "nominal (PM)", log, "" if log else "these",
+            {"time_s": "time [s]"} if log else None, ("a note",),
+        )
+    )  # fmt: skip
+
+
+def comparison_log() -> Document:
+    return comparison(log=True)
+
+
+def settle() -> Document:
+    """A log of two levels, the first of which still changes at its beginning, and of a third that is too short."""
+    rng = np.random.default_rng(3)
+    volts = np.repeat([6.0, 12.0, 18.0], (200, 200, 12))
+    lag = np.where(np.arange(len(volts)) < 200, np.exp(-np.arange(len(volts)) / 40), 0.0)
+    runs = records.Runs(
+        "log.csv",
+        {
+            "configuration": np.repeat("6T2A", len(volts)), "time_s": 0.01 * np.arange(len(volts)),
+            "supply_voltage_V": volts, "payload_kg": 0.0 * volts, "slope_deg": 0.0 * volts,
+            "total_current_A": 1.2 + volts / 20 + 0.01 * rng.standard_normal(len(volts)),
+            "motor_speed_rpm": 350 * volts * (1 - 0.5 * lag) + 3 * rng.standard_normal(len(volts)),
+        },
+    )  # fmt: skip
+    return settle_report.document(settling.settle(runs), "Too few for the loop.", ("a further note",))
+
+
+DOCUMENTS: dict[str, Callable[[], Document]] = {
+    "check": check, "size": size, "comparison": comparison, "comparison_log": comparison_log,
+    "settle": settle,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_a_document_reads_as_recorded(name):
+    assert as_text(DOCUMENTS[name]()) == (RECORD / f"{name}.txt").read_text(encoding="utf-8")
+
+
+SMALL = Document(
+    "A & B",
+    "Speed **0.5 m/s**.",
+    (Note("page only", terminal=False), Note(("one `x_m`", "two"), name="notes")),
+    (
+        Section("Rows", (
+            Table("rows", (
+                Column("run"), Column("measured", "A", "{:.1f}", "current"), Column("error", "%", "{:+.2f}", "current"),
+                Column("source", terminal=False),
+            ), [("a", 1.25, Cell(-0.001, "good"), "<hand>"), ("b", None, Cell(float("nan")), "log")], "all rows"),
+        )),
+    ),
+)  # fmt: skip
+
+
+def test_a_robot_is_fitted_to_the_rows_that_its_folder_records(tmp_path):
+    robot, runs = tmp_path / "robot.toml", records.read("measured")
+    robot.write_text("# a robot\n")
+    file = RobotFile(nominal(), str(robot))
+    assert fit_of(file, runs) == "" == fit_of(RobotFile(nominal(), "nominal"), runs)
+    manifest = {
+        "arguments": ["loop", "x.csv"],
+        "hashes": {"robot": store.digest(robot.read_bytes()), "x.csv": runs.digest},
+    }
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    assert fit_of(file, runs) == "these"
+    assert fit_of(file, records.Runs("other", runs.columns)) == "others"
+    robot.write_text("# changed by hand\n")
+    assert fit_of(file, runs) == ""
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest | {"arguments": ["compare", "x.csv"]}))
+    assert fit_of(file, runs) == ""
+
+
+def test_page_terminal_and_csv_show_the_same_cells(tmp_path, capsys):
+    page = page_renderer.write(tmp_path, SMALL).read_text(encoding="utf-8")
+    rows = Tables(page).tables["rows"]
+    assert rows == [
+        ["run", "current", "source"], ["measured [A]", "error [%]"], ["a", "1.2", "0.00", "<hand>"], ["b", "–", "–", "log"],
+    ]  # fmt: skip
+    (link,) = re.findall(r'download="rows.csv" href="data:text/csv;charset=utf-8,([^"]*)"', page)
+    assert [*csv.reader(io.StringIO(urllib.parse.unquote(link)))] == [
+        ["run", "current: measured [A]", "current: error [%]", "source"], ["a", "1.25", "-0.001", "<hand>"], ["b", "", "", "log"],
+    ]  # fmt: skip
+    assert (
+        "A &amp; B" in page
+        and "Speed <b>0.5 m/s</b>." in page
+        and "<code>x_m</code>" in page
+        and not outside(tmp_path)
+    )
+    terminal_renderer.show(SMALL)
+    shown = capsys.readouterr().out
+    assert (
+        shown.startswith("Speed 0.5 m/s.\n- one x_m\n- two\n") and "page only" not in shown and "<hand>" not in shown
+    )
+    assert [line.split() for line in shown.splitlines()[-2:]] == [["a", "1.2", "0.00"], ["b", "–", "–"]]
+
+
+def test_a_long_table_is_cut_and_names_its_file(tmp_path, capsys):
+    table = Table("rows", (Column("run", form="{}"),), [(k,) for k in range(250)], file="runs.csv")
+    document = Document("T", "A.", (), (Section("Rows", (table,)),))
+    page = page_renderer.write(tmp_path, document).read_text(encoding="utf-8")
+    assert len(Tables(page).tables["rows"]) == 201 and "The first 200 of 250 rows" in page
+    assert '<a class="csv" download href="runs.csv">' in page
+    terminal_renderer.show(document)
+    assert capsys.readouterr().out == "A.\n250 rows: see runs.csv\n"
+
+
+def test_the_page_of_check_shows_its_figure_with_its_finding(tmp_path):
+    page = page_renderer.write(tmp_path, check()).read_text(encoding="utf-8")
+    assert drawn(page) == {"margins"}
+    assert 'aria-label="2 of 3 requirements are missed: ' in page
+
+
+if __name__ == "__main__":
+    RECORD.mkdir(exist_ok=True)
+    for key, made in DOCUMENTS.items():
+        (RECORD / f"{key}.txt").write_text(as_text(made()), encoding="utf-8")

@@ -1,0 +1,100 @@
+"""Readings over time on a page: data of the interactive figure, residuals, and figures for phones."""
+
+import json
+
+import numpy as np
+import pytest
+
+from mmrjax.model import channels
+from sweeps import pages
+from sweeps.pages import figure_style, page
+from sweeps.pages.time_overlay import POINTS, time_overlay
+
+SPEED, CURRENT = channels.find("motor_speed"), channels.find("motor_current")
+
+
+def overlay(rows=200, offset=(1.0, 5.0)):
+    """Two recordings, their rows shuffled; the simulated speed is off by a constant of each, a current is missing."""
+    time = np.tile(np.linspace(0.0, 10.0, rows), 2)
+    run = np.repeat(["a", "b"], rows)
+    measured = 100 * np.sin(time)
+    table = {
+        "run_id": run, "time_s": time, SPEED.column: measured, CURRENT.column: np.full(2 * rows, np.nan),
+        f"simulated_{SPEED.column}": measured + np.where(run == "a", *offset),
+        f"simulated_{CURRENT.column}": np.zeros(2 * rows),
+    }  # fmt: skip
+    order = np.random.default_rng(0).permutation(2 * rows)
+    return time_overlay({k: v[order] for k, v in table.items()}, [SPEED, CURRENT], {"simulated_": "simulated"})
+
+
+def test_the_run_with_the_largest_residuals_comes_first():
+    made = overlay()
+    data = json.loads(made.to_json())
+    assert list(data["runs"]) == ["b", "a"] and list(json.loads(overlay(offset=(5.0, 1.0)).to_json())["runs"]) == [
+        "a",
+        "b",
+    ]
+    assert [c["label"] for c in data["channels"]] == [SPEED.label]  # a channel without readings is left out
+    time, ((measured, simulated),) = data["runs"]["b"]["time"], data["runs"]["b"]["channels"]
+    assert np.all(np.diff(time) > 0)
+    np.testing.assert_allclose(np.subtract(simulated, measured), 5.0, atol=1e-3)
+
+
+def test_static_figure_shows_simulated_less_measured():
+    with figure_style.style():
+        above, below = overlay().draw().axes
+    np.testing.assert_allclose(below.lines[-1].get_ydata(), 5.0)
+    assert above.get_title(loc="left") == "run b" and above.get_ylabel() == figure_style.axis_label(SPEED)
+
+
+def test_long_recordings_are_thinned_but_keep_their_spikes():
+    made = overlay(rows=40_000)
+    spike = made.rows["b"][12_345]
+    made.table[SPEED.column][spike] = 1e4
+    text = made.to_json()
+    readings = json.loads(text)["runs"]["b"]["channels"][0][0]
+    assert max(readings) == 1e4 and len(readings) < POINTS and len(text) < 700_000
+
+
+def test_a_missing_reading_is_null():
+    made = overlay()
+    made.table[SPEED.column][made.rows["b"][3]] = np.nan
+    assert json.loads(made.to_json())["runs"]["b"]["channels"][0][0][3] is None
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_panels_are_stacked_for_phones(tmp_path, monkeypatch, stated):
+    """Each panel then has the labels that a row or a column of panels shares."""
+    monkeypatch.setattr(pages, "FOR_PHONES", stated)
+    drawn = []
+
+    def draw():
+        fig, grid = figure_style.figure(1, 2, 3.0, sharey="row")
+        grid[0, 0].set_ylabel("current")
+        drawn.append((fig, grid))
+        return fig
+
+    album = page.Album(tmp_path)
+    album.add("panels", draw)
+    assert album.pictures["panels"].count("<svg") == len(drawn) == 1 + stated
+    if stated:
+        fig, grid = drawn[1]
+        assert fig.get_size_inches()[0] == figure_style.NARROW
+        assert grid[0, 0].get_position().y0 > grid[0, 1].get_position().y1
+        assert grid[0, 1].get_ylabel() == "current"
+
+
+def test_a_colour_scale_is_not_inverted_in_the_dark(tmp_path):
+    album = page.Album(tmp_path)
+
+    def draw(scale):
+        fig, grid = figure_style.figure(1, 1, 2.0)
+        grid[0, 0].imshow(np.eye(2)) if scale else grid[0, 0].plot([0, 1])
+        return fig
+
+    for name, scale in {"map": True, "line": False}.items():
+        album.add(name, lambda scale=scale: draw(scale))
+    assert (
+        'class="scale ' in album.pictures["map"]
+        and "scale" not in album.pictures["line"].split(">")[0].split("class=")[1].split('"')[1]
+    )
