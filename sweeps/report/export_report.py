@@ -47,8 +47,8 @@ def document(found: Export) -> Document:
         table = Table("fitted", columns, fitted, "parameters of the format", terminal=False)
         sections.append(Section("Parameters of the format", (table, Note(_FITTED, "key", terminal=False))))
     if found.checks:
-        columns = (Column("check"), Column("value", form="{:.3g}"))
-        checks = Table("checks", columns, list(found.checks.items()), "checks of the files")
+        shown = (Column("check"), Column("value", form="{:.3g}"))
+        checks = Table("checks", shown, list(found.checks.items()), "checks of the files")
         sections.append(Section("Checks of the files", (checks,)))
     conditions = (
         Note(tuple(words.conditions_seen(found)), name="seen", terminal=False),
