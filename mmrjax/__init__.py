@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from mmrjax.model.signals import State as State
     from sweeps import sweep as sweep
     from sweeps.compilation_cache import keep_programs as keep_programs
+    from sweeps.export.drive_export import export as export
     from sweeps.report.words.note_words import describe as describe
 
 #: Module of each public name.
@@ -66,6 +67,7 @@ _ABOVE = {
     "calibrate": "calibration",
     "describe": "sweeps.report.words.note_words",
     "discover": "calibration",
+    "export": "sweeps.export.drive_export",
     "keep_programs": "sweeps.compilation_cache",
     "read_robot": "calibration",
     "read_runs": "calibration",
@@ -88,6 +90,7 @@ __all__ = [
     "calibrate",
     "describe",
     "discover",
+    "export",
     "initial_state",
     "keep_programs",
     "nominal",
