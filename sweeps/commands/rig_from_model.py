@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.input_files import content
 from sweeps.export import mujoco
 
@@ -57,12 +57,12 @@ def of_mujoco(source: Path, joint: str | None) -> str:
         joint = next(iter(drives))
     if joint not in joints:
         raise BadConfiguration(
-            f"--joint: got {joint}; {source} has no such joint; {choices(joint, filter(None, joints))}"
+            f"--joint: got {joint}; {source} has no such joint; {allowed_words(joint, filter(None, joints))}"
         )
     if joint not in drives:
         raise BadConfiguration(
             f"--joint: got {joint}, which no <dcmotor> of {source} drives, so its winding is not known; "
-            f"{choices(joint, drives) if drives else 'expected a model with a <dcmotor>'}"
+            f"{allowed_words(joint, drives) if drives else 'expected a model with a <dcmotor>'}"
         )
     which = joints.index(joint)
     if model.jnt_type[which] != int(library.mjtJoint.mjJNT_HINGE):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import resources
 from pathlib import Path
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from sweeps.console import say
 
 #: Kinds of rig, in words.
@@ -39,7 +39,7 @@ def new(file: Path, kind: str, force: bool, source: Path | None = None, joint: s
         raise BadConfiguration(f"--joint: got {joint} without --from; expected a model that has this joint")
     if kind not in KINDS:
         each = "; ".join(f"{name}: {what}" for name, what in KINDS.items())
-        raise BadConfiguration(f"--kind: got {kind}; {choices(kind, KINDS)} ({each})")
+        raise BadConfiguration(f"--kind: got {kind}; {allowed_words(kind, KINDS)} ({each})")
     if file.exists() and (file.is_dir() or not force):
         what = "a folder; state a file, as my-rig.toml" if file.is_dir() else "there already; --force replaces it"
         raise BadConfiguration(f"{file}: {what}")
