@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from sweeps import sweep as sweep
     from sweeps.compilation_cache import keep_programs as keep_programs
     from sweeps.report.words.note_words import describe as describe
+    from sweeps.export.drive_export import export as export
 
 #: Module of each public name.
 _HOME = {
@@ -62,6 +63,7 @@ _ABOVE = {
     "calibrate": "calibration",
     "describe": "sweeps.report.words.note_words",
     "discover": "calibration",
+    "export": "sweeps.export.drive_export",
     "keep_programs": "sweeps.compilation_cache",
     "read_robot": "calibration",
     "read_runs": "calibration",
@@ -80,6 +82,7 @@ __all__ = [
     "calibrate",
     "describe",
     "discover",
+    "export",
     "initial_state",
     "keep_programs",
     "nominal",

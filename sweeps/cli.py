@@ -343,6 +343,23 @@ def settle(
 
 
 @_command(
+    config.Export,
+    arguments=("robot",),
+    example="mmrjax export found/robot.toml --to mujoco --data runs.csv --out exported",
+    failure="does not occur: runs that do not settle are left out of the comparison",
+)
+def export(told: Told, out: _Out = None, force: _Force = False) -> int:
+    """Write a drive in the format of another simulator, and a page on what the format loses.
+
+    Parameters of the format are refitted to this model over the runs of --data. LAW.md describes the law to people
+    who have never seen this program: equations, constants with intervals, conditions seen, what was not tested.
+    """
+    from sweeps.commands import export_drive as room
+
+    return room.export(told.config, out, force)
+
+
+@_command(
     config.Loop,
     beside=config.LoopBeside,
     example="mmrjax loop measured --out found, then mmrjax sweep --robot found/robot.toml",
@@ -461,15 +478,20 @@ def new(
     kind: Annotated[
         str, typer.Option(help="tracked, wheeled, bench, dyno, pendulum, servo, linear or carriage.")
     ] = "bench",
+    source: Annotated[
+        Path | None, typer.Option("--from", help="A model of MuJoCo (.xml) whose driven joint is the rig.")
+    ] = None,
+    joint: Annotated[str | None, typer.Option(help="Name of that joint.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file where there is one.")] = False,
 ) -> int:
     """Write a rig's file to fill in, with units and where each number comes from; it asks nothing.
 
     As written it can be read, with numbers of an example. Units are SI but where a comment says another.
+    With --from the numbers are those of a model's joint, as export --to mujoco writes them.
     """
     from sweeps.commands import rig_new
 
-    return rig_new.new(file, kind, force)
+    return rig_new.new(file, kind, force, source, joint)
 
 
 @rig.command("check", epilog="Example: mmrjax rig check my-rig.toml my-runs.csv")

@@ -589,6 +589,22 @@ class Settle(RobotPart, OutputPart):
     )
 
 
+class Export(RobotPart, OutputPart):
+    """A drive in the format of another simulator."""
+
+    robot: str = about("nominal", "nominal, sm1, sm2, or a robot's TOML file", metavar="[ROBOT.toml]", format="path")
+    to: Literal["mujoco", "jax", "onnx", "mjlab", "table", "randomization"] = about(
+        "mujoco", "Format (docs/howto/export.md)"
+    )
+    data: str | None = about(
+        None, "A table of runs or a log, with which the exported drive is compared", usual="a grid without readings"
+    )
+    configuration: str | None = about(None, "Which of the robot's configurations", usual="its first")
+    joint: str = about("drive", "Name of the joint in the simulator's model, for mujoco")
+    draws: Annotated[int, Field(ge=1, le=100_000)] = about(1000, "Draws of the posterior, for randomization")
+    seed: Seed = about(0, "Of the draws")
+
+
 class Loop(RobotPart, InferencePart, OutputPart):
     """The closed loop beside its data."""
 

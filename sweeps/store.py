@@ -109,6 +109,11 @@ class Folder:
         """Write a text file."""
         writing.write_text(self.partial / name, text)
 
+    def write_bytes(self, name: str, content: bytes) -> None:
+        """Write a file of bytes."""
+        with writing.naming(self.partial / name):
+            (self.partial / name).write_bytes(content)
+
     def write_json(self, name: str, content: dict[str, Any]) -> None:
         """Write a JSON file; what is not finite becomes null."""
         writing.write_json(self.partial / name, content)
