@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from mmrjax.model.signals import State as State
     from sweeps import sweep as sweep
     from sweeps.compilation_cache import keep_programs as keep_programs
-    from sweeps.report.words.note_words import describe as describe
     from sweeps.export.drive_export import export as export
+    from sweeps.report.words.note_words import describe as describe
 
 #: Module of each public name.
 _HOME = {
