@@ -472,22 +472,30 @@ rig = typer.Typer(
 app.add_typer(rig, name="rig")
 
 
-@rig.command(epilog="Example: mmrjax rig new my-rig.toml --kind wheeled")
+@rig.command(epilog="Example: mmrjax rig new my-rig.toml --from robot.urdf --joint left_wheel_joint")
 def new(
     file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The file to write.")],
     kind: Annotated[
-        str, typer.Option(help="tracked, wheeled, bench, dyno, pendulum, servo, linear or carriage.")
-    ] = "bench",
-    source: Annotated[
-        Path | None, typer.Option("--from", help="A model of MuJoCo (.xml) whose driven joint is the rig.")
+        str | None,
+        typer.Option(
+            help="tracked, wheeled, bench, dyno, pendulum, servo, linear or carriage.  "
+            "\\[default: what the joint of --from moves, else bench]"
+        ),
     ] = None,
-    joint: Annotated[str | None, typer.Option(help="Name of that joint.")] = None,
+    source: Annotated[
+        Path | None, typer.Option("--from", help="A URDF or a model of MuJoCo, of which one joint is the rig.")
+    ] = None,
+    joint: Annotated[
+        str | None, typer.Option(help="Name of that joint; it turns.  \\[default: the only driven one]")
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file where there is one.")] = False,
 ) -> int:
     """Write a rig's file to fill in, with units and where each number comes from; it asks nothing.
 
     As written it can be read, with numbers of an example. Units are SI but where a comment says another.
-    With --from the numbers are those of a model's joint, as export --to mujoco writes them.
+
+    --kind wheeled writes the file of a kind. --from reads a joint: mass, inertia, radius, ratio, friction, damping,
+    armature. Each number has its source and a wide ±. The command lists what it did not find.
     """
     from sweeps.commands import rig_new
 
