@@ -162,28 +162,28 @@ def _dc_motor(model: Any, actuator: int, dof: int, ratio: float, file: str) -> d
     resistance, constant = float(gain[0]), float(gain[1])
     effects = _effects(dynamic, bias, ratio)
     friction = float(model.dof_frictionloss[dof]) + (float(bias[3]) * ratio if float(dynamic[5]) > 0 else 0.0)
-    of = lambda value, unit, what, width="": Stated(float(value), unit, f"{file}, {what}", width)  # noqa: E731
+    number = lambda value, unit, what, width="": Stated(float(value), unit, f"{file}, {what}", width)  # noqa: E731
     found = {
-        "motor.resistance": of(resistance, "ohm", "<dcmotor> resistance", "10 %"),
-        "motor.torque_constant": of(constant, "N·m/A", "<dcmotor> motorconst", "10 %"),
-        "motor.inertia": of(float(model.dof_armature[dof]) / ratio**2, "kg·m^2", "armature / gear²", "50 %"),
-        "motor.friction_coulomb": of(0.0, "N·m", "all friction is at the joint"),
-        "motor.friction_viscous": of(0.0, "N·m·s", "all damping is at the joint"),
-        "gearbox.efficiency_load": of(1.0, "-", "no loss in proportion to the torque: state one if you know it"),
-        "load.loss_coulomb": of(friction, "N·m", "frictionloss and lugre of the joint", "100 %"),
-        "load.loss_viscous": of(np.ravel(model.dof_damping[dof])[0], "N·m·s", "damping of the joint", "100 %"),
+        "motor.resistance": number(resistance, "ohm", "<dcmotor> resistance", "10 %"),
+        "motor.torque_constant": number(constant, "N·m/A", "<dcmotor> motorconst", "10 %"),
+        "motor.inertia": number(float(model.dof_armature[dof]) / ratio**2, "kg·m^2", "armature / gear²", "50 %"),
+        "motor.friction_coulomb": number(0.0, "N·m", "all friction is at the joint"),
+        "motor.friction_viscous": number(0.0, "N·m·s", "all damping is at the joint"),
+        "gearbox.efficiency_load": number(1.0, "-", "no loss in proportion to the torque: state one if you know it"),
+        "load.loss_coulomb": number(friction, "N·m", "frictionloss and lugre of the joint", "100 %"),
+        "load.loss_viscous": number(np.ravel(model.dof_damping[dof])[0], "N·m·s", "damping of the joint", "100 %"),
     }
     inductance = float(dynamic[0]) * resistance
     voltage = float(np.max(np.abs(model.actuator_ctrlrange[actuator])))
     if inductance > 0:
-        found["motor.inductance"] = of(inductance, "H", "<dcmotor> inductance", "50 %")
+        found["motor.inductance"] = number(inductance, "H", "<dcmotor> inductance", "50 %")
     if voltage > 0:
-        found["motor.voltage_limit"] = of(voltage, "V", "<dcmotor> ctrlrange")
+        found["motor.voltage_limit"] = number(voltage, "V", "<dcmotor> ctrlrange")
     if model.actuator_forcelimited[actuator]:
         limit = float(np.max(np.abs(model.actuator_forcerange[actuator]))) / constant
-        found["driver.current_limit"] = of(limit, "A", "<dcmotor> forcerange / motorconst")
+        found["driver.current_limit"] = number(limit, "A", "<dcmotor> forcerange / motorconst")
     for name, fields in effects.items():
-        found |= {f"effects.{name}.{key}": of(value, "SI", "<dcmotor>") for key, value in fields.items()}
+        found |= {f"effects.{name}.{key}": number(value, "SI", "<dcmotor>") for key, value in fields.items()}
     return found
 
 
