@@ -443,7 +443,7 @@ def test_rig_that_was_exported_comes_back_to_the_last_digit(rig, tmp_path):
     for name, text in first.items():
         (tmp_path / name).write_text(text)
     again = tmp_path / "again.toml"
-    again.write_text(rig_new.text(None, tmp_path / "scene.xml", "drive"))
+    again.write_text(rig_new.text(None, tmp_path / "scene.xml", "drive", None))
     second = xml_of(again)
     lines = [[line for line in f["drive.xml"].splitlines() if "<!--" not in line] for f in (first, second)]
     assert lines[0] == lines[1]
@@ -477,7 +477,7 @@ def test_models_without_a_driven_joint_are_refused_in_a_sentence(source, joint, 
     bodies = "".join(map(body.format, ("name='drive'", "name='other'", "name='slide' type='slide'")))
     (tmp_path / "two.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
     with pytest.raises(BadConfiguration, match=message):
-        rig_new.text(None, tmp_path / source, joint)
+        rig_new.text(None, tmp_path / source, joint, None)
 
 
 def test_older_mujoco_is_refused_with_the_version_that_it_takes(monkeypatch, rig):

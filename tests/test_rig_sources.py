@@ -43,7 +43,7 @@ def values(text, tmp_path):
 
 
 def test_wheel_of_a_urdf_is_a_robot_on_wheels_with_sources(tmp_path):
-    text = rig_new.text(None, DIFFBOT, "left_wheel_joint")
+    text = rig_new.text(None, DIFFBOT, "left_wheel_joint", None)
     found, sds = values(text, tmp_path)
     expected = {
         "sides": 2, "rover.mass": 5.2, "rover.radius": 0.065, "rover.inertia": 6.8e-4, "gearbox.ratio": 34,
@@ -60,7 +60,7 @@ def test_wheel_of_a_urdf_is_a_robot_on_wheels_with_sources(tmp_path):
 
 
 def test_arm_of_a_urdf_carries_what_is_fixed_to_it(tmp_path):
-    found, _ = values(rig_new.text(None, DIFFBOT, "arm_joint"), tmp_path)
+    found, _ = values(rig_new.text(None, DIFFBOT, "arm_joint", None), tmp_path)
     assert found["arm.inertia"] == pytest.approx(7e-4 + 0.2 * 0.1**2 + 2e-5 + 0.1 * 0.2**2)
     assert found["arm.torque_gravity"] == pytest.approx((0.2 * 0.1 + 0.1 * 0.2) * GRAVITY)
     assert found["arm.angle_zero"] == pytest.approx(math.pi / 2)  # it points forward, and turns down
@@ -86,7 +86,7 @@ def test_urdf_agrees_with_mujoco_in_any_frames(seed, tmp_path):
 
 def test_wheel_of_a_mujoco_model_has_the_numbers_of_its_default_class(tmp_path):
     (tmp_path / "free.xml").write_text(FREE)
-    text = rig_new.text(None, tmp_path / "free.xml", "left")
+    text = rig_new.text(None, tmp_path / "free.xml", "left", None)
     found, _ = values(text, tmp_path)
     expected = {
         "sides": 2, "rover.mass": 6.0, "rover.radius": 0.08, "rover.inertia": 0.5 * 0.5 * 0.08**2,
@@ -98,7 +98,7 @@ def test_wheel_of_a_mujoco_model_has_the_numbers_of_its_default_class(tmp_path):
 
 def test_armature_without_a_ratio_turns_with_the_load(tmp_path):
     (tmp_path / "free.xml").write_text(FREE.replace(' gear="20"', ""))
-    found, _ = values(rig_new.text("bench", tmp_path / "free.xml", "left"), tmp_path)
+    found, _ = values(rig_new.text("bench", tmp_path / "free.xml", "left", None), tmp_path)
     assert found["motor.inertia"] == 0
     assert found["bench.inertia"] == pytest.approx(0.5 * 0.5 * 0.08**2 + 0.0016, rel=1e-6)
 
@@ -130,7 +130,7 @@ def test_robots_with_a_mistake_are_refused_in_a_sentence(old, new, joint, messag
     assert old in text
     (tmp_path / "r.urdf").write_text(text.replace(old, new))
     with pytest.raises(BadConfiguration, match=message) as refusal:
-        rig_new.text(None, tmp_path / "r.urdf", joint)
+        rig_new.text(None, tmp_path / "r.urdf", joint, None)
     assert "\n" not in str(refusal.value)
 
 

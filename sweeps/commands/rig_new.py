@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -45,14 +46,14 @@ def joint_of(source: Path, joint: str | None) -> JointNumbers:
     return rig_from_mujoco.read(source, joint)
 
 
-def text(kind: str | None, source: Path | None, joint: str | None) -> str:
-    """Text of a rig's file, with the numbers of a joint in their lines.
+def text(kind: str | None, source: Path | None, joint: str | None, sheet: Mapping[str, str] | None) -> str:
+    """Text of a rig's file, with the numbers of a joint and of a data sheet in their lines.
 
     Args:
-        kind: None: what the joint moves, else `USUAL`; source: a model; joint: by name.
+        kind: None: what the joint moves, else `USUAL`; source: a model; joint: by name; sheet: numbers by name.
 
     Raises:
-        BadConfiguration: as `joint_of`.
+        BadConfiguration: as `joint_of` and `rig_from_sheet.read`.
     """
     numbers: dict[str, Stated] = {}
     origins = []
@@ -61,6 +62,11 @@ def text(kind: str | None, source: Path | None, joint: str | None) -> str:
         kind = found.kind(kind)
         numbers |= found.numbers(kind)
         origins.append(f"joint {found.joint} of {found.file}")
+    if sheet is not None:
+        from sweeps.commands import rig_from_sheet
+
+        numbers |= rig_from_sheet.read(sheet)
+        origins.append("a data sheet")
     kind = kind or USUAL
     if not origins:
         return template(kind)
@@ -74,14 +80,15 @@ def new(
     force: bool,
     source: Path | None = None,
     joint: str | None = None,
+    sheet: Mapping[str, str] | None = None,
 ) -> int:
-    """Write a rig's file to fill in, or one with the numbers of a model; returns 0.
+    """Write a rig's file to fill in, or one with the numbers of a model or data sheet; returns 0.
 
     Args:
-        kind, source, joint: as of `text`.
+        kind, source, joint, sheet: as of `text`.
 
     Raises:
-        BadConfiguration: no such kind, model, joint or folder, or a file that exists without
+        BadConfiguration: no such kind, model, joint or folder, a contradictory sheet, or a file that exists without
             `force`.
     """
     if joint is not None and source is None:
@@ -94,8 +101,8 @@ def new(
         raise BadConfiguration(f"{file}: {what}")
     if not file.parent.is_dir():
         raise BadConfiguration(f"{file}: no such folder as {file.parent}; make it first")
-    written = text(kind, source, joint)
-    if source is None:
+    written = text(kind, source, joint, sheet)
+    if source is None and sheet is None:
         what = f"{KINDS[kind or USUAL]}. Fill in what is marked example: yours, then"
     else:
         lacking = ", ".join(examples(written))
