@@ -490,7 +490,7 @@ def new(
         ),
     ] = None,
     source: Annotated[
-        Path | None, typer.Option("--from", help="A URDF or a model of MuJoCo, of which one joint is the rig.")
+        Path | None, typer.Option("--from", help="A URDF or a model of MuJoCo with the driven joint.")
     ] = None,
     joint: Annotated[
         str | None, typer.Option(help="Name of that joint; it turns.  \\[default: the only driven one]")

@@ -188,7 +188,7 @@ def _dc_motor(model: Any, actuator: int, dof: int, ratio: float, file: str) -> d
 
 
 def _effects(dynamic: Sequence[float], bias: Sequence[float], ratio: float) -> dict[str, dict[str, float]]:
-    """Effects that terms of a `<dcmotor>` stand for: name → fields."""
+    """Effects of a `<dcmotor>`: name → fields."""
     found: dict[str, dict[str, float]] = {}
     resistance_thermal, capacity, stiffness = (float(dynamic[k]) for k in (2, 3, 5))
     amplitude, ripples, phase, coulomb, static, fade = (float(x) for x in bias[:6])

@@ -36,8 +36,8 @@ def read(root: Element, file: str, joint: str | None) -> JointNumbers:
         root: element `<robot>`; file: its name; joint: by name, None: the only driven one.
 
     Raises:
-        BadConfiguration: a joint that is unknown or does not turn, links that form a loop, a number that is none or
-            negative, or what turns has no inertia.
+        BadConfiguration: an unknown joint or one of another kind, links that form a loop, a word for a number, a
+            negative mass or inertia, or no inertia of what turns.
     """
     robot = _Urdf(root, file)
     return robot.numbers(robot.chosen(joint))
@@ -79,7 +79,7 @@ class _Urdf:
         """Name of a joint that turns.
 
         Raises:
-            BadConfiguration: no such joint, or one that does not turn.
+            BadConfiguration: an unknown joint, or one that is fixed or slides.
         """
         turning = [name for name, element in self.joints.items() if element.get("type") in TURNS]
         candidates = [name for name in turning if self._driven(name)] or turning

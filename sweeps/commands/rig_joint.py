@@ -38,7 +38,7 @@ class JointNumbers:
         inertia: of what turns with the joint, about its axis, without `armature`; radius: of the wheel.
         ratio: turns of the motor for one of the joint.
         friction, damping, armature: at the joint.
-        weight: largest torque of gravity; angle: at which it is zero and what turns hangs.
+        weight: largest torque of gravity; angle: of the load at rest under gravity.
         drive: numbers of the motor by dotted name; they replace what follows from the others.
     """
 
