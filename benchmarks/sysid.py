@@ -89,7 +89,7 @@ def exact(known: dict[str, float], theta: np.ndarray, times: np.ndarray) -> np.n
 
 def ours(robot: Any, start: np.ndarray, times: np.ndarray, ratio: float) -> Any:
     """A compiled fit, speeds (voltages, times) → Optimum, and the coordinates of its result."""
-    coordinates = priors.coordinates(
+    coordinates = priors.parameter_coordinates(
         robot, NAMES, {n: (float(s), float(s)) for n, s in zip(NAMES, start, strict=True)}
     )
     count, samples = len(VOLTAGES), len(times)
@@ -160,7 +160,7 @@ def main() -> None:
     options.add_argument("--draws", type=int, default=20, help="noise draws")
     chosen = options.parse_args()
     robot, times = lifted(), STEP * np.arange(1, SAMPLES + 1)
-    fields, known = priors.known(robot), constants(robot)
+    fields, known = priors.parameters_by_name(robot), constants(robot)
     truth = np.array([float(fields[n].value) for n in NAMES])
     start, clean = truth * OFF, exact(known, truth, times)
     rng = np.random.default_rng(0)

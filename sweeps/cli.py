@@ -47,6 +47,9 @@ _Trust = Annotated[
 _Effects = Annotated[
     list[str] | None, typer.Option("--effects", help="A Python file with effects of your own, repeatable.")
 ]
+_Columns = Annotated[
+    str | None, typer.Option("--columns", help="A preset of the data's columns, or its file (docs/howto/formats.md).")
+]
 
 
 class Told(NamedTuple):
@@ -231,7 +234,7 @@ def sweep(
 def compare(
     told: Told,
     data: Annotated[
-        str, typer.Argument(help="A CSV of measured runs, or measured, or simulated_by_paper.")
+        str, typer.Argument(help="Measured runs in any format, or measured, or simulated_by_paper.")
     ] = "measured",
     own_mass: Annotated[
         bool, typer.Option("--own-mass", help="Take the robot's mass and the payload, not the stated total mass.")
@@ -303,7 +306,7 @@ def render(
 )
 def calibrate(
     told: Told,
-    data: Annotated[str, typer.Argument(help="A CSV of measured runs or histories, or measured.")] = "measured",
+    data: Annotated[str, typer.Argument(help="Measured runs or histories in any format, or measured.")] = "measured",
     out: _Out = None,
     force: _Force = False,
 ) -> int:
@@ -328,7 +331,7 @@ def calibrate(
 def settle(
     told: Told,
     log: Annotated[
-        str, typer.Argument(metavar="LOG.csv", help="A log over time: time_s, what is imposed, channels.")
+        str, typer.Argument(metavar="LOG", help="A log over time in any format: time_s, what is imposed, channels.")
     ],
     out: _Out = None,
     force: _Force = False,
@@ -370,7 +373,7 @@ def loop(
     told: Told,
     data: Annotated[
         str,
-        typer.Argument(help="A CSV of measured runs, or with time_s of histories from rest; or measured."),
+        typer.Argument(help="Measured runs in any format, or with time_s histories from rest; or measured."),
     ] = "measured",
     out: _Out = None,
     force: _Force = False,
@@ -535,8 +538,10 @@ def new(
 def rig_check(
     file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The rig's file.")],
     data: Annotated[
-        str | None, typer.Argument(metavar="[DATA.csv]", help="A table of runs, settled or over time (time_s, s).")
+        str | None,
+        typer.Argument(metavar="[DATA]", help="A table of runs or a log, in any format (docs/howto/formats.md)."),
     ] = None,
+    columns: _Columns = None,
     effects: _Effects = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON (mmrjax.rig_check/1) instead of words.")] = False,
     no_cache: _NoCache = False,
@@ -550,7 +555,21 @@ def rig_check(
     _start_jax(no_cache)
     from sweeps.commands import rig_check as room
 
-    return room.check(file, data, tuple(effects or ()), json)
+    return room.check(file, data, tuple(effects or ()), json, columns)
+
+
+@app.command("inspect", epilog="Example: mmrjax inspect log.bag; mmrjax inspect log.h5::/run1 --json")
+def inspect_file(
+    file: Annotated[str, typer.Argument(metavar="FILE", help="A file of data; ::PATH for a part of it.")],
+    json: Annotated[bool, typer.Option("--json", help="Print JSON (mmrjax.inspect/1) instead of words.")] = False,
+) -> int:
+    """List what a file of data contains: signals, units, rates, ranges, gaps; and propose the lines of [columns].
+
+    Exit codes: 0 it can be read; 4 it cannot.
+    """
+    from sweeps.commands import inspect as room
+
+    return room.inspect(file, json)
 
 
 @app.command(epilog="Example: mmrjax explain series_resistance")

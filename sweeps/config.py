@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
+from calibration.data import presets_file
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import BadConfiguration, choices, parsed
 from calibration.data.input_files import toml_content, toml_text
@@ -68,6 +69,17 @@ class RobotPart(Part):
     )
     effects: tuple[str, ...] = about(
         (), "A Python file with effects of your own, repeatable; its code is run", verbatim=True, executes=True
+    )
+
+
+class DataPart(Part):
+    """Columns of a table or log that have other names than this program's."""
+
+    columns: str | None = about(
+        None,
+        "Names, units and signs of the data's columns: a preset "
+        f"({', '.join(presets_file.PACKAGED)}; with the numbers it asks for, vesc,pole_pairs=7) or a preset's file",
+        usual="[columns] of the robot's file",
     )
 
 
@@ -365,6 +377,7 @@ class OutputPart(Part):
     """What is written beside the numbers."""
 
     report: bool = about(True, "Write report.html")
+    table: Literal["csv", "parquet"] = about("csv", "Tables of the folder: CSV, or Parquet too")
 
 
 class ProfilePart(FidelityPart):
@@ -404,7 +417,7 @@ class ProfilePart(FidelityPart):
         return super().options if self.profile is None else {}
 
 
-class Simulate(RobotPart, ProfilePart, SupplyPart, TurnPart, PosteriorPart, OutputPart):
+class Simulate(RobotPart, DataPart, ProfilePart, SupplyPart, TurnPart, PosteriorPart, OutputPart):
     """A few given runs; those over time from standstill, or over a profile."""
 
     @model_validator(mode="after")
@@ -432,7 +445,7 @@ class Sweep(RobotPart, BatchPart, SupplyPart, GridPart, PosteriorPart, OutputPar
     """A grid of runs: every combination of the axes."""
 
 
-class Compare(RobotPart, FidelityPart, PosteriorPart, OutputPart):
+class Compare(RobotPart, DataPart, FidelityPart, PosteriorPart, OutputPart):
     """The runs of a measured table."""
 
 
@@ -545,7 +558,7 @@ class Reproduce(RobotPart, ModelPart):
     model: str = about(fidelities.NAMES[0], "steady, or track for Figs. 23-27 too")
 
 
-class Calibrate(RobotPart, InferencePart, OutputPart):
+class Calibrate(RobotPart, DataPart, InferencePart, OutputPart):
     """A calibration beside its data; None leaves what has it to the fidelity and the data."""
 
     model: Annotated[str, AfterValidator(_fidelity)] | None = about(
@@ -578,7 +591,7 @@ class Calibrate(RobotPart, InferencePart, OutputPart):
     hold_out: bool | None = about(None, "Fit again without each block", usual="steady only")
 
 
-class Settle(RobotPart, OutputPart):
+class Settle(RobotPart, DataPart, OutputPart):
     """A log over time, from which settled runs are taken."""
 
     shortest_s: Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)] | None = about(
@@ -605,7 +618,7 @@ class Export(RobotPart, OutputPart):
     seed: Seed = about(0, "Of the draws")
 
 
-class Loop(RobotPart, InferencePart, OutputPart):
+class Loop(RobotPart, DataPart, InferencePart, OutputPart):
     """The closed loop beside its data."""
 
     replicates: Annotated[int, Field(ge=250, le=100_000)] = about(
@@ -660,7 +673,7 @@ class Size(RequirementsPart, RobotPart, OutputPart):
     seed: Seed = about(0, "Of the starts")
 
 
-class Sensitivity(RobotPart, FidelityPart, SupplyPart, OutputPart):
+class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, OutputPart):
     """A sensitivity study.
 
     Operating points are those of a grid; None leaves them to the method: Table 8 where gradients do, its corners and

@@ -125,6 +125,7 @@ def read_runs(
     robot: Robot,
     *,
     measured: bool,
+    columns: str | None = None,
     series: bool = False,
     battery: bool = False,
     of_turns: bool = False,
@@ -132,9 +133,10 @@ def read_runs(
     """Read a table, and say on stderr which of its columns are not used.
 
     Args:
-        source: a file, or a packaged table.
+        source: a file of any format, or a packaged table.
         robot: has the configurations of the table.
         measured: whether readings are needed; series: whether time histories are taken.
+        columns: a preset or its file, see `records.read`.
         battery: whether the runs are on the battery, see `records.read`.
         of_turns: whether a table of turns has every channel of either side, and of the yaw, of which it has a column.
 
@@ -142,11 +144,11 @@ def read_runs(
         BadData: what `records.read` refuses, time histories where none are taken, or a configuration that the
             robot does not have.
     """
-    runs = records.read(source, measured=measured, battery=battery, robot=robot, of_turns=of_turns)
+    runs = records.read(source, robot, columns=columns, measured=measured, battery=battery, of_turns=of_turns)
     if not series:
         from calibration.inference import observers
 
-        observers.kind(runs).check_settled(runs)
+        observers.observer_kind(runs).check_settled(runs)
     runs.configurations(robot)
     for note in runs.notes:
         tell(note)

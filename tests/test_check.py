@@ -128,7 +128,9 @@ def test_every_change_meets_its_requirement_and_breaks_what_it_says(folder, resu
     for k, r in enumerate(result["requirements"]):
         assert bool(r["change"]) <= (not r["met"])
         for c in r["change"]:
-            outcomes = sheet.check(robot_file.change(robot, {c["parameter"]: c["to"]}, "test"), asked, changes=False)
+            outcomes = sheet.check_requirements(
+                robot_file.change(robot, {c["parameter"]: c["to"]}, "test"), asked, changes=False
+            )
             assert outcomes[k].met, (r["name"], c)
             before = [x["met"] for x in result["requirements"]]
             broken = {n for n, b, o in zip(names, before, outcomes, strict=True) if b and not o.met}
@@ -137,7 +139,9 @@ def test_every_change_meets_its_requirement_and_breaks_what_it_says(folder, resu
                 1 if c["parameter"] == "battery.cells" else 0.002 * c["to"]
             )
             alone = dataclasses.replace(asked, each=(asked.each[k],))
-            (short,) = sheet.check(robot_file.change(robot, {c["parameter"]: near}, "test"), alone, changes=False)
+            (short,) = sheet.check_requirements(
+                robot_file.change(robot, {c["parameter"]: near}, "test"), alone, changes=False
+            )
             assert not short.met, (r["name"], c, near)
             tried += 1
     assert tried > (8 if len(names) > 5 else 1)
@@ -375,7 +379,7 @@ def test_what_no_robot_can_do_is_refused(robot, tmp_path, capsys):
         "mmrjax: r.toml, speed_m_s: the envelope's slope_deg goes up to 20; lacquered_wood holds 6T2A up to "
         f"{steepest:.1f} deg at most (adhesion 0.32), whatever drives it\n"
     )
-    sheet.refuse(robot, read('speed_m_s = 1\n[envelope]\nslope_deg = 20\nsurface = "concrete"'))
+    sheet.refuse_impossible(robot, read('speed_m_s = 1\n[envelope]\nslope_deg = 20\nsurface = "concrete"'))
     file.write_text('speed_m_s = 1\n[envelope]\nconfiguration = "4W2"\n')
     assert command(["check", file, "--out", tmp_path / "run"]) == 2
     assert "the robot has no configuration 4W2; did you mean 4W2T?" in capsys.readouterr().err
@@ -385,11 +389,11 @@ def test_what_no_robot_can_do_is_refused(robot, tmp_path, capsys):
 
 
 def test_rated_is_what_the_parts_permit(robot):
-    asked = sheet.rated(robot, read("winding_C = 'rated'\nmotor_speed_rpm = { most = 'rated' }"))
+    asked = sheet.with_ratings(robot, read("winding_C = 'rated'\nmotor_speed_rpm = { most = 'rated' }"))
     assert [r.limit for r in asked.each] == pytest.approx([125.0, 12000.0])
     robot = dataclasses.replace(robot, gearbox=dataclasses.replace(robot.gearbox, torque_limit=None))
     with pytest.raises(BadConfiguration, match=r"^r.toml, gearbox_Nm: the robot states no rating; state a number$"):
-        sheet.rated(robot, read("gearbox_Nm = 'rated'"))
+        sheet.with_ratings(robot, read("gearbox_Nm = 'rated'"))
 
 
 def test_contradictions_are_those_of_one_use():
@@ -413,7 +417,7 @@ payload_kg = [0, 8]
 @pytest.fixture(scope="module")
 def of_posture(robot):
     asked = requirements_file.read(OF_POSTURE, "posture.toml")
-    return {o.requirement.name: o for o in sheet.check(robot, asked, changes=False)}
+    return {o.requirement.name: o for o in sheet.check_requirements(robot, asked, changes=False)}
 
 
 @pytest.mark.slow
@@ -429,12 +433,12 @@ def test_steps_and_sizes_of_section_2_2(of_posture):
 @pytest.mark.slow
 def test_longer_levers_would_get_over_the_step(robot):
     alone = requirements_file.read("step_mm = 300\n[envelope]\npayload_kg = [0, 8]\n", "posture.toml")
-    (found,) = sheet.check(robot, alone)
+    (found,) = sheet.check_requirements(robot, alone)
     (longer,) = (c for c in found.change if c.parameter == "running_gear.lever_length")
     assert longer.before == pytest.approx(0.205) and longer.after == pytest.approx(0.259, abs=0.002)
     assert longer.gradient > 0 and longer.breaks == ()
     changed = params.replace(robot, {"running_gear.lever_length": longer.after})
-    assert sheet.check(changed, alone, changes=False)[0].met
+    assert sheet.check_requirements(changed, alone, changes=False)[0].met
 
 
 @pytest.mark.slow
@@ -443,7 +447,9 @@ def test_stairs_need_friction_reach_and_a_tread(robot):
     text = 'stairs_rise_mm = {{ least = 170, tread_mm = 290, surface = "{}" }}'
 
     def rise(surface):
-        (found,) = sheet.check(robot, requirements_file.read(text.format(surface), "stairs.toml"), changes=False)
+        (found,) = sheet.check_requirements(
+            robot, requirements_file.read(text.format(surface), "stairs.toml"), changes=False
+        )
         assert found.at["tread_mm"] == 290 and not found.met
         return found.value
 
@@ -486,7 +492,7 @@ def test_posture_of_a_robot_that_states_no_running_gear_is_not_known(robot):
     gear = tuple(p.name for p in params.walk(robot) if p.name.startswith("running_gear."))
     bare = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, unknown=gear))
     with pytest.raises(BadConfiguration, match="step_mm: the robot's file states no running_gear"):
-        sheet.refuse(bare, requirements_file.read("step_mm = 100", "posture.toml"))
+        sheet.refuse_impossible(bare, requirements_file.read("step_mm = 100", "posture.toml"))
 
 
 def test_heat_that_the_file_does_not_state_is_asked_for(tmp_path, capsys):

@@ -31,10 +31,10 @@ def space_of(world, folder):
     rigs.case(world).write(folder)
     robot = robot_file.read(folder / "rig.toml")
     runs = records.read(folder / "table.csv", robot=robot)
-    observer = observers.kind(runs)
-    library = scales.library_for(robot, runs.conditions(robot), effects.BY_NAME)
-    sd = noise.from_table(runs, observer.sizes(runs)).sd
-    return discover.pose(runs, robot, sd, settings_for(observer), library=library)
+    observer = observers.observer_kind(runs)
+    library = scales.library_of_size(robot, runs.conditions(robot), effects.BY_NAME)
+    sd = noise.noise_from_table(runs, observer.sizes(runs)).sd
+    return discover.pose_candidates(runs, robot, sd, settings_for(observer), library=library)
 
 
 @pytest.mark.nightly
@@ -114,14 +114,14 @@ def test_a_fit_that_ends_above_the_one_it_builds_on_starts_again_there(monkeypat
         return np.array([1.0, 9.0 if scores else 0.0])
 
     monkeypatch.setattr(candidates, "fit_candidates", fit)
-    monkeypatch.setattr(candidates, "start", start)
+    monkeypatch.setattr(candidates, "start_of_fit", start)
     base, space = candidate((), 20.0), SimpleNamespace(free=1)
     for lowest, kept in ((3.0, 3.0), (11.0, 10.0)):
         costs["a", 0, 7] = lowest
-        found = candidates.fit_beside(space, [(("a",), base, "scores"), (("b",), base, "scores")], None)
+        found = candidates.fit_in_addition(space, [(("a",), base, "scores"), (("b",), base, "scores")], None)
         assert [c.cost for c in found] == [kept, 30.0]
         assert asked.pop() == [("b", 1, 0), ("a", 0, 7)] and asked.pop() == [("a", 1, 9), ("b", 1, 9)]
-    assert candidates.fit_beside(space, [], None) == []
+    assert candidates.fit_in_addition(space, [], None) == []
 
 
 def test_two_threads_never_trace_at_once():

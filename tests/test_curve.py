@@ -145,7 +145,7 @@ def test_a_curve_of_what_shows_magnitudes_is_the_same_in_mirror_image():
     columns = {"order": np.tile(np.arange(9.0), 2), "supply_voltage_V": np.repeat([12.0, -12.0], 9)}
     columns |= {"configuration": np.repeat("6T2A", 18), "slope_deg": np.zeros(18), "payload_kg": np.zeros(18)}
     ways = dict.fromkeys(curve.WAYS, np.repeat([1.0, -1.0], 9))
-    for looked in (curves.families, curves.windows):
+    for looked in (curves.curve_families, curves.window_families):
         (basis,) = (b for b in looked(columns, np.ones(18), robot, None, ways) if b.places[0] in curve.READINGS)
         for (place, _), shapes in zip(basis.names, np.asarray(basis.columns), strict=True):
             np.testing.assert_allclose(shapes[:9], (1 if place == "motor_current" else -1) * shapes[9:])
@@ -179,7 +179,7 @@ def test_curves_are_those_that_the_trace_looks_for():
     )
     columns = {name: np.arange(9.0) for name in ("order", "total_current_A", "motor_speed_rpm")}
     columns |= {"configuration": np.repeat("bench", 9), "supply_voltage_V": np.tile([6.0, 12.0, 24.0], 3)}
-    (basis,) = (b for b in curves.families(columns, np.ones(9), robot) if b.places[0] in curve.READINGS)
+    (basis,) = (b for b in curves.curve_families(columns, np.ones(9), robot) if b.places[0] in curve.READINGS)
     assert set(basis.names) == {("output_torque", "order"), ("output_torque", "current"), ("position", "order")}
     assert all(f"curve_{place}_{over}" in UNNAMED for place, over in basis.names)
 

@@ -14,21 +14,21 @@ def test_relative_error_is_equation_35_with_simulated_below():
 
 
 def test_summary_leaves_out_rows_without_a_simulation():
-    assert simulation_errors.summary(np.array([3.0, -4.0, np.nan])) == {
+    assert simulation_errors.error_summary(np.array([3.0, -4.0, np.nan])) == {
         "rows": 2,
         "rms_percent": pytest.approx(np.sqrt(12.5)),
         "max_percent": 4.0,
     }
-    assert simulation_errors.summary(np.array([np.nan]))["rows"] == 0
+    assert simulation_errors.error_summary(np.array([np.nan]))["rows"] == 0
 
 
 def test_certainty_is_equation_a1():
     y = np.array([1.0, 2.0, 4.0])
-    assert simulation_errors.certainty(y, y) == 1.0
-    assert simulation_errors.certainty(y, np.full(3, y.mean())) == pytest.approx(0.0)
-    assert simulation_errors.certainty(y, y + 1) == pytest.approx(1 - 3 / (21 - 49 / 3))
-    assert np.isnan(simulation_errors.certainty(np.ones(3), y)) and np.isnan(
-        simulation_errors.certainty(y[:1], y[:1])
+    assert simulation_errors.r_squared(y, y) == 1.0
+    assert simulation_errors.r_squared(y, np.full(3, y.mean())) == pytest.approx(0.0)
+    assert simulation_errors.r_squared(y, y + 1) == pytest.approx(1 - 3 / (21 - 49 / 3))
+    assert np.isnan(simulation_errors.r_squared(np.ones(3), y)) and np.isnan(
+        simulation_errors.r_squared(y[:1], y[:1])
     )
 
 

@@ -284,8 +284,7 @@ def test_onnx_model_is_the_step_of_jax(with_effects):
     pytest.importorskip("jax2onnx")
     pytest.importorskip("onnxruntime")
     drive, _, known = with_effects
-    with pytest.warns(UserWarning, match="float64"):
-        files = onnx.files(drive, known)
+    files = onnx.files(drive, known)
     assert onnx.difference(drive, known, files["actuator.onnx"]) < 1e-5
 
 

@@ -10,7 +10,7 @@ from test_log_kinds import servo, written
 
 from calibration.data import runs as records
 from calibration.inference import noise, observers, priors
-from calibration.inference.optimizers import linearised_signed
+from calibration.inference.optimizers import linearise_rollout
 from mmrjax.numerics.linear_equations import (
     factorise,
     half_solved,
@@ -124,9 +124,9 @@ def test_a_step_of_a_search_on_a_log_calls_no_lapack(tmp_path):
     log = {name: column[:12] for name, column in servo(np.random.default_rng(1), levels=(0.9,), hold=0.2).items()}
     robot = written(tmp_path, "servo", log)
     runs = records.read(tmp_path / "log.csv", robot=robot)
-    known = noise.from_table(runs, observers.kind(runs).sizes(runs))
-    coordinates = priors.coordinates(robot, ("motor.torque_constant", "wheel.loss_coulomb"))
-    problem = observers.pose(runs, robot, coordinates, known.sd)
-    step = jax.make_jaxpr(lambda z: linearised_signed(problem, z, problem.data))(jnp.zeros(2))
+    known = noise.noise_from_table(runs, observers.observer_kind(runs).sizes(runs))
+    coordinates = priors.parameter_coordinates(robot, ("motor.torque_constant", "wheel.loss_coulomb"))
+    problem = observers.pose_problem(runs, robot, coordinates, known.sd)
+    step = jax.make_jaxpr(lambda z: linearise_rollout(problem, z, problem.data))(jnp.zeros(2))
     assert re.search(LAPACK, str(jax.make_jaxpr(jnp.linalg.inv)(jnp.eye(2)))), "it can fail"
     assert not re.findall(LAPACK, str(step))

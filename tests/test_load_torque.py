@@ -280,9 +280,9 @@ def test_rows_are_held_out_by_levels_of_the_torque(tmp_path):
     torque = [0.1, 0.1003, 0.2, 0.2004, 0.4, 0.4001]
     lines = ["supply_voltage_V,motor_speed_rpm,load_torque_Nm", *(f"24,{4000 - 900 * m:.6g},{m}" for m in torque)]
     runs, _ = read(tmp_path, lines)
-    found = blocks.distinct(runs, SettledRuns.blocks)
+    found = blocks.distinct_blocks(runs, SettledRuns.blocks)
     assert list(found) == ["load_torque"] and [int(m.sum()) for m in found["load_torque"].values()] == [2, 2, 2]
-    assert blocks.in_words("load_torque") == "load torque"
+    assert blocks.kind_in_words("load_torque") == "load torque"
 
 
 def test_a_drift_that_goes_with_the_torque_is_none():
@@ -294,7 +294,7 @@ def test_a_drift_that_goes_with_the_torque_is_none():
     rig = bench()
     for with_torque in (False, True):
         known = columns | ({"load_torque_Nm": np.linspace(0, 0.5, 18)} if with_torque else {})
-        over = {variable for basis in bases.families(known, np.ones(18), rig) for _, variable in basis.names}
+        over = {variable for basis in bases.curve_families(known, np.ones(18), rig) for _, variable in basis.names}
         assert ("order" in over) != with_torque
 
 

@@ -461,7 +461,7 @@ WRONG = {
     "time: row 2 is not a finite number": dict(time=[0, np.nan]),
     "cycles: got 0; expected a whole number from 1": dict(time=[0, 1], cycles=0),
     f"mode, row 1: got fly; expected {', '.join(MODES)}": dict(time=[0, 1], mode="fly"),
-    "no field slope; there are": dict(time=[0, 1], slope=3.0),
+    "no field slope; expected one of": dict(time=[0, 1], slope=3.0),
     "voltage: got 3 values; expected 2": dict(time=[0, 1], voltage=[1, 2, 3]),
     "voltage: row 2 is not finite": dict(time=[0, 1], voltage=[1, np.nan]),
     "duty: got 1.5; expected -1 to 1": dict(time=[0, 1], duty=1.5),

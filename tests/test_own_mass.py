@@ -13,11 +13,11 @@ from calibration.data import own_mass, robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.discovery import discover, findings
-from calibration.discovery.candidates import Candidate, filled
+from calibration.discovery.candidates import Candidate, fill_slots
 from calibration.inference.calibration import calibrate
-from calibration.inference.linearization import shape_of, shape_scales, shaped
+from calibration.inference.linearization import shape_at, shape_of, shape_scales
 from calibration.inference.observers import SettledRuns
-from calibration.inference.optimizers import read
+from calibration.inference.optimizers import observe_robot
 from mmrjax.effects import ALL, BY_NAME, UNNAMED
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, paper_robots, params
@@ -82,7 +82,7 @@ def fits(tmp_path_factory):
     robot = robot_file.with_effects(paper_robots.nominal(), UNSEEN)
     robot = params.replace(robot, {f"effects.{n}.amplitude": 0.3 * _sd(BY_NAME[n]) for n in UNSEEN})
     sd = 0.02 * np.abs(runs.measured())
-    space = discover.pose(runs, robot, sd, SETTLED.settings, stated, BY_NAME)
+    space = discover.pose_candidates(runs, robot, sd, SETTLED.settings, stated, BY_NAME)
     z = np.zeros(len(space.coordinates))
     z[: space.free] = np.random.default_rng(3).normal(0.0, 0.5, space.free)
     # The exponent of sinkage is then beyond its bounds, which a file could not state.
@@ -90,9 +90,9 @@ def fits(tmp_path_factory):
     written = Written(runs, tmp_path_factory.mktemp("written"), ALL)
 
     def of(name):
-        active = filled([name] if name else [], SETTLED.settings)
+        active = fill_slots([name] if name else [], SETTLED.settings)
         problem = space.problem(active)
-        seen = jax.device_get(read(problem, problem.robot(jnp.asarray(z))))
+        seen = jax.device_get(observe_robot(problem, problem.robot(jnp.asarray(z))))
         candidate = Candidate(active, z, z, 0.0, z, z, True, True, True)
         again, status = written(findings.proposed_robot(space, candidate))
         return seen.reading[: len(runs)], seen.status[: len(runs)], again, status
@@ -122,7 +122,7 @@ def test_robot_that_the_loop_writes_is_the_one_that_it_fitted(name, fits):
 def test_shape_that_a_fit_reaches_is_one_that_a_file_may_state(effect):
     shape = shape_of(effect())
     z = np.linspace(-6.0, 6.0, 61)
-    value = np.asarray(shaped(shape_scales(shape), jnp.asarray(z)))
+    value = np.asarray(shape_at(shape_scales(shape), jnp.asarray(z)))
     low, high = shape.spec.bounds
     assert low <= value.min() and value.max() <= high
     if shape.name == "phase":

@@ -177,7 +177,7 @@ WRONG = {
     "unknown column": ("time_s,dutty\n0,1\n5,1\n", r"mission.csv: unknown column dutty; .*duty"),
     "column without a name": ("time_s,,duty\n0,1,1\n5,1,1\n", r"unknown column \(without a name\)"),
     "unknown unit": ("time_s,speed_kmh\n0,1\n5,1\n", r"column speed_kmh: got the unit kmh; expected one of speed_mm_s, speed_m_s, speed_km_h"),
-    "no unit": ("time,duty\n0,1\n5,1\n", r"column time: got the unit none; expected one of time_s, time_ms, time_min, time_h"),
+    "no unit": ("time,duty\n0,1\n5,1\n", r"column time: got the unit none; expected one of time_s, time_ms, time_us, time_ns, time_min, time_h"),
     "unit of another quantity": ("time_s,motor_speed_mm_s\n0,1\n5,1\n", r"column motor_speed_mm_s: got the unit mm_s; expected one of motor_speed_rpm"),
     "a quantity twice": ("time_s,speed_mm_s,speed_m_s\n0,1,1\n5,1,1\n", r"got columns speed_mm_s and speed_m_s; expected one of them"),
     "a column twice": ("time_s,duty,duty\n0,1,1\n5,1,1\n", r"got column duty twice"),

@@ -32,7 +32,7 @@ def rig(kind, imposed, folder):
     rigs.case(world).write(folder)
     robot = robot_file.read(folder / "rig.toml")
     runs = records.read(folder / "table.csv", robot=robot)
-    return robot, runs, scales.library_for(robot, runs.conditions(robot), effects.BY_NAME)
+    return robot, runs, scales.library_of_size(robot, runs.conditions(robot), effects.BY_NAME)
 
 
 def with_all(robot, library, share):
@@ -152,7 +152,7 @@ def test_a_motor_that_states_what_it_bears_is_judged_by_that(tmp_path):
         able = dataclasses.replace(robot, motor=dataclasses.replace(robot.motor, temperature_limit=hot))
         path = {"motor.resistance_thermal_winding": 4.0, "motor.resistance_thermal_housing": 400.0}
         able = params.replace(able, {name: jnp.asarray(value) for name, value in path.items()})
-        kind = scales.library_for(able, runs.conditions(able), effects.BY_NAME)["torque_constant_saturation"]
+        kind = scales.library_of_size(able, runs.conditions(able), effects.BY_NAME)["torque_constant_saturation"]
         limits.append(amplitude_of(kind()).spec.bounds[1] * float(able.current_continuous) ** 2)
     assert limits[0] == pytest.approx(limits[1], rel=1e-6)
 
@@ -179,20 +179,20 @@ def test_friction_along_the_travel_is_sized_by_the_travel_and_looked_for_where_a
         "supply_voltage_V,duty,time_s,output_angle_deg\n" + "\n".join(f"6,{r}" for r in rows) + "\n"
     )
     runs = records.read(tmp_path / "log.csv", robot=robot)
-    turned = scales.turned_in(runs, robot)
+    turned = scales.output_rotation(runs, robot)
     assert turned == pytest.approx(2 * np.pi * np.sqrt((1 + 4 + 4) / 3))
     kinds = [
-        scales.library_for(robot, runs.conditions(robot), effects.BY_NAME, x)["position_friction"]
+        scales.library_of_size(robot, runs.conditions(robot), effects.BY_NAME, x)["position_friction"]
         for x in (turned, 2 * turned)
     ]
     one, two = (amplitude_of(kind()).spec for kind in kinds)
     assert two.sd == pytest.approx(0.5 * one.sd) and two.bounds[1] == pytest.approx(0.5 * one.bounds[1])
     # At its sd it is as large over the travel as a torque of the same share.
-    offset = scales.library_for(robot, runs.conditions(robot), effects.BY_NAME, turned)["presliding"]
+    offset = scales.library_of_size(robot, runs.conditions(robot), effects.BY_NAME, turned)["presliding"]
     assert one.sd * turned == pytest.approx(amplitude_of(offset()).spec.sd, rel=0.2)
     blind = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, channels=("output_speed",)))
-    assert not scales.present(effects.BY_NAME["position_friction"], blind)
-    assert scales.present(effects.BY_NAME["angle_friction"], blind)
+    assert not scales.effect_applies(effects.BY_NAME["position_friction"], blind)
+    assert scales.effect_applies(effects.BY_NAME["angle_friction"], blind)
 
 
 def servo(folder):
@@ -241,7 +241,7 @@ def metered(tmp_path, off):
 
 def test_the_loop_looks_for_an_error_of_every_instrument(tmp_path):
     runs, robot = metered(tmp_path, 0.0)
-    scored = [e for e in discover.prepared(runs, robot).library.values() if e.balance == "sensor"]
+    scored = [e for e in discover.prepare_loop(runs, robot).library.values() if e.balance == "sensor"]
     assert {e.channel for e in scored} == set(robot.rig.channels)
     (torque,) = (e for e in scored if e.name == "output_torque_offset")
     size = np.sqrt(np.mean(runs["output_torque_Nm"] ** 2))

@@ -213,9 +213,9 @@ REPRODUCTION = ("sweeps", "paper")
 SPELLED = {
     ("calibration/discovery/menu.py", "TURNING, STANDING"),
     ("sweeps/report/words/effect_words.py", "CHECKED_BY"),  # which act checks which instrument
-    ("calibration/inference/bases.py", "VARIABLES"),
+    ("calibration/data/contents.py", "MEANINGS"),  # words in the names of other people's signals
     ("calibration/inference/blocks.py", "BLOCKS"),  # what is imposed may be a channel's column
-    ("calibration/inference/observers/settled_ends.py", "_sliding"),  # the two that show slip
+    ("calibration/inference/observers/settled_ends.py", "_slides_at_end"),  # the two that show slip
 }
 
 
@@ -659,14 +659,17 @@ def test_front_door_loads_nothing_heavy():
 #: What `calibrate`, `discover` and `foresee` do to a table and a robot inside, from instruments to the base fit.
 INNER = {
     "with_inferred_instruments", "with_surface_configurations", "of_surfaces", "with_table_mass",
-    "with_initial_states", "with_begins", "check_start", "inferred", "library_for", "settings_for", "without_copies",
-    "pose", "fit_base", "trace",
+    "with_initial_states", "measure_initial_states", "check_start", "infer_noise", "library_of_size", "settings_for",
+    "without_copies", "pose", "pose_problem", "pose_candidates", "fit_base", "trace",
 }  # fmt: skip
 #: Campaigns and notebooks that call a part of that all the same, and why.
 CALLED: dict[tuple[str, str], str] = {
-    ("loop_baselines", "pose"): "other ways to select effects, on the loop's own problem after its own preparation",
+    (
+        "loop_baselines",
+        "pose_candidates",
+    ): "other ways to select effects, on the loop's own problem after its own preparation",
     ("loop_baselines", "fit_base"): "the same",
-    ("loop_findings", "pose"): "further runs, read by fits that the loop made after its own preparation",
+    ("loop_findings", "pose_candidates"): "further runs, read by fits that the loop made after its own preparation",
     ("track_table", "pose"): "a function of its own by that name: rows of the paper through a resolved running gear",
     ("track_table", "with_table_mass"): "the same rows, searched by members and not by `calibrate`",
 }
@@ -686,11 +689,11 @@ def test_modules_have_base_names_of_their_own():
 
 
 def inner_calls(source: str) -> Iterator[tuple[int, str]]:
-    """Calls of `INNER` functions in a module, but of methods of what `prepared` gives."""
+    """Calls of `INNER` functions in a module, but of methods of what `prepare_loop` gives."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) in INNER:
             whose, _, name = ast.unparse(node.func).rpartition(".")
-            prepared = whose == "given" or whose.startswith("prepared(")
+            prepared = whose == "given" or whose.startswith("prepare_loop(")
             if not (name == "trace" and prepared):
                 yield node.lineno, name
 
@@ -707,16 +710,18 @@ def test_campaigns_and_notebooks_take_the_way_of_users():
     }
     assert found == set(CALLED)
     shared = dict.fromkeys(("loop", "loop_series", "rigs", "rig_logs"), "campaign.looped")  # which takes the one way
-    ways = shared | {"loop_baselines": "campaign.begun", "campaign": "calibration.discovery.discover.prepared"}
+    ways = shared | {"loop_baselines": "campaign.begun", "campaign": "calibration.discovery.discover.prepare_loop"}
     for campaign, name in ways.items():
         tree = ast.parse((ROOT / f"benchmarks/{campaign}.py").read_text(encoding="utf-8"))
         assert name in {imported for imported, _ in names_imported(tree, "")}, campaign
 
 
 def test_a_campaign_of_its_own_way_is_found():
-    bad = "space = pose(runs, robot)\nfound = discover.trace(runs, robot)\nnoise.inferred(runs)"
-    assert [name for _, name in inner_calls(bad)] == ["pose", "trace", "inferred"]
-    assert not [*inner_calls("given = prepared(runs, robot)\ngiven.trace()\nprepared(runs).trace()\ncalibrate(runs)")]
+    bad = "space = pose(runs, robot)\nfound = discover.trace(runs, robot)\nnoise.infer_noise(runs)"
+    assert [name for _, name in inner_calls(bad)] == ["pose", "trace", "infer_noise"]
+    assert not [
+        *inner_calls("given = prepare_loop(runs, robot)\ngiven.trace()\nprepare_loop(runs).trace()\ncalibrate(runs)")
+    ]
 
 
 def test_one_preparation_serves_all():

@@ -117,7 +117,7 @@ def test_prior_is_the_one_of_calibrate_and_sensitivity(nominal):
     u = np.linspace(0.01, 0.99, 99)
     for each in (name, "motor.resistance"):
         values = sampled(nominal, **{each: "prior"}).samples.marginals[each](u)
-        expected = priors.coordinates(nominal, [each]).value(stats.norm.ppf(u)[:, None])[:, 0]
+        expected = priors.parameter_coordinates(nominal, [each]).value(stats.norm.ppf(u)[:, None])[:, 0]
         np.testing.assert_allclose(values, expected, rtol=1e-14)
     median, sd = float(found[name].value), found[name].spec.prior_sd(float(found[name].value))
     quantile = sampled(nominal, **{name: "prior"}).samples.marginals[name]

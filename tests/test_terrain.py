@@ -87,7 +87,7 @@ def test_distance_of_points_on_an_edge_has_a_finite_derivative():
     [
         ([0, 1, 0.5], [0, 0, 0], "x falls from 1 to 0.5 m at point 3"),
         ([0], [0], "two points or more"),
-        ([0, np.nan], [0, 0], "no number"),
+        ([0, np.nan], [0, 0], "not a number"),
     ],
 )
 def test_polylines_that_are_none_are_refused(x, z, message):

@@ -78,11 +78,11 @@ TRUE = {LATERAL: 1.45, WIDTH: 0.236}
 
 @pytest.mark.slow
 def test_settled_turns_are_observed_as_turns(robot, of_world):
-    assert observers.kind(of_world) is SettledTurns
+    assert observers.observer_kind(of_world) is SettledTurns
     names = tuple(f"6T2A.{n}" for n in (LATERAL, WIDTH))
     sd = np.broadcast_to([channels.find(n).factor * SDS[n] for n in SHOWN], of_world.measured().shape)
     truth = {name: (TRUE[name.partition(".")[2]], 0.05) for name in names}
-    posed = observers.pose(of_world, robot, priors.coordinates(robot, names, truth), sd)
+    posed = observers.pose_problem(of_world, robot, priors.parameter_coordinates(robot, names, truth), sd)
     seen = posed.observation(jnp.zeros(2))
     whitened = (np.asarray(seen.reading) - of_world.measured()) / sd
     assert np.sqrt((whitened**2).mean()) == pytest.approx(1.0, abs=0.2)  # noise alone
@@ -92,7 +92,7 @@ def test_settled_turns_are_observed_as_turns(robot, of_world):
 def posed_turns(robot, runs):
     names = tuple(f"6T2A.{n}" for n in (LATERAL, WIDTH, "ground.friction.static"))
     sd = np.broadcast_to([channels.find(n).factor * SDS[n] for n in SHOWN], runs.measured().shape)
-    return observers.pose(runs, robot, priors.coordinates(robot, names), sd)
+    return observers.pose_problem(runs, robot, priors.parameter_coordinates(robot, names), sd)
 
 
 @pytest.mark.slow
@@ -118,7 +118,7 @@ def test_one_evaluation_of_turns_has_the_derivatives_of_the_root(robot, of_world
         return (posed.signed(posed.observation(z), posed.data),) * 2
 
     z = jnp.asarray([0.3, -0.4, 0.2])
-    apart = fit.rooted(posed, z)
+    apart = fit.with_roots(posed, z)
     r, jacobian = jax.jit(lambda z: apart.linearised(apart.robot, z, apart.data)[:2])(z)
     wanted, value = jax.jit(jax.jacfwd(through, has_aux=True))(z)
     np.testing.assert_allclose(r, value, rtol=1e-6, atol=1e-6)
@@ -132,7 +132,7 @@ def test_turns_free_what_turns_show(robot):
 
 
 def test_turns_are_held_out_by_how_sharp_they_are(of_world):
-    found = blocks.blocks(of_world, blocks.TURN)
+    found = blocks.blocks_of_kind(of_world, blocks.TURN)
     assert list(found) == ["-1 to -0.5", "-0.44 to 0", "0.12 to 0.43", "0.7 to 1"]
     assert np.sum(list(found.values()), 0).tolist() == [1] * len(DUTIES)
 
@@ -204,8 +204,8 @@ def test_wheels_that_creep_tell_the_effective_width_alone(tmp_path):
     runs = records.read(table, robot=robot)
     names = tuple(f"4W2T.{n}" for n in (LATERAL, WIDTH))
     sd = np.broadcast_to([channels.find(n).factor * SDS[n] for n in MOTION], runs.measured().shape)
-    about = identifiability.analyse(
-        observers.pose(runs, robot, priors.coordinates(robot, names), sd), jnp.zeros(len(names))
+    about = identifiability.analyse_identifiability(
+        observers.pose_problem(runs, robot, priors.parameter_coordinates(robot, names), sd), jnp.zeros(len(names))
     )
     ((one, other, correlation),) = about.correlated()
     assert {one, other} == set(names)

@@ -14,13 +14,13 @@ from calibration.data.columns import DRIVEN
 from calibration.data.courses import applied, courses, stretches, varies
 from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
-from calibration.discovery.reach import reach
+from calibration.discovery.reach import reach_of_table
 from calibration.discovery.settings import settings_for
 from calibration.inference import checks
-from calibration.inference.blocks import blocks, distinct
+from calibration.inference.blocks import blocks_of_kind, distinct_blocks
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import StopsOnSlope
-from calibration.inference.linearization import probe
+from calibration.inference.linearization import balance_probe
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Histories, settled_ends
 from mmrjax.effects import BY_NAME
@@ -256,7 +256,7 @@ def test_only_what_changes_has_a_value_an_instant(observer, runs):
 @pytest.mark.slow
 def test_defects_of_all_knots_are_a_constant_defect(observer):
     """Their linear response, through changes of conditions, against the derivative by an amplitude."""
-    robot, effects = paper_robots.nominal(), tuple(probe(balance) for balance in ("electrical", "track"))
+    robot, effects = paper_robots.nominal(), tuple(balance_probe(balance) for balance in ("electrical", "track"))
 
     def readings(amplitudes):
         put = tuple(dataclasses.replace(e, amplitude=a) for e, a in zip(effects, amplitudes, strict=True))
@@ -295,11 +295,11 @@ def test_blocks_of_runs_that_vary_are_whole_runs(runs):
     level["run_id"] = np.concatenate([runs["run_id"], np.full(5, "level")])
     level["supply_voltage_V"][-5:], level["mode"][-5:] = 24.0, "voltage"
     more = Runs("more", level)
-    assert set(blocks(more, "voltage")) == {"run stair", "run reversal", "run coasting", "24.0"}
-    for mask in blocks(more, "voltage").values():
+    assert set(blocks_of_kind(more, "voltage")) == {"run stair", "run reversal", "run coasting", "24.0"}
+    for mask in blocks_of_kind(more, "voltage").values():
         assert len(np.unique(more["run_id"][mask])) == 1
-    assert blocks(runs, "voltage") == {} and set(blocks(runs, "slope")) == {"0.0", "4.0", "-3.0"}
-    assert "voltage" not in distinct(runs, Histories.blocks)
+    assert blocks_of_kind(runs, "voltage") == {} and set(blocks_of_kind(runs, "slope")) == {"0.0", "4.0", "-3.0"}
+    assert "voltage" not in distinct_blocks(runs, Histories.blocks)
     assert varies(more).sum() == len(runs) and len(set(courses(more))) == 4 and courses(more)[-1] == ""
 
 
@@ -314,7 +314,7 @@ def test_ends_are_those_of_stretches_driven_forwards(runs):
 def test_reach_takes_what_the_motors_were_given(observer):
     driven = observer.driven
     assert driven.shape[0] > 4 and (np.asarray(driven.voltage) > 0).all() and (np.asarray(driven.duty) == 1).all()
-    found = reach(paper_robots.nominal(), driven, ("speed",))
+    found = reach_of_table(paper_robots.nominal(), driven, ("speed",))
     assert found.voltages == (12.0, 15.0, 18.0, 24.0, 33.0) and found.used[0].slopes == (-4.0, -3.0, 0.0, 3.0, 4.0)
 
 
@@ -403,7 +403,7 @@ def test_what_cannot_change_within_a_run_is_refused(runs):
     with pytest.raises(BadData, match=r"configuration: run coasting has several values; a run has one configuration"):
         Histories.check(changed(runs, configuration=other), nothing)
     mass = 11.5 + runs["payload_kg"] + 0.5 * (runs["time_s"] > 1)
-    with pytest.raises(BadData, match=r"total_mass_kg: run coasting changes by 0.5 kg beside its payload"):
+    with pytest.raises(BadData, match=r"total_mass_kg: run coasting changes by 0.5 kg apart from its payload"):
         Histories.check(changed(runs, total_mass_kg=mass), nothing)
     payload = runs["payload_kg"] + 3.0 * (runs["time_s"] > 1)
     Histories.check(changed(runs, payload_kg=payload, total_mass_kg=11.5 + payload), nothing)

@@ -216,8 +216,8 @@ def test_table_of_histories_passes_the_input_checks(quick, tmp_path):
         made = histories.case(w, seed=1)
         made.write(tmp_path)
         runs = records.read(tmp_path / "table.csv")
-        kind = observers.kind(runs)
-        known = noise.from_table(runs, kind.sizes(runs))
+        kind = observers.observer_kind(runs)
+        known = noise.noise_from_table(runs, kind.sizes(runs))
         assert runs.has("time_s") and len(runs) == made.label["rows"]
         assert kind.check(runs, known) == kind.check_start(runs, known, paper_robots.nominal()) == []
         assert np.isnan(runs.measured()).sum() == made.label["missing"]

@@ -128,7 +128,7 @@ def _other_names(strange: list[str], column: str) -> str:
     shown = ", ".join(strange[:NAMED]) + (", ..." if len(strange) > NAMED else "")
     return (
         f"; other columns: {shown}; if one of them is it, say so in the robot's file, with the factor from its unit: "
-        f'[columns] {column} = {{column = "{guess}", factor = 1.0}}'
+        f'[columns] {column} = {{column = "{guess}", factor = 1.0}} (mmrjax inspect proposes such lines)'
     )
 
 

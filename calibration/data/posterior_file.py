@@ -69,11 +69,11 @@ class Posterior:
         NumPy, which compiles nothing, else traceable."""
         import jax.numpy as jnp
 
-        from calibration.inference.priors import held_within
+        from calibration.inference.priors import clip_softly
 
         xp = np if isinstance(z, np.ndarray) else jnp
         u = xp.asarray(self.location) + xp.asarray(self.spread) * z
-        u = held_within(u, self.low, self.high, self.softness * self.spread)
+        u = clip_softly(u, self.low, self.high, self.softness * self.spread)
         kinds = np.asarray(self.kinds)
         theta = xp.where(xp.asarray(kinds == LOG), xp.exp(xp.where(kinds == LOG, u, 0.0)), u)
         theta = xp.where(xp.asarray(kinds == ANGLE), xp.remainder(u + np.pi, 2 * np.pi) - np.pi, theta)

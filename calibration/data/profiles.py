@@ -19,6 +19,8 @@ from jaxtyping import Array
 from calibration.data import delimited, input_files
 from calibration.data.columns import LOAD, SUPPLY
 from calibration.data.input_errors import BadConfiguration, BadData, choices, is_number, number
+from calibration.data.named_arrays import texts
+from calibration.data.sources import opening, reading
 from mmrjax.errors import counted
 from mmrjax.missions.mission import Start
 from mmrjax.missions.profile import (
@@ -196,7 +198,7 @@ def known_columns() -> dict[str, tuple[str, str]]:
 
 
 def read(source: str | Path) -> ProfileTable:
-    """Read a packaged profile by its name, or a CSV file.
+    """Returns a packaged profile, by its name, or that of a file in any format of a table.
 
     Raises:
         BadData: no such file, fewer than two rows, an unknown, misspelt or repeated column or unit, a time that does
@@ -206,19 +208,29 @@ def read(source: str | Path) -> ProfileTable:
     """
     if str(source) in PACKAGED:
         file = resources.files("calibration") / "data" / "profiles" / f"{source}.csv"
-        return _parsed(file.read_bytes(), str(source))
-    path = Path(source)
+        return _of_text(file.read_bytes(), str(source))
+    path, within = opening.split(str(source))
     if not path.exists():
         raise BadData(f"{source}: no such file and no packaged profile; {choices(str(source), PACKAGED)}")
-    return _parsed(input_files.table(path, path.name or str(source)), path.name)
+    table = reading.table(path, within)
+    if table is None:
+        return _of_text(input_files.table(path, path.name or str(source)), path.name)
+    rows = [list(table.header), *map(list, zip(*map(texts, table.values), strict=True))]
+    return _parsed(table.name, _settings(table.name, []), rows, table.digest, table.notes)
 
 
-def _parsed(content: bytes, name: str) -> ProfileTable:
+def _of_text(content: bytes, name: str) -> ProfileTable:
     text, encoded = delimited.text(name, content)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     above = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
     settings = _settings(name, lines[:above])
     rows, notes = delimited.cells(name, lines[above:])
+    return _parsed(name, settings, rows, hashlib.sha256(content).hexdigest(), (*encoded, *notes))
+
+
+def _parsed(
+    name: str, settings: dict[str, Any], rows: list[list[str]], digest: str, notes: tuple[str, ...]
+) -> ProfileTable:
     if not rows:
         raise BadData(f"{name}: the file is empty; expected a header with time_s and rows")
     header, body = rows[0], rows[1:]
@@ -242,7 +254,7 @@ def _parsed(content: bytes, name: str) -> ProfileTable:
         raise BadData(f"{name}: got {len(time)} rows times {settings['cycles']} cycles; expected at most {LONGEST}")
     return ProfileTable(
         name, time, modes, demand, values, cells.surfaces(), settings["linear"], settings["cycles"],
-        hashlib.sha256(content).hexdigest(), settings["begins"], (*encoded, *notes),
+        digest, settings["begins"], notes,
     )  # fmt: skip
 
 

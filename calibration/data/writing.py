@@ -13,6 +13,8 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from calibration.data import frames
+
 
 @contextlib.contextmanager
 def naming(path: Path | str) -> Iterator[None]:
@@ -36,8 +38,17 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     write_text(path, json.dumps(finite(content), indent=2, ensure_ascii=False) + "\n")
 
 
-def write_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
-    """Write a table as CSV; what is not finite becomes an empty cell."""
+def write_table(path: Path, columns: Mapping[str, np.ndarray], tables: str = "csv") -> None:
+    """Write a table as CSV; what is not finite becomes an empty cell.
+
+    Args:
+        tables: `parquet` to write the same columns into a file of that format too, with all their digits.
+    """
+    if tables == "parquet":
+        from pyarrow import parquet
+
+        with naming(path):
+            parquet.write_table(frames.to_arrow(columns), path.with_suffix(".parquet"))
     with naming(path), path.open("w", newline="", encoding="utf-8") as stream:
         _write_rows(stream, columns)
 

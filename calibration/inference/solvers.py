@@ -1,4 +1,4 @@
-"""Solvers of optimistix and optax by the names that `calibrate --solver` takes. Importable without jax."""
+"""Solvers of optimistix and optax by the names in `calibrate --solver`. Importable without jax."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TOLERANCE = 1e-6
 RATE = 0.02
 
 
-def solver(name: str) -> optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser:
+def solver_by_name(name: str) -> optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser:
     """Returns the solver of a name, one of `NAMES`.
 
     Raises:

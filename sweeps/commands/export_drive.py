@@ -5,16 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
-
 from calibration.data import robot_file
-from mmrjax.model import channels
 from sweeps import config as configuration
-from sweeps.console import say
-from sweeps.export import export_words as words
 from sweeps.export.formats import Export, exported
 from sweeps.inputs import load_robot
-from sweeps.skeleton import leave, page
+from sweeps.report import export_report
+from sweeps.report.words import export_words as words
+from sweeps.skeleton import leave, report
 from sweeps.store import open_folder
 
 
@@ -31,10 +28,8 @@ def export(config: configuration.Export, out: Path | None, force: bool) -> int:
             folder.write_bytes(name, content if isinstance(content, bytes) else content.encode())
         folder.write_text("LAW.md", words.law(found))
         folder.write_json("result.json", to_json(found))
-        show(found)
-        return leave(
-            folder, config, {"seed": config.seed}, page=page("export", found), runs=found.comparison.situation.runs
-        )
+        shown = report(export_report.document(found))
+        return leave(folder, config, {"seed": config.seed}, page=shown, runs=found.comparison.situation.runs)
 
 
 def to_json(found: Export) -> dict[str, Any]:
@@ -63,26 +58,3 @@ def to_json(found: Export) -> dict[str, Any]:
         ],
         "files": sorted(found.files),
     }
-
-
-def show(found: Export) -> None:
-    """Print what was exported, what becomes of each effect, and the errors."""
-    say(words.statement(found))
-    shown = Table(title="what the format holds", title_justify="left", box=None, pad_edge=False)
-    for heading in ("term or effect", "verdict", "kept", "how"):
-        shown.add_column(heading)
-    for fate in found.comparison.fates:
-        shown.add_row(fate.name, fate.verdict, words.kept(fate), fate.how)
-    say(shown)
-    errors = Table(title=words.errors_title(found), title_justify="left", box=None, pad_edge=False)
-    errors.add_column("model")
-    names = list(found.comparison.errors[0].percent)
-    for name in names:
-        errors.add_column(f"{channels.find(name).label} [%]", justify="right")
-    for error in found.comparison.errors:
-        errors.add_row(error.label, *(f"{error.percent[n]:.3g}" for n in names))
-    say(errors)
-    for sentence in words.remarks(found):
-        say(f"- {sentence}")
-    for name, value in found.checks.items():
-        say(f"- {name}: {value:.3g}")

@@ -84,7 +84,7 @@ def simulate(
             )
     _check_charge(robot, config)
     if isinstance(given, str):
-        runs = read_runs(given, robot, measured=False, battery=config.battery)
+        runs = read_runs(given, robot, columns=config.columns, measured=False, battery=config.battery)
     else:
         runs = one_run(robot, given, config.battery, source.stated)
     for column in source.stated:

@@ -65,7 +65,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
     file = load_robot(config)
     robot = file.robot
     if isinstance(given, str):
-        runs = read_runs(given, robot, measured=False, battery=config.battery)
+        runs = read_runs(given, robot, columns=config.columns, measured=False, battery=config.battery)
     else:
         runs = one_run(robot, given, config.battery)
     if fidelities.facts(config.model).histories and len(runs) > _HISTORIES:

@@ -12,8 +12,8 @@ from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from calibration.data.writing import naming
 from mmrjax.model.robot import Robot
-from sweeps.export import export_words
 from sweeps.export.formats import Export, exported
+from sweeps.report.words import export_words
 
 
 def export(

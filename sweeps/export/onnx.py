@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import warnings
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -25,6 +27,14 @@ def _library(name: str) -> Any:
         return __import__(name)
     except ImportError as error:
         raise BadConfiguration(f"--to onnx: {name} is not installed; {EXTRA}") from error
+
+
+@contextlib.contextmanager
+def _single() -> Iterator[None]:
+    """Context of single precision, without JAX's warnings that a stated double becomes single."""
+    with jax.enable_x64(False), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Explicitly requested dtype", UserWarning)
+        yield
 
 
 def step_of(joint: Joint, constants: Sequence[Constant]) -> tuple[Any, list[str], list[str]]:
@@ -56,7 +66,7 @@ def files(joint: Joint, constants: Sequence[Constant]) -> dict[str, str | bytes]
     jax2onnx, onnx = _library("jax2onnx"), _library("onnx")
     step, inputs, outputs = step_of(joint, constants)
     shapes: list[tuple[int | str, ...]] = [("joints",)] * (len(inputs) - 1) + [(1,)]
-    with jax.enable_x64(False):
+    with _single():
         model = jax2onnx.to_onnx(
             step, shapes, model_name=joint.name, opset=OPSET, input_names=inputs, output_names=outputs
         )
@@ -69,7 +79,7 @@ def difference(joint: Joint, constants: Sequence[Constant], model: bytes) -> flo
     runtime = _library("onnxruntime")
     step, inputs, _ = step_of(joint, constants)
     given = random_states(joint, len(inputs))
-    with jax.enable_x64(False):
+    with _single():
         expected = [np.asarray(x) for x in jax.jit(step)(*given)]
     session = runtime.InferenceSession(model, providers=["CPUExecutionProvider"])
     found = session.run(None, dict(zip(inputs, given, strict=True)))

@@ -215,7 +215,7 @@ def idle_current(robot: Robot, configuration: str, speed_wheel: np.ndarray) -> n
 def fit_line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
     """Least-squares line through the points, evaluated at them, and its R² (A1)."""
     line = np.polyval(np.polyfit(x, y, 1), x)
-    return line, simulation_errors.certainty(y, line)
+    return line, simulation_errors.r_squared(y, line)
 
 
 # --- runs ---------------------------------------------------------------------------------------------
@@ -341,6 +341,6 @@ def summary(rows: Rows) -> dict[str, dict[str, Any]]:
     ways = {name: errors(getattr(rows, name), rows.measured) for name in ("plain", "raised", "weighed")}
     ways["paper"] = simulation_errors.relative_error(rows.paper, rows.measured)
     return {
-        way: {c.name: simulation_errors.summary(values[:, k]) for k, c in enumerate(channels_of_paper())}
+        way: {c.name: simulation_errors.error_summary(values[:, k]) for k, c in enumerate(channels_of_paper())}
         for way, values in ways.items()
     }

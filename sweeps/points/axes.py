@@ -351,7 +351,7 @@ def _prior(name: str, robot: Robot) -> Quantile:
 
     from calibration.inference import priors
 
-    coordinates = priors.coordinates(robot, [name])
+    coordinates = priors.parameter_coordinates(robot, [name])
 
     def quantile(u: np.ndarray) -> np.ndarray:
         return in_blocks(coordinates.value, ndtri(u)[:, None])[:, 0]

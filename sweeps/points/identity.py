@@ -30,7 +30,7 @@ def identity(config: Part, robot: Robot, files: Iterable[str], device: str) -> I
     Raises:
         BadConfiguration: a file that cannot be read.
     """
-    configuration = _flat(config.model_dump(mode="json", exclude={"report"}), "")
+    configuration = _flat(config.model_dump(mode="json", exclude={"report", "table"}), "")
     configuration |= {f"robot {p.name}": repr(float(p.value)) for p in params.walk(robot)}
     return {
         "configuration": configuration,

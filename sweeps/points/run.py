@@ -184,7 +184,7 @@ def followed(robot: Robot, runs: Runs, model: str | None) -> Table:
     Raises:
         BadConfiguration: a fidelity that cannot follow them.
     """
-    seen = jax.device_get(_observed(observers.kind(runs).of(runs, robot, model), params.strong(robot)))
+    seen = jax.device_get(_observed(observers.observer_kind(runs).of(runs, robot, model), params.strong(robot)))
     columns = {c.column: seen.reading[:, k] / c.factor for k, c in enumerate(robot.channels)}
     return {**conditions(robot, runs), **columns, **outputs.codes(seen.status, seen.flags)}
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.sizing.chart import LIMITS, Chart
 from calibration.sizing.design import OBJECTIVES
-from calibration.sizing.design_search import Found
+from calibration.sizing.design_search import SizedDesign
 from mmrjax.errors import counted
 from sweeps.report.check_report import sheet
 from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table, drawing
@@ -60,7 +60,9 @@ def document(found: SizeResult, robot_name: str) -> Document:
     )
 
 
-def _table(name: str, found: SizeResult, designs: Iterable[Found], title: str = "", terminal: bool = False) -> Table:
+def _table(
+    name: str, found: SizeResult, designs: Iterable[SizedDesign], title: str = "", terminal: bool = False
+) -> Table:
     left_out = found.sizing.unmeetable
     rows = [
         (

@@ -171,14 +171,15 @@ def instruction(what: Instruction) -> str:
         return ". And: ".join(map(experiment, what.experiments))
     if isinstance(what, TooWeak):
         return f"A series in {what.variable} would show what is missing by {what.sigma:.1f} sigma"
-    return f"{more_runs(what)}; read every channel. What the {bases.in_words(what.place)} lacks then shows its shape"
+    place = bases.place_in_words(what.place)
+    return f"{more_runs(what)}; read every channel. What the {place} lacks then shows its shape"
 
 
 def more_runs(what: MoreRuns) -> str:
     """More runs along the variable of a discrepancy."""
     if what.variable in bases.ORDERS:
         return _steady_speeds(what)
-    happens = bases.window(what.variable)
+    happens = bases.window_from_name(what.variable)
     if happens is not None:
         return _again(happens)
     if what.within.imposed != "voltage":

@@ -104,16 +104,16 @@ def product_alone(note: fit_notes.ProductAlone) -> str:
 def no_prediction(note: fit_notes.NoPrediction) -> str:
     """Rows that a fit without their block does not predict."""
     return (
-        f"held out by {blocks.in_words(note.kind)}: {note.rows} of {note.of} rows have no prediction, because the "
-        "robot fitted without them slides there; the errors leave them out"
+        f"held out by {blocks.kind_in_words(note.kind)}: {note.rows} of {note.of} rows have no prediction, because "
+        "the robot fitted without them slides there; the errors leave them out"
     )
 
 
 def same_predictions(note: fit_notes.SamePredictions) -> str:
     """Kinds of blocks that give the same predictions."""
     return (
-        f"held out by {' or by '.join(blocks.in_words(k) for k in note.others)}: the same predictions as held out by "
-        f"{blocks.in_words(note.kind)}, which stand for them; these runs do not vary them apart"
+        f"held out by {' or by '.join(blocks.kind_in_words(k) for k in note.others)}: the same predictions as held "
+        f"out by {blocks.kind_in_words(note.kind)}, which stand for them; these runs do not vary them apart"
     )
 
 
