@@ -35,7 +35,7 @@ from calibration.sensitivity.model import Model, chosen_outputs  # noqa: E402
 from calibration.sensitivity.result import Points  # noqa: E402
 from calibration.sensitivity.study import Study  # noqa: E402
 from mmrjax import nominal  # noqa: E402
-from mmrjax.fidelities.variation import Variation, evaluate  # noqa: E402
+from mmrjax.fidelities.variation import Variation, evaluate_points  # noqa: E402
 from mmrjax.model.conditions import Conditions  # noqa: E402
 from mmrjax.model.paper_tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V  # noqa: E402
 
@@ -188,13 +188,13 @@ def speed(points: int, repeats: int) -> dict[str, Any]:
     best = {"numpy": math.inf, "ours": math.inf, "ours_in_study": math.inf}
     variation, there = Variation(model.robot, model.columns), jax.numpy.asarray(values)
     model(values, conditions)
-    evaluate(variation, "steady", there, conditions, {}, OUTPUTS)
+    evaluate_points(variation, "steady", there, conditions, {}, OUTPUTS)
     for _ in range(repeats):  # in turn
         began = time.perf_counter()
         fast = by_numpy(own)
         best["numpy"] = min(best["numpy"], time.perf_counter() - began)
         began = time.perf_counter()
-        jax.block_until_ready(evaluate(variation, "steady", there, conditions, {}, OUTPUTS))
+        jax.block_until_ready(evaluate_points(variation, "steady", there, conditions, {}, OUTPUTS))
         best["ours"] = min(best["ours"], time.perf_counter() - began)
         began = time.perf_counter()
         answer = model(values, conditions)  # including transfers between NumPy and the device

@@ -101,7 +101,7 @@ def ours(robot: Any, start: np.ndarray, times: np.ndarray, ratio: float) -> Any:
         *map(jnp.asarray, (clock, run, sample, rows_of, rows_of[:, [0, -1]])),
     )
     motor = channels.USUAL.index("motor_speed")
-    only_speed = jnp.zeros(len(channels.usual())).at[motor].set(1.0)
+    only_speed = jnp.zeros(len(channels.usual_channels())).at[motor].set(1.0)
     rows = count * samples
 
     def fitted(speeds: Any) -> fit.Optimum:

@@ -276,7 +276,7 @@ def pose(what: str) -> tuple[Posed, Robot, Runs]:
     simulated = np.full(len(measured), np.nan)
     simulated[tracked] = 100 * (1 - speed * float(robot.gearbox.ratio) / (motor * float(robot.radius_pulley)))
     data = data_from_readings(measured[row], SettledRuns.sizes(table)[row], len(names))
-    problem = Problem(params.strong(robot), coordinates, Resolved(chosen, "track", wheeled=rest), data)
+    problem = Problem(params.without_weak_types(robot), coordinates, Resolved(chosen, "track", wheeled=rest), data)
     return Posed(problem, row, measured, slope, voltage, tracked, what, simulated), robot, table
 
 
@@ -290,7 +290,7 @@ def lumped(posed: Posed, robot: Robot, table: Runs, seen: list[np.ndarray]) -> t
     size = np.abs(posed.measured) * np.array([0.01 * share[name] for name in channels.USUAL])
     data = data_from_readings(posed.measured, size, len(names))
     coordinates = priors.parameter_coordinates(robot, names, stated, any_surface=True)
-    problem = Problem(params.strong(robot), coordinates, SettledRuns.of(table, robot, "steady"), data)
+    problem = Problem(params.without_weak_types(robot), coordinates, SettledRuns.of(table, robot, "steady"), data)
     weights = [np.asarray(data.weight) * s[:, None] for s in seen]
     found, _ = search_each(problem, [np.zeros(len(names))] * len(seen), weights)
     slope = jax.jit(jax.jacfwd(lambda z, data: problem.misfit(z, data)))
@@ -403,7 +403,7 @@ def lumped_slip(arguments: argparse.Namespace) -> None:
         base = dataclasses.replace(robot, effects=effects)
         coordinates = priors.parameter_coordinates(base, names, any_surface=True)
         data = data_from_readings(posed.measured, np.ones_like(posed.measured), len(names))
-        problem = Problem(params.strong(base), coordinates, SettledRuns.of(table, base, "steady"), data)
+        problem = Problem(params.without_weak_types(base), coordinates, SettledRuns.of(table, base, "steady"), data)
         observed = eqx.filter_jit(lambda problem, z: problem.observation(z))
         for name, here in seen.items():
             compared = here & (np.arange(len(here)) > 0)
@@ -441,7 +441,9 @@ def timed(arguments: argparse.Namespace) -> dict[str, Any]:
     conditions = table.conditions(robot)
     data = data_from_readings(table.measured(), SettledRuns.sizes(table), len(coordinates))
     none = jax.tree.map(lambda x: x[:0], conditions)
-    problem = Problem(params.strong(robot), coordinates, Resolved(conditions, "track", wheeled=none), data)
+    problem = Problem(
+        params.without_weak_types(robot), coordinates, Resolved(conditions, "track", wheeled=none), data
+    )
     values = np.where(np.array(coordinates.scale), np.log(np.maximum(np.abs(SET_S), 1e-12)), np.array(SET_S))
     centre = (values - np.asarray(coordinates.location)) / np.asarray(coordinates.spread)
     size = (arguments.population, len(coordinates))

@@ -17,7 +17,7 @@ import typer
 
 from calibration.data.input_errors import BadConfiguration, InputError
 from mmrjax import SOUND_AT_LEVEL_0, __version__, fidelities
-from mmrjax.errors import shortened
+from mmrjax.errors import shorten
 from sweeps import config, config_campaign
 from sweeps import options as made
 from sweeps.flags import flags as flags_of
@@ -604,7 +604,7 @@ def _prepared(resolved: Any, no_cache: bool = False) -> Any:
     XLA_FLAGS, be it to nothing, is heeded.
     """
     model = getattr(resolved, "model", None)  # None: of a calibration, whose data decide
-    one_thread = model is not None and fidelities.facts(model).one_thread
+    one_thread = model is not None and fidelities.fidelity_facts(model).one_thread
     options = (f"xla_cpu_small_while_loop_byte_threshold={WHOLE}",) * isinstance(resolved, config.Loop)
     _start_jax(no_cache, ("--xla_cpu_multi_thread_eigen=false",) * one_thread, options)
     return resolved
@@ -737,5 +737,5 @@ def _no_number(error: Any) -> str:
 
 
 def _fail(message: str, code: int) -> int:
-    print(f"mmrjax: {shortened(' '.join(message.splitlines()))}", file=sys.stderr)
+    print(f"mmrjax: {shorten(' '.join(message.splitlines()))}", file=sys.stderr)
     return code

@@ -14,7 +14,7 @@ from pydantic_core import PydanticCustomError
 
 from calibration.data import presets_file
 from calibration.data.columns import ROWS
-from calibration.data.input_errors import BadConfiguration, choices, parsed
+from calibration.data.input_errors import BadConfiguration, allowed_words, parsed
 from calibration.data.input_files import toml_content, toml_text
 from calibration.inference import solvers
 from mmrjax import fidelities
@@ -26,8 +26,8 @@ from sweeps.flags import flags
 _VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c].range for c in ("voltage", "payload", "slope_deg"))
 Slope = Annotated[float, Field(ge=_SLOPE[0], le=_SLOPE[1], allow_inf_nan=False)]
 Payload = Annotated[float, Field(ge=_PAYLOAD[0], le=_PAYLOAD[1], allow_inf_nan=False)]
-_SPEED = channels.find("motor_speed").range
-_CURRENT = channels.find("motor_current").range
+_SPEED = channels.find_channel("motor_speed").range
+_CURRENT = channels.find_channel("motor_current").range
 MotorCurrent = Annotated[float, Field(ge=_CURRENT[0], le=_CURRENT[1], allow_inf_nan=False)]
 _TORQUE = CONDITIONS["load_torque"].range
 LoadTorque = Annotated[float, Field(ge=_TORQUE[0], le=_TORQUE[1], allow_inf_nan=False)]
@@ -104,7 +104,7 @@ def _fidelity(model: str) -> str:
 def _solver(name: str) -> str:
     """The name of a solver of fits, refused where there is no such one."""
     if name not in solvers.NAMES:
-        raise PydanticCustomError("unknown", choices(name, solvers.NAMES))
+        raise PydanticCustomError("unknown", allowed_words(name, solvers.NAMES))
     return name
 
 
@@ -158,7 +158,7 @@ class FidelityPart(ModelPart):
     @property
     def options(self) -> dict[str, float]:
         """Every option of the fidelity, as stated or by default."""
-        facts = fidelities.facts(self.model)
+        facts = fidelities.fidelity_facts(self.model)
         return facts.resolved(**{option.name: getattr(self, f"{option.name}_s") for option in facts.options})
 
 
@@ -763,7 +763,7 @@ def _keys(kind: type[Part], file: Path, beside: type[Part] | None) -> dict[str, 
     own, others = solver_keys(kind), [] if beside is None else solver_keys(beside)
     for key in table:
         if key not in own + others:
-            known = choices(key, own + others) if own + others else "this command has none"
+            known = allowed_words(key, own + others) if own + others else "this command has none"
             raise BadConfiguration(f"{file.name}, solver.{key}: no such key; {known}")
         if key in values:
             raise BadConfiguration(f"{file.name}, solver.{key}: the file states {key} too; expected it once")
@@ -836,7 +836,7 @@ def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given
     place = ".".join(str(part) for part in first["loc"])
     where = f"{file.name}, {place}" if file is not None and key not in given else called(key)
     if first["type"] == "extra_forbidden":
-        return f"{where}: no such key; {choices(key, kind.model_fields)}"
+        return f"{where}: no such key; {allowed_words(key, kind.model_fields)}"
     limits = {
         name: first["ctx"][name] for name in ("gt", "ge", "lt", "le", "expected") if name in first.get("ctx", {})
     }

@@ -396,13 +396,13 @@ def open_folder(
     """
     import jax
 
-    from mmrjax.compile.programs import sources
+    from mmrjax.compile.programs import source_hash
 
     identity = {
         "command": command,
-        "program": f"{sources()}, {jax.default_backend()}",
+        "program": f"{source_hash()}, {jax.default_backend()}",
         "config": config.model_dump(exclude={"report", "table"}),
-        "robot": {p.name: float(p.value) for p in params.walk(robot)},
+        "robot": {p.name: float(p.value) for p in params.walk_parameters(robot)},
         "runs": None if runs is None else {key: value.tolist() for key, value in runs.columns.items()},
         "effects": [digest(Path(file).read_bytes()) for file in config.effects],
     }

@@ -205,11 +205,11 @@ def test_stated_noise_comes_before_columns_and_columns_before_estimates(measured
 )
 def test_noise_refuses(text, says):
     with pytest.raises(BadConfiguration, match=says):
-        noise.parse_noise(text, channels.usual())
+        noise.parse_noise(text, channels.usual_channels())
 
 
 def test_noise_is_in_any_unit_of_its_channel():
-    shown = tuple(channels.find(name) for name in ("total_current", "yaw_rate"))
+    shown = tuple(channels.find_channel(name) for name in ("total_current", "yaw_rate"))
     found = noise.parse_noise("current=40mA,yaw_rate=0.6deg/s", shown)
     assert found == {0: (pytest.approx(0.04), False), 1: (pytest.approx(np.radians(0.6)), False)}
 
@@ -381,7 +381,7 @@ def test_the_command_leaves_a_folder_that_other_commands_take(tmp_path, monkeypa
     # Percentages differ: `compare` keeps equation (35), so the readings themselves are compared.
     fitted, compared = (rows_of(tmp_path / folder) for folder in ("c/rows.csv", "d/comparison.csv"))
     for mine, theirs in zip(fitted, compared, strict=True):
-        for c in channels.rows(channels.USUAL):
+        for c in channels.channels_named(channels.USUAL):
             assert float(theirs[f"simulated_{c.column}"]) == pytest.approx(float(mine[f"after_{c.column}"]), rel=1e-6)
     code, _, err = mmrjax("calibrate", "measured", "--free", "6T2A.mu")
     assert code == 2 and "--free 6T2A.mu: no such parameter" in err
@@ -486,7 +486,9 @@ def test_a_robot_with_a_configuration_of_its_own_calibrates_from_its_file_alone(
     creep = "rover.ground.friction.speed_static"
     truth = robot_file.change(rover, {creep: 0.05}, where="test")
     shown = steady_batch(truth, conditions.conditions(truth))
-    runs = changed(conditions, **{c.column: np.asarray(shown.reading[c.name]) / c.factor for c in channels.usual()})
+    runs = changed(
+        conditions, **{c.column: np.asarray(shown.reading[c.name]) / c.factor for c in channels.usual_channels()}
+    )
     made = quick(runs, rover, noise="current=1%,motor_speed=0.5%,speed=1%")
     assert set(made.parameters) == {f"rover.{name}" for name in priors.FRICTION}
     low, high = made.parameters[creep].interval

@@ -47,7 +47,7 @@ def seen(base):
 def made(seen):
     """The table of those runs."""
     conditions, runs = seen
-    columns = {c.column: np.asarray(runs.result.reading[c.name]) / c.factor for c in channels.usual()}
+    columns = {c.column: np.asarray(runs.result.reading[c.name]) / c.factor for c in channels.usual_channels()}
     return dataclasses.replace(conditions, source="made", columns={**conditions.columns, **columns})
 
 
@@ -57,7 +57,7 @@ def test_the_share_of_the_guides_is_what_the_track_model_puts_out(seen):
 
 
 def test_in_track_the_guide_friction_stands_for_the_product(base):
-    names = priors.default_names(["6T2A", "4W2T"], base, computed=fidelities.facts("track").computes)
+    names = priors.default_names(["6T2A", "4W2T"], base, computed=fidelities.fidelity_facts("track").computes)
     assert GUIDE_FRICTION in names and GUIDE_SHARE not in names and len(names) == 11
     turned, known = priors.with_guide_share(base, "6T2A")
     fields, mean = priors.parameters_by_name(turned), known[GUIDE_FRICTION][0]
@@ -125,7 +125,7 @@ def test_the_robot_says_the_same_in_the_other_fidelities(found, made):
 def test_a_belt_too_stiff_for_the_step_is_said(base, made):
     """Friction and contacts are implicit in a step, the springs of the belt are not."""
     stiff = params.replace(base, {"running_gear.span_stiffness": jnp.asarray(1e8)})
-    (said,) = fidelities.get("track").cautions(stiff, made.conditions(stiff))
+    (said,) = fidelities.get_fidelity("track").cautions(stiff, made.conditions(stiff))
     assert said.startswith("rows 1, 2")
     assert "the track model's step of 0.0001 s is above the largest stable one" in said
 

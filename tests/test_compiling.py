@@ -19,7 +19,7 @@ from calibration.discovery.settings import settings_for
 from calibration.inference import noise, observers
 from mmrjax import effects
 from mmrjax.compile.compiling import compiled, for_equations
-from mmrjax.effects.scaled import scaled
+from mmrjax.effects.scaled import scaled_effect
 from mmrjax.fidelities.steady import steady
 from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
@@ -54,7 +54,7 @@ def test_two_rigs_of_one_structure_share_their_programs(tmp_path, kind):
 
 
 def effects_sd(effect):
-    return next(p.spec.prior_sd(0.0) for p in params.walk(effect) if p.spec.amplitude)
+    return next(p.spec.prior_sd(0.0) for p in params.walk_parameters(effect) if p.spec.amplitude)
 
 
 @pytest.mark.slow
@@ -83,7 +83,7 @@ def test_what_equations_read_keeps_programs_apart():
 
 def test_an_effect_of_another_size_is_the_same_to_equations():
     kind = effects.BY_NAME["churning"]
-    wide = scaled(kind, (3.0, 1.0, 3.0))
+    wide = scaled_effect(kind, (3.0, 1.0, 3.0))
     one = wide(amplitude=jnp.asarray(2e-4))
     assert effects_sd(one) == pytest.approx(3 * effects_sd(kind()))
     plain = for_equations(one)

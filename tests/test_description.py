@@ -12,7 +12,7 @@ from mmrjax.model import channels
 from sweeps.report.words import loop_words
 
 ROWS, SD = 40, 0.02
-CURRENT, SPEED = channels.find("total_current"), channels.find("motor_speed")
+CURRENT, SPEED = channels.find_channel("total_current"), channels.find_channel("motor_speed")
 
 
 class Sized(SimpleNamespace):

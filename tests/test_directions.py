@@ -45,7 +45,7 @@ def table(name: str, amplitude: float, voltages: tuple[float, ...]) -> Runs:
         "supply_voltage_V": voltage,
     }
     rng = np.random.default_rng(1)
-    for channel in channels.usual():
+    for channel in channels.usual_channels():
         reading = np.asarray(shown[channel.name]) / channel.factor
         sd = channel.sd_share * np.maximum(np.abs(reading), 0.2 * np.abs(reading).max())
         columns |= {channel.column: reading + sd * rng.normal(size=sd.size), channel.sd_column: sd}
@@ -56,7 +56,7 @@ def test_runs_that_go_both_ways_are_known_by_what_drives_them_or_by_a_speed():
     measured = read("measured")
     assert not discover.goes_both_ways(measured)
     columns, rows = dict(measured.columns), len(measured)
-    speeds = [c.column for c in channels.usual() if c.zero_at_rest]
+    speeds = [c.column for c in channels.usual_channels() if c.zero_at_rest]
 
     def changed(**values):
         return dataclasses.replace(measured, columns={**columns, **values})
@@ -134,4 +134,4 @@ def test_loop_takes_friction_of_one_direction_for_dry_friction():
 
 
 def _sd(name: str) -> float:
-    return next(p for p in params.walk(BY_NAME[name]()) if p.spec.amplitude).spec.prior_sd(0.0)
+    return next(p for p in params.walk_parameters(BY_NAME[name]()) if p.spec.amplitude).spec.prior_sd(0.0)

@@ -24,7 +24,7 @@ from calibration.inference.linearization import PROBED, shape_of, with_shape_gri
 from calibration.inference.observers import Histories
 from calibration.inference.optimizers import levenberg_marquardt
 from mmrjax.effects import BY_NAME, UNNAMED
-from mmrjax.effects.curve import weights
+from mmrjax.effects.curve import ordinate_weights
 from mmrjax.model import paper_robots, params
 
 #: What these histories are searched for; the whole library is what the command and the campaign search.
@@ -211,7 +211,7 @@ def test_columns_are_differences_of_runs_with_a_curve(seen, balance):
     expected = np.asarray(read(sides[0]) - read(sides[1])) / (2 * float(size))
     y = jnp.asarray([shape[f"y{k}"] for k in range(6)])
     along = np.asarray(linear.signals.direction if balance != "ground" else linear.signals.direction_travel)
-    over_time = np.asarray(weights(linear.time, 0.0, 0.8) @ y) * along
+    over_time = np.asarray(ordinate_weights(linear.time, 0.0, 0.8) @ y) * along
     got = np.asarray(linear.columns(PROBED.index(balance), jnp.asarray(over_time[:, None])))[:, 0]
     # linear between samples 20 ms apart; at the start the direction rises within the first of them
     assert np.linalg.norm(got - expected) < 0.05 * np.linalg.norm(expected)

@@ -122,8 +122,8 @@ def test_robot_written_and_read_gives_the_same_readings(found, tmp_path):
         == [found.what.effect]
         == [f"curve_{found.what.balance}_{found.what.variable}"]
     )
-    assert {p.name: float(p.value) for p in params.walk(robot)} == {
-        p.name: float(p.value) for p in params.walk(found.what.robot)
+    assert {p.name: float(p.value) for p in params.walk_parameters(robot)} == {
+        p.name: float(p.value) for p in params.walk_parameters(found.what.robot)
     }
     reading = steady_batch(robot, found.runs.conditions(robot)).reading
     seen = jnp.stack([reading[name] for name in channels.USUAL], -1)

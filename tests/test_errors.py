@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibration.inference import simulation_errors
-from mmrjax.model.channels import usual
+from mmrjax.model.channels import usual_channels
 
 
 def test_relative_error_is_equation_35_with_simulated_below():
@@ -35,7 +35,7 @@ def test_certainty_is_equation_a1():
 def test_channel_errors_leave_out_what_is_missing():
     measured = np.array([[2.0, np.nan, 1.0], [4.0, np.nan, np.nan]])
     simulated = np.array([[2.0, 5.0, 1.1], [5.0, 5.0, 1.1]])
-    found = simulation_errors.channel_errors(usual(), simulated, measured, np.ones((2, 3)))
+    found = simulation_errors.channel_errors(usual_channels(), simulated, measured, np.ones((2, 3)))
     assert [found[c]["rows"] for c in ("total_current", "motor_speed", "speed")] == [2, 0, 1]
     assert found["total_current"]["rms_sigma"] == pytest.approx(np.sqrt(0.5))
     assert found["total_current"]["max_percent"] == pytest.approx(100 / np.sqrt(10))
@@ -46,5 +46,5 @@ def test_channel_errors_leave_out_what_is_missing():
 
 def test_channel_errors_take_another_percentage():
     one = np.ones((2, 3))
-    found = simulation_errors.channel_errors(usual(), one, one, one, percent=np.full((2, 3), -7.0))
+    found = simulation_errors.channel_errors(usual_channels(), one, one, one, percent=np.full((2, 3), -7.0))
     assert found["speed"]["rms_percent"] == 7.0 and found["speed"]["rms_sigma"] == 0.0

@@ -21,7 +21,7 @@ import pytest
 from calibration.data import posterior_file, robot_file
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.inference import priors
-from calibration.inference.fit_posterior import of_coordinates
+from calibration.inference.fit_posterior import posterior_of_coordinates
 from mmrjax import effects
 from mmrjax.model import balances, paper_robots, params
 from mmrjax.model.signals import Signals
@@ -167,7 +167,7 @@ def term(drive, part, given, rate=False):
     )  # fmt: skip
     if rate:
         return jnp.asarray(effect.rate(robot, signals))
-    return jnp.asarray(balances.added(dataclasses.replace(robot, effects=(effect,)), signals, part.balance))
+    return jnp.asarray(balances.effects_sum(dataclasses.replace(robot, effects=(effect,)), signals, part.balance))
 
 
 def test_mujoco_runs_the_drive_as_the_native_model_over_table_8(plain):
@@ -364,9 +364,9 @@ def test_mjlab_actuator_gives_the_torque_of_jax_within_a_stand_in(with_effects, 
 def test_draws_are_correlated_as_the_posterior_and_in_both_formats(plain, tmp_path):
     drive, runs, known = plain
     names = ("motor.resistance", "motor.friction_coulomb")
-    at = priors.coordinates(drive.file.robot, names, {})
+    at = priors.parameter_coordinates(drive.file.robot, names, {})
     spread = np.array([[0.3, 0.0], [-0.24, 0.18]])
-    posterior = of_coordinates(at, np.zeros(2), spread @ spread.T)
+    posterior = posterior_of_coordinates(at, np.zeros(2), spread @ spread.T)
     normal = float(np.mean(runs.signals.normal))
     law = mujoco.translated(drive, normal)
     refitted = dict(zip(law.names, map(float, law.start), strict=True))
@@ -447,8 +447,8 @@ def test_rig_that_was_exported_comes_back_to_the_last_digit(rig, tmp_path):
     lines = [[line for line in f["drive.xml"].splitlines() if "<!--" not in line] for f in (first, second)]
     assert lines[0] == lines[1]
     before, after = (robot_file.find(str(f)).robot for f in (rig, again))
-    numbers = {p.name: float(p.value) for p in params.walk(after)}
-    for p in params.walk(before):
+    numbers = {p.name: float(p.value) for p in params.walk_parameters(after)}
+    for p in params.walk_parameters(before):
         name = p.name
         if not name.startswith(("battery", "running_gear", "motor.resistance_thermal", "motor.time", "rig")):
             assert numbers[name] == pytest.approx(float(p.value), rel=1e-8), name

@@ -19,7 +19,7 @@ from mmrjax.fidelities import histories as integrator
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.steady import steady
 from mmrjax.model import params
-from mmrjax.model.balances import absent
+from mmrjax.model.balances import absent_balances
 from mmrjax.model.conditions import Conditions
 from sweeps.pages import comparison_figures
 
@@ -92,7 +92,7 @@ def test_a_loop_and_a_calibration_say_so_before_they_fit(tmp_path, robot, factor
 
 def test_the_file_says_what_is_imposed_and_needs_no_winding(robot, tmp_path):
     assert robot.rig.imposed == "motor_current"
-    assert {"electrical", "inductance", "supply"} <= absent(robot)
+    assert {"electrical", "inductance", "supply"} <= absent_balances(robot)
     robot_file.write(robot, tmp_path / "again.toml")
     assert robot_file.read(tmp_path / "again.toml").rig == robot.rig
     (tmp_path / "bad.toml").write_text(RIG.replace('["motor_speed"]', '["motor_current"]'), encoding="utf-8")
@@ -145,7 +145,7 @@ def test_a_shaft_turns_through_rest_and_is_held_there_at_its_very_moment(tmp_pat
 
     def ours(dry):
         changed = params.replace(robot, {"bench.loss_coulomb": dry, "motor.inductance": 1e-9})
-        found = integrator.histories(changed, Conditions(motor_current=jnp.asarray(levels)), jnp.asarray(times))
+        found = integrator.history_signals(changed, Conditions(motor_current=jnp.asarray(levels)), jnp.asarray(times))
         return found.speed_motor, found.speed_motor
 
     slope, shown = map(np.asarray, jax.jit(jax.jacfwd(ours, has_aux=True))(DRY))

@@ -12,7 +12,7 @@ from calibration.data.input_errors import BadConfiguration, BadData, InputError
 from calibration.discovery.discover import without_copies
 from calibration.inference.checks import _check_stuck_channels
 from calibration.inference.fit_notes import StiffSupply
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from sweeps.pages import comparison_figures
 
 RIG = """
@@ -158,7 +158,7 @@ def test_a_stiff_supply_is_no_stuck_instrument(tmp_path):
 
 @pytest.mark.parametrize("count", [1, np.int64(1), np.int32(2), np.uint8(0)])
 def test_counts_of_numpy_are_counts(count):
-    assert counted(count, "row") == f"{int(count)} row" + ("" if int(count) == 1 else "s")
+    assert count_noun(count, "row") == f"{int(count)} row" + ("" if int(count) == 1 else "s")
 
 
 @pytest.mark.parametrize("column", ["motor_current_A", "motor_speed_rpm", None])

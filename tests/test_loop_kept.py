@@ -59,7 +59,7 @@ def test_a_stage_of_another_version_is_made_again(tmp_path, monkeypatch):
     found = []
     stage(lambda: 1)
     stage(refuse)
-    monkeypatch.setattr(programs, "sources", lambda: "mended")
+    monkeypatch.setattr(programs, "source_hash", lambda: "mended")
     stage(lambda: 2)
     assert found == [1, 1, 2]
 

@@ -46,7 +46,7 @@ def happening():
 
 def test_the_legend_of_errors_hides_no_title():
     shown = tuple(
-        channels.find(n) for n in ("motor_current_left", "motor_current_right", "yaw_rate", "output_torque")
+        channels.find_channel(n) for n in ("motor_current_left", "motor_current_right", "yaw_rate", "output_torque")
     )
     rows = {when: {c.name: {"rms_percent": 1.0} for c in shown} for when in (0, 1)}
     fig = loop_figures.errors(SimpleNamespace(channels=shown, errors=rows, errors_held_out={"slope": rows}))

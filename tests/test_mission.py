@@ -55,7 +55,7 @@ def flagged(flags):
 
 @pytest.fixture(scope="module")
 def robot():
-    return params.strong(paper_robots.nominal())
+    return params.without_weak_types(paper_robots.nominal())
 
 
 MANY = (
@@ -321,7 +321,7 @@ def test_derivatives_through_stops_and_reversals_match_differences(robot):
     """Of energy, path, Wh/m and temperature, by parameters and by times and values of rows, to 1e-4."""
     time, mode, values = MANY
     start = rows(time, mode, **values)
-    base = {p.name: float(p.value) for p in params.walk(robot)}
+    base = {p.name: float(p.value) for p in params.walk_parameters(robot)}
 
     def outputs(x):
         changed = params.replace(robot, {name: base[name] * x[k] for k, name in enumerate(BY)})
@@ -354,7 +354,7 @@ def test_derivatives_by_every_parameter_and_row_match_differences(robot):
     time, mode, values = MANY
     start = rows(time, mode, **values)
     fixed = ("battery.", "6T2A", "running_gear.")  # on a supply, on wheels, with contacts lumped: not read
-    named = {p.name: float(p.value) for p in params.walk(robot) if not p.name.startswith(fixed)}
+    named = {p.name: float(p.value) for p in params.walk_parameters(robot) if not p.name.startswith(fixed)}
     names = [name for name, value in named.items() if value != 0]
     columns = [n for n in ("time", "demand", "voltage", "slope_deg", "payload") if getattr(start, n) is not None]
 

@@ -36,7 +36,7 @@ def table(masses=MASSES, surface=None) -> records.Runs:
         "total_mass_kg": np.array([masses[n] for n in names]) + payload,
         "payload_kg": payload,
         "slope_deg": np.tile([0.0, 5.0, 12.0], 4)[::-1],
-    } | {c.column: np.linspace(1.0, 2.0, 12) for c in channels.usual()}
+    } | {c.column: np.linspace(1.0, 2.0, 12) for c in channels.usual_channels()}
     return records.Runs("runs.csv", columns | ({} if surface is None else {"surface": np.full(12, surface)}))
 
 
@@ -64,7 +64,7 @@ class Written:
         have = {e.name: e for e in back.effects}
         assert set(have) == {e.name for e in robot.effects}
         whole = dataclasses.replace(back, effects=tuple(have.get(e.name, e) for e in self.effects))
-        return jax.device_get(_swept(params.strong(whole), self.runs.conditions(back)))
+        return jax.device_get(_swept(params.without_weak_types(whole), self.runs.conditions(back)))
 
 
 # --- every effect ---------------------------------------------------------------------------------------
@@ -101,7 +101,7 @@ def fits(tmp_path_factory):
 
 
 def _sd(effect) -> float:
-    return next(p for p in params.walk(effect()) if p.spec.amplitude).spec.prior_sd(0.0)
+    return next(p for p in params.walk_parameters(effect()) if p.spec.amplitude).spec.prior_sd(0.0)
 
 
 def shown(name):
@@ -137,7 +137,7 @@ def test_comparison_can_fail(tmp_path):
     runs, robot = table(), paper_robots.nominal()
     written = Written(runs, tmp_path, ())
     conditions = runs.conditions(robot)
-    before, _ = jax.device_get(_swept(params.strong(robot), conditions))
+    before, _ = jax.device_get(_swept(params.without_weak_types(robot), conditions))
     assert np.abs(written(robot)[0] / before - 1).max() > 0.02
     np.testing.assert_allclose(written(own_mass.with_table_mass(robot, runs))[0], before, rtol=1e-9)
 
@@ -166,7 +166,7 @@ def curves(tmp_path_factory):
         (present,) = with_it.effects
         whole = tuple(present if e.name == name else e() for e in every)
         fitted = dataclasses.replace(with_it, effects=whole)
-        reading, _ = jax.device_get(_swept(params.strong(fitted), runs.conditions(fitted)))
+        reading, _ = jax.device_get(_swept(params.without_weak_types(fitted), runs.conditions(fitted)))
         return reading, written(with_it)[0]
 
     return of

@@ -6,7 +6,7 @@ import pytest
 from mmrjax.model import channels
 from sweeps.pages import mission_page, runs_page, sweep_page
 
-SHOWN = [channels.find("total_current"), channels.find("speed")]
+SHOWN = [channels.find_channel("total_current"), channels.find_channel("speed")]
 
 
 def table(statuses, flags):

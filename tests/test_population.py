@@ -355,7 +355,7 @@ def test_running_gear_is_found_through_the_track_model(tmp_path):
     robot = params.replace(paper_robots.nominal(), changed)
     shown = track_batch(robot, table.conditions(robot), duration=0.6, step=5e-5, rolling=True).result.reading
     columns = dict(table.columns)
-    for channel in channels.usual():
+    for channel in channels.usual_channels():
         columns[channel.column] = np.asarray(shown[channel.name]) / channel.factor
     data = dataclasses.replace(table, columns=columns)
     found = calibrate(

@@ -171,7 +171,7 @@ def test_measured_runs_show_a_voltage_drop_and_a_slip_that_rests_on_a_row(tmp_pa
     assert float(again.configurations["4W2T"].mass) == 13.1
     unweighed = {k: v for k, v in runs.columns.items() if k != "total_mass_kg"}
     shown = steady_batch(again, dataclasses.replace(runs, columns=unweighed).conditions(again)).reading
-    swept = np.stack([np.asarray(shown[c.name]) for c in channels.usual()], -1)
+    swept = np.stack([np.asarray(shown[c.name]) for c in channels.usual_channels()], -1)
     np.testing.assert_allclose(swept, found.readings_of_rows.after, rtol=1e-7)
 
 

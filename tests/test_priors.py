@@ -15,7 +15,10 @@ from calibration.inference.foreign import inherited_priors
 from mmrjax.effects import ALL
 from mmrjax.model import paper_robots, params
 
-EVERY = [p.name for p in params.walk(dataclasses.replace(paper_robots.nominal(), effects=tuple(e() for e in ALL)))]
+EVERY = [
+    p.name
+    for p in params.walk_parameters(dataclasses.replace(paper_robots.nominal(), effects=tuple(e() for e in ALL)))
+]
 
 
 @pytest.fixture(scope="module")
@@ -25,17 +28,17 @@ def every(robot_with_effects):
 
 
 def test_coordinates_start_at_the_nominal_robot(every, robot_with_effects):
-    nominal = np.array([float(p.value) for p in params.walk(robot_with_effects)])
+    nominal = np.array([float(p.value) for p in params.walk_parameters(robot_with_effects)])
     value = np.asarray(every.value(jnp.zeros(len(every))))
     bounded = {"4W2T.track.guide_share", "running_gear.inertia_tracked", "running_gear.inertia_wheeled"}
-    on_bound = np.array([p.name in bounded for p in params.walk(robot_with_effects)])
-    sd = np.array([p.spec.prior_sd(float(p.value)) for p in params.walk(robot_with_effects)])
+    on_bound = np.array([p.name in bounded for p in params.walk_parameters(robot_with_effects)])
+    sd = np.array([p.spec.prior_sd(float(p.value)) for p in params.walk_parameters(robot_with_effects)])
     assert np.all(np.abs(value - nominal)[~on_bound] <= 1e-5 * sd[~on_bound])  # nearest bound: half an sd
     assert np.all((value[on_bound] > 0) & (value[on_bound] < 0.01))  # their nominal value is their bound
 
 
 def test_coordinates_never_leave_the_bounds_and_never_die(every, robot_with_effects):
-    bounds = np.array([p.spec.bounds for p in params.walk(robot_with_effects)])
+    bounds = np.array([p.spec.bounds for p in params.walk_parameters(robot_with_effects)])
     for z in np.linspace(-40, 40, 33):
         value = np.asarray(every.value(jnp.full(len(every), z)))
         rounding = 1e-12 * (1 + np.abs(bounds))  # of exp(log(bound)); bounds reach 1e6

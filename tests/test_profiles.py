@@ -57,7 +57,7 @@ def test_packaged_patrol_is_an_hour_with_120_starts():
 def test_range_of_other_consumers_is_the_batterys():
     from mmrjax.model import params
 
-    (found,) = (p for p in params.walk(paper_robots.nominal()) if p.name == "battery.current_other")
+    (found,) = (p for p in params.walk_parameters(paper_robots.nominal()) if p.name == "battery.current_other")
     assert profiles.QUANTITIES["current_other"].range == found.spec.bounds
 
 
@@ -97,7 +97,7 @@ def test_units_in_names(read, column, cell, field, value):
 
 
 def test_units_of_a_channel_are_those_of_its_row():
-    for channel in channels.usual():
+    for channel in channels.usual_channels():
         found = channel.units
         assert channel.column == f"{channel.name}_{next(iter(found))}"
         assert len(found) == 1 + len(channel.other_units)

@@ -76,7 +76,7 @@ def table_of(rig, changed, levels, slopes=None, sd=0.01, seed=5):
         columns |= {"slope_deg": np.asarray(slopes, float), "payload_kg": np.zeros(len(levels))}
     robot = params.replace(robot, {name: np.asarray(value, float) for name, value in changed.items()})
     conditions = Runs("a table", columns, layout=layout).conditions(robot)
-    result = jax.device_get(fidelities.get("steady").run(robot, conditions, {}, lambda share: None).result)
+    result = jax.device_get(fidelities.get_fidelity("steady").run(robot, conditions, {}, lambda share: None).result)
     drawn = np.random.default_rng(seed)
     written = {key: value for key, value in columns.items() if key != "configuration"}
     for c in robot.channels:
@@ -504,9 +504,9 @@ def test_parameters_of_a_rig_say_where_they_come_from(tmp_path):
 
 
 def test_the_packaged_robots_parameters_keep_their_sources(tmp_path):
-    specs = {p.name: p.spec for p in params.walk(nominal())}
+    specs = {p.name: p.spec for p in params.walk_parameters(nominal())}
     assert "eq. (15)" in specs["motor.resistance"].meaning
-    own_specs = {p.name: p.spec for p in params.walk(robot_file.read(of_kind(tmp_path, "bench")))}
+    own_specs = {p.name: p.spec for p in params.walk_parameters(robot_file.read(of_kind(tmp_path, "bench")))}
     assert "eq." not in own_specs["motor.resistance"].meaning
     assert (
         own_specs["motor.resistance"].source == params.STATED and own_specs["motor.inertia"].source == params.DEFAULT

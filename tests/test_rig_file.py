@@ -130,7 +130,7 @@ def test_bench_is_what_its_file_states(tmp_path):
         ("bench.loss_coulomb", 0.1, 0.05),
     )
     zero = ("motor.friction_coulomb", "motor.friction_viscous", "gearbox.friction_coulomb", "bench.loss_viscous")
-    known = {p.name: float(p.value) for p in params.walk(robot)}
+    known = {p.name: float(p.value) for p in params.walk_parameters(robot)}
     assert [known[name] for name in zero] == [0.0] * 4 and known["bench.radius"] == 1.0
     assert robot.gearbox.torque_limit is None and robot.motor.speed_limit > 1e8
 

@@ -89,13 +89,13 @@ def test_the_speed_at_which_a_run_begins_moves_with_the_robot(tmp_path):
     robot, times = robot_file.load(str(path)), jnp.array([0.0, 0.1, 0.2])
     given = Conditions(motor_speed=100.0, motor_acceleration=0.0)
     names = ("cart.radius", "gearbox.ratio")
-    values = {p.name: float(p.value) for p in params.walk(robot) if p.name in names}
+    values = {p.name: float(p.value) for p in params.walk_parameters(robot) if p.name in names}
 
     @jax.jit
     def slopes(shares):
         def speed(shares):
             changed = {name: values[name] * share for name, share in zip(names, shares, strict=True)}
-            found = integrator.histories(params.replace(robot, changed), given, times).speed
+            found = integrator.history_signals(params.replace(robot, changed), given, times).speed
             return found, found
 
         return jax.jacfwd(speed, has_aux=True)(shares)
@@ -124,7 +124,7 @@ def test_readings_without_a_sign_are_refused_unless_the_file_says_so(tmp_path, l
     robot, t = robot_file.load(str(path)), np.arange(0, 2, 0.02)
     way = np.where(t < 1, 1.0, -1.0)
     driven = {"supply_voltage_V": 12.0, "duty": way / 2} if duty else {"supply_voltage_V": 6 * way}
-    columns = {"time_s": t, **driven, channels.find(shown).column: np.abs(way)}
+    columns = {"time_s": t, **driven, channels.find_channel(shown).column: np.abs(way)}
     cells = np.stack(np.broadcast_arrays(*columns.values()), 1)
     np.savetxt(tmp_path / "log.csv", cells, delimiter=",", header=",".join(columns), comments="")
     runs = records.read(tmp_path / "log.csv", robot=robot)
@@ -290,7 +290,9 @@ def test_curves_of_a_drive_that_reverses_count_along_its_travel(tmp_path):
                 seen += 1
     assert seen >= 2
     curve = UNNAMED["curve_track_speed_motor"](amplitude=1.0, y1=2.0, y3=-1.0)
-    term = jax.jit(lambda speed: curve.term(robot, balances.begin(robot, Conditions(0), State(0.0, speed, 0.0, 0.0))))
+    term = jax.jit(
+        lambda speed: curve.term(robot, balances.begin_signals(robot, Conditions(0), State(0.0, speed, 0.0, 0.0)))
+    )
     ahead, back = (float(term(way * 300.0)) for way in (1, -1))
     assert ahead == pytest.approx(-back) and abs(ahead) > 0.1
 
@@ -496,9 +498,9 @@ def test_a_jump_of_the_voltage_is_exact_in_every_step(tmp_path):
 
     def of(resistance):
         changed = params.replace(robot, {"motor.resistance": resistance})
-        steps = integrator.within(changed, driven, times)
+        steps = integrator.course_between_instants(changed, driven, times)
         currents = tuple(x.current for x in (steps.first, steps.begin, steps.end))
-        between = integrator.Within.read((*currents, steps.decays), jnp.array([0.5, 0.5, 0.4, 0.5, 0.5]))
+        between = integrator.StepCourse.read((*currents, steps.decays), jnp.array([0.5, 0.5, 0.4, 0.5, 0.5]))
         found = jnp.append(steps.first.current, between[2])
         return found[1:], found[1:]
 
@@ -521,16 +523,16 @@ def through_rest(tmp_path_factory):
     path.write_text(DRIVE.format(imposed="voltage", channels='"motor_current", "motor_speed"', start="rest") + BENCH)
     robot = robot_file.read(path)
     every = np.arange(0, 1.2, 0.02)
-    values = {p.name: float(p.value) for p in params.walk(robot)}
+    values = {p.name: float(p.value) for p in params.walk_parameters(robot)}
 
     def speeds(longest):
-        times = integrator.grid(every, longest=longest)
+        times = integrator.time_grid(every, longest=longest)
         volts = 6.0 * np.where(np.sin(2 * np.pi * (1.3 * times + 0.4 * times**2)) >= 0, 1.0, -1.0)
         held = Conditions(voltage=volts)
 
         def of(shares):
             changed = {name: values[name] * (1 + share) for name, share in zip(THROUGH_REST, shares, strict=True)}
-            found = integrator.histories(params.replace(robot, changed), held, jnp.asarray(times))
+            found = integrator.history_signals(params.replace(robot, changed), held, jnp.asarray(times))
             return found.speed_motor[np.searchsorted(times, every)]
 
         return of

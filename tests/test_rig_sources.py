@@ -38,7 +38,7 @@ def values(text, tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text(text, encoding="utf-8")
     robot = robot_file.read(path)
-    numbers = {"sides": float(robot.sides), **{p.name: float(p.value) for p in params.walk(robot)}}
+    numbers = {"sides": float(robot.sides), **{p.name: float(p.value) for p in params.walk_parameters(robot)}}
     return numbers, {name: sd for name, _, sd in robot.rig.priors}
 
 

@@ -37,7 +37,7 @@ DRIVE = {
 
 def rig(load, *, sides=1.0, **stated):
     """A rig from nothing with one load, with its channels."""
-    robot = paper_robots.blank(Configurations({"rig": load}), sides, Rig(**stated))
+    robot = paper_robots.blank_robot(Configurations({"rig": load}), sides, Rig(**stated))
     return params.replace(robot, DRIVE)
 
 

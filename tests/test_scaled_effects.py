@@ -17,7 +17,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import discover, scales
 from mmrjax import effects
-from mmrjax.effects.scaled import amplitude_of, scaled, shape_of
+from mmrjax.effects.scaled import amplitude_of, scaled_effect, shape_of
 from mmrjax.model import params
 from mmrjax.model.quantities import RPM
 from sweeps.commands import rig_new
@@ -73,12 +73,17 @@ def test_every_effect_of_a_rigs_size_is_read_again_as_it_was_written(tmp_path, k
         robot_file.write(whole, tmp_path / "robot.toml")
         again = robot_file.read(tmp_path / "robot.toml")
         assert eqx.tree_equal(whole.effects, again.effects)
-        specs = [{p.name: p.spec for p in params.walk(r) if p.name.startswith("effects.")} for r in (whole, again)]
+        specs = [
+            {p.name: p.spec for p in params.walk_parameters(r) if p.name.startswith("effects.")}
+            for r in (whole, again)
+        ]
         assert specs[0] == specs[1]
         assert eqx.tree_equal(pickle.loads(pickle.dumps(again)), again)
-        plain = {p.name: p.spec.bounds for name in library for p in params.walk(effects.BY_NAME[name]())}
+        plain = {p.name: p.spec.bounds for name in library for p in params.walk_parameters(effects.BY_NAME[name]())}
         off_library += sum(
-            plain[p.name.rpartition(".")[2]] != p.spec.bounds for p in params.walk(again) if "effects." in p.name
+            plain[p.name.rpartition(".")[2]] != p.spec.bounds
+            for p in params.walk_parameters(again)
+            if "effects." in p.name
         )
     assert off_library  # else there would be nothing to state
 
@@ -88,7 +93,7 @@ def test_effects_of_turns_of_a_rigs_size_are_read_again_as_they_were_written(tmp
     """The loop writes them into the robot of a table of turns, which every command takes."""
     robot, *_ = rig("wheeled", "voltage", tmp_path)
     beside = effects.OF_TURNS | effects.OF_CHANNELS
-    library = {name: scaled(kind, (3.0, 1.0, 2.0)) for name, kind in beside.items()}
+    library = {name: scaled_effect(kind, (3.0, 1.0, 2.0)) for name, kind in beside.items()}
     whole = with_all(robot, library, 0.5)
     robot_file.write(whole, tmp_path / "robot.toml")
     assert library and eqx.tree_equal(whole.effects, robot_file.read(tmp_path / "robot.toml").effects)
@@ -159,7 +164,11 @@ def test_a_motor_that_states_what_it_bears_is_judged_by_that(tmp_path):
 
 def test_one_class_for_the_same_factors():
     kind = effects.BY_NAME["churning"]
-    assert scaled(kind, (2.0, 1.0, 2.0)) is scaled(kind, (2.0, 1.0, 2.0)) is not scaled(kind, (3.0, 1.0, 3.0))
+    assert (
+        scaled_effect(kind, (2.0, 1.0, 2.0))
+        is scaled_effect(kind, (2.0, 1.0, 2.0))
+        is not scaled_effect(kind, (3.0, 1.0, 3.0))
+    )
 
 
 @pytest.mark.parametrize("stated", ["3", "[1, 2]", "[1, 2, 0]", '[1, 2, "x"]'])

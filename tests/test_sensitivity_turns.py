@@ -87,7 +87,7 @@ def test_radius_of_a_run_and_its_derivative():
 
     found = mm.simulate(ROBOT, asked).reading
     moves = np.hypot(found["speed"], found["lateral_speed"])
-    at = next(p.value for p in params.walk(ROBOT) if p.name == "6T2A.turning.lateral")
+    at = next(p.value for p in params.walk_parameters(ROBOT) if p.name == "6T2A.turning.lateral")
     assert float(of(jnp.asarray(at))) == pytest.approx(float(moves / found["yaw_rate"]), rel=1e-9)
     exact = jax.jit(jax.grad(of))(jnp.asarray(at))
     jitted = jax.jit(of)

@@ -59,7 +59,7 @@ def test_estimates_are_right_on_average(share):
 
 
 def test_both_parts_of_the_noise_add_as_squares():
-    mixed = series_noise.SeriesNoise(channels.find("total_current"), 0.03, 0.04, 7.4, "slope_deg", 4)
+    mixed = series_noise.SeriesNoise(channels.find_channel("total_current"), 0.03, 0.04, 7.4, "slope_deg", 4)
     np.testing.assert_allclose(mixed.sd(np.array([0.0, 1.0])), [0.03, 0.05])
 
 
@@ -99,11 +99,11 @@ def test_a_display_shows_nothing_finer_than_its_step():
 
 def test_a_coarse_display_with_few_readings_has_a_floor():
     """With 0.1, 0.2 and 0.4 A the smallest reading would else have the largest weight by far."""
-    current = channels.find("total_current")
+    current = channels.find_channel("total_current")
     assert display_step(np.array([0.1, 0.2, 0.4, 0.4, 0.1]), current) == pytest.approx(0.1)
     assert display_step(np.array([0.137, 0.2242, 0.41, 0.433]), current) < 1e-3
     levels = np.array([1000.0, 2000.0, 3000.0]) * channels.RPM
-    assert display_step(levels, channels.find("motor_speed")) == pytest.approx(100 * channels.RPM)
+    assert display_step(levels, channels.find_channel("motor_speed")) == pytest.approx(100 * channels.RPM)
 
 
 def test_rows_without_series_are_assumed_as_usual_and_stated_ones_stay():
@@ -118,7 +118,7 @@ def test_rows_without_series_are_assumed_as_usual_and_stated_ones_stay():
     assert known.source == ("assumed", "assumed", "no readings") and known.word == "assumed"
     assert np.all(np.isinf(known.freedom))
     assert mine.source == ("stated", "series", "no readings") and mine.word == "estimated"
-    assert channels.names(mine.silent) == ("motor_speed",)
+    assert channels.channel_names(mine.silent) == ("motor_speed",)
     np.testing.assert_allclose(mine.sd[:, 0], 0.2)
     assert mine.freedom[1] == mine.along_series[0].freedom
 

@@ -174,8 +174,8 @@ def test_paper_parts_make_the_papers_robot(robot, asked):
     x = np.log([[48.0, float(robot.chassis(0).radius), 1.0]])
     design = jax.tree.map(lambda v: v[0], choice.designs(np.array([row]), x))
     made, _ = build_robot(of.robot, of.base_mass, of.configuration, design)
-    own = {p.name: float(p.value) for p in params.walk(robot)}
-    other = {p.name: float(p.value) for p in params.walk(made)}
+    own = {p.name: float(p.value) for p in params.walk_parameters(robot)}
+    other = {p.name: float(p.value) for p in params.walk_parameters(made)}
     assert {n for n in own if not math.isclose(own[n], other[n], rel_tol=1e-9)} == set()
 
 

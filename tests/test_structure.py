@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 
 import pytest
 
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.model import channels
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -223,7 +223,7 @@ def channels_are_counted_in_one_place(path: PurePosixPath, tree: ast.Module) -> 
     """No literal outside the table of channels spells two or more of them."""
     if path.parts[0] == "mmrjax" or path.parts[:2] == REPRODUCTION:
         return
-    spelled = {word: c.name for c in channels.usual() for word in (c.name, c.column, c.sd_column)}
+    spelled = {word: c.name for c in channels.usual_channels() for word in (c.name, c.column, c.sd_column)}
     place, inner = places(tree), set()
     for node in walked(tree):
         if id(node) in inner or not isinstance(node, ast.Tuple | ast.List | ast.Set | ast.Dict):
@@ -290,8 +290,8 @@ def front_door_fits_nothing(path: PurePosixPath, tree: ast.Module) -> Iterator[B
 KEPT = {
     ("mmrjax/__init__.py", "globals"): "a public name, once it is imported",
     ("mmrjax/undercarriage/mjcf.py", "_template"): "pure: the topology of the track model",
-    ("mmrjax/effects/scaled.py", "scaled"): "pure: a class of a class and its factors",
-    ("mmrjax/model/params.py", "own_spec"): "pure, of hashable arguments",
+    ("mmrjax/effects/scaled.py", "scaled_effect"): "pure: a class of a class and its factors",
+    ("mmrjax/model/params.py", "rig_spec"): "pure, of hashable arguments",
     ("calibration/data/effect_file.py", "_instants"): "pure: signals of the nominal robot",
     ("calibration/data/effect_file.py", "sys.modules"): "a user's module, by a name that follows from its path",
     ("calibration/data/parts.py", "motors"): "a packaged table",
@@ -305,7 +305,7 @@ KEPT = {
         "_compiled",
     ): "a worker's compiled job, by its name; computes the same when compiled again",
     ("sweeps/points/cluster.py", "_start"): "where jax keeps programs, once a process",
-    ("mmrjax/compile/programs.py", "sources"): "a hash of the files of this program",
+    ("mmrjax/compile/programs.py", "source_hash"): "a hash of the files of this program",
     ("mmrjax/compile/programs.py", "_linear_algebra"): "lets jax find LAPACK, once a process",
     ("mmrjax/compile/programs.py", "_private"): "that a folder is private, as it is first used",
     ("sweeps/compilation_cache.py", "os.environ"): "set for jax, before it is imported",
@@ -843,8 +843,8 @@ def test_toml_is_read_in_one_place():
 
 
 def test_how_many_of_something_is_said_in_the_singular_where_it_is_one():
-    """By `errors.counted`: what is of a larger number (`3 of {n} rows`), or cannot be one, may have its plural."""
-    assert [counted(n, "row") for n in (0, 1, 2, 2000)] == ["0 rows", "1 row", "2 rows", "2,000 rows"]
+    """By `errors.count_noun`: what is of a larger number (`3 of {n} rows`), or cannot be one, may have its plural."""
+    assert [count_noun(n, "row") for n in (0, 1, 2, 2000)] == ["0 rows", "1 row", "2 rows", "2,000 rows"]
     unless, things = (
         r"(?<!of )(?<!first )(?<!--runs: got )",
         "runs|rows|cells|values|parameters|samples|lines|designs",

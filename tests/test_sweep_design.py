@@ -111,7 +111,7 @@ def test_distribution_is_that_of_scipy(kind, nominal):
 
 
 def test_prior_is_the_one_of_calibrate_and_sensitivity(nominal):
-    found = {p.name: p for p in params.walk(nominal)}
+    found = {p.name: p for p in params.walk_parameters(nominal)}
     name = "6T2A.ground.friction.speed_static"
     assert found[name].spec.relative_sd is not None  # a scale
     u = np.linspace(0.01, 0.99, 99)

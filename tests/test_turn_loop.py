@@ -16,7 +16,7 @@ from calibration.discovery.discover import discover, pose_candidates, prepare_lo
 from calibration.inference import bases as bases_room
 from calibration.inference.observers.turns import TurnLinearization
 from mmrjax import effects
-from mmrjax.effects.curve import weights
+from mmrjax.effects.curve import ordinate_weights
 from mmrjax.model import params
 
 pytestmark = pytest.mark.slow
@@ -103,7 +103,7 @@ def test_column_of_a_curve_is_what_the_curve_does(linear, shown, name):
     ends = {"low": float(x.min()), "high": float(x.max())}
     effect = params.replace(effects.UNNAMED[name](), {n: jnp.asarray(v) for n, v in (ordinates | ends).items()})
 
-    shapes = np.asarray(weights(jnp.asarray(x), ends["low"], ends["high"]))
+    shapes = np.asarray(ordinate_weights(jnp.asarray(x), ends["low"], ends["high"]))
     columns = bases_room.place_signature(linear, balance, way[:, None] * shapes) @ np.array(list(ordinates.values()))
     size = 1e-4 * float(effect.amplitude or 1.0)
     wanted = shown(effect, size)

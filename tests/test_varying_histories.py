@@ -24,7 +24,7 @@ from calibration.inference.linearization import balance_probe
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Histories, settled_ends
 from mmrjax.effects import BY_NAME
-from mmrjax.fidelities.histories import CHANGE, LONGEST, START, grid, histories
+from mmrjax.fidelities.histories import CHANGE, LONGEST, START, history_signals, time_grid
 from mmrjax.missions.mission import mission
 from mmrjax.missions.profile import MODES, profile
 from mmrjax.model import paper_robots, params
@@ -41,7 +41,7 @@ EVERY = 0.02
 SD = {"total_current_A": 0.05, "motor_speed_rpm": 15.0, "speed_mm_s": 4.0}
 #: What the robot that is measured has in place of the nominal values.
 TRUTH = {"motor.resistance": 0.68, "6T2A.track.loss_coulomb": 0.30, "6T2A.ground.rolling_resistance": 0.05}
-NOMINAL = {p.name: float(p.value) for p in params.walk(paper_robots.nominal()) if p.name in TRUTH}
+NOMINAL = {p.name: float(p.value) for p in params.walk_parameters(paper_robots.nominal()) if p.name in TRUTH}
 UNDECLARED = "series_resistance"
 #: Largest difference of a derivative from differences of runs, over its largest.
 DERIVATIVES, DIFFERENCE = 1e-6, 3e-6
@@ -53,7 +53,7 @@ def engine():
 
     @jax.jit
     def course(values, modes, voltage, slope):
-        known = {p.name: p for p in params.walk(paper_robots.nominal())}
+        known = {p.name: p for p in params.walk_parameters(paper_robots.nominal())}
         cold = {"motor.time_constant_winding": jnp.asarray(known["motor.time_constant_winding"].spec.bounds[1])}
         robot = dataclasses.replace(paper_robots.nominal(), effects=(BY_NAME[UNDECLARED](),))
         robot = params.replace(robot, {f"effects.{UNDECLARED}.amplitude": jnp.asarray(0.0), **cold, **values})
@@ -151,27 +151,29 @@ def test_grid_is_fine_after_every_change_and_bounded():
         np.array([0.5, 1.2, 1.21]),
         np.array([2.0, 1.0, 1e-3]),
     )
-    found = grid(times, changes, sizes)
+    found = time_grid(times, changes, sizes)
     step = np.diff(found)
     assert np.isin(times, found).all() and np.isin(changes, found).all() and (step > 0).all()
     assert step.max() <= LONGEST * (1 + 1e-9)
     for begin, first in ((0.0, START[0]), (0.5, CHANGE[0] / 2), (1.2, CHANGE[0])):
         assert 0.5 * first < step[np.searchsorted(found, begin)] <= 1.5 * first
     assert step[np.searchsorted(found, 1.21)] > 0.8 * LONGEST  # after a small one they are long at once
-    np.testing.assert_array_equal(grid(times), grid(times, np.array([0.0, 2.5]), np.ones(2)))  # no change within
-    before = grid(times)
+    np.testing.assert_array_equal(
+        time_grid(times), time_grid(times, np.array([0.0, 2.5]), np.ones(2))
+    )  # no change within
+    before = time_grid(times)
     np.testing.assert_array_equal(found[found < 0.5], before[before < 0.5])
     # one small change a sample takes no more steps than none
     often = np.arange(1, 4000) * 0.005
-    assert len(grid(often, often, np.full(len(often), 0.01))) <= len(grid(often)) + 3
+    assert len(time_grid(often, often, np.full(len(often), 0.01))) <= len(time_grid(often)) + 3
 
 
 @pytest.mark.slow
 def test_constant_values_at_every_instant_are_those_of_a_constant_run():
-    robot, g = paper_robots.nominal(), jnp.asarray(grid(np.arange(0.02, 0.3, 0.02)))
+    robot, g = paper_robots.nominal(), jnp.asarray(time_grid(np.arange(0.02, 0.3, 0.02)))
     one = Conditions(0, 24.0, 5.0, 2.0)
     many = Conditions(0, jnp.full(len(g), 24.0), 5.0, 2.0)
-    a, b = (histories(robot, c, g) for c in (one, many))
+    a, b = (history_signals(robot, c, g) for c in (one, many))
     for name in ("current", "speed_motor", "speed"):
         np.testing.assert_allclose(getattr(b, name), getattr(a, name), rtol=1e-12, atol=1e-15)
 
@@ -191,7 +193,7 @@ def test_runs_are_those_of_missions(simulated):
 @pytest.fixture(scope="module")
 def of_values(observer):
     """Names of parameters, their values, the readings by values, and those of several values, compiled."""
-    known = {p.name: float(p.value) for p in params.walk(paper_robots.nominal())}
+    known = {p.name: float(p.value) for p in params.walk_parameters(paper_robots.nominal())}
     names = [*TRUTH, "motor.inertia", "motor.inductance", "6T2A.ground.friction.static"]
 
     def readings(x):

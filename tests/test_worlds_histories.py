@@ -43,7 +43,7 @@ def package():
     base = params.replace(paper_robots.nominal(), CLIMBING)
     full = dataclasses.replace(base, effects=tuple(BY_NAME[n]() for n in PASSING))
     times = np.arange(round(DURATION / EVERY) + 1) * EVERY
-    every = {p.name: p.value for p in params.walk(full)}
+    every = {p.name: p.value for p in params.walk_parameters(full)}
 
     def read(battery, values=None):
         slope = np.degrees(RUNS.slope)

@@ -174,7 +174,7 @@ def check_units(arrays: NamedArrays, meanings: Sequence[Column | None]) -> None:
             continue
         named = {unit: column for column, unit in meaning.quantity.columns().items()}
         for stated, where in (
-            (quantities.at_the_end(meaning.shown, named), "in its name"),
+            (quantities.unit_at_end(meaning.shown, named), "in its name"),
             (stated_below, f"in {arrays.units_from}"),
         ):
             if stated and stated != meaning.unit:

@@ -223,9 +223,9 @@ def _proposed(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
                 continue
             units = {} if column not in every else every[column].columns()
             stated = (
-                quantities.spelled(signal.unit)
+                quantities.unit_in_column(signal.unit)
                 if signal.unit
-                else quantities.at_the_end(signal.name, set(units.values())) or ""
+                else quantities.unit_at_end(signal.name, set(units.values())) or ""
             )
             mine = next((c for c, u in units.items() if u == stated), column)
             doubt = "" if stated and mine in units and units[mine] == stated else "  # unit not stated: check it"

@@ -16,7 +16,7 @@ from calibration.data import input_files
 from calibration.data.columns import WORDS
 from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays, Raw, number
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.model import channels, quantities
 
 #: Size of a file from which on plain tables are read as arrays at once [bytes].
@@ -52,7 +52,8 @@ def arrays(path: Path, name: str) -> NamedArrays:
     for k, row in enumerate(body, 1):
         if len(row) != len(header):
             raise BadData(
-                f"{name} row {k}: got {counted(len(row), 'cell')}; the header has {counted(len(header), 'column')}"
+                f"{name} row {k}: got {count_noun(len(row), 'cell')}; "
+                f"the header has {count_noun(len(header), 'column')}"
             )
     return NamedArrays(
         name,
@@ -112,7 +113,7 @@ def row_of_units(header: Sequence[str], first: Sequence[str]) -> tuple[str, ...]
     cell of it is a number, or no cell of a column of numbers is a unit."""
     if len(first) != len(header) or any(math.isfinite(number(cell)) for cell in first):
         return ()
-    units = tuple(quantities.spelled(cell.strip("[]()")).strip("-") for cell in first)
+    units = tuple(quantities.unit_in_column(cell.strip("[]()")).strip("-") for cell in first)
     known = {unit for quantity in (*quantities.SET, *channels.EVERY) for unit in quantity.columns().values()} - {""}
     stated = any(unit in known for column, unit in zip(header, units, strict=True) if column not in WORDS)
     return units if stated else ()

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from calibration.data.input_errors import BadConfiguration, BadData, InputError
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 
 #: First bytes of formats that are not read, and what they are (`sources.opening` has those that are).
 BINARY = {
@@ -131,7 +131,7 @@ def toml_content(text: str, where: str | Path, kind: type[InputError] = BadConfi
         inner = value.values() if isinstance(value, dict) else value
         keys += len(value) if isinstance(value, dict) else 0
         if keys > KEYS:
-            raise kind(f"{where}: has more than {counted(KEYS, 'key')}; is it the right file?")
+            raise kind(f"{where}: has more than {count_noun(KEYS, 'key')}; is it the right file?")
         for each in inner:
             if isinstance(each, dict | list):
                 left.append((each, depth + 1))

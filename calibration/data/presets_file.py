@@ -12,7 +12,7 @@ from typing import Any
 
 from calibration.data import input_files
 from calibration.data.columns import Layout
-from calibration.data.input_errors import BadConfiguration, choices, parsed, stated_number
+from calibration.data.input_errors import BadConfiguration, allowed_words, parsed, stated_number
 from mmrjax.model import channels
 
 #: Presets that come with the package, in `calibration/data/presets/`.
@@ -114,7 +114,7 @@ def find(stated: str | Path) -> Preset:
     path = Path(name)
     if not path.exists():
         raise BadConfiguration(
-            f"--columns: got {name}; no such file and no packaged preset; {choices(name, PACKAGED)}"
+            f"--columns: got {name}; no such file and no packaged preset; {allowed_words(name, PACKAGED)}"
         )
     return read(input_files.toml_text(path, path.name), path.name, given)
 
@@ -161,7 +161,7 @@ def read(text: str, where: str, given: Mapping[str, float]) -> Preset:
 def _parsed(content: Mapping[str, Any], where: str, given: Mapping[str, float]) -> Preset:
     for key in content:
         if key not in KEYS:
-            raise BadConfiguration(f"{where}: got the key {key}; {choices(key, KEYS)}")
+            raise BadConfiguration(f"{where}: got the key {key}; {allowed_words(key, KEYS)}")
     numbers = _numbers(content.get("ask", {}), where, given)
     header = _texts(content.get("header", []), f"{where}, header")
     columns = content.get("columns", {})
@@ -171,7 +171,7 @@ def _parsed(content: Mapping[str, Any], where: str, given: Mapping[str, float]) 
     known, found = layout.spellings(), []
     for mine, theirs in columns.items():
         if mine not in known:
-            listed = choices(mine, known, shown=layout.known())
+            listed = allowed_words(mine, known, shown=layout.known())
             raise BadConfiguration(
                 f"{where}, columns.{mine}: no such column of a table; {listed}; also in other units"
             )
@@ -185,7 +185,7 @@ def _numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[str, fl
         raise BadConfiguration(f"{where}, ask: got {asked!r}; expected a table")
     for key in given:
         if key not in asked:
-            listed = choices(key, asked) if asked else "it asks for no number"
+            listed = allowed_words(key, asked) if asked else "it asks for no number"
             raise BadConfiguration(f"--columns {where}: got {key}; {listed}")
     found: dict[str, float] = {}
     for key, stated in asked.items():
@@ -211,7 +211,7 @@ def _column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) ->
     table = theirs if isinstance(theirs, dict) else {"column": theirs}
     for key in table:
         if key not in KEYS_OF_COLUMN:
-            raise BadConfiguration(f"{where}: got the key {key}; {choices(key, KEYS_OF_COLUMN)}")
+            raise BadConfiguration(f"{where}: got the key {key}; {allowed_words(key, KEYS_OF_COLUMN)}")
     stated = table.get("column")
     names = _texts([stated] if isinstance(stated, str) else stated, f"{where}.column", form)
     factor = stated_number(table.get("factor", 1.0), f"{where}.factor")
@@ -220,7 +220,7 @@ def _column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) ->
             if table[key] not in numbers:
                 raise BadConfiguration(
                     f"{where}.{key}: got {table[key]}; expected a number that [ask] names; "
-                    f"{choices(str(table[key]), numbers)}"
+                    f"{allowed_words(str(table[key]), numbers)}"
                 )
             value = numbers[table[key]]
             if key == "per" and not value:

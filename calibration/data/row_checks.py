@@ -313,6 +313,6 @@ def drives(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterato
 
 def shows_magnitude(name: str, instrument: Instrument) -> str:
     return (
-        f"{name}: {channels.find(instrument.channel).column} is positive where its side is driven backward; it is "
-        "taken to show magnitude alone, and magnitudes are compared"
+        f"{name}: {channels.find_channel(instrument.channel).column} is positive where its side is driven "
+        "backward; it is taken to show magnitude alone, and magnitudes are compared"
     )

@@ -13,7 +13,7 @@ from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.named_arrays import texts
 from calibration.data.sources import reading
 from mmrjax.climbing import terrain
-from mmrjax.climbing.climb_simulation import ON_GROUND, Sequence, clearance
+from mmrjax.climbing.climb_simulation import ON_GROUND, Sequence, roller_clearance
 from mmrjax.climbing.terrain import Terrain
 from mmrjax.model.robot import Robot
 
@@ -150,7 +150,7 @@ def below(robot: Robot, angle: float) -> str:
     """Why levers cannot begin at an angle [deg] on level ground; empty where they can."""
     gear = robot.running_gear
     axle = robot.radius_pulley + gear.grouser_height
-    above = float(clearance(axle, gear, jnp.radians(angle)))
+    above = float(roller_clearance(axle, gear, jnp.radians(angle)))
     if above >= -ON_GROUND:
         return ""
     least = -float(np.degrees(np.arcsin((axle - gear.levers.roller) / gear.lever_length)))

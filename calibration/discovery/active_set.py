@@ -88,7 +88,7 @@ def _parts(space: ActiveSet, z: Array) -> tuple[Array, tuple[Array, ...], tuple[
     held = space.held()
     amplitudes = space.sd * (amplitude @ held)
     shapes = shape_at(space.scales, shape @ held)
-    return base, params.one_by_one(amplitudes), params.one_by_one(shapes)
+    return base, params.split_numbers(amplitudes), params.split_numbers(shapes)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -258,6 +258,6 @@ def candidate_space(
     )
     have = {e.name for e in bare.base.effects}
     more = tuple(library[e.name]() for e in effects if e.name not in have)
-    robot = params.strong(dataclasses.replace(bare.base, effects=(*bare.base.effects, *more)))
+    robot = params.without_weak_types(dataclasses.replace(bare.base, effects=(*bare.base.effects, *more)))
     data = dataclasses.replace(bare.data, centre=jnp.zeros(len(coordinates)))
     return CandidateSpace(bare, Problem(robot, coordinates, bare.observe, data), scored_library(effects))

@@ -109,7 +109,7 @@ from calibration.inference.residual_clusters import residual_clusters
 from mmrjax import effects
 from mmrjax.compile.precision import SINGLE, Threads, in_double, is_double
 from mmrjax.effects import Effect
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.model import channels
 from mmrjax.model.robot import Robot
 
@@ -187,7 +187,7 @@ def discover(
     space = pose_candidates(distinct, ready.robot, known.sd, ready.settings, ready.stated, ready.library)
     with compile_ahead(space, functools.partial(bases_at_fit, distinct), ready.settings) as later:
         traced, notes = keep("verdict", lambda: ready.trace(progress=tell, later=later, keep=keep)), ready.notes
-    silent = channels.names(known.silent)
+    silent = channels.channel_names(known.silent)
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
     others = Threads(2, kept.BESIDE)
@@ -218,7 +218,7 @@ def discover(
         notes = (Outstanding(tuple(outstanding), known.word), *notes)
     assumed = [c for c in known.silent if c not in {s.channel for s in known.along_series}]
     if assumed:
-        notes = (*notes, AssumedNoise(channels.names(assumed), noise_room.default_noise(assumed)))
+        notes = (*notes, AssumedNoise(channels.channel_names(assumed), noise_room.default_noise(assumed)))
     if known.along_series:
         notes = (*notes, NoiseFromSeries(known.along_series))
     return dataclasses.replace(found, remarks=(*notes, *found.remarks), sensitivity=tuple(sensitivity))
@@ -285,7 +285,7 @@ def prepare_loop(
     kind = observers.observer_kind(distinct)
     if len(distinct) < kind.fewest:
         raise BadData(
-            f"{runs.source}: {counted(len(distinct), kind.word)} cannot show what a model lacks; at least "
+            f"{runs.source}: {count_noun(len(distinct), kind.word)} cannot show what a model lacks; at least "
             f"{kind.fewest} are needed"
         )
     ready = preparation.prepare(distinct, robot, noise, stated)
@@ -1164,7 +1164,7 @@ def _noise(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str
         share = 100 * noise.sd / np.maximum(kind.sizes(runs), 1e-12)
     return {
         name: {"source": noise.source[k], "median_percent": float(np.nanmedian(share[:, k]))}
-        for k, name in enumerate(channels.names(noise.channels))
+        for k, name in enumerate(channels.channel_names(noise.channels))
         if noise.source[k] != "no readings"
     }
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from calibration.discovery.active_set import CandidateSpace
 from calibration.inference.observers import Observer
 from mmrjax.compile.compiling import SELDOM, compiled
-from mmrjax.model.energy import sinks
+from mmrjax.model.energy import sink_powers
 from mmrjax.model.robot import Robot
 
 #: The sink of `energy.SINKS` that contains the whole power of a balance.
@@ -59,5 +59,5 @@ def _dissipated_power(observe: Observer, robot: Robot) -> Float[Array, "balances
     signals = observe.operating(robot)
     if signals is None:
         return None
-    power = jax.vmap(lambda run, at: sinks(robot, run, at))(observe.conditions, signals)
+    power = jax.vmap(lambda run, at: sink_powers(robot, run, at))(observe.conditions, signals)
     return jnp.stack([jnp.asarray(power[name], float) for name in SINK.values()])

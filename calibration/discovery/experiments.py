@@ -48,7 +48,7 @@ from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.fidelities.steady import IMPLICIT
 from mmrjax.model import channels
 from mmrjax.model.robot import Robot
-from mmrjax.numerics.linear_equations import half_solved
+from mmrjax.numerics.linear_equations import solve_lower
 from mmrjax.numerics.newton import implicit_slopes
 
 #: Alternatives are predicted in batches of a multiple of this, so that most classes share compiled programs.
@@ -208,7 +208,7 @@ def _predicted(
             jnp.concatenate([wide, jnp.zeros(unknowns.shape[1])])
         )
         slopes = predicted.arrange_readings(batch, [a[:, : wide.size] for a in acts], implicit_slopes(every, left))
-        half = jnp.concatenate([half_solved(informed.T @ informed, slopes[:, : z.size].T).T, slopes[:, z.size :]], 1)
+        half = jnp.concatenate([solve_lower(informed.T @ informed, slopes[:, : z.size].T).T, slopes[:, z.size :]], 1)
         exists = found.exists & jnp.all(jnp.isfinite(half), 1) & jnp.isfinite(found.value)
         return dataclasses.replace(found, exists=exists), half
 
@@ -236,7 +236,7 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], set
     z = jnp.asarray(np.stack([c.z for c in those]))
     informed = jnp.stack([_informed(equipped, c, mine) for c, mine in zip(those, indices, strict=True)])
     within = reach_of_space(space, space.bare.robot(jnp.asarray(those[0].z[: space.free])))
-    everything, shown = menu.experiment_menu(within), channels.names(space.bare.channels)
+    everything, shown = menu.experiment_menu(within), channels.channel_names(space.bare.channels)
     found, half = jax.device_get(
         _predicted(equipped, other, predicted.batch_experiments(everything, shown), active, z, informed)
     )

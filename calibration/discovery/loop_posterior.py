@@ -42,7 +42,7 @@ def posterior_of_curve(space: CandidateSpace, active: tuple[str, ...], curve: Di
     turn = np.eye(len(shaped))
     turn[inner:, inner:] = np.asarray(shaped.root)
     base, kept = _parts(shaped.base, space, active, curve.z[:inner])
-    spec = {p.name: p.spec for p in params.walk(curve.problem.base)}
+    spec = {p.name: p.spec for p in params.walk_parameters(curve.problem.base)}
     ordinates = _clipped_parameters(
         shaped.names, [spec[n] for n in shaped.names], np.asarray(shaped.root) @ curve.z[inner:]
     )

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.discovery import setups
 from calibration.discovery.loop_notes import Heat, Overspeed, Overvoltage, Watch
 from calibration.discovery.reach import SLOPE, Reach, Used
@@ -161,7 +161,9 @@ def _weighed(robot: Robot, at: Array) -> Array:
     still = State(*(jnp.zeros(()),) * 4)
     stated = setups.without(robot, "mass")
     loads = [Conditions(configuration=k.astype(int), payload=m) for k, m in at]
-    return jnp.stack([balances.begin(robot, c, still).mass - balances.begin(stated, c, still).mass for c in loads])
+    return jnp.stack(
+        [balances.begin_signals(robot, c, still).mass - balances.begin_signals(stated, c, still).mass for c in loads]
+    )
 
 
 def _show(robot: Robot, channel: str, signals: Sequence[Signals]) -> Array:
@@ -209,7 +211,7 @@ def calibration_acts(reach: Reach) -> tuple[Act, ...]:
     timing = Act("timing", ("timing",), _timed, _one_tuple_each(paces), 3e-3)
     acts = [weighing] * reach.has_ground
     acts += ammeter * ("total_current" in reach.measured)
-    meters = [c for c in channels.rows(reach.measured) if c.misses_zero]
+    meters = [c for c in channels.channels_named(reach.measured) if c.misses_zero]
     acts += [
         Act(f"zero of {c.label}", ("zero reading",), _Zero(c.name), ((0.0,),), None, channel=c.name) for c in meters
     ]
@@ -380,7 +382,9 @@ def check_forbidden(forbidden: Sequence[str], robot: Robot) -> None:
     allowed = (*KINDS, *robot.configurations)
     for name in forbidden:
         if name not in allowed:
-            raise BadConfiguration(f"--forbid {name}: no such experiment or configuration; {choices(name, allowed)}")
+            raise BadConfiguration(
+                f"--forbid {name}: no such experiment or configuration; {allowed_words(name, allowed)}"
+            )
 
 
 # --- possible experiments -----------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from mmrjax.fidelities.steady import IMPLICIT
 from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
-from mmrjax.model.signals import STALLED, done
+from mmrjax.model.signals import STALLED, is_done
 
 T = TypeVar("T")
 #: Mass of a robot on stands [kg]: nearly zero, but its ratio to the load is defined.
@@ -127,9 +127,9 @@ def predict_readings(
     there, (runs, unknowns); and all predictions."""
     acts = tuple(act(robot, at) for act, at in zip(experiments.acts, experiments.at, strict=True))
     result, _, left = map_over_runs(IMPLICIT.shown, robot, experiments, unknowns, found)
-    every = jnp.stack([result.reading[c] for c in channels.names(robot.channels)], -1)
+    every = jnp.stack([result.reading[c] for c in channels.channel_names(robot.channels)], -1)
     held = np.array([experiments.set_up[k][0] is setups.blocked for k in experiments.which])
-    does = jnp.where(jnp.asarray(held), result.status == STALLED, done(result.status))
+    does = jnp.where(jnp.asarray(held), result.status == STALLED, is_done(result.status))
     exists = arrange_readings(
         experiments, [jnp.ones(a.shape, bool) for a in acts], jnp.broadcast_to(does[:, None], every.shape)
     )

@@ -144,5 +144,5 @@ def reach_of_table(robot: Robot, conditions: Conditions, measured: tuple[str, ..
 def reach_of_space(space: CandidateSpace, robot: Robot | None = None) -> Reach:
     """Limits of the next experiments with the robot of a space, or with a fitted one if given."""
     weight = space.weight
-    measured = tuple(c for k, c in enumerate(channels.names(space.bare.channels)) if weight[:, k].any())
+    measured = tuple(c for k, c in enumerate(channels.channel_names(space.bare.channels)) if weight[:, k].any())
     return reach_of_table(space.bare.base if robot is None else robot, space.bare.observe.driven, measured)

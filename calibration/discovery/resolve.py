@@ -144,7 +144,10 @@ def resolve(
 def _noise(found: DiscoveryResult, stated: str | None) -> str | None:
     """Option `noise` of `calibrate` for the loop's sds."""
     assumed = [name for name, about in found.noise.items() if about["source"] == "assumed"]
-    return ",".join(part for part in (stated, noise_room.default_noise(channels.rows(assumed))) if part) or None
+    return (
+        ",".join(part for part in (stated, noise_room.default_noise(channels.channels_named(assumed))) if part)
+        or None
+    )
 
 
 def _slip_rms(fitted: CalibrationResult, robot: Robot) -> float:

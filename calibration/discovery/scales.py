@@ -26,10 +26,10 @@ from calibration.discovery.reach import LOADED, RUNNING
 from mmrjax.compile.compiling import OVER_TIME, compiled
 from mmrjax.compile.precision import in_double
 from mmrjax.effects import Effect
-from mmrjax.effects.scaled import amplitude_of, scaled, shape_of
-from mmrjax.fidelities.steady import operating_signals, shown_batch
+from mmrjax.effects.scaled import amplitude_of, scaled_effect, shape_of
+from mmrjax.fidelities.steady import operating_signals, results_of_rows
 from mmrjax.model import channels, paper_robots, params
-from mmrjax.model.balances import BALANCES, absent, added
+from mmrjax.model.balances import BALANCES, absent_balances, effects_sum
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
@@ -128,7 +128,7 @@ def _at_position(signals: Signals, kind: type[Effect], turned: float | None = No
 
 def effect_applies(kind: type[Effect], robot: Robot) -> bool:
     """True if a rig has the balance that an effect enters, and the parts that it needs there."""
-    if kind.balance in absent(robot) or (not robot.has_ground and (kind.movers or kind.needs_belt)):
+    if kind.balance in absent_balances(robot) or (not robot.has_ground and (kind.movers or kind.needs_belt)):
         return False
     if kind.driver == "position" and not set(PLACED) & set(robot.rig.channels):
         return False
@@ -141,7 +141,7 @@ def _steady(robot: Robot, conditions: Conditions) -> Conditions:
 
 
 def _signals(robot: Robot, conditions: Conditions) -> Signals:
-    return shown_batch(robot, conditions)[1] if conditions.turns else _travelling(robot, conditions)
+    return results_of_rows(robot, conditions)[1] if conditions.turns else _travelling(robot, conditions)
 
 
 @functools.partial(compiled, options=OVER_TIME)
@@ -152,7 +152,7 @@ def _travelling(robot: Robot, conditions: Conditions) -> Signals:
 @functools.cache
 def _nominal() -> tuple[Robot, Signals]:
     """The nominal robot and its signals over Table 8."""
-    robot = params.strong(paper_robots.nominal())
+    robot = params.without_weak_types(paper_robots.nominal())
     axes = np.meshgrid(
         paper_robots.VOLTAGES_V, paper_robots.SLOPES_DEG, paper_robots.PAYLOADS_KG, (0, 1), indexing="ij"
     )
@@ -201,7 +201,7 @@ def _scale_effect(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple
     else:
         low, high = amplitude_of(grown).spec.bounds
         limits = min(factor, MOST_OFF / (max(-low, high) * _unit_share(grown, *mine)))
-    return scaled(kind, (float(factor), float(stretch), float(limits)))
+    return scaled_effect(kind, (float(factor), float(stretch), float(limits)))
 
 
 def _at_rated_load(robot: Robot, signals: Signals) -> Signals:
@@ -230,7 +230,7 @@ def _unit_share(effect: Effect, robot: Robot, signals: Signals) -> float:
     def share(s: Signals) -> tuple[jax.Array, jax.Array]:
         shown = next((c.read(robot, s) for c in channels.EVERY if c.name == effect.channel), None)
         whole = WHOLE[effect.balance](robot, s) if shown is None else shown
-        return jnp.asarray(added(alone, s, effect.balance, effect.channel), float), jnp.asarray(whole, float)
+        return jnp.asarray(effects_sum(alone, s, effect.balance, effect.channel), float), jnp.asarray(whole, float)
 
     term, total = jax.vmap(share)(signals)
     return _size(term) / _size(total)

@@ -25,7 +25,7 @@ from calibration.inference.optimizers import CORES, with_roots
 from calibration.inference.problem import Problem
 from mmrjax.compile.compiling import SELDOM, SMALL, compiled
 from mmrjax.compile.precision import Threads
-from mmrjax.numerics.linear_equations import half_solved
+from mmrjax.numerics.linear_equations import solve_lower
 
 #: Share of a signature's norm below which the free parameters absorb it completely.
 ABSORBED = 1e-3
@@ -82,7 +82,7 @@ class Fit(eqx.Module):
         """Factors of a linearisation."""
         jacobian, e, readings = linear.jacobian, linear.residual, linear.readings
         asked = jnp.concatenate([jacobian[:readings].T, (jacobian.T @ e)[:, None]], 1)
-        solved = half_solved(jacobian.T @ jacobian, asked)
+        solved = solve_lower(jacobian.T @ jacobian, asked)
         half, step = solved[:, :-1], solved[:, -1]
         return Fit(half, step, e[:readings] - half.T @ step)
 
@@ -130,7 +130,7 @@ def _curve_score(fit: Fit, columns: Array) -> tuple[Array, Array]:
     products = products * scale[:, None] * scale
     dots = dots * scale
     asked = jnp.concatenate([dots[:, None], jnp.eye(dots.size)], 1)
-    half = half_solved(products + jnp.eye(dots.size), asked)
+    half = solve_lower(products + jnp.eye(dots.size), asked)
     explained = jnp.sum(half[:, 0] ** 2)
     # E = tr(A (A + I)⁻¹) under the null: degrees of freedom.
     freedom = dots.size - jnp.sum(half[:, 1:] ** 2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.inference.observers import Observer
 
 #: Family-wise error of the test for a missing effect, divided among the kinds of evidence: single effects, curves,
@@ -113,6 +113,6 @@ def settings_for(kind: type[Observer], replicates: int = 500, seed: int = 0, pre
         BadConfiguration: `prefer` is not one of `PREFERENCES`.
     """
     if prefer not in PREFERENCES:
-        raise BadConfiguration(f"--prefer: got {prefer}; {choices(prefer, PREFERENCES)}")
+        raise BadConfiguration(f"--prefer: got {prefer}; {allowed_words(prefer, PREFERENCES)}")
     shares = dict(zip(kind.evidence, SHARES[kind.evidence], strict=True))
     return Settings(shares, replicates=replicates, seed=seed, prefer=prefer)

@@ -14,7 +14,7 @@ from calibration.discovery.projection import Projection
 from calibration.inference.bases import ORDERS, place_signature, scale_to_unit_range, window_from_name
 from calibration.inference.linearization import Linearization
 from mmrjax.compile.compiling import compiled
-from mmrjax.effects.curve import ORDINATES, weights
+from mmrjax.effects.curve import ORDINATES, ordinate_weights
 
 #: Priors of the ordinates that are tried: correlation lengths [spacings], sizes [σ by an ordinate].
 LENGTHS, SIZES = (1.0, 1.5, 2.5, 4.0), tuple(np.geomspace(0.3, 300.0, 25))
@@ -84,7 +84,7 @@ def _basis(variable: str, x: np.ndarray, low: float, high: float) -> np.ndarray:
     return np.asarray(_weights(np.asarray(x), np.asarray(low), np.asarray(high)))
 
 
-_weights: Callable[..., Array] = compiled(weights)
+_weights: Callable[..., Array] = compiled(ordinate_weights)
 
 
 def smooth_curve(linear: Linearization, balance: str, variable: str, counts: np.ndarray) -> Smooth:

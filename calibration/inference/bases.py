@@ -16,9 +16,9 @@ from numpy.polynomial import legendre
 
 from calibration.data.columns import CURRENT, LOAD, SPEED, Layout
 from calibration.inference.linearization import Linearization
-from mmrjax.effects.curve import DRIFT, EVERY_VARIABLE, READ_BY, WAYS, acts_along, counted_by, in_travel
+from mmrjax.effects.curve import DRIFT, EVERY_VARIABLE, READ_BY, WAYS, direction_signal, in_travel_frame, sign_factor
 from mmrjax.model import channels
-from mmrjax.model.balances import absent
+from mmrjax.model.balances import absent_balances
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 
@@ -109,7 +109,7 @@ Bases = tuple[Basis, ...]
 
 def is_channel_place(place: str) -> bool:
     """True if a place is a channel, whose readings have an error; False if it is a balance."""
-    return place not in (*BALANCES, *OF_TURNS) and place in channels.names(channels.EVERY)
+    return place not in (*BALANCES, *OF_TURNS) and place in channels.channel_names(channels.EVERY)
 
 
 def balance_of(place: str) -> str:
@@ -140,7 +140,7 @@ def balances_of(robot: Robot | None, among: Sequence[str] = BALANCES) -> tuple[s
     """Balances of `among` that a robot has; all for None."""
     if robot is None:
         return tuple(among)
-    return tuple(b for b in among if b not in absent(robot))
+    return tuple(b for b in among if b not in absent_balances(robot))
 
 
 def channels_of(robot: Robot | None) -> tuple[Channel, ...]:
@@ -214,7 +214,9 @@ def curve_families(
         over[variable] = next(iter(over)) if drift else variable
 
     def curve(place: str, variable: str) -> np.ndarray:
-        x, way = in_travel(place, variable, np.asarray(columns[VARIABLES[variable]]), ways.__getitem__, unsigned)
+        x, way = in_travel_frame(
+            place, variable, np.asarray(columns[VARIABLES[variable]]), ways.__getitem__, unsigned
+        )
         return (
             way[:, None]
             * legendre.legvander(scale_to_unit_range(x, weight), TERMS - 1)
@@ -243,7 +245,7 @@ def condition_polynomials(
     """Polynomials in all conditions for each configuration; arguments as in `curve_families`."""
     of_column = {column: variable for variable, column in VARIABLES.items()}
     of_column |= {CURRENT: "current", LOAD: "current"}  # its sign is also that of the torque that drives the shafts
-    along = (in_travel(place, of_column[c], np.asarray(columns[c]), ways.__getitem__)[0] for c in scope.axes)
+    along = (in_travel_frame(place, of_column[c], np.asarray(columns[c]), ways.__getitem__)[0] for c in scope.axes)
     spans = [scale_to_unit_range(x, weight) for x in along]
     powers = [p for p in itertools.product(range(DEGREE + 1), repeat=len(spans)) if sum(p) <= DEGREE]
     terms = [
@@ -251,7 +253,7 @@ def condition_polynomials(
         for name in np.unique(columns["configuration"])
         for p in powers
     ]
-    return ways[acts_along(place)][:, None] * np.stack(terms, 1)
+    return ways[direction_signal(place)][:, None] * np.stack(terms, 1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -320,7 +322,7 @@ def window_families(
         if VARIABLES[condition] not in scope.axes:
             continue
         told = factor * np.asarray(columns[VARIABLES[condition]], float)
-        x, _ = in_travel(SHAFTS, condition, told, facing.__getitem__)
+        x, _ = in_travel_frame(SHAFTS, condition, told, facing.__getitem__)
         levels = np.unique(x[counts])
         levels = levels if 2 < len(levels) <= MOST_LEVELS else levels[:0]
         offered += [(condition, x, counts & (x == level)) for level in levels]
@@ -338,7 +340,7 @@ def window_families(
     unsigned = robot.rig.magnitudes if robot else ()
     return tuple(
         Basis.of(
-            np.stack([s * counted_by(place, ways.__getitem__, unsigned) for place in places for s, _ in shapes])[
+            np.stack([s * sign_factor(place, ways.__getitem__, unsigned) for place in places for s, _ in shapes])[
                 :, :, None
             ],
             [(place, name) for place in places for _, name in shapes],

@@ -174,14 +174,16 @@ def _free_names(
     present = _present(runs, robot)
     default = priors.default_names(present, robot, computed=computes, turns=runs.turns)
     owned = priors.stated_names(robot, present, () if plan.observe.axis else priors.OVER_TIME)
-    held = {*default, *fidelities.unread(fidelity, owned, runs.turns)}
+    held = {*default, *fidelities.unread_parameters(fidelity, owned, runs.turns)}
     default = (*default, *(n for n in owned if n not in held and not n.endswith(computes)))
     default = (*default, *priors.delay_names(robot, plan.observe.free()[0]))
     names = priors.choose_free_names(robot, default, *words)
-    if unread := fidelities.unread(fidelity, names, runs.turns):
+    if unread := fidelities.unread_parameters(fidelity, names, runs.turns):
         if fidelities.OF_TURNS in unread[0]:
             raise BadConfiguration(f"--free {unread[0]}: these runs are straight, which do not show it")
-        reads = ", ".join(other for other in fidelities.NAMES if not fidelities.unread(other, unread, runs.turns))
+        reads = ", ".join(
+            other for other in fidelities.NAMES if not fidelities.unread_parameters(other, unread, runs.turns)
+        )
         raise BadConfiguration(f"--free {unread[0]}: --model {fidelity} does not read it; allowed: --model {reads}")
     return names
 
@@ -247,7 +249,7 @@ def _population_options(
         BadConfiguration: options of a population without one, or for data that no population search supports.
     """
     if population is None:
-        population = POPULATION if fidelities.unread("steady", names, runs.turns) else 0
+        population = POPULATION if fidelities.unread_parameters("steady", names, runs.turns) else 0
     if (members is not None or generations is not None) and not population:
         raise BadConfiguration("--generations, --members: there is no population; state --population")
     if population and not posed.observe.eased:
@@ -281,7 +283,7 @@ def _search(
     tell(Step("steady"))
     if evolved.size:
         population.Members(posed, evolved.file)  # refuses another calibration's file before the search of steady
-    draws = rng.standard_normal((fidelities.facts("steady").effort.starts, size))
+    draws = rng.standard_normal((fidelities.fidelity_facts("steady").effort.starts, size))
     draws[0] = 0.0
     easy = multistart.search_from_starts(
         observers.pose_problem(runs, base, posed.coordinates, known.sd), known, draws, solver

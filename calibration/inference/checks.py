@@ -17,7 +17,7 @@ from calibration.inference.noise import Noise
 from calibration.inference.ranges import check_ranges
 from calibration.inference.uninformative import copied_channels, nothing_varies
 from calibration.inference.unused import unexplained_torque_notes, unused_notes
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import SLIDES, STATUSES
 
@@ -102,10 +102,10 @@ def _check_enough_readings(runs: Runs, names: Sequence[str], noise: Noise) -> No
     also = f" and estimate {levels} noise levels" if levels else ""
     cure = "fix some with --fix, or state --noise" if levels else "fix some with --fix"
     whole = readings == len(runs) * shown
-    rows = counted(len(runs), "row")
-    have = f"{rows} of {shown} channels" if whole else f"{counted(readings, 'reading')} in {rows}"
+    rows = count_noun(len(runs), "row")
+    have = f"{rows} of {shown} channels" if whole else f"{count_noun(readings, 'reading')} in {rows}"
     least = f"{needed} rows" if whole else f"{needed * shown} readings"
-    what = f"cannot fit {counted(len(names), 'parameter')}{also}" if names else "cannot be fitted"
+    what = f"cannot fit {count_noun(len(names), 'parameter')}{also}" if names else "cannot be fitted"
     raise BadData(f"{runs.source}: {have} {what}; at least {least} are needed{f', or {cure}' if names else ''}")
 
 

@@ -25,15 +25,15 @@ def conduct_notes(runs: Runs, robot: Robot) -> list[Note]:
     ends, shown, lasts = kind.settled(runs)
     if not kind.axis or not len(ends) or not robot.has_ground or "speed" not in robot.rig.channels:
         return []
-    speed = shown[:, channels.index("speed", robot.channels)]
+    speed = shown[:, channels.channel_index("speed", robot.channels)]
     names = ends["run_id"] if ends.has("run_id") else np.array(["(no run_id)"] * len(ends))
     conditions = ends.conditions(robot)
     if "motor_speed" in robot.rig.channels:
-        turning = shown[:, channels.index("motor_speed", robot.channels)]
+        turning = shown[:, channels.channel_index("motor_speed", robot.channels)]
     else:
         imposed = conditions.motor_speed
         turning = np.full(len(ends), np.nan) if imposed is None else np.asarray(imposed)
-    steady = operating_readings(robot, conditions)[:, channels.index("speed", robot.channels)]
+    steady = operating_readings(robot, conditions)[:, channels.channel_index("speed", robot.channels)]
     radius = np.asarray([float(c.radius) for c in robot.configurations.members])[np.asarray(conditions.configuration)]
     movers = radius * turning / float(robot.gearbox.ratio)
     measured = np.isfinite(speed)

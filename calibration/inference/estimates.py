@@ -125,7 +125,7 @@ def channel_noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np
             100 * float(np.nanmedian(share[:, k])) if np.isfinite(share[:, k]).any() else np.nan,
             100 * float(shares[k]) if known.estimated[k] else None,
         )
-        for k, name in enumerate(channels.names(posed.channels))
+        for k, name in enumerate(channels.channel_names(posed.channels))
     }
 
 
@@ -160,7 +160,7 @@ def hold_out_errors(posed: Problem, held: holdout.HeldOut, measured: np.ndarray,
             _row_numbers(inside & lost),
             bool(held.converged[k]),
         )
-    reading = dict(zip(channels.names(posed.channels), held.reading.T, strict=True))
+    reading = dict(zip(channels.channel_names(posed.channels), held.reading.T, strict=True))
     return HeldOut(_errors(posed.channels, held.reading, measured, sd, percent), _row_numbers(lost), blocks, reading)
 
 
@@ -180,7 +180,7 @@ def readings_by_channel(
     percent, sigma = sized_error(after, measured), (after - measured) / sd
     return {
         name: ChannelReadings(*(x[:, k] for x in (measured, sd, before, after, percent, sigma)))
-        for k, name in enumerate(channels.names(shown))
+        for k, name in enumerate(channels.channel_names(shown))
     }
 
 

@@ -97,7 +97,7 @@ def predict_identifiability(runs: Runs, robot: Robot, noise: str | None = None, 
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}
     names = priors.free_names(robot, present, *observe.free())
     if not observe.axis:
-        names = tuple(n for n in names if n not in fidelities.unread("steady", names, runs.turns))
+        names = tuple(n for n in names if n not in fidelities.unread_parameters("steady", names, runs.turns))
     if not names:
         raise BadConfiguration("nothing to determine: every loss is zero, so it is held; state yours with a ±")
     coordinates = priors.parameter_coordinates(robot, names, any_surface=robot.rig.inherits)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from mmrjax.numerics.linear_equations import solved
+from mmrjax.numerics.linear_equations import solve
 
 #: Rejected steps in a row after which a search ends.
 PATIENCE = 12
@@ -87,7 +87,7 @@ def one_sided_step(r: Array, jacobian: Array, one_sided: slice, damping: Array |
     def again(carry: tuple) -> tuple:
         turns, active, _, best, lowest = carry
         counts = edge * active[:, None]
-        d = -solved(normal + counts.T @ counts, gradient + counts.T @ height)
+        d = -solve(normal + counts.T @ counts, gradient + counts.T @ height)
         beyond, here = height + edge @ d > 0, value(d)
         better = here < lowest
         return turns + 1, beyond, active, jnp.where(better, d, best), jnp.where(better, here, lowest)

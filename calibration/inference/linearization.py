@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from mmrjax.compile.compiling import compiled
 from mmrjax.effects import Effect
-from mmrjax.effects.curve import in_travel
+from mmrjax.effects.curve import in_travel_frame
 from mmrjax.effects.scaled import amplitude_of as amplitude_of
 from mmrjax.effects.scaled import shape_of as shape_of
 from mmrjax.model import balances, params
@@ -156,7 +156,7 @@ def effect_terms(robot: Robot, signals: Signals, effects: tuple[ScoredEffect, ..
     def term(effect: Effect, remembered: Array) -> Array:
         alone = dataclasses.replace(robot, effects=(effect,))
         with_memory = dataclasses.replace(signals, memory={**signals.memory, effect.name: remembered})
-        return jnp.asarray(balances.added(alone, with_memory, effect.balance, effect.channel), float)
+        return jnp.asarray(balances.effects_sum(alone, with_memory, effect.balance, effect.channel), float)
 
     terms = [map_over_shapes(e, term, m) for e, m in zip(effects, memory, strict=True)]
     return jnp.concatenate(terms) if terms else jnp.zeros(0)
@@ -252,7 +252,7 @@ class Linearization(eqx.Module):
 
     def in_travel(self, place: str, variable: str) -> tuple[np.ndarray, np.ndarray]:
         """Variable of a curve in a place [SI] and its factor, by point, as `effects.curve` uses both."""
-        x, way = in_travel(place, variable, self.variable(variable), self.variable, self.magnitudes)
+        x, way = in_travel_frame(place, variable, self.variable(variable), self.variable, self.magnitudes)
         return np.asarray(x), np.broadcast_to(way, (self.points,))
 
     def runs(self) -> list[np.ndarray]:

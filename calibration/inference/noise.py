@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from jaxtyping import Float
 
-from calibration.data.input_errors import BadConfiguration, BadData, choices
+from calibration.data.input_errors import BadConfiguration, BadData, allowed_words
 from calibration.data.runs import Runs
 from calibration.inference import series_noise
 from calibration.inference.series_noise import SeriesNoise
@@ -59,7 +59,7 @@ class Noise:
 
     def scaled(self, factors: Mapping[str, float]) -> Noise:
         """Noise with the sds of some channels multiplied by a factor, by channel name."""
-        factor = np.array([factors.get(name, 1.0) for name in channels.names(self.channels)])
+        factor = np.array([factors.get(name, 1.0) for name in channels.channel_names(self.channels)])
         return dataclasses.replace(self, sd=self.sd * factor)
 
 
@@ -81,7 +81,7 @@ def parse_noise(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float,
     for part in text.split(","):
         name, _, value = part.strip().partition("=")
         if name not in channel_of_word:
-            raise BadConfiguration(f"--noise {part.strip()}: no such channel; {choices(name, words)}")
+            raise BadConfiguration(f"--noise {part.strip()}: no such channel; {allowed_words(name, words)}")
         k = channel_of_word[name]
         if k in stated:
             raise BadConfiguration(f"--noise {part.strip()}: {name} is given twice; expected each channel once")
@@ -134,7 +134,7 @@ def noise_from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -
             )
         sd[:, k] = np.where(finite, size * sizes[:, k] if relative else size, 1.0)
         source.append("stated" if k in shares else "estimated")
-    quantum = np.array([runs.layout.variance(name) for name in channels.names(runs.channels)])
+    quantum = np.array([runs.layout.variance(name) for name in channels.channel_names(runs.channels)])
     given = np.array([s in ("columns", "stated") for s in source])  # an estimate already includes it
     if (given & (quantum > 0)).any():
         sd = np.where(given & np.isfinite(measured), np.sqrt(sd**2 + quantum), sd)

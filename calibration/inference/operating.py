@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from mmrjax.compile.compiling import SELDOM, compiled
-from mmrjax.fidelities.steady import shown_batch, steady
+from mmrjax.fidelities.steady import results_of_rows, steady
 from mmrjax.model import channels, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
-from mmrjax.model.signals import Result, done
+from mmrjax.model.signals import Result, is_done
 
 #: Conditions are padded to a multiple of this, so that tables of similar size share compiled programs.
 PAD = 16
@@ -44,10 +44,12 @@ def operating_readings(
     if conditions.turns:  # the load of a turn is friction
         posed = conditions
     padded = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[index]), posed)
-    strong = params.strong(robot)
-    readings = shown_batch(strong, padded)[0] if conditions.turns else _settled(strong, padded)
-    reading = np.stack([np.asarray(readings.reading[c]) for c in names or channels.names(robot.channels)], 1)[:runs]
-    moving = done(np.asarray(readings.status))[:runs]
+    strong = params.without_weak_types(robot)
+    readings = results_of_rows(strong, padded)[0] if conditions.turns else _settled(strong, padded)
+    reading = np.stack([np.asarray(readings.reading[c]) for c in names or channels.channel_names(robot.channels)], 1)[
+        :runs
+    ]
+    moving = is_done(np.asarray(readings.status))[:runs]
     return np.where(moving[:, None], reading, np.nan)
 
 

@@ -32,7 +32,7 @@ from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax.compile.compiling import OVER_TIME, SELDOM, SMALL, compiled
 from mmrjax.compile.precision import Threads
 from mmrjax.model.robot import Robot
-from mmrjax.numerics.linear_equations import half_solved
+from mmrjax.numerics.linear_equations import solve_lower
 
 #: Predicted decrease of the objective below which a point is an optimum: in ½σ² (the remaining step is then below
 #: a twentieth of a posterior sd, similar to the effect of the integrator's tolerance), and as a share.
@@ -138,7 +138,7 @@ def _solver(data: Data, long: bool) -> OneSidedLevenbergMarquardt:
 def _optimum(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array) -> Optimum:
     held_rows = penalty_slice(data)
     informed = jacobian[informative_residuals(data)]
-    half = half_solved(informed.T @ informed, jnp.eye(z.shape[0]))
+    half = solve_lower(informed.T @ informed, jnp.eye(z.shape[0]))
     sd = jnp.linalg.norm(half, axis=0)
     ahead = r + jacobian @ one_sided_step(r, jacobian, held_rows, 0.0)
     decrement = half_squares(r, held_rows) - half_squares(ahead, held_rows)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from calibration.data.input_errors import BadConfiguration, choices, number
+from calibration.data.input_errors import BadConfiguration, allowed_words, number
 from calibration.data.surfaces import GROUND
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.model import params
@@ -158,12 +158,12 @@ def _numbers(coordinates: Coordinates, z: Float[Array, " parameters"]) -> tuple[
     """Parameters at coordinates z, and the tied ones, as scalars [SI]."""
     theta = coordinates.value(z)
     tied = coordinates.ratios * theta[np.array([k for _, k in coordinates.followers], int)]
-    return (*params.one_by_one(theta), *params.one_by_one(tied))
+    return (*params.split_numbers(theta), *params.split_numbers(tied))
 
 
 def parameters_by_name(robot: Robot) -> dict[str, Parameter]:
     """Parameters of the robot by dotted name."""
-    return {p.name: p for p in params.walk(robot)}
+    return {p.name: p for p in params.walk_parameters(robot)}
 
 
 def friction_names(robot: Robot, configuration: str) -> tuple[str, ...]:
@@ -362,10 +362,10 @@ def expand_name(word: str, everything: list[str], option: str) -> list[str]:
         if below:
             return below
         groups = sorted({n.rsplit(".", 1)[0] + ".*" for n in everything})
-        raise BadConfiguration(f"{option} {word}: no parameters below it; {choices(word, groups)}")
+        raise BadConfiguration(f"{option} {word}: no parameters below it; {allowed_words(word, groups)}")
     if word not in everything:
         raise BadConfiguration(
-            f"{option} {word}: no such parameter; {choices(word, _similar_names(word, everything))}"
+            f"{option} {word}: no such parameter; {allowed_words(word, _similar_names(word, everything))}"
         )
     return [word]
 
@@ -446,7 +446,7 @@ def parameter_coordinates(
     for name in stated:
         if name not in fields:
             raise BadConfiguration(
-                f"--prior {name}: no such parameter; {choices(name, _similar_names(name, list(fields)))}"
+                f"--prior {name}: no such parameter; {allowed_words(name, _similar_names(name, list(fields)))}"
             )
         if name not in names:
             raise BadConfiguration(f"--prior {name}: it is not free; add --free {name} (with --free default)")

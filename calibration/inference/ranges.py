@@ -134,7 +134,7 @@ def _with_friction_factor(robot: Robot, factor: float) -> Robot:
     """Robot with its friction torques and its ground's rolling resistance multiplied by a factor."""
     torques = [
         p
-        for p in params.walk(robot)
+        for p in params.walk_parameters(robot)
         if p.name.endswith((".friction_coulomb", ".friction_viscous", ".loss_coulomb", ".loss_viscous"))
     ]
     return params.replace(robot, {p.name: factor * p.value for p in torques})
@@ -181,7 +181,7 @@ def _slips(robot: Robot, channel: Channel, factor: float) -> bool:
 
 def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
     """Refuse a gear ratio that is the inverse of the ratio of the speeds of motor and output."""
-    shown = dict(zip(channels.names(robot.channels), measured.T, strict=True))
+    shown = dict(zip(channels.channel_names(robot.channels), measured.T, strict=True))
     conditions = runs.conditions(robot)
     which = np.asarray(conditions.configuration)
     radius = np.asarray([float(c.radius) for c in robot.configurations.members])[which]

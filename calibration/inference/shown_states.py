@@ -279,4 +279,4 @@ def _wheel_per_unit(problem: Problem, plan: Plan) -> float:
     robot, none = problem.base, jnp.zeros(())
     chassis = robot.configurations.members[0]
     rolling = State(none, robot.gearbox.ratio, chassis.radius, none, distance=chassis.radius)
-    return 1 / float(problem.channels[plan.motion].read(robot, balances.begin(robot, Conditions(0), rolling)))
+    return 1 / float(problem.channels[plan.motion].read(robot, balances.begin_signals(robot, Conditions(0), rolling)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 
 if TYPE_CHECKING:
     import optimistix as optx
@@ -35,7 +35,7 @@ def solver_by_name(name: str) -> optx.AbstractLeastSquaresSolver | optx.Abstract
         BadConfiguration: an unknown name.
     """
     if name not in NAMES:
-        raise BadConfiguration(f"solver: got {name}; {choices(name, NAMES)}")
+        raise BadConfiguration(f"solver: got {name}; {allowed_words(name, NAMES)}")
     import optax
     import optimistix as optx
 

@@ -16,7 +16,7 @@ from mmrjax.model import channels
 #: of the torque as a share of its size.
 BRAKED, VARIES = 0.5, 0.2
 #: Channel of the torque at the output.
-TORQUE = channels.find("output_torque")
+TORQUE = channels.find_channel("output_torque")
 
 
 def unused_notes(runs: Runs) -> tuple[Unused, ...]:

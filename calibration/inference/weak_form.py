@@ -75,7 +75,7 @@ def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar) ->
 
     def left(robot: Robot, state: State, current: Scalar) -> Scalar:
         at = dataclasses.replace(state, current=current)
-        return jnp.asarray(balances.driven(robot, conditions, at, way).voltage_left)
+        return jnp.asarray(balances.driven_signals(robot, conditions, at, way).voltage_left)
 
     fixed: Any = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, (robot, state))
     current = jnp.zeros(())
@@ -88,12 +88,12 @@ def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar) ->
 
 def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str]) -> tuple[Array, Array, Signals]:
     """Returns terms f and y of a row's equations, and its signals; `probes`: effects that read no signal."""
-    conditions, names = row.conditions, channels.names(robot.channels)
+    conditions, names = row.conditions, channels.channel_names(robot.channels)
     chassis = robot.chassis(conditions.configuration)
     none, one = jnp.zeros(()), jnp.ones(())
 
     def per_unit(k: int, state: State) -> Scalar:
-        return channels.find(names[k]).read(robot, balances.begin(robot, conditions, state))
+        return channels.find_channel(names[k]).read(robot, balances.begin_signals(robot, conditions, state))
 
     if plan.imposed == "motor_speed":
         turning: Scalar = jnp.asarray(conditions.motor_speed)
@@ -118,14 +118,14 @@ def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str
         own: Scalar = current
         if plan.imposed == "voltage" and plan.current < 0:
             own = _current(robot, conditions, at, row.way)
-        return balances.rolling(robot, conditions, dataclasses.replace(at, current=own), row.way), own
+        return balances.rolling_signals(robot, conditions, dataclasses.replace(at, current=own), row.way), own
 
     if robot.has_ground and plan.mechanical and plan.travels:
         # The wheels turn faster than the load travels because of slip.
-        first = balances.begin(robot, conditions, state_at(turning, current))
+        first = balances.begin_signals(robot, conditions, state_at(turning, current))
         if any(e.balance == "slip" and e.name not in probes for e in robot.effects):
             first = signals_at(turning)[0]
-        turning = turning + balances.added(robot, first, "slip") * robot.gearbox.ratio / chassis.radius
+        turning = turning + balances.effects_sum(robot, first, "slip") * robot.gearbox.ratio / chassis.radius
     signals, own = signals_at(turning)
     f, y = [], []
     if plan.electrical:
@@ -139,7 +139,7 @@ def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str
     if plan.others:
         if robot.has_ground:
             creep = chassis.ground.speed_creep(signals.traction, signals.normal, signals.adhesion)
-            lost = balances.added(robot, signals, "slip")
+            lost = balances.effects_sum(robot, signals, "slip")
             signals = dataclasses.replace(signals, speed=signals.speed_theoretical - creep - lost)
         says = balances.sensor(robot, signals)
         f += [says[names[k]] - shown[k] for k in plan.others]
@@ -152,7 +152,7 @@ def _terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[Sc
     """Returns the terms of each row at coordinates z, with derivatives by base parameters, readings and effects."""
     entering = tuple(dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor"))
     probes = tuple(balance_probe(b) for b in entering)
-    size, names = z.size, channels.names(problem.channels)
+    size, names = z.size, channels.channel_names(problem.channels)
 
     def one(row: Rows) -> tuple[Any, tuple[Any, Signals]]:
         def both(x: Array) -> tuple[Any, tuple[Any, Signals]]:

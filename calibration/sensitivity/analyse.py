@@ -35,7 +35,7 @@ LEAST = 1_000
 
 def default_evaluations(outputs: tuple[OutputRow, ...], model: str, method: str) -> int:
     """Default number of model evaluations."""
-    long = fidelities.facts(model).rollout or any(o in derived.OF_START for o in outputs)
+    long = fidelities.fidelity_facts(model).rollout or any(o in derived.OF_START for o in outputs)
     return EVALUATIONS_LONG if long else EVALUATIONS_SHAPLEY if method == "shapley" else EVALUATIONS
 
 

@@ -12,17 +12,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.data.contradictions import cannot_stand
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from mmrjax import derived, fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.derived import Derived
 from mmrjax.fidelities import outputs as table_of_outputs
 from mmrjax.fidelities.outputs import Output
-from mmrjax.fidelities.variation import STATUS, Variation, evaluate
+from mmrjax.fidelities.variation import STATUS, Variation, evaluate_points
 from mmrjax.model import channels
 from mmrjax.model.conditions import OF_SIDES, Conditions
 from mmrjax.model.robot import Robot
-from mmrjax.model.signals import STATUSES, done
+from mmrjax.model.signals import STATUSES, is_done
 
 #: Points in one call for few and for many points: solves, runs over time, and the derivatives of both. All calls have
 #: one of these shapes, so that all studies of the same inputs and outputs share compiled programs.
@@ -58,7 +58,7 @@ def count_statuses(codes: np.ndarray) -> dict[str, int]:
 
 def known_outputs(robot: Robot) -> dict[str, OutputRow]:
     """Every output by name: those of a fidelity, then the derived ones."""
-    rows: tuple[OutputRow, ...] = (*table_of_outputs.table(robot.channels), *derived.TABLE)
+    rows: tuple[OutputRow, ...] = (*table_of_outputs.output_table(robot.channels), *derived.TABLE)
     return {o.name: o for o in rows}
 
 
@@ -67,13 +67,17 @@ def default_outputs(robot: Robot, turns: bool) -> tuple[str, ...]:
     beside: tuple[str, ...] = DEFAULT
     if turns:
         apart = {row.name for row in derived.OF_STRAIGHT}
-        return (*channels.names(robot.channels), *(n for n in DEFAULT if n not in apart), derived.OF_TURNS[0].name)
+        return (
+            *channels.channel_names(robot.channels),
+            *(n for n in DEFAULT if n not in apart),
+            derived.OF_TURNS[0].name,
+        )
     if not robot.has_ground:
         beside = ("power_supply",)
     elif robot.rig.imposed == "motor_speed":  # it stalls on no slope
         beside = tuple(name for name in DEFAULT if name != "steepest_slope")
     outputs = known_outputs(robot)
-    return tuple(n for n in (*channels.names(robot.channels), *beside) if robot.knows(outputs[n].rests_on))
+    return tuple(n for n in (*channels.channel_names(robot.channels), *beside) if robot.knows(outputs[n].rests_on))
 
 
 def chosen_outputs(words: tuple[str, ...], robot: Robot, turns: bool = False) -> tuple[OutputRow, ...]:
@@ -91,13 +95,15 @@ def chosen_outputs(words: tuple[str, ...], robot: Robot, turns: bool = False) ->
     of_turns = {*(o.name for o in derived.OF_TURNS), *(c.name for c in channels.OF_TURNS if c.settled)}
     for word in words or default_outputs(robot, turns):
         for name in start if word == "start" else (word,):
-            if not turns and name in of_turns and name not in channels.names(robot.channels):
+            if not turns and name in of_turns and name not in channels.channel_names(robot.channels):
                 raise BadConfiguration(
                     f"--outputs {name}: the robot travels straight; vary the drive of its sides independently, e.g. "
                     f"--vary {OF_SIDES[0]}=0.2:0.8"
                 )
             if name not in outputs:
-                raise BadConfiguration(f"--outputs {name}: no such output; {choices(name, [*outputs, 'start'])}")
+                raise BadConfiguration(
+                    f"--outputs {name}: no such output; {allowed_words(name, [*outputs, 'start'])}"
+                )
             if (row := outputs[name]) in derived.OF_GROUND and not robot.has_ground:
                 raise BadConfiguration(f"--outputs {name}: the robot's load is a shaft, which has no ground")
             if lacking := robot.unknown(row.rests_on):
@@ -142,7 +148,7 @@ class Model:
 
     def chunk(self, source: str, points: int, differentiated: bool = False) -> int:
         """Number of points in one call, for a number of all points."""
-        long = source == derived.START or (source in fidelities.TABLE and fidelities.facts(source).rollout)
+        long = source == derived.START or (source in fidelities.TABLE and fidelities.fidelity_facts(source).rollout)
         kind = ("derivatives of runs" if long else "derivatives") if differentiated else "runs" if long else "solves"
         few, many = CHUNKS[kind]
         return few if points <= 4 * few else many
@@ -230,10 +236,10 @@ def _outputs(
 ) -> dict[str, Array]:
     """Outputs of a source, NaN if the run did not converge, and statuses."""
     if source in fidelities.TABLE:
-        made = evaluate(variation, source, values, conditions, options, names)
+        made = evaluate_points(variation, source, values, conditions, options, names)
     else:
         made = _derived(variation, source, names, values, conditions)
-    solved = done(made[STATUS])
+    solved = is_done(made[STATUS])
     return {name: x if name == STATUS else jnp.where(solved, x, jnp.nan) for name, x in made.items()}
 
 
@@ -241,7 +247,7 @@ def _derived(
     variation: Variation, source: str, names: tuple[str, ...], values: Array, conditions: Conditions
 ) -> dict[str, Array]:
     conditions = jax.tree.map(lambda x: jnp.broadcast_to(x, values.shape[:1]), conditions)
-    compute = derived.compute(source)
+    compute = derived.compute_function(source)
     made = jax.vmap(lambda v, c: compute(*variation.at(v, c)))(values, conditions)
     return {name: made[name] for name in (*names, STATUS)}
 

@@ -50,7 +50,7 @@ class Study:
     ) -> None:
         supply = Supply() if supply is None else supply
         self.robot, self.inputs, self.points, self.tell = robot, inputs, points, tell
-        options = fidelities.facts(model).resolved() if options is None else options
+        options = fidelities.fidelity_facts(model).resolved() if options is None else options
         self.model = Model(robot, inputs.columns, model, options, outputs)
         names = robot.configurations.names
         self.conditions = Conditions(

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtri
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.posterior_file import Posterior
 from calibration.inference import priors
 from calibration.inference.fit_posterior import posterior_of_coordinates
@@ -132,7 +132,7 @@ def default_input_names(
     out = tuple(f"{name}." for name in absent) + (() if battery else ("battery.",))
     guides = {f"{name}.{g}" for name in wheels for g in (priors.GUIDE_SHARE, priors.GUIDE_FRICTION)}
     by_name = priors.parameters_by_name(robot)
-    left_out = {*guides, *fidelities.unread(model, by_name, turns), *robot.rig.exact}
+    left_out = {*guides, *fidelities.unread_parameters(model, by_name, turns), *robot.rig.exact}
     if not robot.rig.inherits:  # parameters of another robot are not its own
         stated = {name for name, _, _ in robot.rig.priors}
         left_out |= {name for name in by_name if name.startswith(_OTHERS) and name not in stated} | {
@@ -185,7 +185,7 @@ def _inputs(
     for name in ranges:
         if name not in CONDITIONS or name == "configuration":
             allowed = [n for n in CONDITIONS if n != "configuration"]
-            raise BadConfiguration(f"--vary {name}: no such condition; {choices(name, allowed)}")
+            raise BadConfiguration(f"--vary {name}: no such condition; {allowed_words(name, allowed)}")
     try:
         axes = Variation(robot, (*parameters.names, *ranges)).axes
     except UsageError as error:

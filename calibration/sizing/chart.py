@@ -12,7 +12,7 @@ from jaxtyping import Array
 from calibration.data.requirements_file import Requirement, Requirements
 from calibration.sizing import sheet
 from mmrjax.compile.compiling import compiled
-from mmrjax.derived.requirements import Point, Ratings, heat_left, ratings, travel
+from mmrjax.derived.requirements import EnvelopePoint, Ratings, heat_left, ratings, travel_quantities
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 
@@ -46,11 +46,11 @@ class Chart:
 
 
 @compiled
-def _margins(robot: Robot, rated: Ratings, points: Point, speeds: Array, wanted: Array) -> Array:
+def _margins(robot: Robot, rated: Ratings, points: EnvelopePoint, speeds: Array, wanted: Array) -> Array:
     """Margins by limit, shape (points, limits)."""
 
-    def one(point: Point, wanted: Array) -> Array:
-        state, _ = travel(robot, point, rated)
+    def one(point: EnvelopePoint, wanted: Array) -> Array:
+        state, _ = travel_quantities(robot, point, rated)
         turns = state["motor_speed_rpm"]
         each = [
             state["adhesion"], jnp.clip(state["left"], -1.0, 1.0),
@@ -85,7 +85,7 @@ def margin_chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -
         v = r.envelope
         inside = (p >= v.payload_kg[0]) & (p <= v.payload_kg[1]) & (s >= v.slope_deg[0]) & (s <= v.slope_deg[1])
         wanted = np.where(inside, np.maximum(wanted, r.limit or 0.0), wanted)
-    robot = params.strong(robot)
+    robot = params.without_weak_types(robot)
     permitted = jnp.asarray([robot.motor.speed_limit, robot.gearbox.speed_limit])
     margins = None
     for charge in e.charge:

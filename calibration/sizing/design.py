@@ -15,8 +15,17 @@ from jaxtyping import Array, Float
 from calibration.data.requirements_file import Envelope, Requirement, Requirements
 from calibration.sizing import sheet
 from calibration.sizing.part_options import Options
-from mmrjax.derived.requirements import CHARGE, NODES, QUANTITIES, SLOPE, Point, Ratings, heat_left, travel
-from mmrjax.derived.requirements import evaluate as requirement
+from mmrjax.derived.requirements import (
+    CHARGE,
+    NODES,
+    QUANTITIES,
+    SLOPE,
+    EnvelopePoint,
+    Ratings,
+    heat_left,
+    travel_quantities,
+)
+from mmrjax.derived.requirements import evaluate_requirement as requirement
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED
@@ -103,7 +112,7 @@ class Task(eqx.Module):
     robot: Robot
     configuration: str = eqx.field(static=True)
     base_mass: float = eqx.field(static=True)
-    points: Point
+    points: EnvelopePoint
     middle: int = eqx.field(static=True)
     demands: tuple[Demand, ...] = eqx.field(static=True)
 
@@ -121,9 +130,9 @@ def sizing_task(robot: Robot, asked: Requirements, options: Options) -> Task:
     """
     name = asked.envelope.configuration or robot.configurations.names[0]
     index: dict[tuple[float, ...], int] = {}
-    kept: list[Point] = []
+    kept: list[EnvelopePoint] = []
 
-    def row(point: Point) -> int:
+    def row(point: EnvelopePoint) -> int:
         key = tuple(float(np.asarray(x)) for x in jax.tree.leaves(point))
         if key not in index:
             index[key] = len(kept)
@@ -138,8 +147,10 @@ def sizing_task(robot: Robot, asked: Requirements, options: Options) -> Task:
     middle = row(_middle(robot, asked.envelope))
     travelling = sorted({k for d in demands if d.requirement and d.requirement.name in LASTING for k in d.rows})
     demands += [Demand(None, words, tuple(travelling) or (middle,)) for words in RATED.values()]
-    points: Point = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *kept)
-    one_cell = params.strong(dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, cells=1)))
+    points: EnvelopePoint = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *kept)
+    one_cell = params.without_weak_types(
+        dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, cells=1))
+    )
     return Task(one_cell, name, options.base_mass, points, middle, tuple(demands))
 
 
@@ -150,7 +161,7 @@ def requirement_label(r: Requirement) -> str:
     return f"{r.quantity.label}{extra}"
 
 
-def _corners(robot: Robot, r: Requirement, at: Point) -> list[tuple[Point, ...]]:
+def _corners(robot: Robot, r: Requirement, at: EnvelopePoint) -> list[tuple[EnvelopePoint, ...]]:
     """Points of a requirement, grouped by the corners of its envelope."""
     count = len(np.asarray(at.payload))
     points = [jax.tree.map(lambda x, k=k: x[k], at) for k in range(count)]
@@ -177,7 +188,7 @@ def _corners(robot: Robot, r: Requirement, at: Point) -> list[tuple[Point, ...]]
     return [(p,) for p in chosen]
 
 
-def _middle(robot: Robot, e: Envelope) -> Point:
+def _middle(robot: Robot, e: Envelope) -> EnvelopePoint:
     middle = Requirement("speed_m_s", 0.0, True, dataclasses.replace(
         e, payload_kg=(sum(e.payload_kg) / 2,) * 2, slope_deg=(sum(e.slope_deg) / 2,) * 2,
         state_of_charge=(sum(e.state_of_charge) / 2,) * 2,
@@ -192,7 +203,7 @@ def evaluate_design(asked: Task, design: Design) -> tuple[Array, Array]:
     Margins are shares of the required or permitted value; a requirement is met if its margin is not negative.
     """
     robot, ratings = build_robot(asked.robot, asked.base_mass, asked.configuration, design)
-    states = jax.vmap(lambda p: travel(robot, p, ratings)[0])(asked.points)
+    states = jax.vmap(lambda p: travel_quantities(robot, p, ratings)[0])(asked.points)
     mass = jnp.asarray(robot.configurations[asked.configuration].mass)
     energy = states["energy_per_metre_Wh"][asked.middle] / 3600.0
     margins = [_margin(asked, d, design, robot, ratings, states) for d in asked.demands]
@@ -248,7 +259,7 @@ def _limit(r: Requirement) -> float:
     return max(float(r.limit or 0.0), 1e-9)
 
 
-def _heat(robot: Robot, points: Point, current: Array, limit: Array) -> Array:
+def _heat(robot: Robot, points: EnvelopePoint, current: Array, limit: Array) -> Array:
     return jax.vmap(lambda p, i: jnp.asarray(heat_left(robot, p, i, limit)))(points, current)
 
 

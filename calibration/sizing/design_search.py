@@ -15,7 +15,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.parts import CellSheet
 from calibration.data.requirements_file import Requirements
 from calibration.inference.fit_notes import Note, Step
@@ -252,7 +252,7 @@ def size_robot(
     """
     for name in objectives:
         if name not in OBJECTIVES:
-            raise BadConfiguration(f"objective: got {name}; {choices(name, OBJECTIVES)}")
+            raise BadConfiguration(f"objective: got {name}; {allowed_words(name, OBJECTIVES)}")
     sheet.refuse_impossible(robot, asked)
     chosen = options_for_robot(robot, motors)
     problem = sizing_task(robot, asked, chosen)

@@ -13,15 +13,25 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.data.contradictions import cannot_stand
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.requirements_file import STAIRS, TREAD, Envelope, Requirement, Requirements
 from calibration.inference.fit_notes import Note, Step
 from mmrjax.compile.compiling import compiled
-from mmrjax.derived.requirements import AMBIENT, AXES, CHARGE, PAYLOAD, SLOPE, Point, Ratings, evaluate, ratings
+from mmrjax.derived.requirements import (
+    AMBIENT,
+    AXES,
+    CHARGE,
+    PAYLOAD,
+    SLOPE,
+    EnvelopePoint,
+    Ratings,
+    evaluate_requirement,
+    ratings,
+)
 from mmrjax.model import params
 from mmrjax.model.paper_tables import adhesion_ratio, lateral_ratio
 from mmrjax.model.quantities import MM
-from mmrjax.model.robot import Robot, cannot_turn
+from mmrjax.model.robot import Robot, turn_error
 from mmrjax.model.signals import CONVERGED, STATUSES
 
 #: Number of values along each axis of an envelope: its ends, and between them if an output may have an extremum.
@@ -139,10 +149,10 @@ def refuse_impossible(robot: Robot, asked: Requirements) -> None:
         if e.configuration and e.configuration not in robot.configurations:
             raise BadConfiguration(
                 f"{where}: the robot has no configuration {e.configuration}; "
-                f"{choices(e.configuration, robot.configurations)}"
+                f"{allowed_words(e.configuration, robot.configurations)}"
             )
         turns = r.quantity.group in ("turn", "across")
-        if turns and (why := cannot_turn(robot, (_configuration(robot, e),))):
+        if turns and (why := turn_error(robot, (_configuration(robot, e),))):
             raise BadConfiguration(f"{where}: {why}")
         if r.quantity.group == "posture" and (why := cannot_stand(robot)):
             raise BadConfiguration(f"{where}: {why}")
@@ -161,7 +171,7 @@ def _configuration(robot: Robot, envelope: Envelope) -> str:
     return envelope.configuration or robot.configurations.names[0]
 
 
-def envelope_points(robot: Robot, requirement: Requirement) -> Point:
+def envelope_points(robot: Robot, requirement: Requirement) -> EnvelopePoint:
     """Points of a requirement's envelope: ends of each range and values between, shape (points,).
 
     An axis without influence on the quantity has one value. The number of points depends only on the quantity.
@@ -177,7 +187,7 @@ def envelope_points(robot: Robot, requirement: Requirement) -> Point:
     def same(x: float) -> Float[Array, " points"]:
         return jnp.full(len(payload), x, float)
 
-    return Point(
+    return EnvelopePoint(
         configuration=jnp.full(len(payload), robot.configurations.index(name)),
         adhesion=same(adhesion_ratio(e.surface, on_tracks)),
         adhesion_lateral=same(lateral_ratio(e.surface, on_tracks)), battery=same(float(e.battery)),
@@ -212,7 +222,7 @@ def _unrated(robot: Robot) -> Robot:
             robot.gearbox, **{name: getattr(gear, name) for name in ("speed_limit", "torque_limit")}
         ),
     )
-    return params.strong(robot)
+    return params.without_weak_types(robot)
 
 
 @compiled
@@ -221,26 +231,28 @@ def _quantity_over(
     rated: Ratings,
     names: tuple[str, ...],
     rows: Float[Array, "rows parameters"],
-    at: Point,
+    at: EnvelopePoint,
     name: str,
 ) -> tuple[Array, Array]:
     """Values and outcomes of a quantity over robots (rows of parameters) and points, shape (rows, points)."""
 
-    def one(theta: Array, point: Point) -> tuple[Array, Array]:
+    def one(theta: Array, point: EnvelopePoint) -> tuple[Array, Array]:
         changed, changed_ratings = _changed(robot, rated, names, theta)
-        quantity = evaluate(changed, point, changed_ratings, name)
+        quantity = evaluate_requirement(changed, point, changed_ratings, name)
         return quantity.value, quantity.outcome
 
     return jax.vmap(lambda theta: jax.vmap(lambda p: one(theta, p))(at))(rows)
 
 
 @compiled
-def _gradient(robot: Robot, rated: Ratings, names: tuple[str, ...], theta: Array, at: Point, name: str) -> Array:
+def _gradient(
+    robot: Robot, rated: Ratings, names: tuple[str, ...], theta: Array, at: EnvelopePoint, name: str
+) -> Array:
     """Derivative of a quantity at one point by the parameters."""
 
     def value(theta: Array) -> Array:
         changed, changed_ratings = _changed(robot, rated, names, theta)
-        return evaluate(changed, at, changed_ratings, name).value
+        return evaluate_requirement(changed, at, changed_ratings, name).value
 
     return jax.grad(value)(theta)
 
@@ -254,7 +266,7 @@ class _QuantityOfRobot:
     names: tuple[str, ...]
 
     @property
-    def at(self) -> Point:
+    def at(self) -> EnvelopePoint:
         return envelope_points(self.robot, self.requirement)
 
     def over(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -286,7 +298,7 @@ def _computed_name(requirement: Requirement) -> str:
 
 def changeable_parameters(robot: Robot, configuration: str) -> dict[str, params.Parameter]:
     """Parameters of a robot that a designer can change, by name, without cells."""
-    by_name = {p.name: p for p in params.walk(robot)}
+    by_name = {p.name: p for p in params.walk_parameters(robot)}
     names = (*CHANGEABLE, *(f"{configuration}.{n}" for n in OF_CONFIGURATION))
     return {name: by_name[name] for name in names if name in by_name}
 
@@ -328,7 +340,7 @@ def check_requirements(
 
 
 def _present_values(held: _QuantityOfRobot) -> np.ndarray:
-    value_of_name = {p.name: float(p.value) for p in params.walk(held.robot)}
+    value_of_name = {p.name: float(p.value) for p in params.walk_parameters(held.robot)}
     return np.array([held.robot.battery.cells if n == CELLS else value_of_name[n] for n in held.names], float)
 
 
@@ -418,7 +430,7 @@ def _changes(held: _QuantityOfRobot, outcome: Outcome) -> list[Change]:
         )
     )
     slopes = slopes / held.requirement.quantity.factor * (1 if held.requirement.least else -1)
-    by_name = {p.name: p for p in params.walk(held.robot)}
+    by_name = {p.name: p for p in params.walk_parameters(held.robot)}
     changes = []
     for k, name in enumerate(names):
         if name == CELLS:

@@ -11,7 +11,7 @@ from calibration.inference import blocks, priors
 from calibration.inference.calibration import calibrate as run
 from calibration.inference.result import CalibrationResult
 from calibration.inference.simulation_errors import OF_SIZE
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from sweeps import config as configuration
 from sweeps.console import pulse, say, tell
 from sweeps.inputs import load_robot, read_runs
@@ -49,7 +49,7 @@ def print_calibration(found: CalibrationResult) -> None:
     """Whether the fit is adequate; parameters, errors and remarks, for a person."""
     say(found.adequacy.statement)
     shown = Table(
-        title=f"{counted(len(found), 'row')}, {found.model}", title_justify="left", box=None, pad_edge=False
+        title=f"{count_noun(len(found), 'row')}, {found.model}", title_justify="left", box=None, pad_edge=False
     )
     for heading in ("parameter", "value", "95 % interval", "shift [σ]", "determined"):
         left = heading in ("parameter", "determined")

@@ -10,7 +10,7 @@ from rich.table import Table
 from calibration.data import contents, presets_file
 from calibration.data.contents import SignalFacts
 from calibration.data.writing import finite
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from sweeps.console import say
 
 
@@ -24,7 +24,7 @@ def inspect(file: str, as_json: bool) -> int:
     if as_json:
         print(json.dumps(finite(found.to_json()), indent=2, ensure_ascii=False))
         return 0
-    say(f"{found.name}: {found.kind}, {counted(len(found.signals), 'signal')}")
+    say(f"{found.name}: {found.kind}, {count_noun(len(found.signals), 'signal')}")
     table = Table(box=None, pad_edge=False)
     for heading in ("signal", "unit"):
         table.add_column(heading, overflow="fold")

@@ -22,7 +22,7 @@ from calibration.inference import foresight, identifiability, priors
 from calibration.inference.fit_notes import Determination
 from calibration.inference.fit_posterior import undetermined_names
 from calibration.inference.foresight import Determined, Foresight
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.model import channels
 from mmrjax.model.channels import HEAT, Channel
 from mmrjax.model.driver import FAST
@@ -91,7 +91,7 @@ class RigCheck:
             )
         if self.examples:
             lines = ", ".join(map(str, self.examples))
-            hold = f"{counted(len(self.examples), 'line')} still hold{'s' * (len(self.examples) == 1)}"
+            hold = f"{count_noun(len(self.examples), 'line')} still hold{'s' * (len(self.examples) == 1)}"
             said.append(f"{hold} the number of an example ({EXAMPLE}): {lines}")
         said += self.doubts
         if self.runs is not None and self.runs.has("duty") and self.runs.has("total_current_A"):
@@ -341,7 +341,9 @@ def print_check(found: RigCheck) -> None:
 
 
 def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
-    shown = _table(f"\n{runs.source}: {counted(len(runs), 'row')}", "column", "used as", "values>r", "from>r", "to>r")
+    shown = _table(
+        f"\n{runs.source}: {count_noun(len(runs), 'row')}", "column", "used as", "values>r", "from>r", "to>r"
+    )
     for c in found.columns():
         ends = [_words(c["words"]), ""] if c["words"] else [_end(c["least"]), _end(c["greatest"])]
         name = c["column"] if c["theirs"] in ("", c["column"]) else f"{c['column']}, yours {c['theirs']}"
@@ -353,7 +355,7 @@ def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
         say(f"- {sentence}")
     names, counts = np.unique(np.array(seen.status), return_counts=True)
     others = [
-        f"{counted(count, 'row')}: {name}"
+        f"{count_noun(count, 'row')}: {name}"
         for name, count in zip(names, counts, strict=True)
         if name not in words.SETTLED
     ]

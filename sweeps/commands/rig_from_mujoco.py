@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from sweeps.commands.rig_joint import Found, JointNumbers, hanging, is_round
 from sweeps.commands.rig_template import Stated
 from sweeps.export import mujoco
@@ -67,7 +67,7 @@ class _Model:
         if joint not in self.joints:
             raise BadConfiguration(
                 f"--joint: got {joint}; {self.file} has no such joint; "
-                f"{choices(joint, known) if known else 'the file has no named hinge'}"
+                f"{allowed_words(joint, known) if known else 'the file has no named hinge'}"
             )
         if joint not in known:
             raise BadConfiguration(f"--joint: got {joint}, which slides or is free; expected a hinge")

@@ -8,7 +8,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from mmrjax.model.signals import GRAVITY
 from sweeps.commands.rig_joint import Found, JointNumbers, hanging, is_round
 
@@ -72,7 +72,7 @@ class _Urdf:
         link = "" if element is None else element.get("link", "")
         if link not in self.links:
             raise BadConfiguration(f"{self.file}, joint {name}, <{end}>: got {link or 'no link'}; "
-                                   f"{choices(link, self.links)}")  # fmt: skip
+                                   f"{allowed_words(link, self.links)}")  # fmt: skip
         return link
 
     def chosen(self, joint: str | None) -> str:
@@ -89,7 +89,9 @@ class _Urdf:
                 raise BadConfiguration(f"--joint: missing, and {self.file} {found}; expected the name of one joint")
             return candidates[0]
         if joint not in self.joints:
-            raise BadConfiguration(f"--joint: got {joint}; {self.file} has no such joint; {choices(joint, turning)}")
+            raise BadConfiguration(
+                f"--joint: got {joint}; {self.file} has no such joint; {allowed_words(joint, turning)}"
+            )
         if joint not in turning:
             kind = self.joints[joint].get("type") or "without a type"
             slides = "; for a carriage: mmrjax rig new --kind linear" if kind == "prismatic" else ""

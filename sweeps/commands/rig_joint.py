@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from sweeps.commands.rig_template import Stated
 
 #: A number and the element of the model that states it.
@@ -67,7 +67,7 @@ class JointNumbers:
             return "wheeled" if self.rolls else "bench" if self.weight is None else "pendulum"
         if stated not in TURNING:
             raise BadConfiguration(f"--kind: got {stated} with --from, which reads a joint that turns; "
-                                   f"{choices(stated, TURNING)}")  # fmt: skip
+                                   f"{allowed_words(stated, TURNING)}")  # fmt: skip
         return stated
 
     def numbers(self, kind: str) -> dict[str, Stated]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.input_files import content
 from sweeps.commands.rig_joint import JointNumbers
 from sweeps.commands.rig_template import KINDS, Stated, examples, filled, template
@@ -95,7 +95,7 @@ def new(
         raise BadConfiguration(f"--joint: got {joint} without --from; expected a model that has this joint")
     if kind is not None and kind not in KINDS:
         each = "; ".join(f"{name}: {what}" for name, what in KINDS.items())
-        raise BadConfiguration(f"--kind: got {kind}; {choices(kind, KINDS)} ({each})")
+        raise BadConfiguration(f"--kind: got {kind}; {allowed_words(kind, KINDS)} ({each})")
     if file.exists() and (file.is_dir() or not force):
         what = "a folder; state a file, as my-rig.toml" if file.is_dir() else "there already; --force replaces it"
         raise BadConfiguration(f"{file}: {what}")

@@ -89,7 +89,7 @@ def inertia(robot: Robot) -> dict[str, Inertia]:
 
 def _shown(robot: Robot, configuration: int, channel: Channel, state: State) -> float:
     """Reading of a channel that follows from a state alone [unit of its column]; 0 for others."""
-    signals = balances.begin(robot, Conditions(configuration), state)
+    signals = balances.begin_signals(robot, Conditions(configuration), state)
     try:
         return float(channel.read(robot, signals)) / channel.factor
     except (AttributeError, TypeError):  # a signal that the balances fill in

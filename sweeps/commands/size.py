@@ -7,7 +7,7 @@ from collections import Counter
 from pathlib import Path
 
 from calibration.data import requirements_file, robot_file
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.parts import motors
 from calibration.described import in_words
 from calibration.sizing import sheet
@@ -39,13 +39,13 @@ def size(config: configuration.Size, out: Path | None, force: bool) -> int:
     for name in objectives:
         if name not in OBJECTIVES:
             where = "--pareto" if config.pareto else "--objective"
-            raise BadConfiguration(f"{where}: got {name}; {choices(name, OBJECTIVES)}")
+            raise BadConfiguration(f"{where}: got {name}; {allowed_words(name, OBJECTIVES)}")
     if config.pareto and len(set(config.pareto)) != 2:
         raise BadConfiguration(f"--pareto: got {', '.join(config.pareto)}; expected two different objectives")
     known = [m.name for m in motors()]
     for name in config.motors:
         if name not in known:
-            raise BadConfiguration(f"--motors: got {name}; {choices(name, known)}")
+            raise BadConfiguration(f"--motors: got {name}; {allowed_words(name, known)}")
     sheet.refuse_impossible(robot, asked)
     with open_folder("size", config, robot, out, force) as folder:
         with pulse(tell, "drawing designs") as heard:

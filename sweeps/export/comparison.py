@@ -190,7 +190,7 @@ def _refitted(law: FormatLaw, least: Any, command: Any, load: Any, way: Any, cur
         apart = [(a - b) / s for a, b, s in zip(found, (current, speed), sizes, strict=True)]
         return jnp.concatenate([*apart, NEAR * jnp.sqrt(1.0 * len(command)) * (z - start)])
 
-    solver: Any = solvers.solver("lm")
+    solver: Any = solvers.solver_by_name("lm")
     found: Any = optx.least_squares(residual, solver, start, max_steps=300, throw=False)
     misfit = lambda z: jnp.sqrt(jnp.mean(residual(z, None) ** 2))  # noqa: E731
     exact, better = misfit(jnp.sqrt(law.start) / scale) < EXACT, misfit(found.value) <= misfit(start)

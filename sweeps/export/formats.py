@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.posterior_file import Posterior
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from mmrjax.compile.precision import in_double
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from sweeps.export import comparison, feed_forward, jax_actuator, mjlab, mujoco, onnx, randomization
 from sweeps.export.comparison import Comparison, Fate
 from sweeps.export.constants import constants_of, posterior_of
@@ -76,7 +76,7 @@ def exported(
         BadConfiguration, BadData: a format, a drive or a table that is refused.
     """
     if to not in FORMATS:
-        raise BadConfiguration(f"--to: got {to}; {choices(to, FORMATS)}")
+        raise BadConfiguration(f"--to: got {to}; {allowed_words(to, FORMATS)}")
     if not at.isprintable() or not at or any(c in at for c in "\"'<>&"):
         raise BadConfiguration(f"--joint: got {at!r}; expected the name of a joint, without quotes and brackets")
     if to in ("mujoco", "randomization"):
@@ -97,7 +97,8 @@ def notes_of(runs: Situation) -> list[str]:
     """Sentences for the head of every file."""
     command = runs.command
     return [
-        f"Seen: {counted(len(command), 'run')} of {runs.source}, {np.min(command):.4g} to {np.max(command):.4g} V, "
+        f"Seen: {count_noun(len(command), 'run')} of {runs.source}, "
+        f"{np.min(command):.4g} to {np.max(command):.4g} V, "
         f"{np.min(runs.load):.4g} to {np.max(runs.load):.4g} N·m at the joint. Nothing beyond was tested. "
         "LAW.md has the equations, the intervals and what is lost."
     ]

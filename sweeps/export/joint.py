@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.robot_file import RobotFile
 from mmrjax import effects as library
 from mmrjax.effects import Effect
@@ -114,7 +114,7 @@ class Joint:
 
     def parameters(self) -> dict[str, params.Parameter]:
         """Parameters that the law depends on, by dotted name."""
-        known = {p.name: p for p in params.walk(self.robot)}
+        known = {p.name: p for p in params.walk_parameters(self.robot)}
         used = [n for part in self.parts for n in names_of(*_symbols(part))]
         further = ["gearbox.ratio", "motor.inertia", "gearbox.efficiency_load"]
         further += ["driver.current_limit"] * (self.limit is not None)
@@ -144,7 +144,8 @@ def joint(file: RobotFile, configuration: str | None = None) -> Joint:
     name = robot.configurations.names[0] if configuration is None else configuration
     if name not in robot.configurations:
         raise BadConfiguration(
-            f"--configuration: got {name}; the robot has no such configuration; {choices(name, robot.configurations)}"
+            f"--configuration: got {name}; the robot has no such configuration; "
+            f"{allowed_words(name, robot.configurations)}"
         )
     if robot.unlike:
         raise BadConfiguration(
@@ -180,7 +181,7 @@ class _Tracer:
 
     def __init__(self, joint: Joint) -> None:
         self.joint, self.at_wheel = joint, True
-        self.parameters = [p.name for p in params.walk(joint.robot)]
+        self.parameters = [p.name for p in params.walk_parameters(joint.robot)]
         self.memories = [e.name for e in joint.robot.remembering]
         taken = {*VARIABLES.values(), "memory", "temperature", "load_torque"}
         self.around = [f.name for f in dataclasses.fields(Signals) if f.name not in taken]
@@ -243,7 +244,7 @@ def _parts(joint: Joint) -> Iterator[Part]:
     base: Sequence[tuple[str, str, str, str, str, str, Callable[[Robot, Signals], Any]]] = (
         ("direction", "way", "-", "x (3 - x²) / 2, x = ω/ω_0 within ±1",
          f"smooth sign of the speed, within ω_0 = {rest:.3g} rad/s of rest", "",
-         lambda r, s: contact.direction(s.speed_wheel, rest)),
+         lambda r, s: contact.smooth_sign(s.speed_wheel, rest)),
         ("back_emf", "back", "V", "E = C_m ω_m", "voltage that the turning motor induces", "",
          lambda r, s: r.motor.voltage_back(s.speed_motor)),
         ("winding", "electrical", "V", "U_R = R I", "voltage across the winding", "current",
@@ -268,7 +269,7 @@ def _parts(joint: Joint) -> Iterator[Part]:
     variable = {"supply": "current", "electrical": "current", "gearbox": "load", "track": "pull"}
     for effect in joint.inside:
         alone = lambda r, e=effect: tuple(x for x in r.effects if x.name == e.name)  # noqa: E731
-        value = lambda r, s, e=effect, alone=alone: balances.added(  # noqa: E731
+        value = lambda r, s, e=effect, alone=alone: balances.effects_sum(  # noqa: E731
             dataclasses.replace(r, effects=alone(r)), s, e.balance
         )
         rate = None

@@ -43,7 +43,7 @@ def drawn(
             "expected FOLDER/robot.toml of calibrate or loop"
         )
     values = posterior.draw(draws, seed)
-    own = {p.name for p in params.walk(joint.robot)}
+    own = {p.name for p in params.walk_parameters(joint.robot)}
     columns = {name: values[:, k] for k, name in enumerate(posterior.names) if name in own}
     centre = mujoco.translated(joint, normal)
     factors = {

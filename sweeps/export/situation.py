@@ -11,11 +11,11 @@ import numpy as np
 
 from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
-from mmrjax.fidelities.steady import shown_batch
+from mmrjax.fidelities.steady import results_of_rows
 from mmrjax.model import balances, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
-from mmrjax.model.signals import Signals, done
+from mmrjax.model.signals import Signals, is_done
 from sweeps.config import GridPart
 from sweeps.export.joint import Joint, channels_of
 from sweeps.inputs import read_runs
@@ -113,8 +113,8 @@ def _absent(joint: Joint, names: tuple[str, ...] = ()) -> Robot:
 
 def _solved(robot: Robot, conditions: Conditions) -> tuple[np.ndarray, Signals]:
     """Mask of the runs that end as their conditions ask, and the signals of all."""
-    result, signals = shown_batch(robot, conditions)
-    return np.asarray(done(result.status)), signals
+    result, signals = results_of_rows(robot, conditions)
+    return np.asarray(is_done(result.status)), signals
 
 
 def situation(joint: Joint, data: Runs | str | None) -> Situation:

@@ -118,7 +118,7 @@ def would_be_seen(found: DiscoveryResult) -> list[dict[str, Any]]:
     level, listed = found.before.kinds["single"].threshold, []
     for s in found.scores:
         if s.name in BY_NAME and s.sigmas_per_prior_sd > 0:
-            spec = next(p.spec for p in params.walk(BY_NAME[s.name]()) if p.spec.amplitude)
+            spec = next(p.spec for p in params.walk_parameters(BY_NAME[s.name]()) if p.spec.amplitude)
             times = level / s.sigmas_per_prior_sd
             size = f"{times * spec.prior_sd(0.0):.2g} {spec.unit}"
             listed.append({"name": s.name, "what": BY_NAME[s.name].family(), "size": size, "times": times})

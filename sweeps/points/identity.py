@@ -31,7 +31,7 @@ def identity(config: Part, robot: Robot, files: Iterable[str], device: str) -> I
         BadConfiguration: a file that cannot be read.
     """
     configuration = _flat(config.model_dump(mode="json", exclude={"report", "table"}), "")
-    configuration |= {f"robot {p.name}": repr(float(p.value)) for p in params.walk(robot)}
+    configuration |= {f"robot {p.name}": repr(float(p.value)) for p in params.walk_parameters(robot)}
     return {
         "configuration": configuration,
         "data": {file: _hash(file) for file in files},

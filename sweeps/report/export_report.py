@@ -64,7 +64,7 @@ def document(found: Export) -> Document:
 
 def _errors(found: Export) -> Table:
     names = list(found.comparison.errors[0].percent)
-    columns = (Column("model"), *(Column(channels.find(n).label, "%", "{:.3g}") for n in names))
+    columns = (Column("model"), *(Column(channels.find_channel(n).label, "%", "{:.3g}") for n in names))
     rows = [(e.label, *(e.percent[n] for n in names)) for e in found.comparison.errors]
     return Table("error-table", columns, rows, words.errors_title(found))
 

@@ -10,7 +10,7 @@ from calibration.sizing.chart import Chart
 from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.design_search import SizedDesign, Sizing
 from calibration.sizing.sheet import Outcome
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.model.robot import Robot
 from sweeps.results.check_results import label
 
@@ -82,7 +82,7 @@ def missed(found: SizedDesign) -> list[str]:
 
 def described(found: SizedDesign) -> str:
     """Motor, gearbox, ratio, radius and cells of a design."""
-    stages = counted(found.drive.stages, "stage")
+    stages = count_noun(found.drive.stages, "stage")
     return (
         f"{found.drive.motor.name}, {found.drive.family} with {stages}, ratio {found.ratio:.4g}, radius "
         f"{1000 * found.radius:.1f} mm, {found.in_series} × {found.parallel:.3g} {found.cell.name}"

@@ -10,7 +10,7 @@ import numpy as np
 from calibration.data import counters
 from calibration.data.input_errors import BadData, number
 from calibration.data.sources.recorded_signals import UNITS, Clock, Signal
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 
 #: Seconds since 1970 between which a clock may count from there: 1990 and 2100.
 EPOCH = (6.3e8, 4.2e9)
@@ -151,7 +151,7 @@ def on_one_grid(
         unit, period = read[key].unit, read[key].period
         if key in late:
             notes.append(
-                f"{name}: {counted(late[key], 'sample')} of {clock.name} recorded late; sorted by their stamps"
+                f"{name}: {count_noun(late[key], 'sample')} of {clock.name} recorded late; sorted by their stamps"
             )
         if period:
             notes.append(f"{name}: {clock.name} wraps at {period:.10g}; counted on from there")

@@ -81,7 +81,7 @@ def table(path: Path, within: str = "") -> NamedArrays | None:
             raise BadData(f"{name}, {signal.path}: {signal.refused or 'has a clock of its own; expected one table'}")
     _check_memory(name, signals)
     values = _in_rows(source, signals)
-    units = tuple(quantities.spelled(signal.unit) for signal in signals.values())
+    units = tuple(quantities.unit_in_column(signal.unit) for signal in signals.values())
     return NamedArrays(
         name, tuple(values), tuple(map(_raw, values.values())), units, "the source", digest=source.digest
     )
@@ -149,7 +149,9 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
     else:
         values, more = _in_rows(source, chosen), ()
         values |= _in_rows(source, extras, len(next(iter(values.values()), [])))
-    units = tuple(quantities.spelled(next((s.unit for c, s in chosen.items() if c == name), "")) for name in values)
+    units = tuple(
+        quantities.unit_in_column(next((s.unit for c, s in chosen.items() if c == name), "")) for name in values
+    )
     arrays = NamedArrays(
         source.name,
         tuple(values),

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import numpy as np
 
 from calibration.data.input_errors import BadData
-from mmrjax.errors import near
+from mmrjax.errors import similar_words
 
 #: Last parts of the paths of signals that are time stamps, without a unit behind them.
 CLOCKS = ("time", "t", "timestamp", "timestamps", "stamp", "elapsed", "clock", "timestamp_sample")
@@ -101,7 +101,7 @@ def one(signals: Sequence[Signal], name: str, where: str) -> Signal:
 
 def offered(name: str, paths: Sequence[str]) -> str:
     """Paths that a message offers for an unknown name: near ones, else the first."""
-    close = near(name, paths, 3)
+    close = similar_words(name, paths, 3)
     if close:
         return f"did you mean {', '.join(close)}?"
     return f"it has {', '.join(paths[:LISTED])}{', ...' if len(paths) > LISTED else ''}"

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.runs import Runs
 from calibration.inference.observers.base import Observer
 from calibration.inference.observers.settled import SettledRuns
@@ -38,8 +38,8 @@ def fidelity_facts(model: str) -> Facts:
         BadConfiguration: no such fidelity.
     """
     if model not in fidelities.TABLE:
-        raise BadConfiguration(f"--model {model}: no such fidelity; {choices(model, fidelities.TABLE)}")
-    return fidelities.facts(model)
+        raise BadConfiguration(f"--model {model}: no such fidelity; {allowed_words(model, fidelities.TABLE)}")
+    return fidelities.fidelity_facts(model)
 
 
 def pose_problem(
@@ -59,5 +59,8 @@ def pose_problem(
         fidelity_facts(model)
     observe = observer_kind(runs).of(runs, base, model)
     return Problem(
-        params.strong(base), coordinates, observe, data_from_readings(runs.measured(), sd, len(coordinates))
+        params.without_weak_types(base),
+        coordinates,
+        observe,
+        data_from_readings(runs.measured(), sd, len(coordinates)),
     )

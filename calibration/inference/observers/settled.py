@@ -39,9 +39,9 @@ from calibration.inference.simulation_errors import root_mean_square
 from mmrjax import fidelities
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.effects import Effect
-from mmrjax.effects.curve import WAYS, acts_along
+from mmrjax.effects.curve import WAYS, direction_signal
 from mmrjax.fidelities.base import Implicit
-from mmrjax.fidelities.rest import direction
+from mmrjax.fidelities.rest import travel_direction
 from mmrjax.fidelities.steady import SIZES, operating_signals
 from mmrjax.model import balances, channels
 from mmrjax.model.conditions import Conditions
@@ -96,7 +96,7 @@ class SettledLinearization(Linearization):
 
     def along_of_sides(self, balance: str) -> np.ndarray:
         """Change of the readings by a defect along the travel, shape (sides, rows, channels)."""
-        way = self.variable(acts_along(balance)).reshape(-1, self.rows)
+        way = self.variable(direction_signal(balance)).reshape(-1, self.rows)
         return np.asarray(self.of_sides(self.probed.index(balance))) * way[:, :, None]
 
     def places(self) -> np.ndarray:
@@ -105,7 +105,7 @@ class SettledLinearization(Linearization):
 
 def side_shares(channel: str, sides: int) -> np.ndarray:
     """Weights of the sides in a channel's reading [-]: one side, or the mean of all."""
-    side = channels.find(channel).side
+    side = channels.find_channel(channel).side
     return np.full(sides, 1 / sides) if side is None or sides == 1 else np.eye(sides)[side]
 
 
@@ -138,7 +138,7 @@ class SettledRuns(Observer):
 
     @classmethod
     def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> SettledRuns:
-        chosen = fidelities.get(fidelity or "steady")
+        chosen = fidelities.get_fidelity(fidelity or "steady")
         conditions = runs.conditions(robot)
         if not chosen.facts.rollout:
             try:
@@ -212,15 +212,15 @@ class SettledRuns(Observer):
         return (), ()
 
     def __call__(self, robot: Robot) -> Observation:
-        return self._observed(robot, fidelities.get(self.fidelity).settled(robot, self.conditions))
+        return self._observed(robot, fidelities.get_fidelity(self.fidelity).settled(robot, self.conditions))
 
     def _observed(self, robot: Robot, result: Result) -> Observation:
-        reading = jnp.stack([result.reading[name] for name in channels.names(robot.channels)], -1)
+        reading = jnp.stack([result.reading[name] for name in channels.channel_names(robot.channels)], -1)
         return Observation(reading, jnp.asarray(result.adhesion_used), result.status, jnp.asarray(result.flags))
 
     @property
     def _implicit(self) -> Implicit | None:
-        return fidelities.get(self.fidelity).implicit
+        return fidelities.get_fidelity(self.fidelity).implicit
 
     def solve(self, robot: Robot) -> tuple[Array, Array] | None:
         implicit = self._implicit
@@ -239,7 +239,7 @@ class SettledRuns(Observer):
 
     @property
     def long(self) -> bool:
-        return fidelities.facts(self.fidelity).rollout
+        return fidelities.fidelity_facts(self.fidelity).rollout
 
     @property
     def eased(self) -> bool:
@@ -252,7 +252,7 @@ class SettledRuns(Observer):
         return int(included.sum())
 
     def cautions(self, robot: Robot) -> list[str]:
-        return fidelities.get(self.fidelity).cautions(robot, self.conditions)
+        return fidelities.get_fidelity(self.fidelity).cautions(robot, self.conditions)
 
     def linearise(
         self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]
@@ -264,7 +264,7 @@ class SettledRuns(Observer):
         """
         kind = self.linearization
         probes = tuple(balance_probe(b) for b in kind.probed)
-        robot, size, shown = problem.robot(z), z.size, channels.names(problem.channels)
+        robot, size, shown = problem.robot(z), z.size, channels.channel_names(problem.channels)
 
         def probed(x: Array) -> Robot:
             delta = x[size:].reshape(len(probes), *self.shape_sides)
@@ -286,7 +286,7 @@ class SettledRuns(Observer):
 
         def signature(effect: Effect) -> Array:
             alone = dataclasses.replace(robot, effects=(effect,))
-            term = jax.vmap(lambda s: balances.added(alone, s, effect.balance, effect.channel))(each)
+            term = jax.vmap(lambda s: balances.effects_sum(alone, s, effect.balance, effect.channel))(each)
             term = jnp.broadcast_to(term, each.speed.shape).reshape(rows, -1)
             if effect.balance == "sensor":
                 term = term @ side_shares(effect.channel, term.shape[1])
@@ -433,7 +433,7 @@ def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarra
 @functools.partial(compiled, options=SELDOM)
 def _directions(observe: SettledRuns, robot: Robot) -> Float[Array, " rows"]:
     """Direction of each run, 1 or -1."""
-    return jax.vmap(lambda c: direction(robot, c))(observe.conditions)
+    return jax.vmap(lambda c: travel_direction(robot, c))(observe.conditions)
 
 
 @functools.partial(compiled, options=SELDOM)

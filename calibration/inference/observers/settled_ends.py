@@ -237,7 +237,9 @@ def _slides_at_end(problem: Problem, ends: Ends) -> np.ndarray:
     """True if a run's movers spin at its end, also while it still gains speed, forwards or back; shape (runs,)."""
     if not {"motor_speed", "speed"} <= set(problem.base.rig.channels):
         return np.zeros(len(ends.mean), bool)
-    turning, travelling = (ends.shown[:, channels.index(c, problem.channels)] for c in ("motor_speed", "speed"))
+    turning, travelling = (
+        ends.shown[:, channels.channel_index(c, problem.channels)] for c in ("motor_speed", "speed")
+    )
     robot = problem.base
     radius = np.array([float(c.radius) for c in robot.configurations.members])
     circumference = radius[np.asarray(ends.conditions.configuration)] * turning

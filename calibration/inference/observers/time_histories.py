@@ -62,23 +62,23 @@ from mmrjax.compile.compiling import OVER_TIME, SELDOM, compiled
 from mmrjax.compile.precision import Threads
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import WAYS
-from mmrjax.fidelities.drive import moving, rates, state_of
+from mmrjax.fidelities.drive import drive_rates, moving, state_of_unknowns
 from mmrjax.fidelities.histories import (
     CHANGE,
     LONGEST,
     LOOSE,
     START,
     STEPS,
-    Followed,
-    Step,
-    Within,
-    at_first,
-    followed,
-    grid,
-    histories,
-    respond,
-    steps_of,
-    within,
+    LinearisedRun,
+    RunStep,
+    StepCourse,
+    course_between_instants,
+    first_instant,
+    history_signals,
+    linearise_run,
+    run_response,
+    run_steps,
+    time_grid,
 )
 from mmrjax.model import balances, channels
 from mmrjax.model.channels import Channel
@@ -87,7 +87,7 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.rig import Begin, Begins, Rig
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, FAILED, Signals, State
-from mmrjax.numerics.linear_equations import solved
+from mmrjax.numerics.linear_equations import solve
 
 #: Most knots of a run's defect in time, and largest product of knots and steps of all runs (2 GB of working memory).
 KNOTS, KNOT_STEPS = 256, 1e7
@@ -229,7 +229,7 @@ class Histories(Observer):
     rows_of: Int[Array, "runs samples"]
     knots: Int[Array, "runs knots"]
     delayed: bool = eqx.field(default=False, static=True)
-    known: Followed | None = None
+    known: LinearisedRun | None = None
 
     @classmethod
     def observes(cls, runs: Runs) -> bool:
@@ -238,7 +238,7 @@ class Histories(Observer):
     @classmethod
     def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> Histories:
         """Observer of a table; rows may be in any order, and constant conditions of a run are its first row's."""
-        if fidelity is not None and fidelities.get(fidelity).name != "drive":
+        if fidelity is not None and fidelities.get_fidelity(fidelity).name != "drive":
             raise BadConfiguration(f"--model {fidelity}: {runs.source} holds time histories; they need --model drive")
         if runs.turns:
             raise BadConfiguration(
@@ -261,7 +261,7 @@ class Histories(Observer):
         ]
         change = LOOSE if robot.loose else CHANGE
         grids = [
-            grid(whole["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change)
+            time_grid(whole["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change)
             for rows, n, c, h in zip(every, noted, _drive_jumps(whole, every, robot.rig), steps, strict=True)
         ]
         # The last instant begins a step too, of length zero.
@@ -431,12 +431,14 @@ class Histories(Observer):
         """Observer with the simulated runs of a robot."""
         if self.known is not None:
             return self
-        known = jax.vmap(lambda c, t: followed(robot, c, t))(self.conditions, self.times)
+        known = jax.vmap(lambda c, t: linearise_run(robot, c, t))(self.conditions, self.times)
         return dataclasses.replace(self, known=known)
 
     def whole(self, robot: Robot) -> Signals:
         """Signals of each run at each instant, shape (runs, instants)."""
-        whole_runs = jax.vmap(lambda c, t, k: histories(robot, c, t, k))(self.conditions, self.times, self.known)
+        whole_runs = jax.vmap(lambda c, t, k: history_signals(robot, c, t, k))(
+            self.conditions, self.times, self.known
+        )
         return jax.tree.map(lambda x: jnp.broadcast_to(x, self.times.shape), whole_runs)
 
     def at_rows(self, whole: Signals) -> Signals:
@@ -522,21 +524,23 @@ class Histories(Observer):
 
         def of_run(times: Array, every: tuple[Array, ...], time: Array) -> Array:
             step, share = rig.before(times, time)
-            return Within.read(tuple(x[step] for x in every), share)
+            return StepCourse.read(tuple(x[step] for x in every), share)
 
         of_runs = jax.vmap(of_run)(self.times, every, self.time[self.rows_of])
         return _by_row(of_runs, self.rows_of, len(self.run))
 
     def __call__(self, robot: Robot) -> Observation:
         def of_run(
-            conditions: Conditions, times: Array, known: Followed | None, instants: Array, time: Array
+            conditions: Conditions, times: Array, known: LinearisedRun | None, instants: Array, time: Array
         ) -> Array:
             """Readings of a run's rows."""
 
             if not self.delayed:
-                return _readings(robot, histories(robot, conditions, times, known, instants))
+                return _readings(robot, history_signals(robot, conditions, times, known, instants))
             step, share = robot.rig.before(times, time)
-            return Within.read(_readings_within_steps(robot, within(robot, conditions, times, known, step)), share)
+            return StepCourse.read(
+                _readings_within_steps(robot, course_between_instants(robot, conditions, times, known, step)), share
+            )
 
         places = self.instant[self.rows_of], self.time[self.rows_of]
         of_runs = jax.vmap(of_run)(self.conditions, self.times, self.known, *places)
@@ -601,7 +605,7 @@ class Histories(Observer):
             self.knots,
             self.time,
             angle,
-            channels=channels.names(problem.channels),
+            channels=channels.channel_names(problem.channels),
             magnitudes=robot.rig.magnitudes,
         )
 
@@ -619,7 +623,7 @@ class Histories(Observer):
         jacobian = linear.jacobian
         counts = jnp.concatenate([data.weight.ravel(), jnp.zeros(linear.rows), jnp.ones(jacobian.shape[1])])
         noise = counts * jax.random.normal(jax.random.wrap_key_data(drawn), counts.shape)
-        return linear.with_residual(noise - jacobian @ solved(jacobian.T @ jacobian, jacobian.T @ noise))
+        return linear.with_residual(noise - jacobian @ solve(jacobian.T @ jacobian, jacobian.T @ noise))
 
     def starts(self, problem: Problem, random: np.random.Generator, count: int) -> Float[np.ndarray, "starts z"]:
         """Starts as in the protocol: the fit of the log's equations in weak form (`weak_form`) and the prior mean.
@@ -879,7 +883,7 @@ def _shown_of_unit(robot: Robot, configuration: int, channel: Channel) -> float:
     radius = float(robot.configurations.members[configuration].radius)
     none, one = jnp.zeros(()), jnp.ones(())
     rolling = State(none, one, radius / robot.gearbox.ratio, none, distance=radius)
-    return float(channel.read(robot, balances.begin(robot, Conditions(configuration), rolling)))
+    return float(channel.read(robot, balances.begin_signals(robot, Conditions(configuration), rolling)))
 
 
 def _extrapolated(time: np.ndarray, shown: np.ndarray) -> tuple[float, float]:
@@ -1030,14 +1034,14 @@ def _common_length(instants: int) -> int:
 
 def _reading(robot: Robot, signals: Signals) -> Float[Array, " channels"]:
     shown = balances.sensor(robot, signals)
-    return jnp.stack([shown[name] for name in channels.names(robot.channels)], -1)
+    return jnp.stack([shown[name] for name in channels.channel_names(robot.channels)], -1)
 
 
 def _readings(robot: Robot, signals: Signals) -> Float[Array, "instants channels"]:
     return jax.vmap(lambda s: _reading(robot, s))(signals)
 
 
-def _readings_within_steps(robot: Robot, steps: Within) -> tuple[Array, ...]:
+def _readings_within_steps(robot: Robot, steps: StepCourse) -> tuple[Array, ...]:
     """Readings as arguments of `Within.read`."""
     return *(_readings(robot, s) for s in (steps.first, steps.begin, steps.end)), steps.decays
 
@@ -1057,7 +1061,7 @@ def _over_delays(problem: Problem, z: Array, data: Data, scanned: Array, values:
 
     def shown(z: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         robot = problem.robot(z)
-        of_run = lambda c, t, k: _readings_within_steps(robot, within(robot, c, t, k))  # noqa: E731
+        of_run = lambda c, t, k: _readings_within_steps(robot, course_between_instants(robot, c, t, k))  # noqa: E731
         *every, decays = jax.vmap(of_run)(observe.conditions, observe.times, observe.known)
         return tuple(every), (*every, decays)
 
@@ -1082,7 +1086,7 @@ def _over_delays(problem: Problem, z: Array, data: Data, scanned: Array, values:
 def _minimum_with_one_held(residual: Array, jacobian: Array, z: Array, held: Array) -> tuple[Array, Array]:
     """Objective at the minimum of a linearisation with one coordinate held, and the coordinates there."""
     free = jnp.where(held, 0.0, jacobian)
-    step = -solved(free.T @ free + jnp.diag(held.astype(float)), free.T @ residual)
+    step = -solve(free.T @ free + jnp.diag(held.astype(float)), free.T @ residual)
     return 0.5 * jnp.sum((residual + free @ step) ** 2), z + step
 
 
@@ -1113,10 +1117,10 @@ def _evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Ev
 @functools.partial(compiled, options=OVER_TIME)
 def _evaluate(
     problem: Problem, z: Numbers, weights: Numbers, active: Numbers | None
-) -> tuple[Array, Array, Observation, Followed]:
+) -> tuple[Array, Array, Observation, LinearisedRun]:
     """Result of `linearise_rollout` for members of a search, and their runs."""
 
-    def one(z: Array, weight: Array, which: Array | None) -> tuple[Array, Array, Observation, Followed]:
+    def one(z: Array, weight: Array, which: Array | None) -> tuple[Array, Array, Observation, LinearisedRun]:
         here = problem
         if which is not None:
             here = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(which))
@@ -1175,7 +1179,7 @@ class _Probed(NamedTuple):
         entering = np.array([places.index(b) if (b := e.effect.balance) in places else 0 for e in effects], int)
         entering = np.repeat(entering, counts)
         enters = np.repeat([1.0 * (e.effect.balance in places) for e in effects], counts)
-        shown = channels.names(robot.channels)
+        shown = channels.channel_names(robot.channels)
         at_sensor = np.array([[e.effect.channel == c for e in effects] for c in shown], float)
         at_sensor = np.repeat(at_sensor, counts, 1) if effects else np.zeros((len(shown), 0))
         return cls(robot, every, size, effects, entering, enters, at_sensor)
@@ -1190,7 +1194,7 @@ class _Probed(NamedTuple):
         conditions: Conditions,
         clock: Array,
         instants: Array,
-        along: Followed,
+        along: LinearisedRun,
         times: Array,
         time: Array,
         *,
@@ -1206,7 +1210,7 @@ class _Probed(NamedTuple):
         remembered, hat = _remembered(robot, conditions, along, self.effects), _hats(clock)
 
         def terms(t: Array, y: Array, held: Conditions, way: Array | None = None) -> Array:
-            signals = moving(robot, held, state_of(robot, y), way)
+            signals = moving(robot, held, state_of_unknowns(robot, y), way)
             return effect_terms(robot, signals, self.effects, remembered(t))
 
         def both(by_probes: Array, t: Array, term: Array) -> Array:
@@ -1215,25 +1219,25 @@ class _Probed(NamedTuple):
             return jnp.concatenate([knots, by_probes[:, self.entering] * (self.enters * term)], 1)
 
         def source(t: Array, y: Array, held: Conditions, way: Array) -> Array:
-            by_probes = jax.jacfwd(lambda a: rates(self.at(a), held, y, way))(none)
+            by_probes = jax.jacfwd(lambda a: drive_rates(self.at(a), held, y, way))(none)
             return both(by_probes, t, terms(t, y, held, way))
 
         def seen(t: Array, y: Array, dy: Array, held: Conditions) -> Array:
             """Changes through the state, and immediate ones: with an imposed speed, current follows from torque."""
 
             def reading(y: Array, amplitude: Array) -> Array:
-                return _reading(robot, moving(self.at(amplitude), held, state_of(robot, y)))
+                return _reading(robot, moving(self.at(amplitude), held, state_of_unknowns(robot, y)))
 
             by_state, at_once = jax.jacfwd(reading, (0, 1))(y, none)
             term = terms(t, y, held)
             shows = jnp.concatenate([jnp.zeros((len(by_state), size * len(clock))), self.at_sensor * term], 1)
             return by_state @ dy + both(at_once, t, term) + shows
 
-        first, begins = at_first(robot, conditions)
-        by_probes = jax.jacfwd(lambda a: at_first(self.at(a), conditions)[1])(none)
+        first, begins = first_instant(robot, conditions)
+        by_probes = jax.jacfwd(lambda a: first_instant(self.at(a), conditions)[1])(none)
         begun = by_probes[:, self.entering] * (self.enters * terms(clock[0], begins, first))
         unmoved = jnp.concatenate([jnp.zeros((len(begins), size * len(clock))), begun], 1)
-        changed = respond(conditions, along, source, seen, unmoved)
+        changed = run_response(conditions, along, source, seen, unmoved)
         whole = jnp.concatenate([seen(clock[0], begins, unmoved, first)[None], changed])
         knots = whole[instants, :, : size * len(clock)].reshape(len(instants), -1, size, len(clock))
         mine = whole[:, :, size * len(clock) :]
@@ -1261,11 +1265,12 @@ def _hats(clock: Array) -> Callable[[Array], Array]:
 
 
 def _remembered(
-    robot: Robot, conditions: Conditions, along: Followed, effects: tuple[ScoredEffect, ...]
+    robot: Robot, conditions: Conditions, along: LinearisedRun, effects: tuple[ScoredEffect, ...]
 ) -> Callable[[Array], list[Array]]:
     """Memory of effects along a known run, at each point of their grids, as a function of time.
 
-    It follows the stages of the run (`histories.followed`); a memory's rate is linear in the memory, or nearly so.
+    It follows the stages of the run (`histories.linearise_run`); a memory's rate is linear in the memory, or nearly
+    so.
     """
     mine = [e for e in effects if e.effect.memory_size is not None]
     counts = np.cumsum([len(e.at) for e in mine])
@@ -1277,7 +1282,7 @@ def _remembered(
         return jnp.split(memory, counts[:-1])
 
     def speeds(y: Array, held: Conditions, way: Array, memory: Array) -> Array:
-        signals = moving(robot, held, state_of(robot, y), way)
+        signals = moving(robot, held, state_of_unknowns(robot, y), way)
 
         def rate(effect: Effect, remembered: Array) -> Array:
             known = dataclasses.replace(signals, memory={**signals.memory, effect.name: remembered})
@@ -1286,9 +1291,9 @@ def _remembered(
         return jnp.concatenate([map_over_shapes(e, rate, m) for e, m in zip(mine, split(memory), strict=True)])
 
     times = jnp.append(along.clock[:, 0], along.clock[-1, 2])
-    steps, constant = steps_of(conditions, times)
+    steps, constant = run_steps(conditions, times)
 
-    def after(memory: Array, step: tuple[Followed, Step]) -> tuple[Array, Array]:
+    def after(memory: Array, step: tuple[LinearisedRun, RunStep]) -> tuple[Array, Array]:
         here, taken = step
         held, spans, passes = taken.held(constant), jnp.diff(here.clock), here.sides[0] != here.sides[1]
 
@@ -1303,8 +1308,8 @@ def _remembered(
         last = stage(memory + ahead * (first - memory), span, here.places[1], here.sides[1])
         return last, jnp.stack([first, last])
 
-    begin = at_first(robot, conditions)[1]
-    angle = state_of(robot, begin).distance / robot.chassis(conditions.configuration).radius
+    begin = first_instant(robot, conditions)[1]
+    angle = state_of_unknowns(robot, begin).distance / robot.chassis(conditions.configuration).radius
     begun = jnp.concatenate(
         [
             map_over_shapes(

@@ -25,7 +25,7 @@ from calibration.inference.problem import Data, Observation, Problem
 from mmrjax import effects, fidelities
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import IN_TURNS, VARIABLES_ROUND, WAYS
-from mmrjax.fidelities.steady import shown_batch
+from mmrjax.fidelities.steady import results_of_rows
 from mmrjax.model.balances import ROUND
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
@@ -120,7 +120,7 @@ class SettledTurns(SettledRuns):
         return True
 
     def read(self, robot: Robot) -> Observation:
-        return self._observed(robot, shown_batch(robot, self.conditions)[0])
+        return self._observed(robot, results_of_rows(robot, self.conditions)[0])
 
     def draws(
         self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray
@@ -149,7 +149,7 @@ class SettledTurns(SettledRuns):
         Curves are over each side's signals, the yaw rate, and the side.
         """
         names = [v for v in VARIABLES if v != "voltage" or robot.rig.shows_voltage]
-        signals = shown_batch(robot, self.conditions)[1]
+        signals = results_of_rows(robot, self.conditions)[1]
         seen = {n: np.asarray(signal_by_point(signals, n)) for n in (*names, *WAYS)}
         points = {bases_room.VARIABLES[v]: seen[v] for v in names}
         points |= {c: np.tile(columns[c], 2) for c in ("configuration", "order") if c in columns}

@@ -93,7 +93,7 @@ def _act(act: menu.Act) -> str:
         return _weigh(act)
     (kind,) = act.kinds
     if act.channel:
-        return ACTS[kind].format(channels.find(act.channel).label)
+        return ACTS[kind].format(channels.find_channel(act.channel).label)
     return ACTS[kind].format(amounts([v for (v,) in act.at], UNITS[kind]))
 
 
@@ -110,7 +110,7 @@ def _weigh(act: menu.Act) -> str:
 def _run(run: menu.Run) -> str:
     level = (run.imposed != "voltage" or bool(run.torque)) and not any(run.slope)
     where = "" if run.setup in setups.WEIGHTLESS or level else f" {slopes(run.slope)}"
-    read = both([channels.find(c).label for c in run.channels])
+    read = both([channels.find_channel(c).label for c in run.channels])
     turning = [menu.round_significant(v / RPM) for v in run.voltage]
     unit = {"voltage": "V", "motor_current": "A of each motor"}.get(run.imposed)
     at = amounts(turning, "rpm of the motor") if unit is None else amounts(run.voltage, unit)

@@ -6,7 +6,7 @@ import numpy as np
 
 from calibration.data.input_errors import rounded
 from mmrjax import __version__
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.model import channels
 from sweeps.export.comparison import APPROXIMATED, DROPPED, EXPORTED, HELD, NATIVE, Fate
 from sweeps.export.formats import FORMATS, Export
@@ -59,14 +59,14 @@ def statement(found: Export) -> str:
     compared = found.comparison
     exported, native = compared.of(EXPORTED), compared.of(NATIVE)
     channels_shown = ", ".join(
-        f"{channels.find(n).label} {rounded(exported[n])} %"
+        f"{channels.find_channel(n).label} {rounded(exported[n])} %"
         + (f" (native {rounded(native[n])} %)" if compared.situation.is_measured else "")
         for n in exported
     )
     drive = found.joint
     return (
         f"The drive of {drive.file.name}, {drive.configuration}, as {FORMATS[found.format]}: its error against "
-        f"{compared.reference} over {counted(len(compared.situation.command), 'run')} is {channels_shown}."
+        f"{compared.reference} over {count_noun(len(compared.situation.command), 'run')} is {channels_shown}."
     )
 
 
@@ -105,7 +105,7 @@ def conditions_seen(found: Export) -> list[str]:
     """Ranges of the compared runs, a line each."""
     runs = found.comparison.situation
     lines = [
-        f"{counted(len(runs.command), 'settled run')} of {runs.source}",
+        f"{count_noun(len(runs.command), 'settled run')} of {runs.source}",
         f"voltage at the driver's output {_span(runs.command)} V",
         f"torque at the joint {_span(runs.load)} N·m",
         f"speed of the joint {_span(runs.inside.speed)} rad/s",
@@ -178,7 +178,7 @@ def law(found: Export) -> str:
     errors = "\n".join(
         f"| {e.label} | {' | '.join(f'{x:.3g}' for x in e.percent.values())} |" for e in compared.errors
     )
-    names = [f"{channels.find(n).label} [%]" for n in compared.errors[0].percent]
+    names = [f"{channels.find_channel(n).label} [%]" for n in compared.errors[0].percent]
     fates = "\n".join(
         f"* {f.name}: {verdicts[f.verdict]} {f.how}{f' ({kept(f)} of its change is kept)' if kept(f) else ''}"
         for f in compared.fates

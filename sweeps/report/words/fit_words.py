@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from calibration.inference import blocks, fit_notes
 from calibration.inference.identifiability import HELD
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.model import channels
 
 if TYPE_CHECKING:
@@ -47,8 +47,8 @@ def noise_off(note: fit_notes.NoiseOff) -> str:
             "conditions: are the sds right?"
         )
     return (
-        f"residuals of {channels.find(note.channel).label} are {note.factor:.2g} times the {note.source} sds, "
-        "under all conditions: are these sds right?"
+        f"residuals of {channels.find_channel(note.channel).label} are {note.factor:.2g} times the {note.source} "
+        "sds, under all conditions: are these sds right?"
     )
 
 
@@ -144,7 +144,7 @@ def generations(note: fit_notes.Generations) -> str:
     end = "the last gained nothing that counts"
     if not note.settled:
         end = "the last still gained: go on with more --generations"
-    return f"{counted(note.members, 'member')} in {counted(note.generations, 'generation')}; {end}"
+    return f"{count_noun(note.members, 'member')} in {count_noun(note.generations, 'generation')}; {end}"
 
 
 def lost_rows(note: fit_notes.LostRows) -> str:
@@ -180,7 +180,7 @@ def ended_at_edge(note: fit_notes.EndedAtEdge) -> str:
 
 def shown_by(test: fit_notes.Shown) -> str:
     """Result of the most significant test of residuals."""
-    whose = f"the residuals of {channels.find(test.channel).label}" if test.channel else ""
+    whose = f"the residuals of {channels.find_channel(test.channel).label}" if test.channel else ""
     return {
         "": "",
         "stated": "the residuals exceed the stated noise",
@@ -202,8 +202,8 @@ OBSTACLES = {
 def _misses(those: Sequence[Miss]) -> str:
     """`total current 74 % of its measured rms (32 % with the file as stated)`."""
     each = [
-        f"{channels.find(m.channel).label} {_percent(m.fitted)} of its measured rms ({_percent(m.as_stated)} with "
-        "the file as stated)"
+        f"{channels.find_channel(m.channel).label} {_percent(m.fitted)} of its measured rms ({_percent(m.as_stated)} "
+        "with the file as stated)"
         for m in those
     ]
     return ", ".join(each)
@@ -245,7 +245,7 @@ LISTED = 6
 
 def residual_cluster(c: ResidualCluster) -> str:
     """Residuals that go with a column without a role."""
-    what = f"residuals of {channels.find(c.channel).label}"
+    what = f"residuals of {channels.find_channel(c.channel).label}"
     within = f" within {c.within}" if c.within else ""
     signs = ", with opposite signs in the two directions of travel" if c.reversing else ""
     p = f"p = {c.p:.1g}"

@@ -16,7 +16,7 @@ from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME
 from calibration.inference import bases, blocks
 from calibration.inference.series_noise import SeriesNoise
 from mmrjax import effects
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.model import channels
 from sweeps.report.words import fit_words
 
@@ -122,7 +122,7 @@ def _claim(sure: Sequence[str], others: Sequence[str]) -> str:
 def _undescribed(said: loop_notes.Summary) -> str:
     """That a model does not describe the runs, by how much, and what to check."""
     each = [
-        f"{channels.find(m.channel).label} by {100 * m.error:.0f} % of its measured rms"
+        f"{channels.find_channel(m.channel).label} by {100 * m.error:.0f} % of its measured rms"
         + (f" (its noise is estimated as {100 * m.noise:.0f} %)" if m.noise > m.error else "")
         for m in said.missed
     ]
@@ -616,11 +616,11 @@ def worse(found: Sequence[Worse], predicted: Mapping[str, tuple[int, int]]) -> s
     parts = []
     for kind, (before, after) in predicted.items():
         mine = [w for w in found if w.kind == kind]
-        changes = [f"{channels.find(w.channel).label} {_change(w.before, w.after)} %" for w in mine]
+        changes = [f"{channels.find_channel(w.channel).label} {_change(w.before, w.after)} %" for w in mine]
         if any(w.rows < max(before, after) for w in mine):
             changes[-1] += f" (of the {min(w.rows for w in mine)} rows that both predict)"
         if before > after:
-            changes.append(f"{counted(before - after, 'row')} fewer predicted")
+            changes.append(f"{count_noun(before - after, 'row')} fewer predicted")
         if changes:
             parts.append(f"by {blocks.kind_in_words(kind)} {', '.join(changes)}")
     return f"Held out, what was found predicts worse: {'; '.join(parts)}." if parts else ""
