@@ -116,6 +116,7 @@ def test_armature_without_a_ratio_turns_with_the_load(tmp_path):
         ('<mass value="0.32"/>', '<mass value="-1"/>', "left_wheel_joint", r"link left_wheel, <mass>: got value -1; expected 0 kg"),
         ('<mass value="0.32"/>', '<mass value="${m}"/>', "left_wheel_joint", r"got '\$\{m\}'; expected a number \[kg\]; run xacro"),
         ('izz="6.8e-4"', 'izz="0"', "left_wheel_joint", r"<inertia>: got 0 kg·m² about the axis of left_wheel_joint"),
+        ('<link name="tool">', '<a:arg xmlns:a="http://www.ros.org/wiki/xacro"/><link name="tool">', "arm_joint", r"r.urdf: has elements of xacro; run"),
         ("inertial>", "inert>", "left_wheel_joint", r"link left_wheel: no <inertial>"),
         ("<robot", "<robot><joint", "arm_joint", r"r.urdf: not a readable XML file \(mismatched tag"),
         ("mechanicalReduction>34", "mechanicalReduction>0.1", "left_wheel_joint", r"left_drive, <mechanicalReduction>: got 0.1;"),

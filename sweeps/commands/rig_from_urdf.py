@@ -46,6 +46,8 @@ def read(root: Element, file: str, joint: str | None) -> JointNumbers:
 class _Urdf:
     def __init__(self, root: Element, file: str) -> None:
         self.root, self.file = root, file
+        if any("xacro}" in element.tag for element in root.iter()):
+            raise BadConfiguration(f"{file}: has elements of xacro; run xacro {file} > robot.urdf, and state that")
         self.links, self.joints = self._named("link"), self._named("joint")
         for name, element in self.joints.items():
             for end in ("parent", "child"):
