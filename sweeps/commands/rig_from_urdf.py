@@ -36,8 +36,8 @@ def read(root: Element, file: str, joint: str | None) -> JointNumbers:
         root: element `<robot>`; file: its name; joint: by name, None: the only driven one.
 
     Raises:
-        BadConfiguration: an unknown joint or one of another kind, links that form a loop, a word for a number, a
-            negative mass or inertia, or no inertia of what turns.
+        BadConfiguration: an unknown joint, a joint that does not turn, a loop of links, a number that is wrong or
+            negative, or no inertia.
     """
     robot = _Urdf(root, file)
     return robot.numbers(robot.chosen(joint))

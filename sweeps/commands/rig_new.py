@@ -70,8 +70,8 @@ def text(kind: str | None, source: Path | None, joint: str | None, sheet: Mappin
     kind = kind or USUAL
     if not origins:
         return template(kind)
-    heading = [f"Filled in from {' and '.join(origins)}; a comment names the source of each number, ± is a guess."]
-    return filled(kind, numbers, heading)
+    origin = f"kind {kind}, filled in from {' and '.join(origins)}"
+    return filled(kind, numbers, f"{origin}; a comment names the source of each number, ± is a guess.")
 
 
 def new(
@@ -106,7 +106,8 @@ def new(
         what = f"{KINDS[kind or USUAL]}. Fill in what is marked example: yours, then"
     else:
         lacking = ", ".join(examples(written))
-        what = f"filled in; not found, so fill in: {lacking}. Then" if lacking else "filled in. Next"
+        what = written.removeprefix("# ").partition(";")[0]
+        what += f"; not found, so fill in: {lacking}. Then" if lacking else ". Next"
     try:
         file.write_text(written, encoding="utf-8")
     except OSError as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib import resources
 
 #: Kinds of rig, in words.
@@ -51,13 +51,13 @@ def template(kind: str) -> str:
     return resources.files("sweeps").joinpath("rigs", f"{kind}.toml").read_text(encoding="utf-8")
 
 
-def filled(kind: str, numbers: Mapping[str, Stated], heading: Sequence[str]) -> str:
+def filled(kind: str, numbers: Mapping[str, Stated], heading: str) -> str:
     """Returns the file of a kind with numbers in their lines.
 
     A number whose line the template lacks is added at the end of its table.
 
     Args:
-        numbers: by dotted name, `load.` for the table of the load; heading: sentences for the first lines.
+        numbers: by dotted name, `load.` for the table of the load; heading: sentence for the first line.
     """
     lines = template(kind).splitlines()
     at = next(k for k, line in enumerate(lines) if line.startswith("load = "))
@@ -65,7 +65,7 @@ def filled(kind: str, numbers: Mapping[str, Stated], heading: Sequence[str]) -> 
     for name, number in numbers.items():
         table, _, key = re.sub(rf"^{LOAD}\.", f"{load}.", name).rpartition(".")
         _put(lines, table, key, f"{key} = {number.text}  # [{number.unit}] {number.source}")
-    return "\n".join([*(f"# {sentence}" for sentence in heading), *lines]) + "\n"
+    return "\n".join([f"# {heading}", *lines]) + "\n"
 
 
 def _put(lines: list[str], table: str, key: str, line: str) -> None:
