@@ -103,6 +103,13 @@ def test_armature_without_a_ratio_turns_with_the_load(tmp_path):
     assert found["bench.inertia"] == pytest.approx(0.5 * 0.5 * 0.08**2 + 0.0016, rel=1e-6)
 
 
+def test_name_with_a_line_break_stays_in_its_comment(tmp_path):
+    robot = DIFFBOT.read_text().replace("left_wheel", "left&#10;mass = 1 #")
+    (tmp_path / "r.urdf").write_text(robot)
+    found, _ = values(rig_new.text(None, tmp_path / "r.urdf", "left\nmass = 1 #_joint", None), tmp_path)
+    assert found["rover.mass"] == pytest.approx(5.2)
+
+
 # --- bad robots -----------------------------------------------------------------------------------------
 
 

@@ -106,7 +106,7 @@ def new(
         what = f"{KINDS[kind or USUAL]}. Fill in what is marked example: yours, then"
     else:
         lacking = ", ".join(examples(written))
-        what = written.removeprefix("# ").partition(";")[0]
+        what = written.removeprefix("# ").partition("; a comment")[0]
         what += f"; not found, so fill in: {lacking}. Then" if lacking else ". Next"
     try:
         file.write_text(written, encoding="utf-8")

@@ -64,8 +64,13 @@ def filled(kind: str, numbers: Mapping[str, Stated], heading: str) -> str:
     load = lines[at - 1].strip("[]")
     for name, number in numbers.items():
         table, _, key = re.sub(rf"^{LOAD}\.", f"{load}.", name).rpartition(".")
-        _put(lines, table, key, f"{key} = {number.text}  # [{number.unit}] {number.source}")
-    return "\n".join([f"# {heading}", *lines]) + "\n"
+        _put(lines, table, key, f"{key} = {number.text}  # [{number.unit}] {_one_line(number.source)}")
+    return "\n".join([f"# {_one_line(heading)}", *lines]) + "\n"
+
+
+def _one_line(text: str) -> str:
+    """Text for a comment: names of a model may have line breaks, which would end it."""
+    return "".join(letter if letter.isprintable() else " " for letter in text)
 
 
 def _put(lines: list[str], table: str, key: str, line: str) -> None:
