@@ -563,7 +563,7 @@ def inspect_file(
     file: Annotated[str, typer.Argument(metavar="FILE", help="A file of data; ::PATH for a part of it.")],
     json: Annotated[bool, typer.Option("--json", help="Print JSON (mmrjax.inspect/1) instead of words.")] = False,
 ) -> int:
-    """List what a file of data contains: signals, units, rates, ranges, gaps; and propose the lines of [columns].
+    """List what a file of data contains: signals, units, rates, ranges, gaps; and propose names for its columns.
 
     Exit codes: 0 it can be read; 4 it cannot.
     """

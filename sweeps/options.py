@@ -27,8 +27,8 @@ def described(name: str, fact: Mapping[str, Any]) -> str:
     if "enum" in fact:
         texts[0] += f": {', '.join(map(str, fact['enum']))}"
     texts[0] += "."
-    texts += [f"\\[{text}]" for text in (_bounds(fact), _default(name, fact)) if text]
-    return "  ".join(texts)
+    texts += [f"[{text}]" for text in (_bounds(fact), _default(name, fact)) if text]
+    return "  ".join(texts).replace("[", "\\[")  # a word in brackets would be markup
 
 
 def _bounds(fact: Mapping[str, Any]) -> str:

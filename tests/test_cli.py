@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rich.text
+import typer
 
 from calibration.data.input_errors import BadConfiguration
 from mmrjax import SOUND_AT_LEVEL_0, fidelities
@@ -570,6 +572,17 @@ def test_help_shows_what_an_option_is_when_it_is_not_given(monkeypatch, capsys):
     text = capsys.readouterr().out
     for default in ("[default: steady]", "[default: 0,5,10,15,20]", "[default: 0.0001]"):
         assert default in text
+
+
+def test_no_word_in_brackets_is_lost_from_a_help():
+    def helps(command):
+        yield re.sub(r"\[/?bold\]", "", command.help or "")
+        yield from (str(getattr(p, "help", "") or "") for p in command.params)
+        for inner in getattr(command, "commands", {}).values():
+            yield from helps(inner)
+
+    for text in helps(typer.main.get_command(cli.app)):
+        assert rich.text.Text.from_markup(text).plain == text.replace("\\[", "["), text
 
 
 @pytest.mark.slow
