@@ -419,6 +419,21 @@ def test_inspect_prints_what_contents_finds(tmp_path, capsys):
     assert 'motor_speed_rpm = "/encoder/rpm"' in said and "log.h5: an HDF5 file, 5 signals" in said
 
 
+def test_contents_of_an_empty_file_are_an_error_and_empty_cells_are_missing(tmp_path):
+    (tmp_path / "log.csv").write_text("t,amps\n0,\n1,\n")
+    assert [s.missing for s in contents.inspect(tmp_path / "log.csv").signals] == [0, 2]
+    (tmp_path / "log.csv").write_text("")
+    with pytest.raises(BadData, match="the file is empty"):
+        contents.inspect(tmp_path / "log.csv")
+
+
+def test_a_bags_folder_without_its_metadata_is_named(tmp_path):
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "bag_0.mcap").touch()
+    with pytest.raises(BadData, match=r"without metadata\.yaml; .* as .*bag_0\.mcap"):
+        contents.inspect(tmp_path / "bag")
+
+
 def test_contents_of_a_presets_log_name_the_preset(tmp_path):
     pd.DataFrame({"ms_today": [1, 2, 3], "input_voltage": 24.0, "duty_cycle": 0.5, "erpm": 100.0}).to_csv(
         tmp_path / "log.csv", index=False

@@ -89,7 +89,7 @@ def inspect(source: str | Path | Any) -> Contents:
     """Returns what a file or a table in memory holds.
 
     Raises:
-        BadData: no such file, or an unreadable one.
+        BadData: no such file, an unreadable one, or one without columns.
     """
     found = _source(source)
     times: dict[int, tuple[np.ndarray, str] | str] = {}
@@ -126,6 +126,8 @@ def _source(source: Any) -> Source:
     if form is not None:
         return opening.opened(path, within, name, form)
     found = _of_text(delimited.arrays(path, name))
+    if not found.signals:
+        raise BadData(f"{name}: the file is empty; expected a header and rows")
     return found.below(within) if within else found
 
 
@@ -134,7 +136,7 @@ def _of_text(arrays: NamedArrays) -> Source:
     signals = []
     for k, (name, raw) in enumerate(zip(arrays.header, arrays.values, strict=True)):
         values = numbers(raw)
-        words = bool(len(values)) and not np.isfinite(values).any()
+        words = not np.isfinite(values).any() and any(str(cell).strip() for cell in raw)
         loaded = np.array(raw) if words else values
         unit = arrays.units[k] if arrays.units else ""
         signals.append(Signal(name, len(values), known(loaded), unit, words=words))

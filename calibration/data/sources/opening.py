@@ -82,6 +82,7 @@ SUFFIXES = {".mat": MATLAB, ".db3": BAG, ".jsonl": JSON, ".ndjson": JSON}
 VALUE, SHARE = 8.0, 0.3
 #: File of a ROS 2 bag's folder that lists its contents.
 _METADATA = "metadata.yaml"
+_RECORDINGS = (".db3", ".mcap")
 
 
 def unreadable(name: str, kind: str, error: BaseException) -> BadData:
@@ -104,8 +105,14 @@ def format_of(path: Path, name: str) -> Format | None:
     Raises:
         BadData: a pipe, a device, a folder that is no bag, or a file that the system does not open.
     """
-    if path.is_dir() and (path / _METADATA).exists():
-        return BAG
+    if path.is_dir():
+        if (path / _METADATA).exists():
+            return BAG
+        if parts := sorted(file.name for file in path.iterdir() if file.suffix in _RECORDINGS):
+            raise BadData(
+                f"{name}: is a folder without {_METADATA}; expected that file of the bag, or the path of a "
+                f"recording, as {path / parts[0]}"
+            )
     begin = input_files.beginning(path, name)
     for magic, found in BEGINNINGS.items():
         if begin.startswith(magic):
