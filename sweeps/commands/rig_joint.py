@@ -109,7 +109,8 @@ def hanging(torque: float, torque_quarter: float) -> tuple[float, float] | None:
         torque, torque_quarter: of gravity about the axis at θ = 0 and at a quarter turn [N·m].
     """
     weight = math.hypot(torque, torque_quarter)
-    return (weight, math.atan2(torque, -torque_quarter)) if weight > LEAST_WEIGHT else None
+    angle = math.atan2(torque, -torque_quarter) + 0.0  # not -0.0, which the file would show
+    return (weight, angle) if weight > LEAST_WEIGHT else None
 
 
 def is_round(centre: np.ndarray, axis: np.ndarray, radius: float, along: np.ndarray | None) -> bool:
