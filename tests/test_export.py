@@ -8,6 +8,7 @@ import dataclasses
 import importlib
 import io
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -521,6 +522,18 @@ def test_runs_of_more_than_one_joint_are_refused(header, row, message, tmp_path)
         situation.situation(drive, str(tmp_path / "runs.csv"))
 
 
+def test_a_rig_without_a_limit_of_the_voltage_needs_runs(rig):
+    rig.write_text(RIG.replace("voltage_limit = 12.0\n", ""))
+    with pytest.raises(BadConfiguration, match=r"--data: not stated, and rig\.toml has no motor\."):
+        situation.situation(joints.joint(robot_file.find(str(rig)), "arm"), None)
+
+
+def test_a_rig_whose_angle_alone_is_read_is_compared_by_its_motor(rig):
+    rig.write_text(RIG.replace('["total_current", "motor_speed"]', '["output_angle"]'))
+    drive = joints.joint(robot_file.find(str(rig)), "arm")
+    assert {c.name for c in joints.channels_of(drive)} == {"motor_speed", "motor_current"}
+
+
 def test_command_leaves_the_files_the_law_and_a_page(mmrjax, rig):
     code, out, _ = mmrjax("export", rig, "--to", "mujoco", "--out", "out", "--joint", "wheel")
     assert code == 0 and "series_resistance" not in out
@@ -539,6 +552,10 @@ def test_command_leaves_the_files_the_law_and_a_page(mmrjax, rig):
     ):
         assert f"## {heading}" in law
     assert "| `motor.resistance` | 1.7 | ohm |" in law
+    equations, constants_ = law.split("## Equations")[1].split("## Constants")
+    symbols = ("i_r", "C_m", "R_rot", "L_d", "M_df0", "K_fd", "M_rf0", "K_fr", "η_rm", "M_0", "K")
+    for text in (equations, constants_):
+        assert [s for s in symbols if not re.search(rf"\b{s}\b", text)] == []
     assert 'joint="wheel"' in (folder / "drive.xml").read_text()
     assert "thermal_drift" in (folder / "report.html").read_text()
 

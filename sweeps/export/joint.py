@@ -241,26 +241,31 @@ def _parts(joint: Joint) -> Iterator[Part]:
     bare = lambda robot: dataclasses.replace(robot, effects=())  # noqa: E731
 
     rest = float(joint.load.speed_still) / float(joint.load.radius)
+    friction = (
+        "M_t = M_t0 sign ω + K_ft ω, and friction by the normal load"
+        if joint.robot.has_ground
+        else "M_t = M_0 sign ω + K ω"
+    )
     base: Sequence[tuple[str, str, str, str, str, str, Callable[[Robot, Signals], Any]]] = (
         ("direction", "way", "-", "x (3 - x²) / 2, x = ω/ω_0 within ±1",
          f"smooth sign of the speed, within ω_0 = {rest:.3g} rad/s of rest", "",
          lambda r, s: contact.smooth_sign(s.speed_wheel, rest)),
         ("back_emf", "back", "V", "E = C_m ω_m", "voltage that the turning motor induces", "",
          lambda r, s: r.motor.voltage_back(s.speed_motor)),
-        ("winding", "electrical", "V", "U_R = R I", "voltage across the winding", "current",
+        ("winding", "electrical", "V", "U_R = R_rot I", "voltage across the winding", "current",
          lambda r, s: r.motor.voltage_winding(s.current)),
-        ("inductance", "inductance", "H", "L", "inductance of the winding", "",
+        ("inductance", "inductance", "H", "L_d", "inductance of the winding", "",
          lambda r, s: r.motor.inductance),
         ("motor_torque", "torque", "N·m", "M = C_m I", "torque that the current makes", "",
          lambda r, s: r.motor.torque_electromagnetic(s.current)),
-        ("motor_friction", "motor", "N·m", "M_f = M_0 sign ω + K ω", "friction of the motor, at its shaft", "",
+        ("motor_friction", "motor", "N·m", "M_f = M_df0 sign ω + K_fd ω", "friction of the motor, at its shaft", "",
          lambda r, s: r.motor.torque_loss(s.speed_motor, s.direction)),
-        ("gear_idle", "idle", "N·m", "M_i = M_r0 sign ω + K_r ω", "idle friction of the gearbox, at its input",
+        ("gear_idle", "idle", "N·m", "M_i = M_rf0 sign ω + K_fr ω", "idle friction of the gearbox, at its input",
          "", lambda r, s: r.gearbox.torque_idle(s.speed_motor, s.direction)),
-        ("gear_efficiency", "efficiency", "-", "η where power flows to the wheel, 1/η_b where it flows back",
+        ("gear_efficiency", "efficiency", "-", "η_rm where power flows to the wheel, 1/η_b where it flows back",
          "share of the torque that the gearbox passes on; `load`: torque at its input", "",
          lambda r, s: r.gearbox.efficiency_flow(s.torque_load, s.direction)),
-        ("output_friction", "track", "N·m", "M_t = M_t0 sign ω + K_t ω, and friction by the normal load",
+        ("output_friction", "track", "N·m", friction,
          "friction between the gearbox and the wheel's rim, at the wheel", "pull",
          lambda r, s: balances.track(bare(r), r.chassis(0), s).torque_track_loss),
     )  # fmt: skip
@@ -331,9 +336,13 @@ def typical(signals: Signals, names: Sequence[str]) -> dict[str, float]:
 
 
 def channels_of(joint: Joint) -> tuple[Any, ...]:
-    """Channels of the robot's instruments, in the order of their table."""
-    shown = joint.file.robot.rig.channels
-    return tuple(c for c in EVERY if c.name in shown)
+    """Channels of the robot's instruments that settled runs show, in the order of their table.
+
+    A rig without any, such as a servo whose angle alone is read, is compared by current and speed of the motor.
+    """
+    settled = [c for c in EVERY if c.settled]
+    shown = tuple(c for c in settled if c.name in joint.file.robot.rig.channels)
+    return shown or tuple(c for c in settled if c.name in ("motor_current", "motor_speed"))
 
 
 def combined(parts: Sequence[Part], field: str) -> Symbol:

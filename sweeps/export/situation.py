@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data.input_errors import BadData
+from calibration.data.columns import Layout
+from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
 from mmrjax.fidelities.steady import results_of_rows
 from mmrjax.model import balances, params
@@ -19,6 +20,7 @@ from mmrjax.model.signals import Signals, is_done
 from sweeps.config import GridPart
 from sweeps.export.joint import Joint, channels_of
 from sweeps.inputs import read_runs
+from sweeps.points import imposed
 from sweeps.points.grid import grid
 
 
@@ -122,9 +124,15 @@ def situation(joint: Joint, data: Runs | str | None) -> Situation:
 
     Raises:
         BadData: a table that is refused, without runs of this configuration, or of a robot that is no single joint.
+        BadConfiguration: no table, and a robot whose file states no limit of the voltage for a grid.
     """
     robot = joint.file.robot
     if data is None:
+        if not Layout.of(robot).table8 and imposed.limit(robot) is None:
+            raise BadConfiguration(
+                f"--data: not stated, and {joint.file.name} has no motor.voltage_limit for a grid of operating "
+                "points; give a table of runs, or state the limit"
+            )
         runs = grid(GridPart.model_construct(configurations=(joint.configuration,)), robot)
         source = "a grid of operating points, without readings"
     else:

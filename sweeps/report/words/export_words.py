@@ -66,7 +66,8 @@ def statement(found: Export) -> str:
     drive = found.joint
     return (
         f"The drive of {drive.file.name}, {drive.configuration}, as {FORMATS[found.format]}: its error against "
-        f"{compared.reference} over {count_noun(len(compared.situation.command), 'run')} is {channels_shown}."
+        f"{compared.reference} over {count_noun(len(compared.situation.command), 'run')} is "
+        f"{channels_shown or 'unknown, since they have no reading of its current or speed'}."
     )
 
 
@@ -137,20 +138,26 @@ def armature(found: Export) -> float:
 
 
 def equations(found: Export) -> list[str]:
-    """The law's equations in words, in the order in which they are computed."""
+    """The law's equations in words, in the order in which they are computed, with the symbols of the constants."""
     robot = found.joint.robot
-    lines = [
-        "ω is the speed of the joint [rad/s], ω_m = i ω that of the motor; sign ω fades to 0 at rest.",
-        "Winding: L dI/dt = U - C_m ω_m - R I - further drops. [V]",
-        "Motor: M_d = C_m I - (M_0 sign ω + K ω_m) - further losses, at its shaft. [N·m]",
-        "Gearbox: M_r = i η (M_d - M_r0 sign ω - K_r ω_m) - further losses, at its output. η turns to 1/η_b where "
-        "the load drives the motor. [N·m]",
-        "Output: M = M_r - (M_t0 sign ω + K_t ω) - further losses: the torque on the joint. [N·m]",
-    ]
-    if robot.has_ground:
-        lines.append("Guides: friction μ_t · share · normal load · radius, among the losses of the output. [N·m]")
     where = {"supply": "winding", "electrical": "winding", "inductance": "winding", "motor": "motor",
              "gearbox": "gearbox", "track": "output", "inertia": "armature"}  # fmt: skip
+    places = {where[p.balance] for p in found.joint.parts if p.effect and p.balance in INSIDE}
+    less = {place: f" - {place} effects" if place in places else "" for place in where.values()}
+    dry, viscous = ("M_t0", "K_ft") if robot.has_ground else ("M_0", "K")
+    backward = "2 - 1/η_rm, at least 0.02" if robot.gearbox.mesh_theory else "η_rm"
+    lines = [
+        "ω is the speed of the joint [rad/s], ω_m = i_r ω that of the motor, U the voltage at the driver's output, I "
+        "the current of the motor. sign ω fades to 0 at rest.",
+        f"Winding: L_d dI/dt = U - C_m ω_m - R_rot I{less['winding']}. [V]",
+        f"Motor: M_d = C_m I - (M_df0 sign ω + K_fd ω_m){less['motor']}, at its shaft. [N·m]",
+        f"Gearbox: M_r = i_r η_rm (M_d - M_rf0 sign ω - K_fr ω_m){less['gearbox']}, at its output. Where the load "
+        f"drives the motor, 1/η_b replaces η_rm, with η_b = {backward}. [N·m]",
+        f"Output: M = M_r - ({dry} sign ω + {viscous} ω){' - guides' if robot.has_ground else ''}{less['output']}: "
+        "the torque on the joint. [N·m]",
+    ]
+    if robot.has_ground:
+        lines.append("Guides: μ_t · share · normal load · radius · sign ω. [N·m]")
     for part in found.joint.parts:
         if part.effect and part.balance in INSIDE:
             lines.append(
@@ -158,8 +165,9 @@ def equations(found: Export) -> list[str]:
             )
     if found.format == "mujoco":
         lines += [
-            "MuJoCo's form of it: U = R' I' + L' dI'/dt + g K ω and M = g K I' - f sign ω - d ω, with R' = R/η, "
-            "L' = L/η, and the motor's current I = c I'. Its numbers are refitted to the law above.",
+            "MuJoCo's form of it: U = R' I' + L' dI'/dt + i_r K ω and M = i_r K I' - f sign ω - d ω, with "
+            "R' = R_rot/η_rm (resistance), L' = L_d/η_rm, K = C_m (motorconst), f (frictionloss), d (damping), and "
+            "the motor's current I = c I' (current over act). Its numbers are refitted to the law above.",
         ]
     return lines
 
