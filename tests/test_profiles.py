@@ -188,7 +188,7 @@ WRONG = {
     "empty file": ("", r"mission.csv: the file is empty; expected a header with time_s"),
     "comments only": ("# cycles = 3\n", r"mission.csv: the file is empty"),
     "header only": ("time_s,duty\n", r"got a header and no rows; expected two rows or more"),
-    "one row only": ("time_s,duty\n0,1\n", r"got one row; expected two rows or more, of which the last ends the mission"),
+    "one row only": ("time_s,duty\n0,1\n", r"got one row; expected two rows or more; the last one ends the mission"),
     "a short row": ("time_s,duty\n0,1\n5\n", r"row 2: got 1 cell; the header has 2 columns"),
     "commas and points": ("time_s;duty\n0;0,5\n5;0.5\n", r"duty: got 0,5 and 0\.5; expected decimal commas or points"),
     "unknown surface": ("time_s,duty,surface\n0,1,ice\n5,1,ice\n", r"row 1, surface: got ice; expected one of these; .*asphalt"),
@@ -205,7 +205,7 @@ WRONG = {
     "gap in a side": ("time_s,duty_left,duty_right\n0,1,\n5,1,1\n", r"row 1, duty_right: got an empty cell; expected a value for either side"),
     "duties beside a speed": ("time_s,duty_left,duty_right,speed_mm_s\n0,1,1,300\n5,1,1,\n", r"row 1, speed_mm_s: got 300 beside duty_left; expected one demand in a row"),
     "yaw rate without a speed": ("time_s,yaw_rate_rad_s,duty\n0,1,1\n5,1,1\n", r"got yaw_rate_rad_s without speed_mm_s; expected a demanded ground speed"),
-    "gap in the yaw rate": ("time_s,speed_mm_s,yaw_rate_deg_s\n0,300,\n5,300,10\n", r"row 1, yaw_rate_deg_s: got an empty cell; expected the yaw rate demanded beside the speed, 0 for straight travel"),
+    "gap in the yaw rate": ("time_s,speed_mm_s,yaw_rate_deg_s\n0,300,\n5,300,10\n", r"row 1, yaw_rate_deg_s: got an empty cell; expected the demanded yaw rate, 0 for straight travel"),
     "yaw rate of a braked robot": ("time_s,speed_mm_s,yaw_rate_rad_s,mode\n0,,1,brake\n5,,,\n", r"row 1, yaw_rate_rad_s: got 1; expected an empty cell: a yaw rate goes with a demanded speed, and this row has mode brake"),
     "setting twice": ("# cycles = 4\n# cycles = 4\ntime_s,duty\n0,1\n5,1\n", r"cycles is set twice"),
 }  # fmt: skip

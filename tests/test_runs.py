@@ -71,7 +71,7 @@ def test_missing_readings_are_nan_and_counted(tmp_path):
     np.testing.assert_array_equal(np.isnan(runs.measured()), [[False, True, False], [True, True, False]])
     assert runs.missing() == [
         "total_current_A: 1 of 2 readings are missing (row 2)",
-        "motor_speed_rpm: no readings; what they would show is not fitted",
+        "motor_speed_rpm: no readings; parameters that only they show are not fitted",
     ]
     assert np.isnan(runs.deviations()).all()
 
@@ -84,7 +84,7 @@ def test_a_table_without_any_known_channel_is_refused(tmp_path):
 
 def test_a_reading_without_its_stated_sd_is_refused(tmp_path):
     text = f"{HEADER},speed_sd_mm_s\n{ROW},4\n{ROW},\n"
-    with pytest.raises(BadData, match=r"row 2, speed_sd_mm_s: got an empty cell beside a reading; expected its sd"):
+    with pytest.raises(BadData, match=r"row 2, speed_sd_mm_s: got an empty cell next to a reading; expected its sd"):
         records.read(write(tmp_path, text))
 
 
@@ -346,9 +346,9 @@ def test_commas_and_points_in_one_column_are_refused(tmp_path):
         (
             "supply_voltage_V",
             "24V",
-            "got 24V; write 24, the unit stands in the column's name; expected a number, -100",
+            "got 24V; write 24, as the column's name has the unit; expected a number, -100",
         ),
-        ("supply_voltage_V", "24 volts", "got 24 volts; write 24, the unit stands in"),
+        ("supply_voltage_V", "24 volts", "got 24 volts; write 24, as the column's name has"),
         (
             "supply_voltage_V",
             "24000",

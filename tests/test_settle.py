@@ -186,7 +186,7 @@ BAD = {
     ),
     "time twice": (
         lambda c: c | {"time_s": np.r_[c["time_s"][0], c["time_s"][0], c["time_s"][2:]]},
-        r"row 2, time_s: 0 s stands twice; give each sample its own time",
+        r"row 2, time_s: 0 s is repeated; give each sample its own time",
     ),
     "no time": (
         lambda c: {k: v for k, v in c.items() if k != "time_s"},
@@ -262,7 +262,7 @@ WRONG = {
     ),
     "an angle in radians": (
         dict(output_angle_deg=np.radians),
-        r"rows \d+ to 200, output_angle_deg: 0\.01745 times as fast as motor_speed_rpm says with the ratio of the rig's "
+        r"rows \d+ to 200, output_angle_deg: 0\.01745 times as fast as motor_speed_rpm with the ratio of the rig's "
         r"file; is it radians for degrees\? write all rows in its unit, or state .* factor = 57\.3\}",
     ),
     "recordings in two units": (
@@ -271,7 +271,7 @@ WRONG = {
     ),
     "an angle that changes its unit": (
         dict(output_angle_deg=lambda x: np.where(np.arange(800) < 350, x, np.radians(x))),
-        r"row 351, output_angle_deg: goes from 3133 to 5\d\.?\d* between two samples, as degrees beside radians",
+        r"row 351, output_angle_deg: goes from 3133 to 5\d\.?\d* between two samples, as if degrees and radians are mixed",
     ),
     "an angle that wraps": (
         dict(output_angle_deg=lambda x: np.mod(x, 360.0)),

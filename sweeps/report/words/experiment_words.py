@@ -191,7 +191,7 @@ def more_runs(what: MoreRuns) -> str:
 
 
 def _steady_speeds(what: MoreRuns) -> str:
-    """Speeds at which a wave is followed."""
+    """Speeds for the record of a wave."""
     three = [f"{menu.round_significant(v):g}" for v in (what.low, 0.5 * (what.low + what.high), what.high)]
     return (
         f"Mark the driving shaft, start every run from the mark, and record steady travel at {', '.join(three[:2])} "

@@ -51,7 +51,7 @@ NOT_TESTED = (
     "Voltages, loads and temperatures outside the runs above.",
     "Fast changes: the comparison is of settled runs, so inductance and inertia rest on their stated values.",
 )
-BACKWARD = "Runs in which the load drives the motor: none is among those above."
+BACKWARD = "Runs in which the load drives the motor: the runs above contain none."
 
 
 def statement(found: Export) -> str:
@@ -158,8 +158,8 @@ def equations(found: Export) -> list[str]:
             )
     if found.format == "mujoco":
         lines += [
-            "MuJoCo's form of it: U = R' I' + L' dI'/dt + g K ω and M = g K I' - f sign ω - d ω, with R' = R/η, "
-            "L' = L/η, and the motor's current I = c I'. Its numbers are refitted to the law above.",
+            "MuJoCo's form of it: U = R' I' + L' dI'/dt + g K ω and M = g K I' - f sign ω - d ω; here R' = R/η, "
+            "L' = L/η, and the motor's current is I = c I'. Its numbers are refitted to the law above.",
         ]
     return lines
 

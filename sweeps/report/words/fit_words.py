@@ -113,7 +113,7 @@ def same_predictions(note: fit_notes.SamePredictions) -> str:
     """Kinds of blocks that give the same predictions."""
     return (
         f"held out by {' or by '.join(blocks.kind_in_words(k) for k in note.others)}: the same predictions as held "
-        f"out by {blocks.kind_in_words(note.kind)}, which stand for them; these runs do not vary them apart"
+        f"out by {blocks.kind_in_words(note.kind)}, which represents them; these runs do not vary them independently"
     )
 
 

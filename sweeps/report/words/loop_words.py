@@ -283,7 +283,7 @@ def _without_name(where: DiscrepancyLocation, p: float, no_effect: str) -> str:
 
 
 def _shown(where: DiscrepancyLocation) -> str:
-    """Variable over which a discrepancy shows, and equally significant others."""
+    """Variable that shows a discrepancy best, and equally significant others."""
     well = [shown_over(v, where.by_duty).removeprefix("best shown ") for v in where.variables_alike]
     return shown_over(where.variable, where.by_duty) + (f" (as well {', '.join(well)})" if well else "")
 
@@ -294,7 +294,7 @@ def _within(where: DiscrepancyLocation) -> str:
 
 
 def shown_over(variable: str, by_duty: bool = False) -> str:
-    """Variable over which a discrepancy shows; `by_duty`: only the duty changed the motors' voltage."""
+    """Variable that shows a discrepancy best; `by_duty`: only the duty changed the motors' voltage."""
     variable = "duty" if by_duty and variable == "voltage" else variable
     happens = bases.window_from_name(variable)
     if variable == "side":
@@ -475,7 +475,7 @@ def _strength(test: loop_notes.NameTest) -> str:
 
 #: What speaks against an effect by itself: short, and in words.
 DOUBTS = {
-    "chance": ("chance", "explains {0.root:.1f} σ{beside}, and chance reaches {0.needed:.1f}"),
+    "chance": ("chance", "explains {0.root:.1f} σ{curves}, and chance reaches {0.needed:.1f}"),
     "curve": ("a curve", "is a worse explanation than a smooth curve in its place"),
     "row": ("{0.what} {0.rests_on}", "rests on {0.what} {0.rests_on}"),
     "blocks": ("blocks", "is chosen again in {again:.0f} % of the data with a block left out"),
@@ -490,7 +490,7 @@ def doubts(test: loop_notes.NameTest | None) -> str:
     if test is None or not test.fails:
         return ""
     over = ", ".join(_over(c.place, *c.variables) for c in test.curves)
-    said = {"beside": over and f" next to smooth curves ({over})", "larger": " and ".join(test.larger)}
+    said = {"curves": over and f" next to smooth curves ({over})", "larger": " and ".join(test.larger)}
     said |= {"over_variable": test.over.replace("_", " ")}
     said["spread"] = f" by ±{100 * test.spread:.0f} %" if math.isfinite(test.spread) else ""
     *first, last = [DOUBTS[d][1].format(test, **said, again=100 * test.again) for d in test.fails]
