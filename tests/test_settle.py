@@ -207,7 +207,7 @@ BAD = {
             | {"supply_voltage_V": np.full(1200, 12.0), "duty": np.repeat([0.5, 0.6] * 3, 200)}
             | {"motor_speed_rpm": np.repeat([1, 1.2, -1, -1.2, 1, 1.2], 200) * (1000 + np.arange(1200) % 3)}
         ),
-        r"motor_speed_rpm: shows -1001 rpm at 6 V; expected the sign of what is imposed; give duty the sign",
+        r"motor_speed_rpm: shows -1001 rpm at 6 V; expected the sign of the imposed quantity; give duty the sign",
     ),
     "nothing imposed": (lambda c: c | {"supply_voltage_V": np.zeros(600)}, r"rows 1 to 600, no settled stretch: supply_voltage_V: nothing drives the motors; log rows"),
     "never settles": (
@@ -247,17 +247,17 @@ WRONG = {
     ),
     "a speed turned round": (
         dict(motor_speed_rpm=lambda x: -x),
-        r"rows \d+ to 200, motor_speed_rpm: shows -1080 rpm at 6 V; expected the sign of what is imposed; state "
+        r"rows \d+ to 200, motor_speed_rpm: shows -1080 rpm at 6 V; expected the sign of the imposed quantity; state "
         r"\[columns\] motor_speed_rpm = \{column = \.\.\., factor = -1\}",
     ),
     "a current turned round": (
         dict(total_current_A=lambda x: -x),
-        r"rows \d+ to 200, total_current_A: shows -0\.6 A at 6 V; expected the sign of what is imposed; state "
+        r"rows \d+ to 200, total_current_A: shows -0\.6 A at 6 V; expected the sign of the imposed quantity; state "
         r"\[columns\] total_current_A = \{column = \.\.\., factor = -1\}",
     ),
     "a voltage without sign": (
         dict(supply_voltage_V=np.abs),
-        r"rows \d+ to 600, motor_speed_rpm: shows -1080 rpm at 6 V; expected the sign of what is imposed; give "
+        r"rows \d+ to 600, motor_speed_rpm: shows -1080 rpm at 6 V; expected the sign of the imposed quantity; give "
         "supply_voltage_V the sign of its direction",
     ),
     "an angle in radians": (

@@ -280,11 +280,11 @@ def row_of(*changes):
 KEEP = tuple((k, 1) for k in range(5))
 REFUSED = {
     "one side": (KINEMATIC, f"motor_speed_left_rpm,{READ}", row_of(KEEP[0], *KEEP[2:]),
-                 "column motor_speed_right_rpm is missing beside motor_speed_left_rpm"),
+                 "column motor_speed_right_rpm is missing, motor_speed_left_rpm is stated"),
     "one duty": (DRIVEN, f"supply_voltage_V,duty_left,{READ}", [(24, 1, *row[2:]) for row in SOUND],
-                 "column duty_right is missing beside duty_left"),
+                 "column duty_right is missing, duty_left is stated"),
     "both ways": (KINEMATIC, f"motor_speed_rpm,{SPEEDS},{READ}", [(1, *row) for row in SOUND],
-                  "column motor_speed_rpm beside motor_speed_left_rpm, motor_speed_right_rpm; keep one"),
+                  "column motor_speed_rpm in addition to motor_speed_left_rpm, motor_speed_right_rpm; keep one"),
     "letters": (KINEMATIC, f"{SPEEDS},motor_current_l_A,motor_current_r_A,yaw_rate_rad_s", SOUND,
                 "column motor_current_l_A: the sides are called left and right; name it motor_current_left_A"),
     "in front": (KINEMATIC, f"{SPEEDS},left_motor_current_A,right_motor_current_A,yaw_rate_rad_s", SOUND,

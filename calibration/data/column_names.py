@@ -32,7 +32,7 @@ def understood(
     named, notes = _in_case(name, header, layout, inferred)
     repeated = sorted({c for c in named if named.count(c) > 1})
     if repeated:
-        raise BadData(f"{name}: column {repeated[0]} stands {named.count(repeated[0])} times; expected once")
+        raise BadData(f"{name}: column {repeated[0]} is present {named.count(repeated[0])} times; expected once")
     if inferred:
         layout = _with_channels(name, named, layout, channels.EVERY)
     if of_turns and {*layout.sides, *VOLTS, *HEADING} & {m.column for m in layout.meanings(name, named) if m}:

@@ -30,7 +30,7 @@ def _conditions(*loads: str) -> dict[str, Condition]:
 
 #: Conditions that act on a vehicle alone, and on a load on a shaft alone.
 ON_GROUND, ON_SHAFT = tuple(_conditions(GROUND)), tuple(_conditions(SHAFT))
-#: Conditions that the packaged robot's tables state, and values of those that a table may leave out.
+#: Conditions that the packaged robot's tables state, and default values of optional ones.
 CONDITIONS = {SUPPLY: BY_COLUMN[SUPPLY], **_conditions(GROUND)}
 DEFAULTS = {c.column: c.usual for c in CONDITIONS.values() if c.usual is not None}
 TIME = {"time_s": BY_COLUMN["time_s"]}
@@ -105,7 +105,7 @@ class Layout:
         imposed: quantity imposed on its motors, one of `rig.IMPOSED`.
         has_ground: True if a ground carries it, see `Robot.has_ground`.
         weight: True if a weight or a constant torque acts on it, which may drive its motors either way.
-        inherits: True if values that its file does not state are those of a packaged robot.
+        inherits: True if a packaged robot gives the values that its file does not state.
         configurations: their names.
         instruments: properties of instruments that are known.
         mapped: (column as this program calls it, column of the file, factor from its unit).

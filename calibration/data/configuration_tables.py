@@ -164,7 +164,7 @@ def _vehicle(table: dict[str, Any], where: str, sides: float) -> tuple[Chassis, 
     """A vehicle before the parameters of its table apply, and the required parameters that the table lacks."""
     if "movers" not in table:
         raise BadConfiguration(
-            f"{where}: what it is is missing; state load = one of {', '.join(rig_file.LOADS)}, or movers = one of "
+            f"{where}: its kind is missing; state load = one of {', '.join(rig_file.LOADS)}, or movers = one of "
             f"{', '.join(MOVERS)}"
         )
     on_tracks = _movers(table.pop("movers"), where)
@@ -197,7 +197,7 @@ def _names(stated: Any, where: str) -> list[str]:
         raise BadConfiguration(f"{where}: got {stated!r}; expected a list of names, at least one, as {_EXAMPLE}")
     for name in stated:
         if stated.count(name) > 1:
-            raise BadConfiguration(f"{where}: {name} stands {stated.count(name)} times; name each once")
+            raise BadConfiguration(f"{where}: {name} is listed {stated.count(name)} times; name each once")
         if name in TAKEN:
             raise BadConfiguration(f"{where}: {name} is the name of something else in a robot file; choose another")
         if not re.fullmatch(r"[A-Za-z0-9_-]+", name):

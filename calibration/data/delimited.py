@@ -200,7 +200,7 @@ def cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], tuple[str, 
             if (other or j in whole) and all(map(_THOUSANDS.fullmatch, written)):
                 beside = ", ".join(f"{cells[0]} in {_column(rows, k)}" for k, cells in list(other.items())[:1])
                 raise BadData(
-                    f"{name}, {_column(rows, j)}: got {written[0]} beside "
+                    f"{name}, {_column(rows, j)}: got {written[0]} next to "
                     f"{beside or 'whole numbers below a thousand'}; {wanted}"
                 )
     return rows, (f"{said}, and numbers have decimal commas; read so" if comma else f"{said}; read so",)

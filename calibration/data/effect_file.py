@@ -1,4 +1,4 @@
-"""User effects: classes in a Python file, checked against the contract and added to the library."""
+"""Effects of users: classes in a Python file, checked against the contract and added to the library."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ def remarks(robot: Robot, runs: Runs) -> list[str]:
     others = [s for s in np.unique(runs["surface"][of_table5]) if s != BENCH] if of_table5.any() else []
     if others:
         said.append(
-            f"the table has runs on {', '.join(others)}: the friction that is written is that of {BENCH}; simulate "
+            f"the table has runs on {', '.join(others)}: the written friction is for {BENCH}; simulate "
             f"with --surface {others[0]} to meet what was fitted"
         )
     return said

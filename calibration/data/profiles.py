@@ -471,8 +471,8 @@ def _check_demands(cells: _Cells, row: int, before: str, mode: str, own: list[st
         where = cells.columns[others[0]][0]
         beside = cells.columns[own[0]][0] if own and not cells.text(MODE, row) else f"mode {mode}"
         raise BadData(
-            f"{cells.source} row {row + 1}, {where}: got {cells.text(others[0], row)} in addition to {beside}; expected "
-            "one demand in a row"
+            f"{cells.source} row {row + 1}, {where}: got {cells.text(others[0], row)} in addition to {beside}; "
+            "expected one demand in a row"
         )
     pair = next((pair for pair in PAIRS if cells.has(pair[0])), ())
     ends = row == len(cells) - 1 and not cells.linear

@@ -23,7 +23,7 @@ from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import GRAVITY
 
 BATTERY = "battery"
-#: From this ratio a gearbox has three stages or more; and the efficiency that makers state for those at most.
+#: Least ratio of a gearbox with three stages or more, and the largest efficiency that makers state for these.
 STAGES, EFFICIENCY = 100.0, 0.85
 #: Least duration of a change of speed, in time constants, that the motors and load do not explain; fewest samples.
 FAR, RISING = 100.0, 3

@@ -80,7 +80,7 @@ FOLLOWS = {
 
 
 def linear(table: dict[str, Any], name: str, where: str, sds: dict[str, float], sides: float) -> None:
-    """Turn the table of a linear unit into that of the shaft of one of its drives, and its sds with it.
+    """Converts the table of a linear unit, and its sds, into the table of the shaft of one of its drives.
 
     Travel r per radian is lead / 2π or the drum's radius. With n drives, each drive has
 
@@ -311,7 +311,7 @@ def needed(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> tuple[str, ...]:
 def refuse_missing(
     missing: Sequence[str], known: Mapping[str, params.Parameter], where: str, given: Iterable[str] = ()
 ) -> None:
-    """Refuse a robot that starts from nothing and does not state what it must.
+    """Refuse a robot that starts from nothing and does not state all required parameters.
 
     Args:
         missing: names of parameters; known: every parameter of the robot.
@@ -344,7 +344,7 @@ def with_priors(robot: Robot, sds: Mapping[str, float], where: str) -> Robot:
     known = {p.name: p for p in params.walk_parameters(robot)}
     for name in sds:
         if name not in known:
-            raise BadConfiguration(f"{where}, {name}: a ± stands with parameters alone; state the number")
+            raise BadConfiguration(f"{where}, {name}: only parameters may have a ±; state the number")
     priors = tuple((name, float(p.value), sds[name]) for name, p in known.items() if name in sds)
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, priors=priors))
 

@@ -134,7 +134,7 @@ def parse(path: Path, library: Library = effects.BY_NAME, notes: list[str] | Non
         schema: version of this form.
         base: name of the robot that it starts from, `nominal` if left out; `none` starts from nothing.
         imposed, channels, start, columns, instruments: how it is driven and measured, see `rig_file`.
-        sides: number of motors with the same drive; `battery.cells`: cells in series.
+        sides: number of motors; `battery.cells`: cells in series.
         configurations: names of the robot's configurations, in order; default: those of the base, or all tables.
             A configuration that is not in the base states `like`, the base's configuration that it starts from.
             Otherwise it states `movers` (`tracks` or `wheels`) or `load` (see `rig_file.LOADS`), and every parameter

@@ -243,7 +243,7 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
             alike = "" if channel not in channels.OF_TURNS else f"; a turn has {' and '.join(layout.sides)} too"
             raise BadData(
                 f"{name} row {at + 1}, {channel.column}: got {number(readings[at])} at {number(imposed[at])} {unit}; "
-                "nothing else drives the motors there, so expected a reading with the sign of what is imposed, the "
+                "nothing else drives the motors there, so expected a reading with the sign of the drive, the "
                 f"same in every row{alike}"
             )
         if wrong.size:
@@ -297,8 +297,8 @@ def lacks(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator
             which = f"{', '.join(map(str, rows[:5]))}{' and more' if len(rows) > 5 else ''}"
             others = f", and so {several.sum() - 1} more" if several.sum() > 1 else ""
             yield (
-                f"{name}: run_id {run} stands in rows {which}{others}; without {', '.join(TIME)} every row is a run "
-                "of its own"
+                f"{name}: run_id {run} is in rows {which}{others}; without {', '.join(TIME)} every row is a "
+                "separate run"
             )
 
 

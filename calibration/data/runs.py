@@ -63,7 +63,7 @@ def read(
             Tables in memory are a pandas or polars DataFrame, an Arrow table, an xarray Dataset, a dict of arrays,
             or a list of records.
         columns: of the source, where its names are not this program's: a packaged preset (`vesc,pole_pairs=7`), a
-            preset's file, or a dict such as `{"motor_speed_rpm": "speed"}`. They win over those of the robot's file.
+            preset's file, or a dict such as `{"motor_speed_rpm": "speed"}`. They win over the robot's file.
         measured, battery, robot, of_turns: as for `of_arrays`.
 
     Raises:
@@ -89,7 +89,7 @@ def read(
 
 
 def _refuse_a_loggers_names(arrays: NamedArrays, layout: Layout) -> None:
-    """Refuses a source without any column of a known name whose columns are those of a preset."""
+    """Refuses a source without any column of a known name whose columns match a preset."""
     if any(m is not None for m in layout.meanings(arrays.name, list(dict.fromkeys(arrays.header)))):
         return
     if name := presets_file.recognised(arrays.header):
@@ -118,7 +118,7 @@ def of_arrays(
         robot: defines the columns that are needed, and the channels. None: the packaged robot, with a channel for
             each further column of one.
         of_turns: True to give a table of turns a channel for each of its columns of one side or of the yaw.
-        mapped: columns that have other names in the source, as `Layout.mapped`; None: those of the robot's file.
+        mapped: columns that have other names in the source, as `Layout.mapped`; None: from the robot's file.
 
     Raises:
         BadData: no columns or rows, no channel, a missing, misspelt or repeated column, or a wrong unit; values that

@@ -1,4 +1,4 @@
-"""From a log over time to settled runs: stretches with a constant drive in which every channel has settled."""
+"""Settled runs from a log over time: stretches with a constant drive in which every channel has settled."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ MOST_GLITCHES, BESIDE = 0.25, (21, 101)
 OF_YAW = tuple(c.name for c in channels.OF_TURNS if c.directed and c.side is None)
 #: Conditions that end a stretch whenever they change.
 EXACT = ("configuration", "surface", "mode", "slope_deg", "payload_kg", "total_mass_kg")
-#: Why samples are left out.
+#: Reasons to leave samples out.
 REASONS = (
     "changes", "short", "settling", "accelerates", "idle", "rest", "stuck", "glitches", "unread", "undriven",
 )  # fmt: skip
@@ -472,7 +472,7 @@ def _levels(
 
 @dataclasses.dataclass(frozen=True)
 class _End:
-    """The end of a level, before it is known whether it is settled.
+    """The end of a level, before the test that it is settled.
 
     Attributes:
         rows: of it; seen: mean, sd and change of each channel over it, by name [unit of the column].
@@ -486,7 +486,7 @@ class _End:
     glitches: dict[str, int]
 
 
-#: Why a level has no settled end: a reason of `REASONS`, the channel to blame, and how much, as a share.
+#: Reason why a level has no settled end: one of `REASONS`, the channel to blame, and the size as a share.
 _Why = tuple[str, str, float]
 
 
@@ -816,7 +816,7 @@ def _check_signs(found: Settled) -> None:
                 if turned
                 else f"give {'duty' if runs.has('duty') else layout.imposed_column} the sign of its direction"
             )
-            raise BadData(f"{_shows(found, wrong[0], channel)}; expected the sign of what is imposed; {cure}")
+            raise BadData(f"{_shows(found, wrong[0], channel)}; expected the sign of the imposed quantity; {cure}")
 
 
 def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> None:

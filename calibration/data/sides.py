@@ -18,7 +18,7 @@ from mmrjax.model.rig import Instrument
 CLEAR = 0.25
 #: Fewest rows that count, and the least share of them that has to contradict the drive [-].
 FEWEST, MOSTLY = 3, 0.75
-#: By how much a side's voltage may be above the supply's, as both are written with few digits [-].
+#: Largest relative excess of a side's voltage over the supply's, as both are written with few digits [-].
 ROUNDED = 0.01
 
 

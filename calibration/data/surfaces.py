@@ -1,4 +1,4 @@
-"""Surfaces of runs: labels of Table 5 scale the paper's robots' adhesion, any other has a friction of its own.
+"""Surfaces of runs: labels of Table 5 scale the paper's robots' adhesion, any other surface has its own friction.
 
 A surface without stated friction becomes a separate configuration, named after configuration and label: its
 `ground.*` is free, and all its other parameters follow the first configuration (`rig.surfaces`).

@@ -211,8 +211,10 @@ class Runs:
         return said
 
     def configurations(self, robot: Robot) -> np.ndarray:
-        """Index of each row's configuration in `robot`, shape (rows,): that of its configuration on its surface
-        (`surface_labels.named`) where the robot has one, else that of its configuration.
+        """Index of each row's configuration in `robot`, shape (rows,).
+
+        It is the configuration on the row's surface (`surface_labels.named`) if the robot has it, else the row's
+        configuration.
 
         Raises:
             InputError: a configuration that the robot does not have; the message lists its configurations.

@@ -21,7 +21,7 @@ from sweeps.export.joint import Joint, joint
 from sweeps.export.law_source import Constant
 from sweeps.export.situation import AtJoint, Situation, situation
 
-#: Names of formats and what they are for.
+#: Names of formats and their uses.
 FORMATS = {
     "mujoco": "MJCF with <dcmotor>, and a scene that runs",
     "jax": "an actuator function in JAX, as source and as a serialised program",

@@ -18,7 +18,7 @@ from calibration.data import input_files
 from calibration.data.input_errors import BadData, InputError
 from calibration.data.sources.recorded_signals import Signal, Source
 
-#: Between the path of a file and that of signals in it.
+#: Separator between the path of a file and the path of signals in it.
 WITHIN = "::"
 
 

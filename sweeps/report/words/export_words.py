@@ -12,7 +12,7 @@ from sweeps.export.comparison import APPROXIMATED, DROPPED, EXPORTED, HELD, NATI
 from sweeps.export.formats import FORMATS, Export
 from sweeps.export.joint import INSIDE
 
-#: How a file of each format is used, in a paragraph of LAW.md.
+#: Use of a file of each format, as a paragraph of LAW.md.
 USE = {
     "mujoco": (
         'Put `<include file="drive.xml"/>` before `<worldbody>` of your model and `class="{name}_drive"` on the '
@@ -82,7 +82,7 @@ def errors_title(found: Export) -> str:
 
 
 def remarks(found: Export) -> list[str]:
-    """What to know of an export."""
+    """Remarks on an export."""
     compared, drive = found.comparison, found.joint
     said = []
     if not compared.situation.is_measured:

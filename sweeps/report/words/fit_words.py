@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from calibration.inference.result import CalibrationResult
 
 
-#: What a parameter far from its prior means, by what it is told of.
+#: Meaning of a parameter far from its prior, by the kind of result.
 FAR = {
     "loop": "{} is implausible, {:.1f} prior sds from its prior: it probably absorbs a missing effect",
     "calibration": "{} lies {:.1f} prior sds from its prior: the prior or the model is wrong",
@@ -30,9 +30,9 @@ FACTS = {
     "no covariance": "the posterior has no finite covariance: values stand, intervals do not",
     "no grip": "no run grips: static friction, and slip below it, are known by their priors alone",
 }
-#: Where a prior comes from that is neither a field's nor stated.
+#: Origin of a prior that is neither from a field nor stated.
 PRIORS = {"product": "its product with the share of the guides, as in the other fidelities"}
-#: How a member of a population loses a row.
+#: Reasons why a member of a population loses a row.
 LOST_AS = {
     "slides": "slide", "tips": "turn over", "failed": "leave the ground for good or cannot be computed",
     "stalled": "stall",
@@ -40,7 +40,7 @@ LOST_AS = {
 
 
 def noise_off(note: fit_notes.NoiseOff) -> str:
-    """By what sds are off."""
+    """Ratio of residuals to their sds."""
     if not note.channel:
         return (
             f"residuals are {note.factor:.2g} times the {note.source} sds in every channel and under all "
@@ -82,7 +82,7 @@ def only_together(note: fit_notes.OnlyTogether) -> str:
 
 
 def of_rows(note: fit_notes.OfRows) -> str:
-    """Of which rows something is so."""
+    """Rows with a property, and its consequence."""
     rows = f"rows {', '.join(map(str, note.rows))}"
     if note.what == "limited":
         return (
@@ -140,7 +140,7 @@ def header(found: CalibrationResult, robot_name: str) -> str:
 
 
 def generations(note: fit_notes.Generations) -> str:
-    """How far a search went."""
+    """Number of generations of a search, and its last gain."""
     end = "the last gained nothing that counts"
     if not note.settled:
         end = "the last still gained: go on with more --generations"
@@ -190,7 +190,7 @@ def shown_by(test: fit_notes.Shown) -> str:
     }[test.what]
 
 
-#: Why no test of residuals decides whether a fit is adequate.
+#: Reasons why no test of residuals decides on the adequacy of a fit.
 OBSTACLES = {
     "undescribed": "This model does not describe these runs: {large}. Check units, signs, sides, and columns that "
     "vary and are not used, before any parameter is read",

@@ -120,7 +120,7 @@ def _claim(sure: Sequence[str], others: Sequence[str]) -> str:
 
 
 def _undescribed(said: loop_notes.Summary) -> str:
-    """That a model does not describe the runs, by how much, and what to check."""
+    """A model that does not describe the runs: its misfit, and checks to make."""
     each = [
         f"{channels.find_channel(m.channel).label} by {100 * m.error:.0f} % of its measured rms"
         + (f" (its noise is estimated as {100 * m.noise:.0f} %)" if m.noise > m.error else "")
@@ -150,7 +150,7 @@ def evidence(found: loop_notes.Mechanism) -> str:
     )
 
 
-#: What speaks against a mechanism.
+#: Evidence against a mechanism.
 NO_MECHANISM = {
     "share": "it explains only {share:.0f} % of the excess misfit",
     "gain": "on runs that its fit has not seen it gains {0.gain:.2g} ± {0.se:.2g} nat a reading",
@@ -473,7 +473,7 @@ def _strength(test: loop_notes.NameTest) -> str:
     return f"{test.effect} {test.root:.1f} σ (chance {test.needed:.1f}{less})"
 
 
-#: What speaks against an effect by itself: short, and in words.
+#: Evidence against a single effect: short, and in words.
 DOUBTS = {
     "chance": ("chance", "explains {0.root:.1f} σ{curves}, and chance reaches {0.needed:.1f}"),
     "curve": ("a curve", "is a worse explanation than a smooth curve in its place"),
@@ -531,7 +531,7 @@ def tentative(found: DiscoveryResult, effect: FoundEffect) -> str:
     return ": ".join(["tentative", *([", ".join(DOUBTS[d][0].format(test) for d in test.fails)] if test else [])])
 
 
-#: Why an effect is not plausible.
+#: Reasons why an effect is not plausible.
 RULED_OUT = {
     "power": "{0.name} would make its balance supply power",
     "size": "{0.name} at {0.size:.2g} times its largest plausible size; check {check}",
@@ -540,7 +540,7 @@ RULED_OUT = {
 
 
 def why_ruled_out(reasons: Sequence[loop_notes.RuledOut]) -> str:
-    """Why effects are not plausible, each."""
+    """Reason why each effect is not plausible."""
     return "; ".join(RULED_OUT[r.why].format(r, check=" and ".join(r.check)) for r in reasons)
 
 
@@ -711,7 +711,7 @@ def kept_out(note: loop_notes.KeptOut) -> str:
 
 
 def still_lacks(note: loop_notes.StillLacks) -> str:
-    """What the effects found leave."""
+    """Discrepancy that remains with the identified effects."""
     place, over = bases.place_in_words(note.place), note.variable.replace("_", " ")
     return f"not everything is explained: an error in the {place} that varies with {over} remains"
 
@@ -726,7 +726,7 @@ def late(note: loop_notes.Late) -> str:
 
 
 def led(note: loop_notes.Led) -> str:
-    """By what the leader of a class was chosen, and whether the other way would have chosen another."""
+    """Criterion that chose the leader of a class; a different choice by the other criterion is reported."""
     names, leader = note.names, note.leader
     by = {
         HELD_OUT: "errors held out",
@@ -758,7 +758,7 @@ def rests_on(note: loop_notes.RestsOn) -> str:
 
 
 def unwritten(note: loop_notes.Unwritten) -> str:
-    """Why what was found is not in the robot that is written."""
+    """Reason why identified effects are not in the written robot."""
     what = "the curve" if note.curve else "what was found"
     how = "no better than" if note.curve and note.gain > 0 else "worse than"
     return (

@@ -10,7 +10,7 @@ from calibration.sensitivity import sensitivity_notes
 if TYPE_CHECKING:
     from calibration.sensitivity.result import SensitivityResult
 
-#: What each method says of an input.
+#: Meaning of each method's result for an input.
 METHODS = {
     "local": "exact derivatives at the robot's own values",
     "sobol": "shares of the variance, alone and with others",
@@ -37,7 +37,7 @@ def statement(found: SensitivityResult) -> str:
 
 
 def sampling(note: sensitivity_notes.Sampling) -> str:
-    """What a method goes over."""
+    """Method and its operating points."""
     return f"{METHODS[note.method]}, over {note.points} operating points"
 
 
