@@ -267,7 +267,7 @@ WRONG = {
     ),
     "recordings in two units": (
         dict(output_angle_deg=lambda x: np.where(np.arange(800) < 400, x - x[399], np.radians(x - x[399]))),
-        r"rows \d+ to 600, output_angle_deg: 0\.01745 times as fast as motor_speed_rpm says",
+        r"rows \d+ to 600, output_angle_deg: 0\.01745 times as fast as motor_speed_rpm with",
     ),
     "an angle that changes its unit": (
         dict(output_angle_deg=lambda x: np.where(np.arange(800) < 350, x, np.radians(x))),
