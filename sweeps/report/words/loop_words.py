@@ -475,7 +475,7 @@ def _strength(test: loop_notes.NameTest) -> str:
 
 #: Evidence against a single effect: short, and in words.
 DOUBTS = {
-    "chance": ("chance", "explains {0.root:.1f} σ{curves}, and chance reaches {0.needed:.1f}"),
+    "chance": ("chance", "explains {0.root:.1f} σ{beside}, and chance reaches {0.needed:.1f}"),
     "curve": ("a curve", "is a worse explanation than a smooth curve in its place"),
     "row": ("{0.what} {0.rests_on}", "rests on {0.what} {0.rests_on}"),
     "blocks": ("blocks", "is chosen again in {again:.0f} % of the data with a block left out"),
@@ -490,7 +490,7 @@ def doubts(test: loop_notes.NameTest | None) -> str:
     if test is None or not test.fails:
         return ""
     over = ", ".join(_over(c.place, *c.variables) for c in test.curves)
-    said = {"curves": over and f" next to smooth curves ({over})", "larger": " and ".join(test.larger)}
+    said = {"beside": over and f" next to smooth curves ({over})", "larger": " and ".join(test.larger)}
     said |= {"over_variable": test.over.replace("_", " ")}
     said["spread"] = f" by ±{100 * test.spread:.0f} %" if math.isfinite(test.spread) else ""
     *first, last = [DOUBTS[d][1].format(test, **said, again=100 * test.again) for d in test.fails]
