@@ -46,7 +46,7 @@ def calibrate(
 
 
 def print_calibration(found: CalibrationResult) -> None:
-    """Whether the fit is adequate; parameters, errors and remarks, for a person."""
+    """Print the answer (adequate or not), parameters, errors and remarks."""
     say(found.adequacy.statement)
     shown = Table(
         title=f"{counted(len(found), 'row')}, {found.model}", title_justify="left", box=None, pad_edge=False

@@ -30,7 +30,7 @@ def new(file: Path, kind: str, force: bool) -> int:
     """Write a rig's file to fill in; returns 0.
 
     Raises:
-        BadConfiguration: no such kind, no such folder, or a file that is there without `force`.
+        BadConfiguration: no such kind, no such folder, or the file exists and `force` is false.
     """
     if kind not in KINDS:
         each = "; ".join(f"{name}: {what}" for name, what in KINDS.items())

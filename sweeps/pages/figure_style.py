@@ -136,7 +136,7 @@ def with_labels(fig: Figure) -> Figure:
 
 
 def has_colour_scale(fig: Figure) -> bool:
-    """True for a figure whose colours stand for numbers, which a dark page must not invert."""
+    """True if colours of the figure encode numbers; a dark page must not invert them."""
     return bool(fig.findobj(lambda artist: isinstance(artist, AxesImage | QuadMesh)))
 
 
@@ -184,7 +184,7 @@ def _luminance(channels: np.ndarray) -> float:
 
 
 def _place(fig: Figure, axes: Axes) -> dict[str, Any]:
-    """Where axes are in the drawing [pt from its upper left corner], and what they run over."""
+    """Position of axes in the drawing [pt from its upper left corner], and their ranges."""
     width, height = 72 * fig.get_size_inches()
     box = axes.get_position(original=False)
     place = [box.x0 * width, (1 - box.y1) * height, box.width * width, box.height * height]

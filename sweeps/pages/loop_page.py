@@ -89,7 +89,7 @@ def findings(found: DiscoveryResult, changed: Mapping[str, loop_figures.Change])
 
 
 def changes(found: DiscoveryResult) -> dict[str, loop_figures.Change]:
-    """What each effect changes in settled runs; nothing of histories, and of effects that the written robot lacks."""
+    """Change of settled runs by each effect; empty for histories and for effects that the written robot lacks."""
     added = [e.name for e in found.effects if e.name in {x.name for x in found.robot.effects}]
     if not isinstance(found.detail, EquationDefects) or not added:
         return {}
@@ -173,8 +173,7 @@ def summary(found: DiscoveryResult) -> list[dict[str, Any]]:
 
 
 def check_first(found: DiscoveryResult) -> list[str]:
-    """What to look at before the robot is used: the reading that weighs most, parameters that moved too far, and what
-    the table contradicts."""
+    """Points to check before use: the reading with the largest weight, parameters that moved far, contradictions."""
     far = [describe(note) for note in found.remarks if isinstance(note, FarFromPrior | Repeats | Copied)]
     against = [note for note in found.remarks if isinstance(note, str)]
     said = [loop_words.largest_share(found), *far, *against[:1]]

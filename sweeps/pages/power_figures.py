@@ -38,7 +38,7 @@ def sources(runs: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def drawable(runs: dict[str, np.ndarray]) -> np.ndarray:
-    """Which runs have numbers, and losses that are none of them negative."""
+    """Mask of runs with numbers and without negative losses."""
     parts, given = np.stack(list(split(runs).values())), sum(sources(runs))
     return np.isfinite(parts).all(0) & (parts >= -1e-6 * np.maximum(given, 1.0)).all(0) & (given > 0)
 

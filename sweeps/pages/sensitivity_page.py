@@ -66,12 +66,12 @@ def write(folder: Path, found: SensitivityResult, file: RobotFile) -> Path:
 
 
 def _decided(study: OutputStudy) -> bool:
-    """Whether any input changes an output at all."""
+    """True if any input changes an output."""
     return bool(study.overall_share.max(initial=0.0) > 0)
 
 
 def _sentence(study: OutputStudy, found: SensitivityResult) -> str:
-    """What decides an output, with its own spread."""
+    """Sentence on the inputs that decide an output, with its spread."""
     share, row = study.overall_share, study.row
     if not _decided(study):
         return "No number at any of these operating points, or nothing changes it."
@@ -170,7 +170,7 @@ def _ranges(found: SensitivityResult) -> str:
 
 
 def _bounds(found: SensitivityResult) -> list[dict[str, str]]:
-    """How bounds of derivatives compare with sampled indices, by output."""
+    """Bounds from derivatives compared with sampled indices, by output."""
     return [
         {
             "label": found.outputs[name].row.label,

@@ -143,7 +143,7 @@ _SPLIT_COLOURS = {
 
 
 def energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[dict[str, Any]]]:
-    """Where the supply's power goes at twelve operating points, in percent, with watts at the end."""
+    """Use of the supply's power at twelve operating points, in percent, with watts at the end."""
     asked = [(c, u, p, s) for c in ratio for u, p in ((15.0, 0.0), (33.0, 8.0)) for s in (0.0, 10.0, 20.0)]
     kind, voltage, payload, slope = (np.array(v) for v in zip(*asked, strict=True))
 

@@ -113,7 +113,7 @@ def same_predictions(note: fit_notes.SamePredictions) -> str:
     """Kinds of blocks that give the same predictions."""
     return (
         f"held out by {' or by '.join(blocks.in_words(k) for k in note.others)}: the same predictions as held out by "
-        f"{blocks.in_words(note.kind)}, which stand for them; these runs do not vary them apart"
+        f"{blocks.in_words(note.kind)}, shown in their place; these runs do not vary them separately"
     )
 
 
@@ -140,7 +140,7 @@ def header(found: CalibrationResult, robot_name: str) -> str:
 
 
 def generations(note: fit_notes.Generations) -> str:
-    """How far a search went."""
+    """Progress of a search."""
     end = "the last gained nothing that counts"
     if not note.settled:
         end = "the last still gained: go on with more --generations"

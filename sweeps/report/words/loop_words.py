@@ -120,7 +120,7 @@ def _claim(sure: Sequence[str], others: Sequence[str]) -> str:
 
 
 def _undescribed(said: loop_notes.Summary) -> str:
-    """That a model does not describe the runs, by how much, and what to check."""
+    """Sentence on a model that does not describe the runs: the misfit and the checks."""
     each = [
         f"{channels.find(m.channel).label} by {100 * m.error:.0f} % of its measured rms"
         + (f" (its noise is estimated as {100 * m.noise:.0f} %)" if m.noise > m.error else "")
@@ -283,7 +283,7 @@ def _without_name(where: DiscrepancyLocation, p: float, no_effect: str) -> str:
 
 
 def _shown(where: DiscrepancyLocation) -> str:
-    """Variable over which a discrepancy shows, and equally significant others."""
+    """Variable that shows a discrepancy, and equally significant others."""
     well = [shown_over(v, where.by_duty).removeprefix("best shown ") for v in where.variables_alike]
     return shown_over(where.variable, where.by_duty) + (f" (as well {', '.join(well)})" if well else "")
 
@@ -294,7 +294,7 @@ def _within(where: DiscrepancyLocation) -> str:
 
 
 def shown_over(variable: str, by_duty: bool = False) -> str:
-    """Variable over which a discrepancy shows; `by_duty`: only the duty changed the motors' voltage."""
+    """Variable that shows a discrepancy; `by_duty`: only the duty changed the motors' voltage."""
     variable = "duty" if by_duty and variable == "voltage" else variable
     happens = bases.window(variable)
     if variable == "side":
@@ -475,7 +475,7 @@ def _strength(test: loop_notes.NameTest) -> str:
 
 #: What speaks against an effect by itself: short, and in words.
 DOUBTS = {
-    "chance": ("chance", "explains {0.root:.1f} σ{beside}, and chance reaches {0.needed:.1f}"),
+    "chance": ("chance", "explains {0.root:.1f} σ{beside}; chance alone reaches {0.needed:.1f}"),
     "curve": ("a curve", "is a worse explanation than a smooth curve in its place"),
     "row": ("{0.what} {0.rests_on}", "rests on {0.what} {0.rests_on}"),
     "blocks": ("blocks", "is chosen again in {again:.0f} % of the data with a block left out"),
@@ -711,7 +711,7 @@ def kept_out(note: loop_notes.KeptOut) -> str:
 
 
 def still_lacks(note: loop_notes.StillLacks) -> str:
-    """What the effects found leave."""
+    """Sentence on the discrepancy that remains with the effects found."""
     place, over = bases.in_words(note.place), note.variable.replace("_", " ")
     return f"not everything is explained: an error in the {place} that varies with {over} remains"
 

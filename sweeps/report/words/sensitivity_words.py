@@ -37,7 +37,7 @@ def statement(found: SensitivityResult) -> str:
 
 
 def sampling(note: sensitivity_notes.Sampling) -> str:
-    """What a method goes over."""
+    """Distribution of the inputs that a method samples."""
     return f"{METHODS[note.method]}, over {note.points} operating points"
 
 
