@@ -104,11 +104,11 @@ def comparison(log: bool = False) -> Document:
     simulated = {c: measured[c] for c in ("configuration", *measured.axes)}
     simulated |= {c.column: error * measured[c.column] for c in measured.channels}
     simulated["status"] = np.where(np.isnan(error), "slides", "converged")
-    table, summary = compared(measured, simulated, sized=log)
+    table, summary = compared(measured, simulated)
     time = {"time_s": 0.1 * np.arange(len(measured))} if log else {}
     return comparison_report.document(
         Comparison(
-            table | time, summary, measured.channels, "measured", "steady", "nominal (PM)", log, "" if log else "these",
+            table | time, summary, measured.channels, "measured", "steady", "nominal (PM)", "" if log else "these",
             {"time_s": "time [s]"} if log else None, ("a note",),
         )
     )  # fmt: skip

@@ -251,7 +251,7 @@ def test_report_shows_the_runs_own_history_with_its_peak(driven):
 def test_comparison_shows_its_rows_and_escapes_its_title(tmp_path):
     measured = records.read("measured")
     table, summary = compare.compared(measured, _table(measured))
-    found = Comparison(table, summary, measured.channels, "a&b.csv", "steady", "<b>x.toml", False)
+    found = Comparison(table, summary, measured.channels, "a&b.csv", "steady", "<b>x.toml")
     page = page_renderer.write(tmp_path, comparison_report.document(found)).read_text()
     assert "<b>x.toml" not in page and "&lt;b&gt;x.toml" in page and "a&amp;b.csv" in page
     assert drawn(page) == {"parity", "errors"} and outside(tmp_path) == []

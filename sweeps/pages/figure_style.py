@@ -8,7 +8,6 @@ import json
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar
 from typing import Any
 
 import matplotlib
@@ -69,32 +68,20 @@ _RC: dict[Any, Any] = {
 }
 
 
-@contextmanager
-def style() -> Iterator[None]:
-    """The settings of every figure, for as long as the block lasts."""
-    with matplotlib.rc_context(_RC):
-        yield
-
-
-#: True while figures are drawn for a phone: one panel below the other.
-_STACKED: ContextVar[bool] = ContextVar("stacked", default=False)
-#: Width of a figure with stacked panels [inches].
+#: Width of a figure with stacked panels, for phones [inches].
 NARROW = 4.3
 
 
 @contextmanager
-def stacked_panels() -> Iterator[None]:
-    """Figures drawn in the block have one column of panels."""
-    token = _STACKED.set(True)
-    try:
+def style(width: float = WIDTH) -> Iterator[None]:
+    """The settings of every figure, for as long as the block lasts; at the width `NARROW` panels are stacked."""
+    with matplotlib.rc_context(_RC | {"figure.figsize": (width, width)}):
         yield
-    finally:
-        _STACKED.reset(token)
 
 
 def figure(rows: int, columns: int, height: float, **keywords: Any) -> tuple[Figure, np.ndarray]:
-    """A figure of the page's width and its axes, shape (rows, columns); within `stacked_panels` one column wide."""
-    stacked = _STACKED.get()
+    """A figure of the width of `style` and its axes, shape (rows, columns)."""
+    stacked = matplotlib.rcParams["figure.figsize"][0] == NARROW
     size = (
         (NARROW, (max(height / rows, 2.2) * columns if columns > 1 else height / rows) * rows)
         if stacked
