@@ -16,6 +16,7 @@ from sweeps import config as configuration
 from sweeps.console import pulse, say, tell
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
+from sweeps.report.words import fit_words
 from sweeps.skeleton import leave, page
 from sweeps.store import open_folder
 
@@ -47,7 +48,8 @@ def calibrate(
 
 def print_calibration(found: CalibrationResult) -> None:
     """Print the answer (adequate or not), parameters, errors and remarks."""
-    say(found.adequacy.statement)
+    say(fit_words.calibration(found))
+    say(f"{found.adequacy.statement}.")
     shown = Table(
         title=f"{counted(len(found), 'row')}, {found.model}", title_justify="left", box=None, pad_edge=False
     )

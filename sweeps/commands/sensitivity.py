@@ -194,7 +194,7 @@ def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs, t
 def print_sensitivity(found: SensitivityResult) -> None:
     """Print decisive inputs of each output, inputs without effect, and the next measurements."""
     say(found.statement())
-    title = f"{sensitivity_words.METHODS[found.method]}, {len(found.points)} operating points"
+    title = sensitivity_words.METHODS[found.method]
     if found.evaluations:
         title += f", {found.evaluations:,} model evaluations"
     shown = Table(title=title, title_justify="left", box=None, pad_edge=False)
