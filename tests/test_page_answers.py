@@ -8,6 +8,7 @@ import pytest
 from calibration.sensitivity.result import Points
 from mmrjax.model import channels
 from sweeps.pages import mission_page, runs_page, sweep_page
+from sweeps.paper import error_tables
 from sweeps.report.words import fit_words, sensitivity_words
 
 SHOWN = [channels.find("total_current"), channels.find("speed")]
@@ -115,3 +116,16 @@ def test_calibration_compares_errors_on_the_same_rows(rows):
     )
     found.adequacy.adequate, found.channels = None, ()
     assert fit_words.calibration(found) == "Adequacy undecided; no row is reached both before and after."
+
+
+def test_reproduce_compares_with_the_bench_and_the_paper():
+    def of(rms, rows, group="all"):
+        cells = [{"rms_percent": rms + k} for k in range(3)]
+        return {"variant": "", "group": group, "rows": rows, "of": 20, "cells": cells}
+
+    every = [of(9, 13), of(9, 13, "6T2A"), of(8, 20), of(5, 20), of(5, 10, "6T2A"), of(3, 20)]
+    assert error_tables.answer(every) == (
+        "rms error against 20 of 20 measured rows: 5.0 % total current, 6.0 % motor speed, 7.0 % speed, with adhesion "
+        "raised (13 rows settle on its own). The paper's own simulation: 3.0 % total current, 4.0 % motor speed, "
+        "5.0 % speed."
+    )

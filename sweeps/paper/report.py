@@ -71,9 +71,11 @@ def _against_the_bench(
     certainty = album.add("fig28_current_over_slope", lambda: run_figures.current_over_slope(robot, mine))
     if TRACKED in mine.ratio:
         album.add("fig29_model_errors", lambda: run_figures.model_errors(robots, rows))
+    errors = error_tables.errors(_variants(name, rows), mine)
     return {
+        "answer": error_tables.answer(errors),
         "certainty": certainty,
-        "errors": error_tables.errors(_variants(name, rows), mine),
+        "errors": errors,
         "raised": data.raised_words(robot, mine.ratio),
         "sliding": list(zip(*_sliding_rows(mine), strict=True)),
         "measured": len(mine.conditions),
