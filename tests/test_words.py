@@ -441,9 +441,9 @@ def test_names_say_what_would_explain_more_than_they():
 @pytest.mark.parametrize(
     ("found", "predicted", "said"),
     [
-        ((10, 4.3, 4.72), (10, 10), "motor speed 4.3 → 4.7 %"),
-        ((10, 0.141, 0.149), (10, 10), "motor speed 0.14 → 0.15 %"),
-        ((8, 4.0, 5.0), (8, 10), "motor speed 4.0 → 5.0 % (of the 8 rows that both predict)"),
+        ((10, 4.3, 4.72), (10, 10), "motor speed 4.3 → 4.7 % (same 10 rows)"),
+        ((10, 0.141, 0.149), (10, 10), "motor speed 0.14 → 0.15 % (same 10 rows)"),
+        ((8, 4.0, 5.0), (8, 10), "motor speed 4.0 → 5.0 % (same 8 rows)"),
         (None, (10, 8), "2 rows fewer predicted"),
         (None, (10, 9), "1 row fewer predicted"),
         (None, (10, 10), ""),
@@ -451,7 +451,7 @@ def test_names_say_what_would_explain_more_than_they():
 )
 def test_what_is_predicted_worse_is_said_with_its_rows(found, predicted, said):
     worse = () if found is None else (Worse("voltage", "motor_speed", *found),)
-    whole = f"Held out, what was found predicts worse: by voltage {said}."
+    whole = f"Predicts worse on held-out rows: by voltage {said}."
     assert loop_words.worse(worse, {"voltage": predicted}) == (whole if said else "")
 
 

@@ -391,7 +391,7 @@ def _rms(errors: Errors, total: int) -> str:
         return "no row is reached"
     rms, worst, rows = (max(float(e[name]) for e in known) for name in ("rms_percent", "max_percent", "rows"))
     few = f" ({rows:.0f}/{total} reached)" if rows < total else ""
-    return f"rms up to {rms:.1f} %, worst reading {worst:.1f} %{few}"
+    return f"rms ≤ {rms:.1f} %, worst {worst:.1f} %{few}"
 
 
 def largest_share(found: DiscoveryResult) -> str:
@@ -617,13 +617,13 @@ def worse(found: Sequence[Worse], predicted: Mapping[str, tuple[int, int]]) -> s
     for kind, (before, after) in predicted.items():
         mine = [w for w in found if w.kind == kind]
         changes = [f"{channels.find(w.channel).label} {_change(w.before, w.after)} %" for w in mine]
-        if any(w.rows < max(before, after) for w in mine):
-            changes[-1] += f" (of the {min(w.rows for w in mine)} rows that both predict)"
+        if mine:
+            changes[-1] += f" (same {min(w.rows for w in mine)} rows)"
         if before > after:
             changes.append(f"{counted(before - after, 'row')} fewer predicted")
         if changes:
             parts.append(f"by {blocks.in_words(kind)} {', '.join(changes)}")
-    return f"Held out, what was found predicts worse: {'; '.join(parts)}." if parts else ""
+    return f"Predicts worse on held-out rows: {'; '.join(parts)}." if parts else ""
 
 
 def _change(before: float, after: float) -> str:
