@@ -16,17 +16,7 @@ from calibration.inference.bases import in_words
 from calibration.inference.details import TimeStatistics
 from mmrjax.effects.curve import EVERY_VARIABLE, Variable
 from mmrjax.model.channels import EVERY, SIDES, Channel
-from sweeps.pages.figure_style import (
-    BLUE,
-    FAINT,
-    GREEN,
-    INK,
-    ORANGE,
-    SKY,
-    figure,
-    looks,
-    note,
-)
+from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, SKY, figure, legend_columns, looks, note
 from sweeps.pages.sweep_figures import UNITS, imposed
 from sweeps.pages.words import short_name
 
@@ -374,7 +364,11 @@ def defects(table: dict[str, np.ndarray], verdict: str, crosses_zero: bool = Fal
             if row == len(whens) - 1:
                 axes.set_xlabel(label)
                 axes.locator_params(axis="x", nbins=5)
-    fig.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=4)
+    fig.legend(
+        *grid[0, 0].get_legend_handles_labels(),
+        loc="outside upper right",
+        ncols=legend_columns(grid[0, 0].get_legend_handles_labels()[1]),
+    )
     return fig
 
 

@@ -11,7 +11,19 @@ from matplotlib.figure import Figure
 
 from mmrjax.model.channels import SIDES
 from mmrjax.model.energy import SINKS
-from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, note
+from sweeps.pages.figure_style import (
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    figure,
+    legend_columns,
+    note,
+)
 from sweeps.points.imposed import UNLIMITED
 
 #: Units of a time axis: how long a mission is for it [s], its size [s], its name.
@@ -97,7 +109,8 @@ def _beside(axes: Axes, label: str, colour: str) -> Axes:
 
 def _legend(axes: Axes, *others: Axes) -> None:
     handles = [h for a in (axes, *others) for h in a.get_legend_handles_labels()[0]]
-    axes.legend(handles, [str(h.get_label()) for h in handles], loc="upper center", ncols=len(handles), fontsize=8)
+    labels = [str(h.get_label()) for h in handles]
+    axes.legend(handles, labels, loc="upper center", ncols=legend_columns(labels), fontsize=8)
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.22 * (high - low))  # room for it
 
